@@ -1,0 +1,46 @@
+# Each target makes its own .venv and installs what it needs; only make and a Python >= 3.11 with
+# venv must be there. Choose one with `make PYTHON=python3.12 …`.
+
+PYTHON ?= $(shell for p in python3 python python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV ?= .venv
+BIN := $(VENV)/bin
+ARGS ?=
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DELETE_ON_ERROR:
+.PHONY: consistency test check bench clean
+
+## The main job: is EKF-SLAM honest? 100 simulated runs; results in out/.
+consistency: $(VENV)/.run
+	$(BIN)/jaxslam consistency $(ARGS)
+
+## The test suite, on every core.
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest -n auto --dist loadscope $(ARGS)
+
+## Format, lint and types.
+check: $(VENV)/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+## Published figures, real data and speed; prints tables, see benchmarks/README.md.
+bench: $(VENV)/.dev
+	$(BIN)/python -m benchmarks $(ARGS)
+
+$(VENV)/bin/python:
+	@test -n "$(PYTHON)" || { echo "jaxslam needs Python >= 3.11 with the venv module"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+
+$(VENV)/.run: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable . --group dev
+	@touch $@
+
+clean:
+	rm -rf $(VENV) out

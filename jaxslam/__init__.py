@@ -1,0 +1,41 @@
+"""jaxslam: pure-functional, differentiable 2-D landmark SLAM.
+
+A SLAM method is a record of pure functions (`protocols`); one driver runs it over a log (`run`) and
+one harness over thousands of simulated worlds (`monte_carlo`). Importing the package configures
+nothing; for float64 set `jax_enable_x64` yourself, as the command line does.
+"""
+
+from jaxslam import (
+    association,
+    charts,
+    consistency,
+    filters,
+    linearize,
+    motion,
+    scenarios,
+    se2,
+    sensors,
+    slots,
+    stats,
+)
+from jaxslam.monte_carlo import monte_carlo
+from jaxslam.run import run
+from jaxslam.simulate import Scenario, simulate
+
+__all__ = [
+    "Scenario",
+    "association",
+    "charts",
+    "consistency",
+    "filters",
+    "linearize",
+    "monte_carlo",
+    "motion",
+    "run",
+    "scenarios",
+    "se2",
+    "sensors",
+    "simulate",
+    "slots",
+    "stats",
+]

@@ -1,0 +1,53 @@
+"""Angles on the circle, and the two entire functions that planar motion needs near zero turn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+# Below this the power series is used. There its first dropped term is under 1e-16, and above it
+# the closed form, and its first two derivatives, lose at most a digit to cancellation.
+_SERIES = 0.5
+
+
+def wrap(angle: ArrayLike) -> jax.Array:
+    """Wrap an angle to (-π, π] by whole turns: a - 2π⌈(a - π)/2π⌉.
+
+    Any shape, radians. An angle already inside is returned unchanged, bit for bit. The derivative
+    is 1 everywhere, also at the seam. (Solà's code corrects by one turn only; see ERRATA.)
+    """
+    a = jnp.asarray(angle)
+    w = a - 2 * np.pi * jnp.ceil((a - np.pi) / (2 * np.pi))
+    # Rounding of the quotient may leave a whole turn too many or too few beside the seam.
+    return jnp.where(w > np.pi, w - 2 * np.pi, jnp.where(w <= -np.pi, w + 2 * np.pi, w))
+
+
+def sinc(x: ArrayLike) -> jax.Array:
+    """sin(x)/x, smooth through 0 with all its derivatives (`jnp.sinc` loses them near 0)."""
+    x = jnp.asarray(x)
+    small = jnp.abs(x) < _SERIES
+    x2 = jnp.where(small, x, 0.0) ** 2
+    series = _horner(
+        x2, [1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 6227020800]
+    )
+    far = jnp.where(small, 1.0, x)
+    return jnp.where(small, series, jnp.sin(far) / far)
+
+
+def sinc_slope(x: ArrayLike) -> jax.Array:
+    """d/dx sin(x)/x = (cos x - sin(x)/x)/x, smooth through 0; used by hand-derived Jacobians."""
+    x = jnp.asarray(x)
+    small = jnp.abs(x) < _SERIES
+    near = jnp.where(small, x, 0.0)
+    series = near * _horner(
+        near**2, [-1 / 3, 1 / 30, -1 / 840, 1 / 45360, -1 / 3991680, 1 / 518918400]
+    )
+    far = jnp.where(small, 1.0, x)
+    return jnp.where(small, series, (jnp.cos(far) - jnp.sin(far) / far) / far)
+
+
+def _horner(x: jax.Array, coefficients: list[float]) -> jax.Array:
+    total = jnp.full_like(x, coefficients[-1])
+    for c in reversed(coefficients[:-1]):
+        total = total * x + c
+    return total

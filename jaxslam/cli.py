@@ -1,0 +1,226 @@
+"""The command `jaxslam`: the only place that parses arguments or configures JAX."""
+
+import argparse
+import shlex
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam import plot, report, se2
+from jaxslam.consistency import align_map
+from jaxslam.datasets import READERS
+from jaxslam.filters.ekf_slam import ekf_slam
+from jaxslam.linalg import is_positive_definite
+from jaxslam.monte_carlo import Campaign, monte_carlo
+from jaxslam.protocols import Filter
+from jaxslam.run import run
+from jaxslam.scenarios import FILTERS, SCENARIOS
+from jaxslam.simulate import Scenario, simulate
+from jaxslam.types import Status
+
+_T = TypeVar("_T")
+
+USAGE_ERROR = 2
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; 0 on success, 2 on bad input, 130 when interrupted."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        options = _parser().parse_args(arguments)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    jax.config.update("jax_enable_x64", options.dtype == "float64")
+    try:
+        return int(options.command(options, shlex.join(["jaxslam", *arguments])))
+    except (ValueError, OSError) as error:
+        print(f"jaxslam: {error}", file=sys.stderr)
+        return USAGE_ERROR
+    except KeyboardInterrupt:
+        print("\njaxslam: interrupted; nothing was written", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="jaxslam", description="2-D landmark SLAM in JAX.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    judge = commands.add_parser(
+        "consistency",
+        help="is a filter honest? a Monte-Carlo campaign",
+        description="Run filters over the same simulated worlds and compare their errors with the "
+        "covariances they claim. Prints a table and writes JSON, CSV and figures.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    judge.add_argument("--scenario", default="circle", help=f"one of: {', '.join(SCENARIOS)}")
+    judge.add_argument(
+        "--filters", default="ekf", help=f'"all", or some of: {",".join(FILTERS)}; comma-separated'
+    )
+    judge.add_argument("--runs", type=int, default=100, help="simulated trajectories")
+    judge.add_argument("--steps", type=int, help="steps of each; default: the scenario's own")
+    judge.add_argument("--block", type=int, default=32, help="runs computed together; sets memory")
+    judge.add_argument("--seed", type=int, default=0, help="of every draw")
+    judge.set_defaults(command=_consistency)
+
+    drive = commands.add_parser(
+        "run",
+        help="EKF-SLAM on a data set",
+        description="Run EKF-SLAM on recorded data; writes trajectory, map, summary and a picture.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    drive.add_argument("--dataset", required=True, help=f"one of: {', '.join(READERS)}")
+    drive.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
+    drive.add_argument("--robot", type=int, help="which robot, where a data set has several")
+    drive.set_defaults(command=_run_dataset)
+
+    for command in (judge, drive):
+        command.add_argument("--dtype", default="float64", choices=["float32", "float64"])
+        command.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
+    return parser
+
+
+def _consistency(options: argparse.Namespace, command: str) -> int:
+    scenario = _scenario(options.scenario, options.steps)
+    names = list(FILTERS) if options.filters == "all" else options.filters.split(",")
+    filters = {name: _pick("filter", name, FILTERS)(scenario) for name in names}
+    if not 0 <= options.seed < 2**32:
+        raise ValueError(f"expected a seed between 0 and 2³²-1, got {options.seed}")
+    report.check_writable(options.out)
+    key = jax.random.key(options.seed)
+    with _Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress:
+        campaign = monte_carlo(
+            scenario, filters, options.runs, key, block=options.block, progress=progress
+        )
+    print(report.table(campaign))
+    written = report.write_files(options.out, _campaign_files(campaign, scenario, options, command))
+    print(f"\n{campaign.seconds:.1f} s; wrote " + ", ".join(str(path) for path in written))
+    return 0
+
+
+def _campaign_files(
+    campaign: Campaign, scenario: Scenario, options: argparse.Namespace, command: str
+) -> dict[str, str | Callable[[Path], object]]:
+    """The campaign, and pictures of its first run under its first filter."""
+    name = next(iter(campaign.filters))
+    key_world, key_filter = jax.random.split(jax.random.fold_in(jax.random.key(options.seed), 0))
+    truth, log = jax.jit(partial(simulate, scenario))(key_world)
+    candidate = FILTERS[name](scenario)
+    filter = candidate if isinstance(candidate, Filter) else candidate(truth)
+    trace = run(filter, log, scenario.pose, scenario.pose_cov, key_filter)
+    title = f"{scenario.name}, {name}, run 0 of seed {options.seed}"
+    figures = {
+        "nees.png": plot.nees_figure(campaign),
+        "errors.png": plot.errors_figure(trace.estimate, truth, title=title),
+        "map.png": plot.map_figure(trace.estimate, truth=truth, title=title),
+    }
+    return {
+        "consistency.json": report.as_json(campaign, command, options.seed),
+        "consistency.csv": report.as_csv(campaign),
+    } | {name: figure.savefig for name, figure in figures.items()}
+
+
+def _run_dataset(options: argparse.Namespace, command: str) -> int:
+    data = _pick("dataset", options.dataset, READERS)(options.path, options.robot)
+    report.check_writable(options.out)
+    ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
+    with _Progress(f"{data.name}, {data.steps:,} steps") as progress:
+        progress.say("running …")
+        began = time.perf_counter()
+        # Value checks happen on the host here; the log then enters the run in the chosen dtype.
+        trace = run(
+            ekf,
+            jax.tree.map(jnp.asarray, data.log),
+            data.pose,
+            data.pose_cov,
+            jax.random.key(0),
+            probe=lambda joint: is_positive_definite(joint.cov),
+        )
+        jax.block_until_ready(trace)
+    seconds = time.perf_counter() - began
+    last = jax.tree.map(lambda leaf: leaf[-1], trace.estimate)
+    summary: dict[str, Any] = {
+        "dataset": data.name,
+        "source": data.source,
+        "command": command,
+        "dtype": str(last.pose.dtype),
+        "steps": data.steps,
+        "measurements": data.measurements,
+        "landmarks": int(last.alive.sum()),
+        "status": {
+            s.name.lower(): int(trace.info.tally(s).sum()) for s in Status if s != Status.EMPTY
+        },
+        "dropped by the reader": data.dropped,
+        "NIS / dof": float(trace.info.nis.sum() / jnp.maximum(trace.info.dof.sum(), 1)),
+        "log-likelihood": float(trace.info.log_likelihood.sum()),
+        "steps not positive definite": int((~trace.probe).sum()),
+        "final pose": [float(value) for value in last.pose],
+        "seconds": round(seconds, 2),
+    }
+    surveyed = None
+    if data.landmarks is not None and summary["landmarks"]:
+        frame, summary["map RMSE after alignment [m]"] = align_map(last, data.landmarks)
+        into_map = jax.vmap(se2.to_frame, (None, 0))
+        surveyed = np.asarray(into_map(jnp.asarray(frame), jnp.asarray(data.landmarks)))
+    figure = plot.map_figure(trace.estimate, true_points=surveyed, title=data.name)
+    files: dict[str, str | Callable[[Path], object]] = {
+        "trajectory.csv": report.trajectory_csv(data.time, trace.estimate),
+        "map.csv": report.map_csv(last, data.tags),
+        "summary.json": report.json_text(summary | {"versions": report.versions()}),
+        "map.png": figure.savefig,
+    }
+    for name, value in summary.items():
+        shown = (
+            ", ".join(f"{k} {v:,}" for k, v in value.items()) if isinstance(value, dict) else value
+        )
+        print(f"{name:30} {shown}")
+    written = report.write_files(options.out, files)
+    print("\nwrote " + ", ".join(str(path) for path in written))
+    return 0
+
+
+def _scenario(name: str, steps: int | None) -> Scenario:
+    make = _pick("scenario", name, SCENARIOS)
+    return make() if steps is None else make(steps)
+
+
+def _pick(kind: str, name: str, known: Mapping[str, _T]) -> _T:
+    if name not in known:
+        raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(known)}")
+    return known[name]
+
+
+class _Progress:
+    """A bar on a terminal; silent where the output is not one."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._began = time.perf_counter()
+        self._shown = sys.stderr.isatty()
+
+    def __enter__(self) -> "_Progress":
+        self.say("compiling …")
+        return self
+
+    def say(self, what: str) -> None:
+        self._draw(f"{self._what}: {what}")
+
+    def __call__(self, done: int, total: int) -> None:
+        filled = round(30 * done / total)
+        spent = time.perf_counter() - self._began
+        bar = "█" * filled + "░" * (30 - filled)
+        self._draw(f"{self._what}: {bar} {done:,}/{total:,} runs, {spent:.0f} s")
+
+    def __exit__(self, *_: object) -> None:
+        self._draw("")
+
+    def _draw(self, line: str) -> None:
+        if self._shown:
+            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,39 @@
+"""Readers of public data sets, one a file; each returns a `Dataset`.
+
+`READERS` is what the command line chooses from, by name: each takes (path, robot). `robot` is the
+number of a robot where a data set has several (None: the first one); elsewhere it must be None.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from jaxslam.datasets.bonn import bonn
+from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.mrclam import mrclam
+from jaxslam.datasets.victoria_park import victoria_park
+
+Reader = Callable[[str | Path, int | None], Dataset]
+
+
+def _of_one_robot(
+    reader: Callable[[str | Path], Dataset], path: str | Path, robot: int | None = None
+) -> Dataset:
+    if robot is not None:
+        raise ValueError(f"this data set has one robot only, so there is no robot {robot}")
+    return reader(path)
+
+
+def _of_several_robots(
+    reader: Callable[[str | Path, int], Dataset], path: str | Path, robot: int | None = None
+) -> Dataset:
+    return reader(path, 1 if robot is None else robot)
+
+
+READERS: dict[str, Reader] = {
+    "bonn": partial(_of_one_robot, bonn),
+    "mrclam": partial(_of_several_robots, mrclam),
+    "victoria_park": partial(_of_one_robot, victoria_park),
+}
+
+__all__ = ["READERS", "Dataset", "bonn", "mrclam", "victoria_park"]

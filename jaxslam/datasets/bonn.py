@@ -1,0 +1,102 @@
+"""The simulated course data of the robot mapping lectures of Freiburg and Bonn."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxslam.datasets.dataset import Dataset, make_log
+from jaxslam.datasets.lines import TextFile
+from jaxslam.motion import pose_increment
+from jaxslam.noise import NoiseCov
+from jaxslam.sensors import range_bearing
+
+SOURCE = (
+    "C. Stachniss, Robot Mapping, course exercises, University of Freiburg and University of Bonn"
+)
+ODOMETRY_COV = np.diag([0.01, 0.01, 0.01]) ** 2
+MEASUREMENT_COV = np.diag([0.1, 0.1]) ** 2
+
+
+def bonn(
+    folder: str | Path,
+    *,
+    odometry_cov: NoiseCov = ODOMETRY_COV,
+    measurement_cov: NoiseCov = MEASUREMENT_COV,
+) -> Dataset:
+    """Read `world.dat` (landmarks: id x y) and `sensor_data.dat` of a folder.
+
+    The latter holds `ODOMETRY rot1 trans rot2`, each followed by the `SENSOR id range bearing` of
+    that step. Turn, go, turn is the pose increment
+    (trans cos rot1, trans sin rot1, rot1 + rot2).
+
+    Source: course data by C. Stachniss, University of Freiburg and University of Bonn.
+
+    Args:
+        folder: where the two files are.
+        odometry_cov: (3, 3) covariance of the pose increment, or a function of (pose, u).
+        measurement_cov: (2, 2) covariance of (range, bearing), or a function of z.
+    Raises:
+        ValueError: `path:line: reason` on a malformed line, a landmark that is not in `world.dat`
+            or is seen twice in a step, or a SENSOR line before the first ODOMETRY.
+    """
+    names, landmarks = _read_world(TextFile(Path(folder) / "world.dat"))
+    tag_of = {name: tag for tag, name in enumerate(names)}
+    file = TextFile(Path(folder) / "sensor_data.dat")
+    controls: list[list[float]] = []
+    rows: list[int] = []
+    tags: list[int] = []
+    z: list[list[float]] = []
+    in_step: set[int] = set()
+    dropped = {"negative ranges": 0}
+    for line, (keyword, *fields) in file:
+        if keyword == "ODOMETRY":
+            rot1, trans, rot2 = file.numbers(line, fields, ("rot1", "trans", "rot2"))
+            controls.append([trans * np.cos(rot1), trans * np.sin(rot1), rot1 + rot2])
+            in_step = set()
+        elif keyword == "SENSOR":
+            _, distance, bearing = file.numbers(line, fields, ("id", "range", "bearing"))
+            name = file.identity(line, fields[0], "id")
+            if not controls:
+                raise file.error(line, "SENSOR before the first ODOMETRY")
+            if name not in tag_of:
+                raise file.error(line, f"landmark {name} is not in world.dat")
+            if name in in_step:
+                raise file.error(line, f"landmark {name} is seen twice in a step")
+            in_step.add(name)
+            if distance < 0:
+                dropped["negative ranges"] += 1
+                continue
+            rows.append(len(controls) - 1)
+            tags.append(tag_of[name])
+            z.append([distance, bearing])
+        else:
+            raise file.error(line, f"unknown keyword {keyword!r}")
+    if not z:
+        raise file.end_error(f"no {'SENSOR' if controls else 'ODOMETRY'} line in the file")
+    return Dataset(
+        name="bonn",
+        log=make_log(controls, rows, tags, z),
+        time=np.arange(1.0, len(controls) + 1.0),
+        motion=pose_increment(odometry_cov),
+        sensor=range_bearing(measurement_cov),
+        tags=names,
+        filter_options={"update": "joint"},
+        landmarks=landmarks,
+        dropped=dropped,
+        source=SOURCE,
+    )
+
+
+def _read_world(file: TextFile) -> tuple[tuple[int, ...], np.ndarray]:
+    """The landmarks' ids in rising order and their positions (N, 2)."""
+    points: dict[int, list[float]] = {}
+    for line, fields in file:
+        _, x, y = file.numbers(line, fields, ("id", "x", "y"))
+        name = file.identity(line, fields[0], "id")
+        if name in points:
+            raise file.error(line, f"landmark {name} occurs twice")
+        points[name] = [x, y]
+    if not points:
+        raise file.end_error("no landmark in the file")
+    names = tuple(sorted(points))
+    return names, np.array([points[name] for name in names])

@@ -1,0 +1,73 @@
+"""Text files read line by line, with errors that say where: `path:line: reason`."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+
+class TextFile:
+    """The lines of a small table in a text file.
+
+    Iterating gives (line number from 1, fields split at white space); blank lines, and lines that
+    start with `comment`, are passed over. Raises ValueError where the file cannot be read.
+    """
+
+    def __init__(self, path: str | Path, comment: str | None = None) -> None:
+        self.path = Path(path)
+        self.comment = comment
+        try:
+            data = self.path.read_bytes()
+        except OSError as problem:
+            raise ValueError(f"{self.path}: cannot be read: {problem.strerror}") from problem
+        try:
+            self.lines = data.decode("utf-8").split("\n")
+        except UnicodeDecodeError as problem:
+            line = data.count(b"\n", 0, problem.start) + 1
+            raise self.error(line, "this is not text") from problem
+
+    def __iter__(self) -> Iterator[tuple[int, list[str]]]:
+        for number, text in enumerate(self.lines, start=1):
+            fields = text.split()
+            if fields and not (self.comment and fields[0].startswith(self.comment)):
+                yield number, fields
+
+    def error(self, line: int, reason: str) -> ValueError:
+        """The error to raise about a line."""
+        return ValueError(f"{self.path}:{line}: {reason}")
+
+    def end_error(self, reason: str) -> ValueError:
+        """The error to raise about what is missing when the file ends."""
+        return self.error(max(len(self.lines) - (self.lines[-1] == ""), 1), reason)
+
+    def numbers(self, line: int, fields: Sequence[str], names: Sequence[str]) -> list[float]:
+        """Finite numbers, one for each name; raises ValueError on any other line."""
+        self.expect(line, fields, names)
+        try:
+            values = [float(field) for field in fields]
+        except ValueError:
+            values = []
+        # float() also takes 1_000, which no program writes into a table.
+        if not values or not all(map(math.isfinite, values)) or "_" in self.lines[line - 1]:
+            for name, field in zip(names, fields, strict=True):
+                if not _is_finite(field):
+                    raise self.error(line, f"{name} is not a finite number: {field!r}")
+        return values
+
+    def identity(self, line: int, field: str, name: str) -> int:
+        """A whole number >= 0; raises ValueError on anything else."""
+        if not (field.isascii() and field.isdigit()):
+            raise self.error(line, f"{name} is not a whole number >= 0: {field!r}")
+        return int(field)
+
+    def expect(self, line: int, fields: Sequence[str], names: Sequence[str]) -> None:
+        """Raise ValueError unless there is one field for each name."""
+        if len(fields) != len(names):
+            wanted = f"{len(names)} fields ({' '.join(names)})"
+            raise self.error(line, f"expected {wanted}, got {len(fields)}")
+
+
+def _is_finite(field: str) -> bool:
+    try:
+        return math.isfinite(float(field)) and "_" not in field
+    except ValueError:
+        return False

@@ -1,0 +1,177 @@
+"""The UTIAS multi-robot cooperative localization and mapping data sets (MRCLAM), one robot a log."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxslam.datasets.dataset import Dataset, make_log
+from jaxslam.datasets.lines import TextFile
+from jaxslam.motion import unicycle
+from jaxslam.noise import NoiseCov
+from jaxslam.sensors import range_bearing
+
+SOURCE = (
+    "K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, The UTIAS multi-robot cooperative "
+    "localization and mapping dataset, International Journal of Robotics Research 30(8), 2011"
+)
+ROBOTS = range(1, 6)
+"""Subjects 1 to 5 are the robots; they carry barcodes like the landmarks, 6 to 20."""
+ODOMETRY_DENSITY = (0.01**2, 0.05**2)
+MEASUREMENT_COV = np.diag([0.15, 0.05]) ** 2
+
+
+def mrclam(
+    folder: str | Path,
+    robot: int = 1,
+    *,
+    odometry_cov: NoiseCov | None = None,
+    measurement_cov: NoiseCov = MEASUREMENT_COV,
+) -> Dataset:
+    """Read `Robot{n}_Odometry.dat` (t v ω) and `Robot{n}_Measurement.dat` (t barcode range bearing).
+
+    The log has a row at every time that occurs in either file. Its control is (v, ω, Δt): the
+    velocity of the latest odometry line before the row, held since the row before; zero until the
+    first line. So Δt = 0 in the first row alone, and of odometry lines with equal times the last
+    one holds. The measurements of one time form one scan. `Barcodes.dat` says whose barcode it is;
+    sightings of robots, barcodes it does not list and repetitions within a scan are dropped and
+    counted. Tags follow the subject numbers; `Landmark_Groundtruth.dat` is the survey.
+
+    Source: Leung, Halpern, Barfoot, Liu, International Journal of Robotics Research 30(8), 2011.
+
+    Args:
+        folder: where the files of one data set are.
+        robot: which robot, 1 to 5.
+        odometry_cov: (2, 2) covariance of (v, ω) over a row's Δt, or a function of (pose, u).
+        measurement_cov: (2, 2) covariance of (range, bearing), or a function of z.
+    Raises:
+        ValueError: `path:line: reason` on a malformed line, a time that goes backwards, a negative
+            range, or a subject without survey; and on a robot other than 1 to 5.
+    """
+    if not isinstance(robot, int) or robot not in ROBOTS:
+        raise ValueError(f"mrclam: expected a robot from 1 to 5, got {robot!r}")
+    folder = Path(folder)
+    subject_of, names = _read_barcodes(TextFile(folder / "Barcodes.dat", "#"))
+    landmarks = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
+    odometry = _read_in_time(
+        TextFile(folder / f"Robot{robot}_Odometry.dat", "#"), ("time", "v", "omega")
+    )
+    seen = _read_in_time(
+        TextFile(folder / f"Robot{robot}_Measurement.dat", "#"),
+        ("time", "barcode", "range", "bearing"),
+    )
+    time = np.unique(np.concatenate([odometry[:, 0], seen[:, 0]]))
+    row, tag, kept, dropped = _associate(seen, time, subject_of, names)
+    return Dataset(
+        name=f"mrclam robot {robot}",
+        log=make_log(_hold(odometry, time), row, tag, seen[kept, 2:]),
+        time=time,
+        motion=unicycle(white_noise(*ODOMETRY_DENSITY) if odometry_cov is None else odometry_cov),
+        sensor=range_bearing(measurement_cov),
+        tags=names,
+        filter_options={"update": "sequential"},
+        landmarks=landmarks,
+        dropped=dropped,
+        source=SOURCE,
+    )
+
+
+def white_noise(v: float, omega: float) -> NoiseCov:
+    """Noise of (v, ω) whose integral does not depend on how time is cut: covariance density/Δt.
+
+    v [m²/s], omega [rad²/s]: the variance of travel and heading gained in a second. An interval of
+    zero, over which nothing moves, gets zero.
+    """
+
+    def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
+        moving = u[2] > 0
+        rate = jnp.where(moving, 1 / jnp.where(moving, u[2], 1.0), 0.0)
+        return rate * jnp.diag(jnp.stack([jnp.asarray(v, u.dtype), jnp.asarray(omega, u.dtype)]))
+
+    return noise_cov
+
+
+def _hold(odometry: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Controls (T, 3): the velocity in force at the time before, and the interval since."""
+    start = np.concatenate([time[:1], time[:-1]])
+    latest = np.searchsorted(odometry[:, 0], start, side="right") - 1
+    velocity = np.where((latest >= 0)[:, None], odometry[np.maximum(latest, 0), 1:], 0.0)
+    velocity[0] = 0.0
+    return np.column_stack([velocity, time - start])
+
+
+def _associate(
+    seen: NDArray[np.float64],
+    time: NDArray[np.float64],
+    subject_of: dict[int, int],
+    names: tuple[int, ...],
+) -> tuple[list[int], list[int], list[int], dict[str, int]]:
+    """Row, tag and index of the measurements kept, and how many were dropped why."""
+    tag_of = {name: tag for tag, name in enumerate(names)}
+    dropped = {"robot sightings": 0, "unknown barcodes": 0, "repeated in a scan": 0}
+    kept: dict[tuple[int, int], int] = {}
+    row = np.searchsorted(time, seen[:, 0])
+    for k, barcode in enumerate(seen[:, 1]):
+        subject = subject_of.get(int(barcode))
+        if subject is None:
+            dropped["unknown barcodes"] += 1
+        elif subject in ROBOTS:
+            dropped["robot sightings"] += 1
+        elif (int(row[k]), tag_of[subject]) in kept:
+            dropped["repeated in a scan"] += 1
+        else:
+            kept[int(row[k]), tag_of[subject]] = k
+    return [r for r, _ in kept], [t for _, t in kept], list(kept.values()), dropped
+
+
+def _read_in_time(file: TextFile, names: tuple[str, ...]) -> NDArray[np.float64]:
+    """A table whose first column never decreases."""
+    table: list[list[float]] = []
+    for line, fields in file:
+        values = file.numbers(line, fields, names)
+        if table and values[0] < table[-1][0]:
+            raise file.error(line, f"time goes back from {table[-1][0]} to {values[0]}")
+        if names[1] == "barcode":
+            file.identity(line, fields[1], "barcode")
+            if values[2] < 0:
+                raise file.error(line, f"the range {values[2]} is negative")
+        table.append(values)
+    if not table:
+        raise file.end_error("no data in the file")
+    return np.array(table)
+
+
+def _read_barcodes(file: TextFile) -> tuple[dict[int, int], tuple[int, ...]]:
+    """The subject of each barcode, and the landmarks among the subjects in rising order."""
+    subject_of: dict[int, int] = {}
+    for line, fields in file:
+        file.expect(line, fields, ("subject", "barcode"))
+        subject = file.identity(line, fields[0], "subject")
+        barcode = file.identity(line, fields[1], "barcode")
+        if barcode in subject_of or subject in subject_of.values():
+            raise file.error(line, f"subject {subject} or barcode {barcode} occurs twice")
+        subject_of[barcode] = subject
+    names = tuple(sorted(set(subject_of.values()) - set(ROBOTS)))
+    if not names:
+        raise file.end_error("no landmark in the file")
+    return subject_of, names
+
+
+def _read_survey(file: TextFile, names: tuple[int, ...]) -> NDArray[np.float64]:
+    """Landmark positions (N, 2) in the order of names."""
+    points: dict[int, list[float]] = {}
+    for line, fields in file:
+        columns = ("subject", "x", "y", "sigma_x", "sigma_y")
+        _, x, y, _, _ = file.numbers(line, fields, columns)
+        subject = file.identity(line, fields[0], "subject")
+        if subject not in names:
+            raise file.error(line, f"subject {subject} is no landmark in Barcodes.dat")
+        if subject in points:
+            raise file.error(line, f"subject {subject} occurs twice")
+        points[subject] = [x, y]
+    missing = [name for name in names if name not in points]
+    if missing:
+        raise file.end_error(f"no position of subject {missing[0]} in the file")
+    return np.array([points[name] for name in names])

@@ -1,0 +1,150 @@
+"""The Victoria Park data set, as GTSAM distributes it: a truck among trees, association given."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+from numpy.typing import NDArray
+
+from jaxslam.datasets.dataset import Dataset, make_log
+from jaxslam.datasets.lines import TextFile
+from jaxslam.linalg import check_covariance
+from jaxslam.motion import pose_increment
+from jaxslam.noise import NoiseCov
+from jaxslam.sensors import relative_position
+
+SOURCE = (
+    "Victoria Park: J. Guivant and E. Nebot, Optimization of the simultaneous localization and "
+    "map-building algorithm for real-time implementation, IEEE Transactions on Robotics and "
+    "Automation 17(3), 2001; victoria_park.txt as distributed with GTSAM"
+)
+_ODOMETRY = "i j dx dy dtheta c_xx c_xy c_xt c_yy c_yt c_tt".split()
+_LANDMARK = "i j x y c_xx c_xy c_yy".split()
+
+
+def victoria_park(
+    path: str | Path,
+    *,
+    odometry_cov: NoiseCov | None = None,
+    measurement_cov: NoiseCov | None = None,
+) -> Dataset:
+    """Read `victoria_park.txt`: pose increments, and landmark positions in the frame of a pose.
+
+    Lines `ODOMETRY i j dx dy dθ` and `LANDMARK i j x y`, each followed by the upper triangle of its
+    covariance; poses and landmarks share one numbering. Odometry must be one chain, and the noise
+    the same on every line of a kind: it becomes the noise of the models, unless overridden. Joint
+    correction: a scan holds two trees at the most. Landmarks have their tags in the order of their
+    numbers; there is no ground truth. GTSAM finds the file:
+    `gtsam.findExampleDataFile("victoria_park.txt")`.
+
+    A scan at the very first pose gets a row of its own, with zero control; then a control of
+    exactly zero carries no noise.
+
+    Source: Guivant & Nebot, IEEE Trans. Robotics and Automation 17(3), 2001, as with GTSAM.
+
+    Args:
+        path: the file.
+        odometry_cov: (3, 3) covariance of (dx, dy, dθ), or a function of (pose, u), instead of the
+            file's.
+        measurement_cov: (2, 2) covariance of (x, y), or a function of z, instead of the file's.
+    Raises:
+        ValueError: `path:line: reason` on a line that is malformed or breaks one of these rules.
+    """
+    file = TextFile(path)
+    controls: list[list[float]] = []
+    poses: dict[int, int] = {}
+    sightings: list[tuple[int, int, int, list[float]]] = []
+    odometry_noise = _Constant(file, 3)
+    landmark_noise = _Constant(file, 2)
+    last = -1
+    for line, (keyword, *fields) in file:
+        if keyword == "ODOMETRY":
+            values = file.numbers(line, fields, _ODOMETRY)
+            i, j = (file.identity(line, fields[k], "ij"[k]) for k in (0, 1))
+            if poses and i != last:
+                raise file.error(line, f"odometry starts at {i}, the line before ended at {last}")
+            poses.setdefault(i, 0)
+            if j in poses:
+                raise file.error(line, f"odometry returns to pose {j}")
+            poses[j] = len(poses)
+            last = j
+            controls.append(values[2:5])
+            odometry_noise.add(line, values[5:])
+        elif keyword == "LANDMARK":
+            values = file.numbers(line, fields, _LANDMARK)
+            i, j = (file.identity(line, fields[k], "ij"[k]) for k in (0, 1))
+            sightings.append((line, i, j, values[2:4]))
+            landmark_noise.add(line, values[4:])
+        else:
+            raise file.error(line, f"unknown keyword {keyword!r}")
+    if not controls or not sightings:
+        raise file.end_error(f"no {'LANDMARK' if controls else 'ODOMETRY'} line in the file")
+
+    _check_sightings(file, poses, sightings)
+    at_start = any(poses[i] == 0 for _, i, _, _ in sightings)
+    if at_start:
+        controls.insert(0, [0.0, 0.0, 0.0])
+    names = tuple(sorted({j for _, _, j, _ in sightings}))
+    tag_of = {name: tag for tag, name in enumerate(names)}
+    first = 0 if at_start else 1
+    odometry_file = _unless_still(odometry_noise.cov) if at_start else odometry_noise.cov
+    return Dataset(
+        name="victoria_park",
+        log=make_log(
+            controls,
+            [poses[i] - first for _, i, _, _ in sightings],
+            [tag_of[j] for _, _, j, _ in sightings],
+            [z for _, _, _, z in sightings],
+        ),
+        time=np.arange(first, first + len(controls), dtype=np.float64),
+        motion=pose_increment(odometry_file if odometry_cov is None else odometry_cov),
+        sensor=relative_position(landmark_noise.cov if measurement_cov is None else measurement_cov),
+        tags=names,
+        filter_options={"update": "joint"},
+        source=SOURCE,
+    )
+
+
+class _Constant:
+    """A covariance that each line repeats as its upper triangle."""
+
+    def __init__(self, file: TextFile, size: int) -> None:
+        self.file = file
+        self.triangle: list[float] = []
+        self.cov: NDArray[np.float64] = np.zeros((size, size))
+
+    def add(self, line: int, triangle: list[float]) -> None:
+        if self.triangle and triangle != self.triangle:
+            raise self.file.error(line, "the covariance differs from that of earlier lines")
+        if not self.triangle:
+            self.triangle = triangle
+            upper = np.triu_indices(len(self.cov))
+            self.cov[upper] = triangle
+            self.cov.T[upper] = triangle
+            try:
+                check_covariance("noise", self.cov, len(self.cov))
+            except ValueError as problem:
+                raise self.file.error(line, str(problem)) from problem
+
+
+def _check_sightings(
+    file: TextFile, poses: dict[int, int], sightings: list[tuple[int, int, int, list[float]]]
+) -> None:
+    seen: set[tuple[int, int]] = set()
+    for line, i, j, _ in sightings:
+        if i not in poses:
+            raise file.error(line, f"no odometry leads to pose {i}")
+        if j in poses:
+            raise file.error(line, f"{j} is a pose, not a landmark")
+        if (i, j) in seen:
+            raise file.error(line, f"landmark {j} is seen twice from pose {i}")
+        seen.add((i, j))
+
+
+def _unless_still(cov: ArrayLike) -> NoiseCov:
+    def noise(pose: jax.Array, u: jax.Array) -> jax.Array:
+        return jnp.where((u == 0).all(), 0.0, jnp.asarray(cov, u.dtype))
+
+    return noise

@@ -1,0 +1,166 @@
+"""Small linear algebra: factors of the few-by-few matrices of a filter, and checks of covariances.
+
+A landmark update factors a 2×2 to 6×6 matrix, millions of times, under `vmap`. The library call
+behind `jnp.linalg.cholesky` costs more there than the arithmetic, and hides a non-positive pivot
+behind NaN; hence the unrolled factor below, which reports it and stays finite.
+"""
+
+import functools
+import operator
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+# Up to this size factors are unrolled into fused elementwise code, beyond it LAPACK is called.
+_UNROLLED = 8
+
+
+def total(terms: Iterable[jax.Array]) -> jax.Array:
+    """The sum of at least one array; written out, it fuses into one elementwise kernel."""
+    return functools.reduce(operator.add, terms)
+
+
+def symmetrize(matrix: jax.Array) -> jax.Array:
+    """(A + Aᵀ)/2 over the last two axes."""
+    return 0.5 * (matrix + jnp.swapaxes(matrix, -1, -2))
+
+
+def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lower L (n, n) with L Lᵀ = A, and whether A is numerically positive definite, ().
+
+    A pivot not above n·eps times its diagonal entry counts as zero: its column of L is zero and the
+    flag is False, so that a positive *semi*-definite A still gets a usable square root, and nothing
+    becomes NaN. Only the lower triangle is read. Non-finite input gives False.
+    """
+    n = matrix.shape[-1]
+    tolerance = n * float(jnp.finfo(matrix.dtype).eps)
+    if n > _UNROLLED:
+        return _cholesky_lapack(matrix, tolerance)
+    zero = jnp.zeros((), matrix.dtype)
+    rows: list[list[jax.Array]] = [[zero] * n for _ in range(n)]
+    positive = jnp.asarray(True)
+    for j in range(n):
+        pivot = matrix[j, j] - sum((rows[j][k] ** 2 for k in range(j)), zero)
+        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        positive = positive & good
+        root = jnp.sqrt(jnp.where(good, pivot, 1.0))
+        rows[j][j] = jnp.where(good, root, 0.0)
+        for i in range(j + 1, n):
+            rest = matrix[i, j] - sum((rows[i][k] * rows[j][k] for k in range(j)), zero)
+            rows[i][j] = jnp.where(good, rest / root, 0.0)
+    return jnp.stack([jnp.stack(row) for row in rows]), positive
+
+
+def _cholesky_lapack(matrix: jax.Array, tolerance: float) -> tuple[jax.Array, jax.Array]:
+    n = matrix.shape[-1]
+    mirrored = jnp.tril(matrix) + jnp.tril(matrix, -1).T
+    factor = jnp.linalg.cholesky(mirrored, symmetrize_input=False)
+    pivots = jnp.diagonal(factor) ** 2
+    positive = jnp.all(pivots > tolerance * jnp.abs(jnp.diagonal(matrix)))
+    # A second factor, of a matrix that is positive definite anyway, keeps gradients finite.
+    safe = jnp.where(positive, mirrored, jnp.eye(n, dtype=matrix.dtype))
+    return jnp.where(positive, jnp.linalg.cholesky(safe, symmetrize_input=False), 0.0), positive
+
+
+def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
+    """L⁻¹ B for lower L (n, n) and B (n, …); rows whose pivot is zero come out zero."""
+    n = factor.shape[-1]
+    if n > _UNROLLED:
+        singular = jnp.diagonal(factor) == 0
+        safe = factor + jnp.diag(singular.astype(factor.dtype))
+        out = jax.scipy.linalg.solve_triangular(safe, rhs.reshape(n, -1), lower=True)
+        return jnp.where(singular[:, None], 0.0, out).reshape(rhs.shape)
+    rows: list[jax.Array] = []
+    for i in range(n):
+        rest = rhs[i] - sum((factor[i, k] * rows[k] for k in range(i)), jnp.zeros_like(rhs[i]))
+        pivot = factor[i, i]
+        rows.append(jnp.where(pivot > 0, rest / jnp.where(pivot > 0, pivot, 1.0), 0.0))
+    return jnp.stack(rows)
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """A⁻¹ of a regular (n, n) matrix: by cofactors up to 3×3, which fuses; by LU beyond."""
+    n = matrix.shape[-1]
+    a = matrix
+    if n == 1:
+        return jnp.reciprocal(a)
+    if n == 2:
+        det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+        return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])]) / det
+    if n == 3:
+        cofactors = jnp.stack(
+            [jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])], axis=1
+        )
+        return cofactors / jnp.dot(a[0], cofactors[:, 0])
+    return jnp.asarray(jnp.linalg.inv(a))
+
+
+def solve_psd(matrix: jax.Array, rhs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A⁻¹ B for a positive definite A (n, n) and B (n, …), and whether A was positive definite."""
+    factor, positive = cholesky(matrix)
+    reverse = factor[::-1, ::-1].T
+    return solve_lower(reverse, solve_lower(factor, rhs)[::-1])[::-1], positive
+
+
+def mahalanobis_squared(
+    error: jax.Array, cov: jax.Array, scale: jax.Array | None = None
+) -> tuple[jax.Array, jax.Array]:
+    """eᵀ P⁻¹ e and whether P (n, n) is numerically regular; 0 and False where it is not.
+
+    P is judged in units of `scale` (n,), by default each coordinate's own standard deviation, so
+    that metres, radians and a covariance of 1e-30 are judged alike. Coordinates of one unit are
+    better given one scale: a variance that is rounding next to its neighbour's then counts as none.
+    Regular means that each Cholesky pivot exceeds 100 n·eps, i.e. no direction is known exactly.
+    """
+    n = cov.shape[-1]
+    if scale is None:  # the square root's slope at a zero variance is infinite, hence the 1.0
+        variance = jnp.diagonal(cov)
+        scale = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
+    spread = scale > 0
+    unit = jnp.where(spread, 1.0 / jnp.where(spread, scale, 1.0), 0.0)
+    factor, positive = cholesky(cov * unit[:, None] * unit[None, :])
+    pivots = jnp.diagonal(factor) ** 2
+    regular = positive & jnp.all(pivots > 100 * n * jnp.finfo(cov.dtype).eps)
+    regular = regular & jnp.all(jnp.isfinite(error))
+    whitened = solve_lower(factor, jnp.where(regular, error, 0.0) * unit)
+    return jnp.where(regular, jnp.sum(whitened**2), 0.0), regular
+
+
+def is_positive_definite(matrix: jax.Array) -> jax.Array:
+    """Whether a symmetric (n, n) matrix is positive definite: its Cholesky factor is finite, ()."""
+    return jnp.all(jnp.isfinite(jnp.linalg.cholesky(matrix, symmetrize_input=False)))
+
+
+def is_concrete(*values: Any) -> bool:
+    """Whether values can be looked at, i.e. no leaf is a tracer."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
+    """Raise ValueError unless cov is a real, finite, symmetric, positive semi-definite (size, size).
+
+    Values are looked at only where they are concrete; a tracer is checked for its shape alone.
+    """
+    shape = np.shape(cov)
+    if shape != (size, size):
+        raise ValueError(f"{name}: expected a covariance of shape ({size}, {size}), got {shape}")
+    if not is_concrete(cov):
+        return
+    values = np.asarray(cov)
+    if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+        raise ValueError(f"{name}: expected real numbers, got dtype {values.dtype}")
+    values = values.astype(np.float64)
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"{name}: the covariance has a NaN or an infinity")
+    scale = np.max(np.abs(values), initial=0.0)
+    if np.max(np.abs(values - values.T), initial=0.0) > 1e-6 * scale:
+        raise ValueError(f"{name}: the covariance is not symmetric")
+    smallest = np.min(np.linalg.eigvalsh(values), initial=np.inf)
+    if smallest < -1e-6 * scale:
+        raise ValueError(
+            f"{name}: the covariance is not positive semi-definite (eigenvalue {smallest:.3g})"
+        )

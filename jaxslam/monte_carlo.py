@@ -1,0 +1,205 @@
+"""Monte-Carlo campaigns: many filters on identical draws, in blocks of vmapped runs.
+
+A run is a key; its world is drawn once and every filter runs on it. Blocks are vmapped and only
+sums leave them, so memory is that of one block per worker however many runs there are. Each run's
+key is derived from its number, so the draws do not depend on the size of the blocks.
+"""
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.consistency import Summary, Sums, score, summarize
+from jaxslam.protocols import Estimator, Filter
+from jaxslam.run import run
+from jaxslam.scenarios import ideal
+from jaxslam.simulate import Scenario, simulate
+from jaxslam.types import Log, Truth
+
+Candidate = Filter | Callable[[Truth], Filter | Estimator]
+"""A filter, or a function of the run's truth that returns a filter or an estimator."""
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """The result: the scenario, what was run, and a `Summary` for each filter by name."""
+
+    scenario: str
+    source: str
+    published: dict[str, float]
+    steps: int
+    runs: int
+    dtype: str
+    divergence_limit: float
+    """[m] a run is divergent when its final position error exceeds it: 5 σ of the ideal spread,
+    σ² = tr P of the position at the end of an EKF with Jacobians at the truth."""
+    filters: dict[str, Summary]
+    seconds: float
+    """wall time, compilation included."""
+    compile_seconds: float
+
+
+def monte_carlo(
+    scenario: Scenario,
+    filters: Mapping[str, Candidate],
+    runs: int,
+    key: jax.Array,
+    *,
+    block: int = 32,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Campaign:
+    """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
+
+    Args:
+        scenario: what to draw; see `scenarios`.
+        filters: by name. A function instead of a filter is called with each run's `Truth`.
+        runs: how many worlds; run i has key fold_in(key, i).
+        key: a PRNG key.
+        block: runs vmapped together; the last block is padded, and the padding not counted.
+        workers: blocks in flight at once, default the number of CPUs (1 on an accelerator).
+        progress: called with (runs done, runs) after each block, in order.
+    Returns:
+        Campaign.
+    Raises:
+        ValueError: on runs or block below 1, no filters, or a filter that does not fit the scenario;
+            before anything is traced.
+    """
+    for name, value in (("runs", runs), ("block", block), ("workers", workers)):
+        if value is not None and (not isinstance(value, int) or value < 1):
+            raise ValueError(f"monte_carlo: expected {name} to be an integer >= 1, got {value!r}")
+    if not filters:
+        raise ValueError("monte_carlo: expected at least one filter")
+    for name, candidate in filters.items():
+        _check_fits(name, candidate, scenario)
+    began = time.perf_counter()
+    block = min(block, runs)
+    numbers = np.arange(-(-runs // block) * block).reshape(-1, block)
+
+    def keys_of(which: jax.Array) -> tuple[jax.Array, jax.Array]:
+        both = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i)))(which)
+        return both[:, 0], both[:, 1]
+
+    def draw(which: jax.Array) -> tuple[Truth, Log]:
+        return jax.vmap(partial(simulate, scenario))(keys_of(which)[0])
+
+    def judge(
+        candidate: Candidate, world: tuple[Truth, Log], which: jax.Array, limit: jax.Array
+    ) -> Sums:
+        def one(truth: Truth, log: Log, key: jax.Array) -> Sums:
+            trace = _estimator(candidate, truth, scenario)(log, key)
+            return score(trace, truth, scenario.sensor, limit)
+
+        each = jax.vmap(one)(*world, keys_of(which)[1])
+        counts = which < runs
+        return Sums(*jax.tree.map(lambda leaf: _sum_where(counts, leaf), each))
+
+    def spread(which: jax.Array) -> jax.Array:
+        truth, log = simulate(scenario, keys_of(which[None])[0][0])
+        trace = _estimator(ideal(scenario), truth, scenario)(log, key)
+        return jnp.sqrt(jnp.trace(trace.estimate.pose_cov[-1, :2, :2]))
+
+    if workers is None:
+        workers = os.cpu_count() or 1 if jax.default_backend() == "cpu" else 1
+    which = jnp.asarray(numbers[0])
+    with ThreadPoolExecutor(workers) as pool:
+        jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+            "": (draw, (which,)),
+            " ideal": (spread, (which[0],)),
+        }
+        world = jax.eval_shape(draw, which)
+        limit_shape = jax.ShapeDtypeStruct((), world[0].pose.dtype)
+        for name, candidate in filters.items():
+            jobs[f"f {name}"] = (partial(judge, candidate), (world, which, limit_shape))
+        compiled = dict(
+            zip(
+                jobs,
+                pool.map(lambda job: jax.jit(job[0]).lower(*job[1]).compile(), jobs.values()),
+                strict=True,
+            )
+        )
+        compile_seconds = time.perf_counter() - began
+        limit = _divergence_limit(scenario, float(compiled[" ideal"](which[0])), limit_shape.dtype)
+
+        def work(numbers_of_block: np.ndarray) -> dict[str, Sums]:
+            which = jnp.asarray(numbers_of_block)
+            world = compiled[""](which)
+            at = jnp.asarray(limit, limit_shape.dtype)
+            return {
+                name: jax.device_get(compiled[f"f {name}"](world, which, at)) for name in filters
+            }
+
+        totals: dict[str, Sums] = {}
+        pending = [pool.submit(work, part) for part in numbers]
+        try:
+            for i, future in enumerate(pending):
+                for name, sums in future.result().items():
+                    wide = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), sums)
+                    totals[name] = (
+                        jax.tree.map(np.add, totals[name], wide) if name in totals else wide
+                    )
+                if progress is not None:
+                    progress(min((i + 1) * block, runs), runs)
+        except BaseException:
+            for future in pending:
+                future.cancel()
+            raise
+    return Campaign(
+        scenario=scenario.name,
+        source=scenario.source,
+        published=scenario.published,
+        steps=scenario.steps,
+        runs=runs,
+        dtype=str(limit_shape.dtype),
+        divergence_limit=limit,
+        filters={name: summarize(total) for name, total in totals.items()},
+        seconds=time.perf_counter() - began,
+        compile_seconds=compile_seconds,
+    )
+
+
+def _sum_where(counts: jax.Array, each: jax.Array) -> jax.Array:
+    """The sum over the leading axis, of what counts."""
+    mask = counts.reshape(-1, *(1,) * (each.ndim - 1))
+    return jnp.where(mask, each, jnp.zeros_like(each)).sum(axis=0)
+
+
+def _estimator(candidate: Candidate, truth: Truth, scenario: Scenario) -> Estimator:
+    method = candidate if isinstance(candidate, Filter) else candidate(truth)
+    if not isinstance(method, Filter):
+        return method
+
+    def drive(log: Log, key: jax.Array) -> Any:
+        return run(method, log, scenario.pose, scenario.pose_cov, key)
+
+    return drive
+
+
+def _check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
+    if not isinstance(candidate, Filter):
+        if not callable(candidate):
+            raise ValueError(f"monte_carlo: {name} is neither a filter nor a function of the truth")
+        return
+    for what, has, needs in (
+        ("control", candidate.control_size, len(scenario.motion.controls)),
+        ("measurement", candidate.measurement_size, len(scenario.sensor.measurements)),
+    ):
+        if has != needs:
+            raise ValueError(
+                f"monte_carlo: filter {name} takes a {what} of size {has}, "
+                f"the scenario {scenario.name} gives {needs}"
+            )
+
+
+def _divergence_limit(scenario: Scenario, spread: float, dtype: Any) -> float:
+    """5 σ of the ideal spread, or, in a world without noise, what rounding can do."""
+    reach = 1.0 + float(np.max(np.abs(np.asarray(scenario.landmarks))))
+    return max(5 * spread, 1000 * float(jnp.finfo(dtype).eps) * reach)

@@ -1,0 +1,46 @@
+"""Move forward, then turn: the guide's robot."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import se2
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Motion
+
+
+def increment(noise_cov: NoiseCov) -> Motion:
+    """u = (forward d [m], turn δ [rad]), noise added to it: Solà C.2.1.
+
+    pose ← (x + (d+w_d) cos θ, y + (d+w_d) sin θ, wrap(θ + δ + w_δ)).
+
+    Args:
+        noise_cov: (2, 2) covariance of w = (w_d, w_δ), or a function of (pose, u).
+    Raises:
+        ValueError: if noise_cov is not a (2, 2) covariance.
+    """
+
+    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+        d, turn = perturb(u, w)
+        return se2.compose(pose, jnp.stack([d, jnp.zeros_like(d), turn]))
+
+    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+        return u + w
+
+    def jacobians(
+        pose: jax.Array, u: jax.Array, w: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        d = u[0] + w[0]
+        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+        by_pose = jnp.eye(3, dtype=pose.dtype).at[0, 2].set(-d * s).at[1, 2].set(d * c)
+        by_noise = jnp.zeros((3, 2), pose.dtype).at[0, 0].set(c).at[1, 0].set(s).at[2, 1].set(1)
+        return by_pose, by_noise, by_noise
+
+    return Motion(
+        name="increment",
+        controls=("forward [m]", "turn [rad]"),
+        noises=("forward [m]", "turn [rad]"),
+        step=step,
+        noise_cov=noise_model("increment", noise_cov, 2),
+        perturb=perturb,
+        jacobians=jacobians,
+    )

@@ -1,0 +1,41 @@
+"""A relative pose, as odometry or scan matching reports it."""
+
+import jax
+
+from jaxslam import se2
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Motion
+
+
+def pose_increment(noise_cov: NoiseCov) -> Motion:
+    """u = (δx [m], δy [m], δθ [rad]) in the robot's frame, noise added to it: pose ⊕ (u + w).
+
+    t ← t + R(θ)(δt + w_t), θ ← wrap(θ + δθ + w_θ): Solà A.3 (59), (60); Williams' ⊕.
+
+    Args:
+        noise_cov: (3, 3) covariance of w = (w_x, w_y, w_θ), or a function of (pose, u).
+    Raises:
+        ValueError: if noise_cov is not a (3, 3) covariance.
+    """
+
+    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+        return se2.compose(pose, perturb(u, w))
+
+    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+        return u + w
+
+    def jacobians(
+        pose: jax.Array, u: jax.Array, w: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        by_pose, by_increment = se2.compose_jacobians(pose, u + w)
+        return by_pose, by_increment, by_increment
+
+    return Motion(
+        name="pose_increment",
+        controls=("forward [m]", "left [m]", "turn [rad]"),
+        noises=("forward [m]", "left [m]", "turn [rad]"),
+        step=step,
+        noise_cov=noise_model("pose_increment", noise_cov, 3),
+        perturb=perturb,
+        jacobians=jacobians,
+    )

@@ -1,0 +1,51 @@
+"""Velocities held over an interval, integrated by one Euler step."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import se2
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Motion
+
+
+def unicycle(noise_cov: NoiseCov) -> Motion:
+    """u = (v [m/s], ω [rad/s], Δt [s]), noise added to the velocities; Euler step.
+
+    pose ← (x + (v+w_v)Δt cos θ, y + (v+w_v)Δt sin θ, wrap(θ + (ω+w_ω)Δt)). The robot of Huang et
+    al. 2010 and of UKF-M's 2-D SLAM example (Brossard et al. 2020); Δt = 0 is no motion, no noise.
+
+    Args:
+        noise_cov: (2, 2) covariance of w = (w_v, w_ω), or a function of (pose, u). It is the
+            covariance of the *velocity* over the interval, so the displacement's grows with Δt².
+    Raises:
+        ValueError: if noise_cov is not a (2, 2) covariance.
+    """
+
+    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+        v, omega, dt = perturb(u, w)
+        return se2.compose(pose, jnp.stack([v * dt, jnp.zeros_like(dt), omega * dt]))
+
+    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+        return jnp.stack([u[0] + w[0], u[1] + w[1], u[2]])
+
+    def jacobians(
+        pose: jax.Array, u: jax.Array, w: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        v, omega, dt = u[0] + w[0], u[1] + w[1], u[2]
+        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+        by_pose = jnp.eye(3, dtype=pose.dtype)
+        by_pose = by_pose.at[0, 2].set(-v * dt * s).at[1, 2].set(v * dt * c)
+        by_noise = jnp.zeros((3, 2), pose.dtype)
+        by_noise = by_noise.at[0, 0].set(dt * c).at[1, 0].set(dt * s).at[2, 1].set(dt)
+        by_dt = jnp.stack([v * c, v * s, omega])
+        return by_pose, jnp.concatenate([by_noise, by_dt[:, None]], axis=1), by_noise
+
+    return Motion(
+        name="unicycle",
+        controls=("v [m/s]", "omega [rad/s]", "dt [s]"),
+        noises=("v [m/s]", "omega [rad/s]"),
+        step=step,
+        noise_cov=noise_model("unicycle", noise_cov, 2),
+        perturb=perturb,
+        jacobians=jacobians,
+    )

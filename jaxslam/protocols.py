@@ -1,0 +1,156 @@
+"""The records of pure functions a SLAM method is made of, and nothing else.
+
+Every field that is a function is pure and traceable and acts on *one* pose, landmark or scan; the
+caller vmaps. Records are made by factories that close over their parameters, so calling the factory
+inside a differentiated function lets `jax.grad` reach those parameters.
+
+Shapes: pose (3,); u (U,) control; w (W,) process noise; z (Z,) measurement; l (L,) landmark
+parameters; s (K,) what a measurement leaves free (K = 0 for a full one).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+
+from jaxslam.types import Estimate, Info, Log, Scan, Trace
+
+Array = jax.Array
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How the robot moves. w = 0 is the nominal motion: one function for simulator and filters."""
+
+    name: str
+    controls: tuple[str, ...]
+    """What u holds, with units; its length is U."""
+    noises: tuple[str, ...]
+    """What w holds, with units; its length is W."""
+    step: Callable[[Array, Array, Array], Array]
+    """(pose, u, w) -> pose, θ wrapped."""
+    noise_cov: Callable[[Array, Array], Array]
+    """(pose, u) -> (W, W)."""
+    perturb: Callable[[Array, Array], Array] | None = None
+    """(u, w) -> u with step(pose, u, w) = step(pose, perturb(u, w), 0), where noise is of that kind;
+    a world that disturbs the odometry instead of the robot needs it."""
+    jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
+    """(pose, u, w) -> by pose (3, 3), by u (3, U), by w (3, W); hand-derived, to verify against."""
+
+
+class Free(NamedTuple):
+    """The Gaussian prior of what a measurement cannot see (Solà 39)."""
+
+    mean: Array
+    """(K,)"""
+    cov: Array
+    """(K, K)"""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """What the robot sees of one landmark."""
+
+    name: str
+    measurements: tuple[str, ...]
+    """What z holds, with units; its length is Z."""
+    landmark: tuple[str, ...]
+    """What l holds, with units; its length is L."""
+    observe: Callable[[Array, Array], Array]
+    """(pose, l) -> z."""
+    residual: Callable[[Array, Array], Array]
+    """(z, z_hat) -> z ⊖ z_hat (Z,), angles wrapped; residual(z, 0) is z with its angles wrapped."""
+    noise_cov: Callable[[Array], Array]
+    """(z) -> (Z, Z)."""
+    invert: Callable[[Array, Array, Array], Array]
+    """(pose, z, s) -> l, with observe(pose, invert(pose, z, s)) = z."""
+    position: Callable[[Array], Array]
+    """(l) -> (2,) where the landmark stands."""
+    embed: Callable[[Array, Array], Array]
+    """(pose, point (2,)) -> l of a landmark that stands there, seen first from pose."""
+    free: Free
+    """the prior of s."""
+    observe_jacobians: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    """(pose, l) -> by pose (Z, 3), by l (Z, L); hand-derived, to verify against."""
+    invert_jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
+    """(pose, z, s) -> by pose (L, 3), by z (L, Z), by s (L, K); hand-derived."""
+
+
+class Basis(NamedTuple):
+    """The derivative of a chart's `retract` at zero, block lower triangular."""
+
+    pose: Array
+    """(3, 3) ∂pose/∂dx."""
+    cross: Array
+    """(L, 3) ∂l/∂dx."""
+    landmark: Array
+    """(L, L) ∂l/∂dl."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Which error the covariance is the covariance of, on a (pose, one landmark) pair.
+
+    The pose's retraction must not depend on a landmark, nor one landmark's on another.
+    """
+
+    name: str
+    retract: Callable[[Array, Array, Array, Array], tuple[Array, Array]]
+    """(pose, l, dx (3,), dl (L,)) -> (pose, l)."""
+    local: Callable[[Array, Array, Array, Array], tuple[Array, Array]]
+    """(pose0, l0, pose, l) -> (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
+    basis: Callable[[Array, Array], Basis] | None = None
+    """(pose, l) -> the derivative of retract at zero; None says identity, and spares the products."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linearizer:
+    """Where Jacobians are taken, with a memory of its own inside the filter's state."""
+
+    name: str
+    init: Callable[[int, Array], Any]
+    """(capacity, pose) -> memory, a pytree of arrays of fixed shape."""
+    motion: Callable[[Any, Motion, Array, Array], tuple[Array, Array, Any]]
+    """(memory, motion, pose, u) -> by pose (3, 3), by w (3, W), memory; at w = 0."""
+    observe: Callable[[Any, Sensor, Array, Array, Array, Array], tuple[Array, Array]]
+    """(memory, sensor, slot (), tag (), pose, l) -> by pose (Z, 3), by l (Z, L)."""
+    invert: Callable[[Any, Sensor, Array, Array, Array, Array], tuple[Array, Array, Array]]
+    """(memory, sensor, tag (), pose, z, s) -> by pose (L, 3), by z (L, Z), by s (L, K)."""
+    born: Callable[[Any, Array, Array], Any]
+    """(memory, born (N,) bool, landmarks (N, L)) -> memory, after new landmarks entered the map."""
+
+
+class Prediction(NamedTuple):
+    """What association may look at: the map before the scan's corrections."""
+
+    tag: Array
+    """(N,) tags of the slots, -1 where dead."""
+    alive: Array
+    """(N,) bool."""
+
+
+Associate = Callable[[Prediction, Scan], tuple[Array, Array]]
+"""(prediction, scan) -> slot (M,) int, -1 where none; is_new (M,) bool: start a landmark."""
+
+
+@dataclass(frozen=True, eq=False)
+class Filter:
+    """A recursive estimator: what `run` drives and the harness judges."""
+
+    name: str
+    control_size: int
+    measurement_size: int
+    init: Callable[[Array, Array], Any]
+    """(pose, pose_cov (3, 3)) -> S."""
+    predict: Callable[[Any, Array, Array], Any]
+    """(S, u, key) -> S."""
+    update: Callable[[Any, Scan, Array], tuple[Any, Info]]
+    """(S, scan, key) -> S, info."""
+    estimate: Callable[[Any], Estimate]
+    """(S) -> moments in map coordinates."""
+    chart: Chart
+
+
+Estimator = Callable[[Log, Array], Trace]
+"""(log, key) -> trace: what the harness runs; `partial(run, filter, …)`, or a batch method."""

@@ -1,0 +1,216 @@
+"""Results on paper: the table of a campaign, its JSON and CSV, and files that appear whole or not."""
+
+import csv
+import io
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxslam.consistency import DOF, LEVEL, Measure, Summary
+from jaxslam.monte_carlo import Campaign
+from jaxslam.types import Estimate
+
+ROWS = (
+    ("nees_pose", "pose NEES", f"{DOF['pose']}"),
+    ("nees_position", "position NEES", f"{DOF['position']}"),
+    ("nees_heading", "heading NEES", f"{DOF['heading']}"),
+    ("nis_per_dof", "NIS / dof", "1"),
+    ("rmse_position", "position RMSE [m]", ""),
+    ("rmse_heading_deg", "heading RMSE [°]", ""),
+    ("rmse_landmarks", "landmark RMSE [m]", ""),
+    ("log_likelihood", "log-likelihood", ""),
+)
+"""Measure, its name in the table, and what an honest filter shows."""
+
+
+def table(campaign: Campaign) -> str:
+    """The campaign for a human: one column a filter, one row a measure, and the verdicts."""
+    names = list(campaign.filters)
+    lines = [["", "honest", *names]]
+    lines.append(["verdict", "consistent", *(s.verdict for s in campaign.filters.values())])
+    for key, label, honest in ROWS:
+        cells = [_cell(s.measures.get(key)) for s in campaign.filters.values()]
+        lines.append([label, honest, *cells])
+        if key in campaign.published:
+            note = [f"{campaign.published[key]:.4g}" if n == "ekf" else "" for n in names]
+            if any(note):
+                lines.append(["  published", "", *note])
+    bands = [_band(s.nis_band) for s in campaign.filters.values()]
+    lines.append([f"NIS / dof, {LEVEL:.0%} band", "", *bands])
+    for block in DOF:
+        shares = [f"{s.inside[block]:.1%}" if block in s.inside else "-" for s in _of(campaign)]
+        lines.append([f"steps in {block} band", f"{LEVEL:.1%}", *shares])
+    always = ("runs", "not_finite", "divergent")
+    for key in _of(campaign)[0].counts:
+        counts = [s.counts[key] for s in _of(campaign)]
+        if key in always or any(counts):
+            lines.append([key.replace("_", " "), "", *(f"{count:,}" for count in counts)])
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    text = [
+        "  ".join(
+            c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths))
+        )
+        for line in lines
+    ]
+    text.insert(1, "-" * len(text[0]))
+    title = f"{campaign.scenario}: {campaign.runs} runs × {campaign.steps} steps, {campaign.dtype}"
+    notes = [
+        f"NEES is not divided by its dof, which is the honest value. ±: {LEVEL:.0%} interval over",
+        "the runs. Verdict: whether pose NEES = 3 lies in its interval, above (optimistic) or",
+        "below (pessimistic). divergent: final position error over "
+        f"{campaign.divergence_limit:.3g} m, 5 σ of the ideal EKF.",
+    ]
+    if campaign.published:
+        notes.append(f"published: {campaign.source}")
+    return "\n".join([title, "", *text, "", *notes])
+
+
+def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> str:
+    """Everything but the curves, with versions, seed and command line; no NaN or infinity in it."""
+    filters = {
+        name: {
+            "verdict": s.verdict,
+            "measures": {key: _finite(measure._asdict()) for key, measure in s.measures.items()},
+            "nis_band": s.nis_band,
+            "steps_inside_band": s.inside,
+            "counts": s.counts,
+        }
+        for name, s in campaign.filters.items()
+    }
+    head = {
+        "scenario": campaign.scenario,
+        "source": campaign.source,
+        "published": campaign.published,
+        "runs": campaign.runs,
+        "steps": campaign.steps,
+        "dtype": campaign.dtype,
+        "seed": seed,
+        "command": command,
+        "nees_convention": "not divided by dof",
+        "level": LEVEL,
+        "divergence_limit_m": campaign.divergence_limit,
+        "seconds": round(campaign.seconds, 3),
+        "compile_seconds": round(campaign.compile_seconds, 3),
+        "versions": versions(),
+    }
+    return json_text(head | {"filters": filters})
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Indented JSON; raises ValueError on a NaN or an infinity, which JSON does not have."""
+    return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def as_csv(campaign: Campaign) -> str:
+    """The curves: one row a filter and step; an empty cell where there is no number."""
+    keys = list(_of(campaign)[0].curves)
+    rows = [
+        [name, str(step + 1), *(_blank(s.curves[key][step]) for key in keys)]
+        for name, s in campaign.filters.items()
+        for step in range(campaign.steps)
+    ]
+    return csv_text(["filter", "step", *keys], rows)
+
+
+def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
+    """One row a step: time, pose and the upper triangle of its covariance (x, y, θ)."""
+    header = ["time", "x", "y", "theta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt"]
+    rows, columns = np.triu_indices(3)
+    triangle = np.asarray(estimate.pose_cov)[:, rows, columns]
+    values = np.concatenate(
+        [np.asarray(time)[:, None], np.asarray(estimate.pose), triangle], axis=1
+    )
+    # 17 digits for the time, an epoch; nine for the rest.
+    return csv_text(
+        header, [[f"{row[0]:.17g}", *(f"{value:.9g}" for value in row[1:])] for row in values]
+    )
+
+
+def map_csv(estimate: Estimate, names: Sequence[int]) -> str:
+    """One row a landmark of a map at one time: the data set's name of it, position, covariance."""
+    rows = []
+    for i in np.flatnonzero(np.asarray(estimate.alive)):
+        cov = np.asarray(estimate.point_covs[i])
+        values = [*np.asarray(estimate.points[i]), cov[0, 0], cov[0, 1], cov[1, 1]]
+        rows.append([str(names[int(estimate.tag[i])]), *(f"{value:.9g}" for value in values)])
+    return csv_text(["landmark", "x", "y", "c_xx", "c_xy", "c_yy"], rows)
+
+
+def csv_text(header: list[str], rows: list[list[str]]) -> str:
+    """Comma-separated text with a header line."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def versions() -> dict[str, str]:
+    """Of Python, this package and what it computes with."""
+    return {"python": platform.python_version()} | {
+        name: version(name) for name in ("jax", "numpy")
+    }
+
+
+def check_writable(folder: Path) -> None:
+    """Raise OSError now, before hours of work, if files cannot be written to the folder.
+
+    The folder is not made here; its nearest existing parent is tried.
+    """
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        raise NotADirectoryError(f"{there} is not a folder")
+    with tempfile.TemporaryFile(dir=there):
+        pass
+
+
+def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], Any]]) -> list[Path]:
+    """Write files, each text or a function that saves to a path; they appear whole or not at all.
+
+    All are written to a hidden folder beside the target first and moved in place only when the last
+    one is complete; on any error, an interrupt too, nothing of them stays behind.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as hidden:
+        for name, content in files.items():
+            target = Path(hidden) / name
+            if callable(content):
+                content(target)
+            else:
+                target.write_text(content, encoding="utf-8")
+        for name in files:
+            os.replace(Path(hidden) / name, folder / name)
+    return [folder / name for name in files]
+
+
+def _of(campaign: Campaign) -> list[Summary]:
+    return list(campaign.filters.values())
+
+
+def _cell(measure: Measure | None) -> str:
+    if measure is None:
+        return "-"
+    if not np.isfinite(measure.low):
+        return f"{measure.value:.4g}"
+    return f"{measure.value:.4g} ± {(measure.high - measure.low) / 2:.2g}"
+
+
+def _band(band: tuple[float, float] | None) -> str:
+    return "-" if band is None else f"[{band[0]:.4f}, {band[1]:.4f}]"
+
+
+def _finite(values: dict[str, float]) -> dict[str, float | None]:
+    return {k: float(v) if np.isfinite(v) else None for k, v in values.items()}
+
+
+def _blank(value: float) -> str:
+    return f"{value:.9g}" if np.isfinite(value) else ""

@@ -1,0 +1,61 @@
+"""The scan driver: one function runs every filter over a whole log."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam.linalg import check_covariance, is_concrete
+from jaxslam.protocols import Filter
+from jaxslam.types import Log, Trace, check_log
+
+
+def run(
+    filter: Filter,
+    log: Log,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
+    key: jax.Array,
+    *,
+    probe: Callable[[Any], Any] | None = None,
+) -> Trace:
+    """Drive a filter along a log: per row predict with the control, then update with the scan.
+
+    Traceable: wrap it in `jax.jit`, `jax.vmap` over logs and keys, or `jax.grad`. The arithmetic
+    runs in the dtype of the log's controls.
+
+    Args:
+        filter: made by a factory of `jaxslam.filters`.
+        log: T rows; control (T, U), scans of M places.
+        pose: (3,) where the robot is before the first control.
+        pose_cov: (3, 3) how well that is known; zero is allowed.
+        key: a PRNG key, split into two a step; a filter without randomness ignores them.
+        probe: called with the filter's own state after each update; what it returns is stacked.
+    Returns:
+        Trace with estimates and infos of leading axis T, and the final state.
+    Raises:
+        ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN in controls
+            or valid measurements, tags repeated within a scan, or a bad pose_cov.
+    """
+    check_log(log, control_size=filter.control_size, measurement_size=filter.measurement_size)
+    if np.shape(pose) != (3,):
+        raise ValueError(f"run: expected a pose of shape (3,), got {np.shape(pose)}")
+    if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
+        raise ValueError("run: the initial pose is not finite")
+    check_covariance("run: pose_cov", pose_cov, 3)
+    log = jax.tree.map(jnp.asarray, log)
+    dtype = log.control.dtype
+    start = filter.init(jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype))
+    keys = jax.random.split(key, (log.control.shape[0], 2))
+
+    def step(state: Any, row: tuple[Log, jax.Array]) -> tuple[Any, Any]:
+        (control, scan), (key_predict, key_update) = row
+        state = filter.predict(state, control, key_predict)
+        state, info = filter.update(state, scan, key_update)
+        return state, (filter.estimate(state), info, () if probe is None else probe(state))
+
+    final, (estimate, info, probed) = jax.lax.scan(step, start, (log, keys))
+    return Trace(estimate, info, final, probed)

@@ -1,0 +1,34 @@
+"""Where a sensor sits on the robot: Solà's S, a constant pose in the robot's frame."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam import se2
+from jaxslam.linalg import is_concrete
+
+NO_OFFSET = (0.0, 0.0, 0.0)
+
+
+def mounting(
+    name: str, mount: ArrayLike
+) -> tuple[Callable[[jax.Array], jax.Array], Callable[[jax.Array], jax.Array]]:
+    """The functions pose -> pose ∘ mount and its derivative by the pose (3, 3).
+
+    Raises ValueError unless mount is a finite (3,); a traced mount is checked for its shape alone.
+    """
+    if np.shape(mount) != (3,):
+        raise ValueError(f"{name}: expected a mounting pose of shape (3,), got {np.shape(mount)}")
+    if is_concrete(mount) and not np.all(np.isfinite(np.asarray(mount))):
+        raise ValueError(f"{name}: the mounting pose is not finite")
+
+    def sensor_pose(pose: jax.Array) -> jax.Array:
+        return se2.compose(pose, jnp.asarray(mount, pose.dtype))
+
+    def jacobian(pose: jax.Array) -> jax.Array:
+        return se2.compose_jacobians(pose, jnp.asarray(mount, pose.dtype))[0]
+
+    return sensor_pose, jacobian

@@ -1,0 +1,164 @@
+"""The glossary of shapes: what flows between worlds, filters and the harness.
+
+All are NamedTuples, hence pytrees; leading axes are added by `vmap` (runs) and `scan` (time).
+T steps, M measurement places a step, N landmark slots, Z measurement size, L landmark size.
+Masks and status codes, never NaN, say what is absent.
+"""
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.linalg import is_concrete
+
+
+class Status(IntEnum):
+    """What became of a measurement place; `Info.status` holds one a place."""
+
+    EMPTY = 0
+    """No measurement there (padding)."""
+    FUSED = 1
+    """Corrected the map."""
+    BORN = 2
+    """Started a new landmark."""
+    REJECTED = 3
+    """Failed the gate; dropped."""
+    OVERFLOW = 4
+    """A new landmark, but the map is full; dropped."""
+    DEFERRED = 5
+    """A new landmark beyond the scan's quota of births; dropped for now."""
+    REPEATED = 6
+    """Its new tag occurs earlier in the same scan; dropped."""
+    SINGULAR = 7
+    """Its innovation covariance is not positive definite; dropped."""
+
+
+class Scan(NamedTuple):
+    """The measurements of one step, padded to M places."""
+
+    z: jax.Array
+    """(M, Z) measurements; any finite number where not valid."""
+    tag: jax.Array
+    """(M,) int: landmark identity, -1 = unknown."""
+    valid: jax.Array
+    """(M,) bool."""
+
+
+class Log(NamedTuple):
+    """What a robot records. Row t: the control that led *to* pose t, and the scan taken there."""
+
+    control: jax.Array
+    """(T, U); the interval Δt, where a model needs one, is part of it."""
+    scan: Scan
+    """with leading T."""
+
+
+class Truth(NamedTuple):
+    """What only a simulator knows."""
+
+    pose: jax.Array
+    """(T, 3) true pose at each scan [m, m, rad]."""
+    landmarks: jax.Array
+    """(N, L) true landmarks, in the order of their tags."""
+    missed: jax.Array
+    """(T,) int: landmarks in view for which the scan had no place."""
+
+
+class Estimate(NamedTuple):
+    """What a filter believes, in map coordinates whatever its own error coordinates."""
+
+    pose: jax.Array
+    """(3,) x [m], y [m], θ [rad] in (-π, π]."""
+    pose_cov: jax.Array
+    """(3, 3)."""
+    points: jax.Array
+    """(N, 2) landmark positions [m]; 0 where not alive."""
+    point_covs: jax.Array
+    """(N, 2, 2)."""
+    alive: jax.Array
+    """(N,) bool."""
+    tag: jax.Array
+    """(N,) int, -1 where not alive."""
+
+
+class Info(NamedTuple):
+    """What one update did, place by place."""
+
+    nis: jax.Array
+    """(M,) normalized innovation squared of fused and rejected places, else 0. Within a joint
+    update: of a place given the places before it, so that the sum is the joint NIS."""
+    dof: jax.Array
+    """(M,) int: Z where fused, else 0."""
+    innovation: jax.Array
+    """(M, Z) z ⊖ ẑ of fused and rejected places, else 0."""
+    innovation_cov: jax.Array
+    """(M, Z, Z) of fused and rejected places, else 0."""
+    slot: jax.Array
+    """(M,) int: the landmark slot corrected or born, -1 if none."""
+    status: jax.Array
+    """(M,) int, see `Status`."""
+    log_likelihood: jax.Array
+    """() Σ log N(innovation; 0, S) over fused places."""
+
+    @property
+    def overflow(self) -> jax.Array:
+        """() bool: at least one measurement was dropped because the map was full."""
+        return (self.status == Status.OVERFLOW).any(-1)
+
+    def tally(self, status: Status) -> jax.Array:
+        """() int: places of this step with that status; over a whole trace, (T,)."""
+        return (self.status == status).sum(-1)
+
+
+class Trace(NamedTuple):
+    """What `run` returns."""
+
+    estimate: Estimate
+    """with leading T, after each update."""
+    info: Info
+    """with leading T."""
+    final: Any
+    """the filter's own state at the end."""
+    probe: Any
+    """what the caller's probe saw after each update, leading T; () without one."""
+
+
+def check_log(log: Log, *, control_size: int, measurement_size: int) -> None:
+    """Raise ValueError, naming the row, unless a log is well formed.
+
+    Shapes and kinds are always checked, values (finite controls, finite valid measurements, tags
+    >= -1 and not repeated within a scan) only where they are concrete.
+    """
+    control, (z, tag, valid) = log.control, log.scan
+    steps = np.shape(control)[0] if np.ndim(control) == 2 else -1
+    _expect("log.control", control, (steps, control_size), np.floating)
+    places = np.shape(tag)[1] if np.ndim(tag) == 2 else -1
+    _expect("log.scan.z", z, (steps, places, measurement_size), np.floating)
+    _expect("log.scan.tag", tag, (steps, places), np.integer)
+    _expect("log.scan.valid", valid, (steps, places), np.bool_)
+    if not is_concrete(log):
+        return
+    there, tags = np.asarray(valid), np.asarray(tag)
+    _refuse(~np.isfinite(np.asarray(control)).all(axis=1), "log.control is not finite")
+    finite = np.isfinite(np.asarray(z)).all(axis=2)
+    _refuse((there & ~finite).any(axis=1), "a valid measurement is not finite")
+    _refuse((there & (tags < -1)).any(axis=1), "a tag is below -1")
+    ordered = np.sort(np.where(there & (tags >= 0), tags, -1 - np.arange(places)), axis=1)
+    _refuse((ordered[:, 1:] == ordered[:, :-1]).any(axis=1), "a tag repeats within the scan")
+
+
+def _expect(name: str, value: Any, shape: tuple[int, ...], kind: type) -> None:
+    if np.shape(value) != shape or -1 in shape:
+        wanted = ", ".join("T or M" if n == -1 else str(n) for n in shape)
+        raise ValueError(f"{name}: expected shape ({wanted}), got {np.shape(value)}")
+    dtype = jnp.result_type(value)
+    if not jnp.issubdtype(dtype, kind):
+        raise ValueError(f"{name}: expected {kind.__name__} values, got {dtype}")
+
+
+def _refuse(bad_rows: Any, why: str) -> None:
+    if bad_rows.any():
+        raise ValueError(f"{why} (row {int(np.argmax(bad_rows))})")

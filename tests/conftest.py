@@ -1,0 +1,68 @@
+"""Strictness of the whole suite (never of the package), and the oracles that many tests share."""
+
+import jax
+import numpy as np
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Angles where something can go wrong: the seam, the series around zero turn and where they end
+# (0.5, and 1 for functions of the half angle).
+HARD_ANGLES = np.array(
+    [0.0, 1e-9, -1e-9, 1e-4, -1e-4, 0.499, 0.501, -0.499, -0.501, 0.999, 1.001, -0.999, -1.001]
+    + [np.pi, np.pi - 1e-9, -np.pi + 1e-9, np.pi / 2, -np.pi / 2, 3.0]
+)
+
+
+def central_differences(function, arguments, argnum, step=1e-5):
+    """∂function/∂arguments[argnum] (C, …, n) over a batch: every array has the leading axis C.
+
+    A jump by a whole turn between the two sides is an angle that crossed its seam, and is undone.
+    """
+    x = np.asarray(arguments[argnum], np.float64)
+    columns = []
+    for i in range(x.shape[1]):
+        shift = np.zeros_like(x)
+        shift[:, i] = step
+        ends = []
+        for moved in (x + shift, x - shift):
+            moved_arguments = list(arguments)
+            moved_arguments[argnum] = moved
+            ends.append(np.asarray(function(*moved_arguments), np.float64))
+        rise = ends[0] - ends[1]
+        rise = rise - 2 * np.pi * np.round(rise / (2 * np.pi))
+        columns.append(rise / (2 * step))
+    size = np.asarray(function(*arguments)).shape
+    return np.stack(columns, axis=-1) if columns else np.zeros((*size, 0))
+
+
+@pytest.fixture(scope="session")
+def differences():
+    return central_differences
+
+
+@pytest.fixture(scope="session")
+def hard_angles():
+    return HARD_ANGLES
+
+
+@pytest.fixture(scope="session")
+def assert_jacobians(differences):
+    """Hold hand-derived Jacobians of every argument against jacfwd and central differences."""
+
+    def check(function, hand, arguments, atol=1e-6, exact=1e-12):
+        arguments = tuple(np.asarray(a, np.float64) for a in arguments)
+        over = tuple(range(len(arguments)))
+        both = jax.jit(jax.vmap(lambda *a: (hand(*a), jax.jacfwd(function, argnums=over)(*a))))
+        batched = jax.jit(jax.vmap(function))
+        by_hand, by_autodiff = both(*arguments)
+        assert len(by_hand) == len(arguments)
+        for k in over:
+            by_differences = differences(batched, arguments, k)
+            assert by_hand[k].shape == by_differences.shape
+            scale = 1 + np.max(np.abs(by_differences), initial=0.0)
+            np.testing.assert_allclose(by_hand[k], by_autodiff[k], rtol=0, atol=exact * scale)
+            np.testing.assert_allclose(by_hand[k], by_differences, rtol=0, atol=atol * scale)
+
+    return check

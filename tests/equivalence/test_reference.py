@@ -1,0 +1,129 @@
+"""The filter against the plain NumPy reference, mean and covariance at every step, to 1e-9."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+import pytest
+from reference import ekf_slam as plain
+
+from jaxslam.filters import ekf_slam
+from jaxslam.run import run
+from jaxslam.scenarios import circle, cloister
+from jaxslam.simulate import simulate
+from jaxslam.types import Status
+
+MODELS = {
+    "cloister": {
+        "motion": plain.increment,
+        "observe": plain.range_bearing,
+        "invert": plain.range_bearing_inverse,
+        "Q": np.diag([0.01, 0.02]) ** 2,
+        "R": np.diag([0.1, np.deg2rad(1.0)]) ** 2,
+        "bearing": 1,
+    },
+    "circle": {
+        "motion": plain.unicycle,
+        "observe": plain.relative_position,
+        "invert": plain.relative_position_inverse,
+        "Q": np.diag([0.05 * 0.25 / np.sqrt(2), 0.05 * 0.25 * 2 * np.sqrt(2)]) ** 2,
+        "R": 0.1**2 * np.eye(2),
+    },
+}
+
+
+def scans_of(log):
+    """Per step the valid (tag, z), in the order of their places."""
+    z, tag, valid = (np.asarray(part) for part in log.scan)
+    return [
+        [(int(tag[t, i]), z[t, i]) for i in np.flatnonzero(valid[t])] for t in range(len(valid))
+    ]
+
+
+def assert_equal_at_every_step(states, steps):
+    """states: Joint with leading T; steps: the reference's (x, P, tags), T of them."""
+    pose, landmarks, cov, alive, tag = (np.asarray(part) for part in states[:5])
+    assert len(steps) == len(pose)
+    largest = 0
+    for t, (x, p, tags) in enumerate(steps):
+        slot_of = {int(g): i for i, g in enumerate(tag[t]) if alive[t, i]}
+        assert set(slot_of) == set(tags), f"step {t}"
+        slots = [slot_of[g] for g in tags]
+        rows = np.array([0, 1, 2] + [3 + 2 * i + k for i in slots for k in (0, 1)])
+        mean = np.concatenate([pose[t], landmarks[t][slots].ravel()])
+        error = mean - x
+        error[2] = plain.wrap(error[2])
+        np.testing.assert_allclose(error, 0, atol=1e-9, err_msg=f"mean at step {t}")
+        own = cov[t][np.ix_(rows, rows)]
+        np.testing.assert_allclose(own, p, rtol=0, atol=1e-9, err_msg=f"covariance at step {t}")
+        largest = max(largest, np.abs(p).max())
+    assert largest > 1e-4  # 1e-9 is small beside what is compared
+
+
+CASES = {
+    "cloister": (cloister(200), {"update": "sequential", "gate": 9.0, "births": 1}),
+    "circle": (circle(500), {"update": "joint"}),
+    "circle joint with gate": (circle(300), {"update": "joint", "gate": 3.0}),
+    "cloister joint with gate": (
+        dataclasses.replace(cloister(80), noise_on="odometry"),
+        {"update": "joint", "gate": 5.0, "births": 3},
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def filtered():
+    """(case, seed) -> log and trace, compiled once a case."""
+
+    @functools.cache
+    def compiled(case):
+        scenario, options = CASES[case]
+        size = len(scenario.landmarks)
+        filter = ekf_slam(scenario.motion, scenario.sensor, size, **options)
+        pose, cov = scenario.pose, scenario.pose_cov
+
+        def both(key):
+            _, log = simulate(scenario, key)
+            return log, run(filter, log, pose, cov, key, probe=lambda state: state)
+
+        return jax.jit(both)
+
+    return functools.cache(lambda case, seed: compiled(case)(jax.random.key(seed)))
+
+
+def reference(case, log, steps=None, **changes):
+    scenario, options = CASES[case]
+    return plain.run(
+        scenario.pose,
+        scenario.pose_cov,
+        np.asarray(log.control)[:steps],
+        scans_of(log)[:steps],
+        joint=options["update"] == "joint",
+        gate=options.get("gate", np.inf),
+        births=options.get("births"),
+        **(MODELS[scenario.name] | changes),
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("case", CASES)
+def test_filter_equals_the_reference_at_every_step(case, seed, filtered):
+    log, trace = filtered(case, seed)
+    assert_equal_at_every_step(trace.probe, list(reference(case, log)))
+    # The gate and the quota were put to work where there is one.
+    options = CASES[case][1]
+    counts = {s: int(trace.info.tally(s).sum()) for s in Status}
+    assert counts[Status.FUSED] > 400
+    assert (counts[Status.REJECTED] > 10) == ("gate" in options)
+    assert (counts[Status.DEFERRED] > 0) == ("births" in options)
+    assert counts[Status.BORN] >= 10
+
+
+@pytest.mark.parametrize("what", ["Q", "R"])
+def test_the_comparison_notices_one_per_cent_more_noise(what, filtered):
+    log, trace = filtered("circle", 0)
+    changes = {what: 1.01 * MODELS["circle"][what]}
+    states = jax.tree.map(lambda a: a[:60], trace.probe)
+    with pytest.raises(AssertionError, match="at step"):
+        assert_equal_at_every_step(states, list(reference("circle", log, 60, **changes)))

@@ -1,0 +1,249 @@
+"""linalg: factors and solves against NumPy, what singular matrices give, and refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import linalg
+
+UNROLLED, LAPACK = [1, 2, 3, 4, 5, 6, 7, 8], [9, 20]
+
+
+def random_covariances(n, count=20, seed=0):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(count, n, n + 2))
+    scale = 10.0 ** rng.uniform(-2, 2, size=(count, n))  # metres next to radians
+    return (root @ root.transpose(0, 2, 1)) * scale[:, :, None] * scale[:, None, :]
+
+
+def outer(*rows):
+    """Σ v vᵀ of integer vectors: exactly semi-definite, without a rounding error."""
+    return sum(np.outer(v, v).astype(float) for v in rows)
+
+
+def semi_definite(n):
+    """Exactly singular (n, n) matrices: zero, a zero in the middle, rank one, a repeated row."""
+    cases = [np.zeros((n, n)), np.diag(np.arange(n).astype(float))]
+    if n > 1:
+        cases.append(outer(2 ** np.arange(n)))
+        cases.append(np.eye(n))
+        cases[-1][:2, :2] = 4.0
+        cases.append(np.diag([1.0] * (n - 1) + [0.0]))
+    return np.array(cases)
+
+
+@pytest.mark.parametrize("n", UNROLLED + LAPACK)
+def test_factor_and_solves_equal_numpy(n):
+    a = random_covariances(n)
+    b = np.random.default_rng(1).normal(size=(len(a), n, 2))
+
+    def everything(a, b):
+        factor, positive = linalg.cholesky(a)
+        solution, solvable = linalg.solve_psd(a, b)
+        return factor, positive & solvable, linalg.solve_lower(factor, b), solution
+
+    factor, flags, half, solution = jax.jit(jax.vmap(everything))(a, b)
+    expected = np.linalg.cholesky(a)
+    unit = np.sqrt(np.einsum("cii->ci", a))[:, :, None]
+    np.testing.assert_allclose(factor / unit, expected / unit, rtol=0, atol=1e-10)
+    assert flags.all()
+    np.testing.assert_allclose(expected @ half, b, atol=1e-9)
+    np.testing.assert_allclose(unit * solution, unit * np.linalg.solve(a, b), atol=1e-7)
+
+
+@pytest.mark.parametrize("n", [3, 9])
+def test_solves_take_a_vector_or_a_matrix(n):
+    a, b = jnp.asarray(random_covariances(n, 1)[0]), np.random.default_rng(1).normal(size=(n, 2))
+    for solve in (linalg.solve_lower, lambda a, b: linalg.solve_psd(a, b)[0]):
+        solve = jax.jit(solve)
+        np.testing.assert_allclose(solve(a, b[:, 0]), solve(a, b)[:, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 9])
+def test_slope_of_the_log_determinant_is_the_inverse(n):
+    """∂ log|A| = A⁻¹; the factor reads the lower triangle only, so the slope lives there."""
+    a = random_covariances(n)
+    log_det = jax.grad(lambda a: 2 * jnp.log(jnp.diagonal(linalg.cholesky(a)[0])).sum())
+    slope = jax.jit(jax.vmap(log_det))(a)
+    np.testing.assert_array_equal(slope, np.tril(slope))
+    unit = np.sqrt(np.einsum("cii->ci", a))
+    unit = unit[:, :, None] * unit[:, None, :]
+    np.testing.assert_allclose(linalg.symmetrize(slope) * unit, np.linalg.inv(a) * unit, rtol=1e-7)
+
+
+@pytest.mark.parametrize("n", [3, 9])
+def test_cholesky_reads_the_lower_triangle_alone(n):
+    a = random_covariances(n, 1)[0]
+    spoiled = np.where(np.triu(np.ones((n, n)), 1) > 0, np.nan, a)
+    factor, positive = jax.jit(linalg.cholesky)(spoiled)
+    assert positive
+    np.testing.assert_allclose(factor, np.linalg.cholesky(a), rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6, 9, 20])
+def test_semi_definite_matrices_are_flagged_and_nothing_is_nan(n):
+    a = semi_definite(n)
+    b = np.ones((len(a), n))
+
+    def use(a, b):
+        solution, positive = linalg.solve_psd(a, b)
+        factor, also = linalg.cholesky(a)
+        return factor, positive | also, solution, linalg.solve_lower(factor, b)
+
+    factor, flags, solution, half = jax.jit(jax.vmap(use))(a, b)
+    assert not flags.any()
+    for part in (factor, solution, half):
+        assert np.isfinite(part).all()
+    # A zero pivot has a zero column in the factor, and a zero row in the solution.
+    dead = np.einsum("cii->ci", np.asarray(factor)) == 0
+    assert dead.any(axis=1).all()
+    assert not np.asarray(factor).transpose(0, 2, 1)[dead].any()
+    assert not np.asarray(half)[dead].any()
+    if n <= 8:  # … so that a usable square root remains.
+        rebuilt = factor @ factor.transpose(0, 2, 1)
+        np.testing.assert_allclose(rebuilt, a, rtol=1e-14)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 9])
+def test_gradients_through_semi_definite_matrices_are_finite(n):
+    def total(a, b):
+        solution, _ = linalg.solve_psd(a, b)
+        factor, _ = linalg.cholesky(a)
+        return jnp.sum(factor) + jnp.sum(solution) + jnp.sum(linalg.solve_lower(factor, b))
+
+    a = semi_definite(n)
+    slopes = jax.jit(jax.vmap(jax.grad(total, argnums=(0, 1))))(a, np.ones((len(a), n)))
+    for slope in slopes:
+        assert np.isfinite(slope).all()
+    assert any(np.any(slope) for slope in slopes) == (n in (2, 3))  # n = 1: 0; n = 9: all masked
+
+
+@pytest.mark.parametrize("n", [4, 12])
+def test_indefinite_and_non_finite_matrices_are_flagged(n):
+    good = random_covariances(n, 1)[0]
+    cases = np.repeat(good[None], 5, axis=0)
+    cases[1] -= 2 * np.linalg.eigvalsh(good)[0] * np.eye(n)
+    cases[2][0, 0] = np.nan
+    cases[3][n - 1, 1] = np.nan
+    cases[4][1, 1] = np.inf
+    flags = jax.jit(jax.vmap(lambda a: linalg.cholesky(a)[1]))(cases)
+    np.testing.assert_array_equal(flags, [True, False, False, False, False])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_inverse_equals_numpy(n):
+    a = np.random.default_rng(2).normal(size=(20, n, n))  # not symmetric
+    out = jax.jit(jax.vmap(linalg.inverse))(a)
+    np.testing.assert_allclose(out @ a, np.broadcast_to(np.eye(n), a.shape), atol=1e-10)
+
+
+def test_symmetrize():
+    a = np.random.default_rng(3).normal(size=(4, 3, 3))
+    np.testing.assert_array_equal(linalg.symmetrize(jnp.asarray(a)), (a + a.transpose(0, 2, 1)) / 2)
+
+
+# --- Mahalanobis --------------------------------------------------------------------------------
+
+distance = jax.jit(jax.vmap(linalg.mahalanobis_squared))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 10])
+def test_mahalanobis_equals_numpy_at_any_scale(n):
+    rng = np.random.default_rng(4)
+    root = np.tril(rng.normal(size=(30, n, n)), -1) * 0.3 + np.eye(n)
+    white = rng.normal(size=(30, n))
+    for exponents in (np.zeros(n), rng.uniform(-12, 8, n), np.full(n, -15.0)):
+        scale = 10.0**exponents
+        cov = root @ root.transpose(0, 2, 1) * np.outer(scale, scale)
+        error = np.einsum("cij,cj->ci", root, white) * scale
+        out, regular = distance(error, cov)
+        assert regular.all()
+        np.testing.assert_allclose(out, (white**2).sum(axis=1), rtol=1e-9)
+
+
+def test_mahalanobis_masks_directions_that_are_known_exactly():
+    error = np.ones((6, 3))
+    turned = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+    cov = np.stack(
+        [
+            np.zeros((3, 3)),
+            np.diag([1.0, 0.0, 1.0]),
+            np.ones((3, 3)),
+            turned @ np.diag([1.0, 2.0, 1e-17]) @ turned.T,
+            np.eye(3),
+            np.diag([1e-30, 1e-30, 1.0]),
+        ]
+    )
+    error[4, 1] = np.nan
+    out, regular = distance(error, cov)
+    np.testing.assert_array_equal(regular, [False] * 5 + [True])
+    np.testing.assert_array_equal(out[:5], np.zeros(5))
+    np.testing.assert_allclose(out[5], 2e30 + 1, rtol=1e-12)
+    slopes = jax.grad(lambda e, p: linalg.mahalanobis_squared(e, p)[0], (0, 1))
+    by_error, by_cov = jax.jit(jax.vmap(slopes))(error[:4], cov[:4])
+    assert not by_error.any()
+    assert not by_cov.any()
+
+
+def test_mahalanobis_with_a_common_scale_judges_coordinates_against_each_other():
+    error, cov = np.array([1.0, 1e-9]), np.diag([1.0, 1e-18])
+    judge = jax.jit(linalg.mahalanobis_squared)
+    np.testing.assert_allclose(judge(error, cov), [2.0, True], rtol=1e-12)
+    np.testing.assert_array_equal(judge(error, cov, np.ones(2)), [0.0, False])
+    np.testing.assert_allclose(judge(error, cov + np.eye(2), np.full(2, 7.0)), [0.5, True])
+
+
+def test_is_positive_definite():
+    cases = np.stack([np.eye(3), np.diag([1.0, -1e-9, 1.0]), np.full((3, 3), np.nan)])
+    flags = jax.vmap(linalg.is_positive_definite)(jnp.asarray(cases))
+    np.testing.assert_array_equal(flags, [True, False, False])
+
+
+# --- checks -------------------------------------------------------------------------------------
+
+BAD = {
+    "shape": (np.eye(3), r"thing: expected a covariance of shape \(2, 2\), got \(3, 3\)"),
+    "vector": ([1.0, 1.0], r"thing: expected a covariance of shape \(2, 2\), got \(2,\)"),
+    "nan": ([[1.0, np.nan], [np.nan, 1.0]], "thing: the covariance has a NaN or an infinity"),
+    "infinite": ([[np.inf, 0.0], [0.0, 1.0]], "thing: the covariance has a NaN or an infinity"),
+    "asymmetric": ([[1.0, 0.1], [0.0, 1.0]], "thing: the covariance is not symmetric"),
+    "negative": ([[1.0, 0.0], [0.0, -0.1]], "thing: the covariance is not positive semi-definite"),
+    "indefinite": ([[1.0, 2.0], [2.0, 1.0]], "thing: the covariance is not positive semi-definite"),
+    "complex": ([[1j, 0.0], [0.0, 1.0]], "thing: expected real numbers"),
+    "boolean": ([[True, False], [False, True]], "thing: expected real numbers"),
+    "text": ([["a", "b"], ["b", "a"]], "thing: expected real numbers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_check_covariance_refuses(case):
+    value, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        linalg.check_covariance("thing", value, 2)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [np.zeros((2, 2)), [[1, 0], [0, 2]], outer([1, 1]), np.float32([[0.1, 0.05], [0.05, 0.1]]) ** 2],
+    ids=["zero", "integers", "singular", "float32"],
+)
+def test_check_covariance_accepts(value):
+    linalg.check_covariance("thing", value, 2)
+
+
+def test_check_covariance_sees_the_shape_of_a_tracer_and_no_more():
+    def traced(cov, size):
+        linalg.check_covariance("thing", cov, size)
+        return cov
+
+    assert jax.eval_shape(lambda c: traced(c, 2), -np.eye(2)).shape == (2, 2)
+    with pytest.raises(ValueError, match="shape"):
+        jax.eval_shape(lambda c: traced(c, 3), np.eye(2))
+
+
+def test_is_concrete():
+    seen = []
+    jax.eval_shape(lambda x: seen.append(linalg.is_concrete([1.0, {"x": x}])), np.zeros(2))
+    assert seen == [False]
+    assert linalg.is_concrete([np.zeros(2), jnp.zeros(2), 1.0])

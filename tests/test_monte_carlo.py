@@ -1,0 +1,188 @@
+"""Campaigns: blocks, workers and loops agree; draws are shared; wrong filters are found out."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import filters, motion, run, scenarios, simulate
+from jaxslam.monte_carlo import monte_carlo
+
+SHORT = worlds.ring(steps=12)
+
+
+@pytest.fixture(scope="module")
+def in_one_block():
+    candidates = {"ekf": worlds.ekf(SHORT), "again": worlds.ekf(SHORT)}
+    return monte_carlo(SHORT, candidates, 10, worlds.key(), block=10, workers=1)
+
+
+def same(a, b, rtol=1e-9):
+    assert a.counts == b.counts
+    assert a.measures.keys() == b.measures.keys()
+    for name in a.measures:
+        np.testing.assert_allclose(a.measures[name], b.measures[name], rtol=rtol)
+    for name in a.curves:
+        np.testing.assert_allclose(a.curves[name], b.curves[name], rtol=rtol)
+
+
+@pytest.mark.parametrize(("block", "workers"), [(4, 1), (3, 2)])
+def test_blocks_and_workers_do_not_change_the_result(in_one_block, block, workers):
+    heard = []
+    campaign = monte_carlo(
+        SHORT,
+        {"ekf": worlds.ekf(SHORT)},
+        10,
+        worlds.key(),
+        block=block,
+        workers=workers,
+        progress=lambda done, total: heard.append((done, total)),
+    )
+    same(campaign.filters["ekf"], in_one_block.filters["ekf"])
+    assert [done for done, _ in heard] == [*range(block, 10, block), 10]
+
+
+def test_every_filter_gets_the_same_draws(in_one_block):
+    same(in_one_block.filters["ekf"], in_one_block.filters["again"], rtol=0)
+
+
+def test_a_campaign_is_the_loop_over_its_runs(in_one_block):
+    ekf, square, nees = worlds.ekf(SHORT), [], []
+    world = jax.jit(partial(simulate, SHORT))
+    for i in range(10):
+        key_world, key_filter = jax.random.split(jax.random.fold_in(worlds.key(), i))
+        truth, log = world(key_world)
+        trace = run(ekf, log, SHORT.pose, SHORT.pose_cov, key_filter)
+        error = np.array(truth.pose - trace.estimate.pose)
+        error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
+        square.append((error[:, :2] ** 2).sum(1).mean())
+        cov = np.asarray(trace.estimate.pose_cov)[1:]  # after one step P is singular
+        nees.append(
+            np.mean([e @ np.linalg.solve(p, e) for e, p in zip(error[1:], cov, strict=True)])
+        )
+    measures = in_one_block.filters["ekf"].measures
+    np.testing.assert_allclose(measures["rmse_position"].value, np.sqrt(np.mean(square)), rtol=1e-9)
+    np.testing.assert_allclose(measures["nees_pose"].value, np.mean(nees), rtol=1e-6)
+
+
+def test_another_seed_is_another_campaign(in_one_block):
+    other = monte_carlo(SHORT, {"ekf": worlds.ekf(SHORT)}, 10, worlds.key(1))
+    ours = in_one_block.filters["ekf"].measures["rmse_position"].value
+    assert abs(other.filters["ekf"].measures["rmse_position"].value / ours - 1) > 1e-3
+
+
+def test_functions_of_the_truth_and_estimators_run_too(in_one_block):
+    ekf = worlds.ekf(SHORT)
+
+    def estimator(truth):
+        return lambda log, key: run(ekf, log, SHORT.pose, SHORT.pose_cov, key)
+
+    campaign = monte_carlo(
+        SHORT, {"ideal": scenarios.ideal(SHORT), "estimator": estimator}, 10, worlds.key(), block=10
+    )
+    same(campaign.filters["estimator"], in_one_block.filters["ekf"])
+    assert campaign.filters["ideal"].measures["nees_pose"].value > 0
+
+
+def test_blocks_share_one_trace():
+    traces = []
+
+    def counted(pose, u, w):
+        traces.append(1)
+        return SHORT.motion.step(pose, u, w)
+
+    watched = dataclasses.replace(SHORT.motion, step=counted)
+    ekf = filters.ekf_slam(watched, SHORT.sensor, 6)
+    counts = []
+    for runs in (2, 6):
+        traces.clear()
+        monte_carlo(SHORT, {"ekf": ekf}, runs, worlds.key(), block=2)
+        counts.append(len(traces))
+    assert counts[0] == counts[1] > 0
+
+
+def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_one_block):
+    ekf = worlds.ekf(SHORT)
+
+    def poisoned(joint, scan, key):
+        joint, info = ekf.update(joint, scan, key)
+        # A scan that starts with a long range in about half of the runs.
+        bad = scan.z[0, 0] > jnp.where(joint.alive.all(), 3.9, jnp.inf)
+        return joint._replace(pose=jnp.where(bad, jnp.nan, joint.pose)), info
+
+    candidates = {
+        "ekf": ekf,
+        "poisoned": dataclasses.replace(ekf, update=poisoned),
+        "small": filters.ekf_slam(SHORT.motion, SHORT.sensor, 4),
+        "always lost": dataclasses.replace(
+            ekf, predict=lambda joint, u, key: joint._replace(pose=joint.pose * jnp.nan)
+        ),
+    }
+    campaign = monte_carlo(SHORT, candidates, 10, worlds.key())
+    same(campaign.filters["ekf"], in_one_block.filters["ekf"])
+    poisoned = campaign.filters["poisoned"]
+    assert poisoned.counts["runs"] + poisoned.counts["not_finite"] == 10
+    assert all(np.isfinite(m.value) for m in poisoned.measures.values())
+    assert campaign.filters["small"].counts["overflow"] == 10 * 12 * 2
+    lost = campaign.filters["always lost"]
+    assert lost.verdict == "diverged"
+    assert lost.counts["not_finite"] == 10
+
+
+def test_a_world_without_noise_does_not_diverge():
+    still = dataclasses.replace(
+        SHORT,
+        motion=motion.increment(np.zeros((2, 2))),
+    )
+    campaign = monte_carlo(still, {"ekf": worlds.ekf(still)}, 3, worlds.key())
+    assert campaign.filters["ekf"].verdict == "undecided"
+    assert campaign.filters["ekf"].counts["divergent"] == 0
+
+
+@pytest.fixture(scope="module")
+def lineup():
+    world = worlds.ring()
+    candidates = {
+        "ekf": worlds.ekf(world),
+        "right_invariant": scenarios.FILTERS["right_invariant"](world),
+        "ideal": scenarios.ideal(world),
+    } | {name: make(world) for name, make in worlds.WRONG.items()}
+    return monte_carlo(world, candidates, 200, worlds.key(), block=100).filters
+
+
+@pytest.mark.parametrize("name", ["ekf", "right_invariant", "ideal"])
+def test_honest_filters_are_found_consistent(lineup, name):
+    assert lineup[name].verdict == "consistent"
+    low, high = lineup[name].nis_band
+    assert low < lineup[name].measures["nis_per_dof"].value < high
+
+
+@pytest.mark.parametrize("name", worlds.WRONG)
+def test_wrong_filters_are_found_out(lineup, name):
+    assert lineup[name].verdict in ("optimistic", "diverged")
+    assert lineup[name].measures["nees_pose"].low > 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"runs": 0}, "runs"),
+        ({"runs": 2.5}, "runs"),
+        ({"block": 0}, "block"),
+        ({"workers": 0}, "workers"),
+        ({"filters": {}}, "at least one"),
+        ({"filters": {"x": 3}}, "neither"),
+        (
+            {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), SHORT.sensor, 2)}},
+            "size 3",
+        ),
+    ],
+)
+def test_bad_arguments_are_refused(change, message):
+    arguments = {"filters": {"ekf": worlds.ekf(SHORT)}, "runs": 2} | change
+    with pytest.raises(ValueError, match=message):
+        monte_carlo(SHORT, key=worlds.key(), **arguments)

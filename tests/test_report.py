@@ -1,0 +1,75 @@
+"""Tables, JSON and CSV say what the campaign says; files appear whole or not at all."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import report
+from jaxslam.monte_carlo import monte_carlo
+
+WORLD = worlds.ring(steps=6)
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    candidates = {"ekf": worlds.ekf(WORLD), "other": worlds.no_cross_covariance(WORLD)}
+    return monte_carlo(WORLD, candidates, 3, worlds.key())
+
+
+def test_the_table_shows_every_measure_and_verdict(campaign):
+    text = report.table(campaign)
+    for _, label, _ in report.ROWS:
+        assert label in text
+    for name, summary in campaign.filters.items():
+        assert name in text
+        assert summary.verdict in text
+        assert f"{summary.measures['nees_pose'].value:.4g}" in text
+    assert "not divided by its dof" in text
+
+
+def test_json_holds_the_measures_and_no_nan(campaign):
+    found = json.loads(report.as_json(campaign, "jaxslam …", 5), parse_constant=pytest.fail)
+    assert found["seed"] == 5
+    assert found["runs"] == 3
+    for name, summary in campaign.filters.items():
+        there = found["filters"][name]
+        assert there["verdict"] == summary.verdict
+        assert there["measures"]["rmse_position"]["value"] == pytest.approx(
+            summary.measures["rmse_position"].value
+        )
+        assert there["counts"] == summary.counts
+
+
+def test_csv_holds_the_curves(campaign):
+    rows = list(csv.DictReader(io.StringIO(report.as_csv(campaign))))
+    assert len(rows) == 2 * WORLD.steps
+    curve = campaign.filters["other"].curves["nees_pose"]
+    found = [r["nees_pose"] for r in rows if r["filter"] == "other"]
+    assert found[0] == ""  # the covariance is singular after one step
+    np.testing.assert_allclose([float(x) for x in found[1:]], curve[1:], rtol=1e-8)
+
+
+def test_files_appear_whole_or_not_at_all(tmp_path):
+    def broken(path):
+        path.write_text("half")
+        raise KeyboardInterrupt
+
+    out = tmp_path / "deep" / "out"
+    with pytest.raises(KeyboardInterrupt):
+        report.write_files(out, {"a.txt": "text", "b.png": broken})
+    assert not list(out.glob("*")) or not out.exists()
+    written = report.write_files(out, {"a.txt": "text", "b.txt": lambda path: path.write_text("b")})
+    assert [path.read_text() for path in written] == ["text", "b"]
+    assert sorted(path.name for path in out.iterdir()) == ["a.txt", "b.txt"]
+
+
+def test_an_unwritable_folder_is_refused_beforehand(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="not a folder"):
+        report.check_writable(tmp_path / "file" / "out")
+    report.check_writable(tmp_path / "not" / "yet" / "there")
+    assert not (tmp_path / "not").exists()

@@ -1,0 +1,282 @@
+"""se2: group laws against 3×3 homogeneous matrices, hand Jacobians against autodiff and differences."""
+
+import inspect
+
+import jax
+import numpy as np
+import pytest
+import scipy.linalg
+
+from jaxslam import se2
+
+
+def poses_of(angles, rng, spread=3.0):
+    xy = rng.normal(size=(len(angles), 2)) * spread
+    return np.concatenate([xy, np.asarray(angles)[:, None]], axis=1)
+
+
+@pytest.fixture(scope="module")
+def cases(hard_angles):
+    """Poses (C, 3): random ones, hard angles, large coordinates; and points (C, 2) to go along."""
+    rng = np.random.default_rng(1)
+    angles = np.concatenate([rng.uniform(-np.pi, np.pi, 10), hard_angles])
+    near, far = poses_of(angles, rng), poses_of(angles, rng, 1e4)
+    poses = np.concatenate([near, far])
+    return poses, rng.permutation(poses), rng.normal(size=(len(poses), 2)) * 3
+
+
+def matrix(pose):
+    x, y, theta = np.asarray(pose, float)
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s, x], [s, c, y], [0, 0, 1]])
+
+
+def twist_matrix(tau):
+    return np.array([[0, -tau[2], tau[0]], [tau[2], 0, tau[1]], [0, 0, 0]])
+
+
+def assert_same_poses(actual, expected, atol=1e-11):
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    scale = 1 + np.abs(expected[..., :2]).max()
+    np.testing.assert_allclose(actual[..., :2], expected[..., :2], rtol=0, atol=atol * scale)
+    turned = np.exp(1j * actual[..., 2]) - np.exp(1j * expected[..., 2])
+    np.testing.assert_allclose(np.abs(turned), 0, atol=atol)
+    assert np.all(actual[..., 2] > -np.pi) and np.all(actual[..., 2] <= np.pi)
+
+
+def batched(function, *arguments):
+    return np.asarray(jax.jit(jax.vmap(function))(*arguments))
+
+
+# --- hand-derived Jacobians ---------------------------------------------------------------------
+
+# Which kind of argument each function takes; a test below holds that none is left out.
+ARGUMENTS = {
+    "compose": "pose pose",
+    "inverse": "pose",
+    "between": "pose pose",
+    "exp": "pose",
+    "log": "pose off the seam",
+    "to_frame": "pose point",
+    "from_frame": "pose point",
+    "polar": "point",
+    "rectangular": "point",
+}
+
+
+def test_every_hand_jacobian_is_verified():
+    names = {n.removesuffix("_jacobians") for n in vars(se2) if n.endswith("_jacobians")}
+    assert names == set(ARGUMENTS)
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_hand_jacobian_is_autodiff_is_differences(name, cases, assert_jacobians):
+    first, second, points = cases
+    kinds = ARGUMENTS[name]
+    if kinds == "pose off the seam":  # log jumps by a whole turn's worth of translation there
+        first = np.where(np.abs(first[:, 2:]) > 3.1, [0, 0, 3.1] + first * [1, 1, 0], first)
+    arguments = {
+        "pose pose": (first, second),
+        "pose point": (first, points),
+        "point": (points,),
+    }.get(kinds, (first,))
+    function, hand = getattr(se2, name), getattr(se2, f"{name}_jacobians")
+    assert len(inspect.signature(function).parameters) == len(arguments)
+    assert_jacobians(function, hand, arguments)
+
+
+def test_log_jacobian_is_autodiff_up_to_the_seam(cases):
+    first = cases[0]
+    (hand,) = jax.jit(jax.vmap(se2.log_jacobians))(first)
+    auto = batched(jax.jacfwd(se2.log), first)
+    np.testing.assert_allclose(hand, auto, atol=1e-12 * np.abs(auto).max())
+
+
+def test_exp_jacobians_beyond_one_turn(assert_jacobians):
+    tau = np.array([[1.0, 2.0, w] for w in (3.5, -4.0, 6.2, 7.0, -20.0)])
+    assert_jacobians(se2.exp, se2.exp_jacobians, (tau,))
+
+
+def test_polar_jacobians_far_and_near(assert_jacobians):
+    rng = np.random.default_rng(2)
+    points = np.concatenate([rng.normal(size=(10, 2)) * 1e4, [[-5.0, 0.0], [-5.0, 1e-12]]])
+    assert_jacobians(se2.polar, se2.polar_jacobians, (points,))
+    close = rng.normal(size=(10, 2)) * 1e-6
+    (hand,) = jax.jit(jax.vmap(se2.polar_jacobians))(close)
+    np.testing.assert_allclose(hand, batched(jax.jacfwd(se2.polar), close), rtol=1e-12)
+
+
+# --- the group ----------------------------------------------------------------------------------
+
+
+def test_compose_inverse_and_between_are_matrix_products(cases):
+    a, b, _ = cases
+    for function, arguments, product in (
+        (se2.compose, (a, b), lambda p, q: matrix(p) @ matrix(q)),
+        (se2.inverse, (a,), lambda p: np.linalg.inv(matrix(p))),
+        (se2.between, (a, b), lambda p, q: np.linalg.inv(matrix(p)) @ matrix(q)),
+    ):
+        expected = np.array([product(*row) for row in zip(*arguments, strict=True)])
+        poses = np.stack(
+            [expected[:, 0, 2], expected[:, 1, 2], np.arctan2(expected[:, 1, 0], expected[:, 0, 0])]
+        ).T
+        assert_same_poses(batched(function, *arguments), poses)
+
+
+def test_group_laws(cases):
+    a, b, _ = cases
+    c = np.roll(a, 3, axis=0)
+    identity = np.zeros_like(a)
+
+    def laws(a, b, c, e):
+        left = se2.compose(se2.compose(a, b), c)
+        right = se2.compose(a, se2.compose(b, c))
+        return left, right, se2.compose(a, e), se2.compose(e, a), se2.compose(a, se2.inverse(a))
+
+    left, right, times_one, one_times, nothing = jax.jit(jax.vmap(laws))(a, b, c, identity)
+    assert_same_poses(left, right)
+    assert_same_poses(times_one, a)
+    assert_same_poses(one_times, a)
+    # Scale: coordinates of 1e4 m cancel here.
+    assert_same_poses(np.asarray(nothing) / [1e4, 1e4, 1], identity)
+
+
+def test_rotation_is_orthogonal_and_counter_clockwise(hard_angles):
+    r = batched(se2.rotation, hard_angles)
+    np.testing.assert_allclose(r @ r.transpose(0, 2, 1), np.broadcast_to(np.eye(2), r.shape), atol=1e-15)
+    np.testing.assert_allclose(np.linalg.det(r), 1, atol=1e-15)
+    np.testing.assert_allclose(se2.rotation(np.pi / 2) @ np.array([1.0, 0.0]), [0, 1], atol=1e-15)
+
+
+def test_frames_are_matrix_products_and_undo_each_other(cases):
+    a, _, points = cases
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    expected = np.array([(matrix(p) @ h)[:2] for p, h in zip(a, homogeneous, strict=True)])
+    world = batched(se2.from_frame, a, points)
+    np.testing.assert_allclose(world, expected, atol=1e-11 * np.abs(expected).max())
+    np.testing.assert_allclose(batched(se2.to_frame, a, world), points, atol=1e-10)
+
+
+# --- exp, log, boxes, adjoint -------------------------------------------------------------------
+
+
+def test_exp_is_the_matrix_exponential(hard_angles):
+    rng = np.random.default_rng(3)
+    tau = poses_of(np.concatenate([hard_angles, [4.0, -5.0, 12.0]]), rng)
+    expected = np.array([scipy.linalg.expm(twist_matrix(t)) for t in tau])
+    moved = batched(se2.exp, tau)
+    np.testing.assert_allclose([matrix(p) for p in moved], expected, atol=1e-12)
+    assert np.all(np.abs(moved[:, 2]) <= np.pi)
+
+
+def test_exp_and_log_undo_each_other(cases):
+    a = cases[0]
+    assert_same_poses(batched(lambda p: se2.exp(se2.log(p)), a), a)
+    inside = a[np.abs(a[:, 2]) < np.pi - 1e-6]
+    back = batched(lambda t: se2.log(se2.exp(t)), inside)
+    np.testing.assert_allclose(back, inside, atol=1e-11 * np.abs(inside).max())
+
+
+def test_boxminus_undoes_boxplus_and_the_other_way_round(cases):
+    a, b, _ = cases
+    assert_same_poses(batched(lambda p, q: se2.boxplus(q, se2.boxminus(p, q)), a, b), a)
+    small = np.clip(b, -3, 3)
+    back = batched(lambda p, t: se2.boxminus(se2.boxplus(p, t), p), a, small)
+    np.testing.assert_allclose(back, small, atol=1e-10)
+
+
+def test_boxplus_increments_are_in_the_local_frame(hard_angles):
+    forward = np.array([0.5, 0.0, 0.0])
+    for theta in hard_angles:
+        moved = se2.boxplus(np.array([1.0, 2.0, theta]), forward)
+        expected = [1 + 0.5 * np.cos(theta), 2 + 0.5 * np.sin(theta)]
+        np.testing.assert_allclose(moved[:2], expected, atol=1e-15)
+
+
+def test_adjoint_moves_an_increment_to_the_other_side(cases):
+    a, b, _ = cases
+    tau = np.clip(b, -2, 2)
+    right = batched(lambda p, t: se2.compose(p, se2.exp(t)), a, tau)
+    left = batched(lambda p, t: se2.compose(se2.exp(se2.adjoint(p) @ t), p), a, tau)
+    assert_same_poses(left, right, atol=1e-10)
+
+
+# --- polar coordinates --------------------------------------------------------------------------
+
+
+def test_polar_is_range_and_bearing_and_rectangular_undoes_it(cases):
+    points = cases[2]
+    expected = np.stack([np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])], axis=1)
+    polar = batched(se2.polar, points)
+    np.testing.assert_allclose(polar, expected, rtol=1e-14)
+    np.testing.assert_allclose(batched(se2.rectangular, polar), points, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_polar_at_the_origin_is_zero_with_zero_derivatives(dtype):
+    tiny = dtype(1e-30) if dtype is np.float32 else dtype(1e-200)  # its square underflows
+    points = np.array([[0, 0], [-0.0, 0], [-0.0, -0.0], [0, tiny], [tiny, -tiny]], dtype)
+
+    def everything(p):
+        return se2.polar(p), jax.jacfwd(se2.polar)(p), jax.jacrev(se2.polar)(p), *se2.polar_jacobians(p)
+
+    for part in jax.jit(jax.vmap(everything))(points):
+        assert part.dtype == dtype
+        np.testing.assert_array_equal(part, np.zeros_like(part))
+
+
+# --- alignment ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def align():
+    return jax.jit(se2.align)
+
+
+def test_align_recovers_a_rigid_motion(align, hard_angles):
+    rng = np.random.default_rng(4)
+    source = rng.normal(size=(7, 2)) * 5
+    for pose in poses_of(hard_angles, rng):
+        target = source @ matrix(pose)[:2, :2].T + pose[:2]
+        assert_same_poses(align(source, target), pose)
+
+
+def test_align_minimises_the_squared_distances(align):
+    rng = np.random.default_rng(5)
+    source = rng.normal(size=(7, 2)) * 5
+    target = source @ matrix([1, -2, 2.5])[:2, :2].T + rng.normal(size=(7, 2))
+
+    def cost(pose):
+        moved = source @ matrix(pose)[:2, :2].T + np.asarray(pose)[:2]
+        return ((moved - target) ** 2).sum()
+
+    best = np.asarray(align(source, target))
+    for direction in np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(10, 3))]):
+        assert cost(best + 1e-3 * direction) > cost(best)
+    # … and it is the global one: over a grid of headings with the best shift for each.
+    for theta in np.linspace(-np.pi, np.pi, 181):
+        shift = target.mean(0) - matrix([0, 0, theta])[:2, :2] @ source.mean(0)
+        assert cost([*shift, theta]) >= cost(best) - 1e-9
+
+
+def test_align_of_one_point_is_a_translation():
+    moved = jax.jit(se2.align)(np.array([[1.0, 2.0]]), np.array([[4.0, -2.0]]))
+    np.testing.assert_allclose(moved, [3, -4, 0], atol=1e-15)
+
+
+def test_float32_in_float32_out(cases):
+    a, b, points = (part[:4].astype(np.float32) for part in cases)
+
+    def everything(a, b, p):
+        one, two = ("inverse", "exp", "log"), ("compose", "between", "boxplus", "boxminus")
+        frames, points = ("to_frame", "from_frame"), ("polar", "rectangular")
+        calls = [(n, (a,)) for n in one] + [(n, (a, b)) for n in two]
+        calls += [(n, (a, p)) for n in frames] + [(n, (p,)) for n in points]
+        out = {name: getattr(se2, name)(*arguments) for name, arguments in calls}
+        for name, arguments in calls:
+            if hasattr(se2, f"{name}_jacobians"):
+                out[f"{name}_jacobians"] = getattr(se2, f"{name}_jacobians")(*arguments)
+        return out, se2.adjoint(a), se2.rotation(a[2])
+
+    out = jax.eval_shape(jax.vmap(everything), a, b, points)
+    assert {leaf.dtype for leaf in jax.tree.leaves(out)} == {np.dtype(np.float32)}

@@ -1,0 +1,105 @@
+"""stats: chi-square tails, quantiles and bands against SciPy, published tables and sampling."""
+
+import jax
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.stats
+
+from jaxslam import stats
+
+DOFS = [1, 2, 3, 5, 40]
+
+
+def density(x, dof):
+    """χ²'s density from its formula."""
+    log_gamma = scipy.special.gammaln(dof / 2)
+    return np.exp((dof / 2 - 1) * np.log(x) - x / 2 - dof / 2 * np.log(2) - log_gamma)
+
+
+@pytest.mark.parametrize("dof", DOFS)
+def test_tail_is_the_integral_of_the_density(dof):
+    for x in (0.1, 1.0, dof, 3.0 * dof):
+        area, _ = scipy.integrate.quad(density, x, np.inf, args=(dof,))
+        np.testing.assert_allclose(stats.chi2_tail(x, dof), area, atol=1e-8)
+    far = np.array([50.0, 200.0])
+    np.testing.assert_allclose(stats.chi2_tail(far, dof), scipy.stats.chi2.sf(far, dof), rtol=1e-9)
+
+
+@pytest.mark.parametrize("dof", DOFS)
+def test_slope_of_the_tail_is_minus_the_density(dof):
+    x = np.array([0.1, 0.7, 1.0, 3.0, 20.0, 45.0])
+    slope = jax.jit(jax.vmap(jax.grad(lambda x: stats.chi2_tail(x, dof))))(x)
+    np.testing.assert_allclose(slope, -density(x, dof), rtol=1e-9)
+
+
+def test_tail_is_one_at_and_below_zero_with_finite_slope():
+    x = np.array([0.0, -1.0])
+    np.testing.assert_array_equal(stats.chi2_tail(x, 2), [1, 1])
+    np.testing.assert_array_equal(jax.vmap(jax.grad(lambda x: stats.chi2_tail(x, 2)))(x), [0, 0])
+    assert stats.chi2_tail(np.float32(1), 2).dtype == np.float32
+
+
+@pytest.mark.parametrize("dof", DOFS)
+def test_quantile_undoes_the_tail(dof):
+    for p in (1e-4, 0.025, 0.5, 0.95, 0.9999):
+        x = stats.chi2_quantile(p, dof)
+        assert isinstance(x, float)
+        np.testing.assert_allclose(stats.chi2_tail(x, dof), 1 - p, rtol=1e-9)
+
+
+def test_sigma_ellipses_hold_what_solas_table_says():
+    """Solà B.3.1 with the figures of ERRATA, per cent."""
+    for dof, table in ((2, [39.35, 86.47, 98.89, 99.97]), (3, [19.87, 73.85, 97.07, 99.89])):
+        held = [100 * (1 - float(stats.chi2_tail(stats.sigma_gate(n), dof))) for n in (1, 2, 3, 4)]
+        np.testing.assert_allclose(held, table, atol=0.005)
+    assert stats.sigma_gate(3) == 9
+    assert stats.sigma_gate(0.5) == 0.25
+
+
+@pytest.mark.parametrize(("dof", "runs", "level"), [(3, 50, 0.95), (2, 1, 0.99), (5, 2000, 0.5)])
+def test_band_is_scipys_and_holds_the_mean(dof, runs, level):
+    low, high = stats.chi2_band(dof, runs, level)
+    expected = scipy.stats.chi2.interval(level, dof * runs)
+    np.testing.assert_allclose([low, high], np.array(expected) / runs, rtol=1e-12)
+
+
+def test_band_holds_its_share_of_sample_means():
+    """Binomial check: 4000 means of 20 χ²_3, 95 % band; 4.5 standard errors of the share, 1.6 %."""
+    means = np.random.default_rng(0).chisquare(3, size=(4000, 20)).mean(axis=1)
+    low, high = stats.chi2_band(3, 20)
+    share = np.mean((means > low) & (means < high))
+    assert abs(share - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 4000)
+
+
+def test_bar_shalom_band_of_fifty_runs():
+    """Bar-Shalom, Li, Kirubarajan 2001: χ²_100 lies in [74.2, 129.6] with 95 %: NEES of 2 states."""
+    np.testing.assert_allclose(stats.chi2_band(2, 50), [1.484, 2.591], atol=1e-3)
+
+
+def test_t_quantile():
+    """Table values of Student's t; with many degrees of freedom, the normal's."""
+    table = [(0.975, 1, 12.706), (0.975, 10, 2.228), (0.95, 5, 2.015), (0.975, 10**7, 1.95996)]
+    for p, dof, value in table:
+        np.testing.assert_allclose(stats.t_quantile(p, dof), value, atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: stats.chi2_quantile(0.0, 2), "probability"),
+        (lambda: stats.chi2_quantile(1.0, 2), "probability"),
+        (lambda: stats.chi2_quantile(float("nan"), 2), "probability"),
+        (lambda: stats.chi2_quantile(0.5, 0), "degrees of freedom"),
+        (lambda: stats.chi2_quantile(0.5, float("nan")), "degrees of freedom"),
+        (lambda: stats.sigma_gate(0), "sigmas"),
+        (lambda: stats.sigma_gate(-3), "sigmas"),
+        (lambda: stats.chi2_band(2, 0), "run"),
+        (lambda: stats.chi2_band(2, 10, 1.0), "probability"),
+        (lambda: stats.chi2_band(2, 10, 1.5), "probability"),
+        (lambda: stats.chi2_band(-2, 10), "degrees of freedom"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,139 @@
+"""types: what `check_log` refuses, and naming the row; the counts of `Info`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam.types import Info, Log, Scan, Status, check_log
+
+
+def good_log(steps=4, places=3):
+    tag = np.tile([0, 1, -1], (steps, 1))
+    valid = np.ones((steps, places), bool)
+    scan = Scan(z=np.ones((steps, places, 2)), tag=tag, valid=valid)
+    return Log(control=np.zeros((steps, 3)), scan=scan)
+
+
+def check(log):
+    return check_log(log, control_size=3, measurement_size=2)
+
+
+def changed(field, row, value):
+    """The good log with one row of one field replaced."""
+    log = good_log()
+    table = (log.control if field == "control" else getattr(log.scan, field)).copy()
+    table[row] = value
+    if field == "control":
+        return log._replace(control=table)
+    return log._replace(scan=log.scan._replace(**{field: table}))
+
+
+def test_a_good_log_passes():
+    check(good_log())
+    check(jax.tree.map(jnp.asarray, good_log()))
+    check(jax.tree.map(lambda a: a.astype(np.float32) if a.dtype == float else a, good_log()))
+
+
+BAD_VALUES = {
+    "control nan": (changed("control", (2, 1), np.nan), r"log.control is not finite \(row 2\)"),
+    "control inf": (changed("control", (3, 0), np.inf), r"log.control is not finite \(row 3\)"),
+    "z nan": (changed("z", (1, 2, 0), np.nan), r"a valid measurement is not finite \(row 1\)"),
+    "z inf": (changed("z", (0, 0, 1), -np.inf), r"a valid measurement is not finite \(row 0\)"),
+    "tag -2": (changed("tag", (3, 1), -2), r"a tag is below -1 \(row 3\)"),
+    "repeated": (changed("tag", 2, [5, 6, 5]), r"a tag repeats within the scan \(row 2\)"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_VALUES)
+def test_bad_values_are_refused_with_their_row(case):
+    log, message = BAD_VALUES[case]
+    with pytest.raises(ValueError, match=message):
+        check(log)
+
+
+@pytest.mark.parametrize("case", BAD_VALUES)
+def test_values_are_not_looked_at_where_they_are_traced(case):
+    def traced(log):
+        check(log)
+        return log
+
+    jax.eval_shape(traced, BAD_VALUES[case][0])
+
+
+def test_padding_may_hold_anything_and_unknown_tags_may_repeat():
+    for field, row, value in (("z", (1, 2, 0), np.nan), ("tag", (1, 2), -7), ("tag", (1, 2), 0)):
+        log = changed(field, row, value)
+        valid = log.scan.valid.copy()
+        valid[1, 2] = False
+        check(log._replace(scan=log.scan._replace(valid=valid)))
+    check(changed("tag", 1, [-1, -1, -1]))
+
+
+BAD_SHAPES = {
+    "control size": (
+        good_log()._replace(control=np.zeros((4, 2))),
+        r"log.control: expected shape \(4, 3\), got \(4, 2\)",
+    ),
+    "control rank": (good_log()._replace(control=np.zeros(3)), r"log.control: expected shape"),
+    "control kind": (
+        good_log()._replace(control=np.zeros((4, 3), int)),
+        r"log.control: expected floating values, got int64",
+    ),
+    "z size": (
+        good_log()._replace(scan=good_log().scan._replace(z=np.ones((4, 3, 1)))),
+        r"log.scan.z: expected shape \(4, 3, 2\), got \(4, 3, 1\)",
+    ),
+    "z kind": (
+        good_log()._replace(scan=good_log().scan._replace(z=np.ones((4, 3, 2), bool))),
+        r"log.scan.z: expected floating values, got bool",
+    ),
+    "steps": (
+        good_log()._replace(scan=good_log(5).scan),
+        r"log.scan.z: expected shape \(4, 3, 2\), got \(5, 3, 2\)",
+    ),
+    "tag rank": (
+        good_log()._replace(scan=good_log().scan._replace(tag=np.zeros(4, int))),
+        r"log.scan.z: expected shape|log.scan.tag: expected shape",
+    ),
+    "tag kind": (
+        good_log()._replace(scan=good_log().scan._replace(tag=np.zeros((4, 3)))),
+        r"log.scan.tag: expected integer values, got float64",
+    ),
+    "valid kind": (
+        good_log()._replace(scan=good_log().scan._replace(valid=np.ones((4, 3), int))),
+        r"log.scan.valid: expected bool.* values, got int64",
+    ),
+    "valid places": (
+        good_log()._replace(scan=good_log().scan._replace(valid=np.ones((4, 2), bool))),
+        r"log.scan.valid: expected shape \(4, 3\), got \(4, 2\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("traced", [False, True], ids=["concrete", "traced"])
+@pytest.mark.parametrize("case", BAD_SHAPES)
+def test_bad_shapes_and_kinds_are_refused_traced_or_not(case, traced):
+    log, message = BAD_SHAPES[case]
+    with pytest.raises(ValueError, match=message):
+        if traced:
+            jax.eval_shape(check, log)
+        else:
+            check(log)
+
+
+def test_info_counts_statuses_of_a_step_and_of_a_trace():
+    codes = np.array([[Status.EMPTY, Status.FUSED, Status.FUSED], [Status.OVERFLOW] * 3])
+    nothing = np.zeros(0)
+    info = Info(nothing, nothing, nothing, nothing, nothing, jnp.asarray(codes), nothing)
+    np.testing.assert_array_equal(info.tally(Status.FUSED), [2, 0])
+    np.testing.assert_array_equal(info.tally(Status.OVERFLOW), [0, 3])
+    np.testing.assert_array_equal(info.overflow, [False, True])
+    step = info._replace(status=jnp.asarray(codes[1]))
+    assert step.overflow
+    assert step.tally(Status.OVERFLOW) == 3
+
+
+def test_status_codes_are_distinct_and_empty_is_zero():
+    assert Status.EMPTY == 0
+    assert len({int(s) for s in Status}) == len(Status)

@@ -1,0 +1,97 @@
+"""Small worlds and deliberately wrong filters that several tests share."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam import filters, linearize, motion, sensors
+from jaxslam.simulate import Scenario
+
+
+def ring(steps: int = 100, seed: int = 3) -> Scenario:
+    """A robot turns twice inside six landmarks; noise so low that an EKF is honest."""
+    rng = np.random.default_rng(seed)
+    around = 2 * np.pi * np.arange(6) / 6
+    radius = 3.0 + rng.uniform(-0.5, 0.5, 6)
+    points = np.stack([radius * np.cos(around), 1.0 + radius * np.sin(around)], axis=1)
+    return Scenario(
+        name="ring",
+        motion=motion.increment(np.diag([0.01, 0.01]) ** 2),
+        sensor=sensors.range_bearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3)),
+        landmarks=points,
+        controls=np.tile([0.125, 4 * np.pi / steps], (steps, 1)),
+    )
+
+
+def ekf(scenario, **options):
+    return filters.ekf_slam(scenario.motion, scenario.sensor, len(scenario.landmarks), **options)
+
+
+def transposed_motion(scenario):
+    """Propagates Fᵀ P F (the slip in the Notes' EKF)."""
+    right = linearize.at_estimate()
+
+    def motion_at(memory, model, pose, u):
+        by_pose, by_noise, memory = right.motion(memory, model, pose, u)
+        return by_pose.T, by_noise, memory
+
+    return ekf(scenario, linearize=dataclasses.replace(right, motion=motion_at))
+
+
+def process_noise_as_measurement_noise(scenario):
+    """Uses Q where R belongs."""
+    u = jnp.asarray(scenario.controls[0])
+    q = np.asarray(scenario.motion.noise_cov(jnp.zeros(3), u))
+    sensor = dataclasses.replace(scenario.sensor, noise_cov=lambda z: jnp.asarray(q, z.dtype))
+    return filters.ekf_slam(scenario.motion, sensor, len(scenario.landmarks))
+
+
+def no_cross_covariance(scenario):
+    """Starts a landmark with the right covariance, but uncorrelated with the map."""
+    right = ekf(scenario)
+    size = len(scenario.sensor.landmark)
+
+    def update(joint, scan, key):
+        after, info = right.update(joint, scan, key)
+        born = jnp.repeat(after.alive & ~joint.alive, size)
+        mask = jnp.concatenate([jnp.zeros(3, bool), born])
+        slot = jnp.concatenate([jnp.full(3, -1), jnp.repeat(jnp.arange(len(joint.alive)), size)])
+        foreign = slot[:, None] != slot[None, :]
+        cut = (mask[:, None] | mask[None, :]) & foreign
+        return after._replace(cov=jnp.where(cut, 0.0, after.cov)), info
+
+    return dataclasses.replace(right, update=update)
+
+
+def no_wrap(scenario):
+    """Subtracts bearings without wrapping the difference."""
+    sensor = dataclasses.replace(scenario.sensor, residual=lambda z, z_hat: z - z_hat)
+    return filters.ekf_slam(scenario.motion, sensor, len(scenario.landmarks))
+
+
+def iterated_on_its_posterior(scenario):
+    """Feeds each scan three times, the posterior of one pass being the prior of the next."""
+    right = ekf(scenario)
+
+    def update(joint, scan, key):
+        joint, info = right.update(joint, scan, key)
+        for _ in range(2):
+            joint, _ = right.update(joint, scan, key)
+        return joint, info
+
+    return dataclasses.replace(right, update=update)
+
+
+WRONG = {
+    "transposed_motion": transposed_motion,
+    "process_noise_as_measurement_noise": process_noise_as_measurement_noise,
+    "no_cross_covariance": no_cross_covariance,
+    "no_wrap": no_wrap,
+    "iterated_on_its_posterior": iterated_on_its_posterior,
+}
+
+
+def key(seed: int = 0):
+    return jax.random.key(seed)
