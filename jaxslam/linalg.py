@@ -8,12 +8,14 @@ behind NaN; hence the unrolled factor below, which reports it and stays finite.
 import functools
 import operator
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
+
+_T = TypeVar("_T")
 
 # Up to this size factors are unrolled into fused elementwise code, beyond it LAPACK is called.
 _UNROLLED = 8
@@ -22,6 +24,15 @@ _UNROLLED = 8
 def total(terms: Iterable[jax.Array]) -> jax.Array:
     """The sum of at least one array; written out, it fuses into one elementwise kernel."""
     return functools.reduce(operator.add, terms)
+
+
+def settle(values: _T) -> _T:
+    """The same arrays, computed once.
+
+    XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
+    of D entries would be solved for anew at each of the D² entries of the covariance it updates.
+    """
+    return cast(_T, jax.lax.optimization_barrier(values))
 
 
 def symmetrize(matrix: jax.Array) -> jax.Array:

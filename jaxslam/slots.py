@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam.linalg import total
+from jaxslam.linalg import settle, symmetrize, total
 
 
 class Joint(NamedTuple):
@@ -72,42 +72,42 @@ def gather(joint: Joint, slot: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def scatter(
     joint: Joint,
-    born: jax.Array,
+    slot: jax.Array,
+    granted: jax.Array,
     landmarks: jax.Array,
     by_pose: jax.Array,
     own_cov: jax.Array,
     tag: jax.Array,
 ) -> Joint:
-    """Fill dead slots with landmarks that depend on the map through the pose alone (Solà (35)-(38)).
+    """Fill dead slots with m landmarks that depend on the map through the pose alone (Solà (35)-(38)).
 
-    Slots i with born[i] get mean landmarks[i], cross-covariance by_pose[i] P_R: and covariance
-    by_pose[i] P_RR by_pose[i]ᵀ + own_cov[i]; the covariance between two of them is
-    by_pose[i] P_RR by_pose[j]ᵀ. The other slots of the arguments are not read.
+    With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM and P_LL = G P_RR Gᵀ + diag(own_cov), so
+    the landmarks of one scan are correlated with each other through the robot. Written as additions
+    to the zeros (and the unit variance) of padding, O(m·D); places not granted add nothing.
 
-    born (N,) bool, landmarks (N, L), by_pose (N, L, 3), own_cov (N, L, L), tag (N,).
+    Args:
+        slot: (m,) dead slots, all different where granted.
+        granted: (m,) bool.
+        landmarks, by_pose, own_cov, tag: (m, L), (m, L, 3), (m, L, L), (m,).
     """
-    capacity, size = joint.landmarks.shape
-    new = coordinates(born, size, robot=False)
-    gain = jnp.concatenate(
-        [jnp.zeros((3, 3), joint.cov.dtype), by_pose.reshape(capacity * size, 3)]
-    )
-    gain = jnp.where(new[:, None], gain, 0.0)
-    # Robot rows first: P_RL of a new landmark, then every new row follows from the robot's rows.
-    robot = joint.cov[:3, :]
-    robot_new = total(joint.cov[:3, k, None] * gain[None, :, k] for k in range(3))
-    robot = jnp.where(new[None, :], robot_new, robot)
-    rows = total(gain[:, k, None] * robot[k, None, :] for k in range(3))
-    own = jnp.where(born[:, None, None], own_cov, 0.0).reshape(capacity * size, size)
-    own = jnp.concatenate([jnp.zeros((3, size), joint.cov.dtype), own])
-    for k in range(size):
-        rows = rows + jnp.where(_same_slot(capacity, size, k), own[:, k, None], 0.0)
-    cov = jnp.where(new[:, None], rows, joint.cov)
-    cov = jnp.where(new[None, :], jnp.where(new[:, None], 0.5 * (rows + rows.T), rows.T), cov)
+    m, size = landmarks.shape
+    here = granted[:, None]
+    rows = 3 + slot[:, None] * size + jnp.arange(size)[None, :]
+    flat = rows.reshape(-1)
+    gain = jnp.where(here[:, :, None], by_pose, 0.0).reshape(m * size, 3)
+    # R is zero at the new columns. With T = R + P_RR Gᵀ/2 there, G T + (G T)ᵀ is the cross-covariance
+    # with the map and, where rows and columns are both new, G P_RR Gᵀ; symmetric to the last bit.
+    half = joint.cov[:3].at[:, flat].add(0.5 * joint.cov[:3, :3] @ gain.T)
+    cross = settle(total(gain[:, k, None] * half[k, None, :] for k in range(3)))
+    own = jnp.where(here[:, :, None], symmetrize(own_cov), 0.0)
+    # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
+    cov = joint.cov.at[flat, flat].add(-jnp.repeat(granted, size).astype(gain.dtype))
+    cov = cov.at[flat].add(cross).at[:, flat].add(cross.T)
     return joint._replace(
-        landmarks=jnp.where(born[:, None], landmarks, joint.landmarks),
-        cov=cov,
-        alive=joint.alive | born,
-        tag=jnp.where(born, tag, joint.tag).astype(jnp.int32),
+        landmarks=joint.landmarks.at[slot].add(jnp.where(here, landmarks, 0.0)),
+        cov=cov.at[rows[:, :, None], rows[:, None, :]].add(own),
+        alive=joint.alive.at[slot].max(granted),
+        tag=joint.tag.at[slot].max(jnp.where(granted, tag, -1).astype(jnp.int32)),
     )
 
 
@@ -118,7 +118,7 @@ def remove(joint: Joint, dead: jax.Array) -> Joint:
     state reduction); here they are overwritten with padding. Removing a dead slot changes nothing.
     """
     size = joint.landmarks.shape[1]
-    keep = coordinates(~dead, size, robot=True)
+    keep = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(~dead, size)])
     eye = jnp.eye(joint.cov.shape[0], dtype=joint.cov.dtype)
     return joint._replace(
         landmarks=jnp.where(dead[:, None], 0.0, joint.landmarks),
@@ -126,15 +126,3 @@ def remove(joint: Joint, dead: jax.Array) -> Joint:
         alive=joint.alive & ~dead,
         tag=jnp.where(dead, -1, joint.tag),
     )
-
-
-def coordinates(slots: jax.Array, landmark_size: int, *, robot: bool) -> jax.Array:
-    """The mask (D,) of state coordinates of a mask (N,) of slots; the robot's three as `robot`."""
-    return jnp.concatenate([jnp.full(3, robot), jnp.repeat(slots, landmark_size)])
-
-
-def _same_slot(capacity: int, size: int, k: int) -> jax.Array:
-    """(D, D) one where the column is coordinate k of the row's slot."""
-    slot_of = jnp.concatenate([jnp.full(3, -1), jnp.repeat(jnp.arange(capacity), size)])
-    is_k = jnp.concatenate([jnp.full(3, False), jnp.tile(jnp.arange(size) == k, capacity)])
-    return (slot_of[:, None] == slot_of[None, :]) & is_k[None, :]

@@ -27,7 +27,8 @@ def births(rng, born, size=2):
     tag = rng.permutation(100)[:CAPACITY]
     spoil = ~np.asarray(born)
     landmarks[spoil], by_pose[spoil], own[spoil], tag[spoil] = np.nan, np.nan, np.nan, -99
-    return np.asarray(born), landmarks, by_pose, own, tag
+    slot = np.where(born, np.arange(CAPACITY), 0)  # as allocate has it
+    return slot, np.asarray(born), landmarks, by_pose, own, tag
 
 
 def assert_padding(joint):
@@ -97,12 +98,27 @@ def test_scatter_is_dense_augmentation_of_several_landmarks_at_once(size):
         part = births(rng, born, size)
         joint = scatter(joint, *part)
         for i in np.flatnonzero(born):
-            dense.add(*(table[i] for table in part[1:]))
+            dense.add(*(table[i] for table in part[2:]))
         dense.assert_equals(joint)
         assert_padding(joint)
     # Two landmarks of one scan are correlated through the robot, and by that alone.
     cross = np.asarray(joint.cov)[3 : 3 + size, 3 + 2 * size : 3 + 3 * size]
     assert np.abs(cross).min() > 1e-6
+
+
+def test_scatter_keeps_the_digits_of_a_covariance_far_below_the_unit_variance_of_padding():
+    """Millimetres in float32: the 1 that stood in the slot must leave no rounding behind."""
+    rng = np.random.default_rng(9)
+    born, landmarks, by_pose, own, tag = births(rng, [True, True, False, False])
+    joint = start()
+    joint = joint._replace(cov=joint.cov.at[:3, :3].multiply(1e-8))
+    dense = Dense(joint)
+    for i in (0, 1):
+        dense.add(landmarks[i], by_pose[i], 1e-8 * own[i], tag[i])
+    single = jax.tree.map(lambda a: np.asarray(a, "f4") if a.dtype == float else a, joint)
+    part = [a.astype("f4") if a.dtype == float else a for a in (landmarks, by_pose, 1e-8 * own)]
+    out = scatter(single, born, *part, tag)
+    np.testing.assert_allclose(out.cov[:7, :7], dense.p, rtol=1e-5, atol=1e-5 * np.abs(dense.p).min())
 
 
 def test_scatter_of_nothing_changes_nothing():
@@ -126,10 +142,10 @@ def test_any_sequence_of_births_and_removals_equals_the_growing_map():
             born = np.zeros(CAPACITY, bool)
             born[np.asarray(slot)[np.asarray(granted)]] = True
             part = births(rng, born)
-            part[4][born] += 1000 * (1 + rng.integers(1000))  # tags do not recur
+            part[5][born] += 1000 * (1 + rng.integers(1000))  # tags do not recur
             joint = scatter(joint, *part)
             for i in np.flatnonzero(born):
-                dense.add(*(table[i] for table in part[1:]))
+                dense.add(*(table[i] for table in part[2:]))
         else:
             dead = rng.random(CAPACITY) < 0.5  # dead slots among them
             tags = np.asarray(joint.tag)[dead & alive]
@@ -189,18 +205,11 @@ def test_gather_returns_a_landmark_and_its_rows():
     np.testing.assert_array_equal(rows, joint.cov[7:9])
 
 
-def test_coordinates_of_slots():
-    mask = slots.coordinates(np.array([True, False]), 3, robot=False)
-    np.testing.assert_array_equal(mask, [0, 0, 0, 1, 1, 1, 0, 0, 0])
-    mask = slots.coordinates(np.array([False, True]), 1, robot=True)
-    np.testing.assert_array_equal(mask, [1, 1, 1, 0, 1])
-
-
 def test_operations_keep_float32():
     joint = start()
     joint = joint._replace(**{k: getattr(joint, k).astype("f4") for k in ("pose", "landmarks", "cov")})
-    born, landmarks, by_pose, own, tag = births(np.random.default_rng(8), [True] * 4)
-    part = (born, landmarks.astype("f4"), by_pose.astype("f4"), own.astype("f4"), tag)
+    slot, born, landmarks, by_pose, own, tag = births(np.random.default_rng(8), [True] * 4)
+    part = (slot, born, landmarks.astype("f4"), by_pose.astype("f4"), own.astype("f4"), tag)
     for out in (jax.eval_shape(slots.scatter, joint, *part), jax.eval_shape(slots.remove, joint, born)):
         assert {out.pose.dtype, out.landmarks.dtype, out.cov.dtype} == {np.dtype("f4")}
         assert out.tag.dtype == np.int32

@@ -41,6 +41,8 @@ class Dataset:
     """(N, 2) surveyed positions [m] in tag order, in a frame of their own; None where unknown."""
     dropped: dict[str, int] = field(default_factory=dict)
     """measurements that are in the file and not in the log, counted by reason."""
+    corrections: tuple[str, ...] = ()
+    """what the reader changed of what the files say, in words."""
     source: str = ""
     """whom to credit."""
 

@@ -20,7 +20,12 @@ SOURCE = (
 ROBOTS = range(1, 6)
 """Subjects 1 to 5 are the robots; they carry barcodes like the landmarks, 6 to 20."""
 ODOMETRY_DENSITY = (0.01**2, 0.05**2)
-MEASUREMENT_COV = np.diag([0.15, 0.05]) ** 2
+"""Variance of travel [m²/s] and heading [rad²/s] gained in a second."""
+MEASUREMENT_COV = np.diag([0.15, 0.01]) ** 2
+EXCHANGED = {11: [3.15071999, 2.38294871], 17: [0.03596156, -2.84396626]}
+"""Two subjects that stand in each other's place in the survey of data set 1, as the file has them:
+the distance of either from a landmark of the same scan differs by metres from the survey, and by
+centimetres once the two are exchanged."""
 
 
 def mrclam(
@@ -29,6 +34,7 @@ def mrclam(
     *,
     odometry_cov: NoiseCov | None = None,
     measurement_cov: NoiseCov = MEASUREMENT_COV,
+    errata: bool = True,
 ) -> Dataset:
     """Read `Robot{n}_Odometry.dat` (t v ω) and `Robot{n}_Measurement.dat` (t barcode range bearing).
 
@@ -39,6 +45,13 @@ def mrclam(
     sightings of robots, barcodes it does not list and repetitions within a scan are dropped and
     counted. Tags follow the subject numbers; `Landmark_Groundtruth.dat` is the survey.
 
+    The default noise is chosen on robots 1 to 3 of data set 1. Bearings of one scan agree with the
+    survey to 0.005 rad, whatever the pose; 0.01 leaves room for time stamps. Ranges are off it by
+    0.16 to 0.19 m, but alike for seconds, so that innovations see 0.11 m; 0.15 is between. With
+    odometry noise of 0.01 m/√s and 0.05 rad/√s, NIS/dof is then 0.78, 1.22 and 0.92. Since the
+    errors of ranges persist, the map's covariance is too small whatever the choice. There are no
+    outliers that would need a gate.
+
     Source: Leung, Halpern, Barfoot, Liu, International Journal of Robotics Research 30(8), 2011.
 
     Args:
@@ -46,6 +59,8 @@ def mrclam(
         robot: which robot, 1 to 5.
         odometry_cov: (2, 2) covariance of (v, ω) over a row's Δt, or a function of (pose, u).
         measurement_cov: (2, 2) covariance of (range, bearing), or a function of z.
+        errata: exchange the positions of subjects 11 and 17 if they are those of data set 1, see
+            `EXCHANGED`; `Dataset.corrections` then says so. False takes the survey as it is.
     Raises:
         ValueError: `path:line: reason` on a malformed line, a time that goes backwards, a negative
             range, or a subject without survey; and on a robot other than 1 to 5.
@@ -54,7 +69,8 @@ def mrclam(
         raise ValueError(f"mrclam: expected a robot from 1 to 5, got {robot!r}")
     folder = Path(folder)
     subject_of, names = _read_barcodes(TextFile(folder / "Barcodes.dat", "#"))
-    landmarks = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
+    points = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
+    corrections = _correct(points) if errata else ()
     odometry = _read_in_time(
         TextFile(folder / f"Robot{robot}_Odometry.dat", "#"), ("time", "v", "omega")
     )
@@ -72,8 +88,9 @@ def mrclam(
         sensor=range_bearing(measurement_cov),
         tags=names,
         filter_options={"update": "sequential"},
-        landmarks=landmarks,
+        landmarks=np.array([points[name] for name in names]),
         dropped=dropped,
+        corrections=corrections,
         source=SOURCE,
     )
 
@@ -159,8 +176,8 @@ def _read_barcodes(file: TextFile) -> tuple[dict[int, int], tuple[int, ...]]:
     return subject_of, names
 
 
-def _read_survey(file: TextFile, names: tuple[int, ...]) -> NDArray[np.float64]:
-    """Landmark positions (N, 2) in the order of names."""
+def _read_survey(file: TextFile, names: tuple[int, ...]) -> dict[int, list[float]]:
+    """The position of every landmark."""
     points: dict[int, list[float]] = {}
     for line, fields in file:
         columns = ("subject", "x", "y", "sigma_x", "sigma_y")
@@ -174,4 +191,13 @@ def _read_survey(file: TextFile, names: tuple[int, ...]) -> NDArray[np.float64]:
     missing = [name for name in names if name not in points]
     if missing:
         raise file.end_error(f"no position of subject {missing[0]} in the file")
-    return np.array([points[name] for name in names])
+    return points
+
+
+def _correct(points: dict[int, list[float]]) -> tuple[str, ...]:
+    """Undo the exchange of data set 1, if this is its survey; what was done, in words."""
+    if any(points.get(subject) != position for subject, position in EXCHANGED.items()):
+        return ()
+    one, other = EXCHANGED
+    points[one], points[other] = points[other], points[one]
+    return (f"the surveyed positions of subjects {one} and {other} were exchanged",)

@@ -156,20 +156,22 @@ def _moments(joint: Joint, sensor: Sensor, chart: Chart) -> Estimate:
     """Means and marginal covariances in map coordinates, whatever the chart and the landmark."""
     capacity, size = joint.landmarks.shape
     pose_cov = joint.cov[:3, :3]
+    every = jnp.arange(capacity)
+    own_covs = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[every, :, every]
+    with_pose = joint.cov[3:, :3].reshape(capacity, size, 3)
 
-    def point(i: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
-        start = 3 + i * size
+    def point(
+        landmark: jax.Array, own: jax.Array, by_robot: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         by_landmark = jax.jacfwd(sensor.position)(landmark)
-        rows = jax.lax.dynamic_slice_in_dim(joint.cov, start, size)
-        own = jax.lax.dynamic_slice_in_dim(rows, start, size, axis=1)
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)
-            cross = basis.cross @ rows[:, :3].T @ basis.landmark.T
+            cross = basis.cross @ by_robot.T @ basis.landmark.T
             own = basis.landmark @ own @ basis.landmark.T + cross + cross.T
             own = own + basis.cross @ pose_cov @ basis.cross.T
         return sensor.position(landmark), by_landmark @ own @ by_landmark.T
 
-    points, point_covs = jax.vmap(point)(jnp.arange(capacity), joint.landmarks)
+    points, point_covs = jax.vmap(point)(joint.landmarks, own_covs, with_pose)
     if chart.basis is not None:
         basis = chart.basis(joint.pose, joint.landmarks[0])
         pose_cov = basis.pose @ pose_cov @ basis.pose.T

@@ -134,9 +134,11 @@ def correct(
         if iteration > 0:
             nu = nu + jnp.einsum("mzi,i->mz", by_pose, xi[:3])
             nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, xi_l)
+        by_pose, by_landmark, nu = linalg.settle((by_pose, by_landmark, nu))
         hp = linalg.total(
             by_pose[:, :, k, None] * joint.cov[None, None, k] for k in range(3)
         ) + linalg.total(by_landmark[:, :, k, None] * prior_rows[:, None, k] for k in range(size_l))
+        hp = linalg.settle(hp)
         s = _innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
         if iteration == 0:
             marginal = s[jnp.arange(m), :, jnp.arange(m)]
@@ -147,9 +149,11 @@ def correct(
         hp = jnp.where(fuse[:, None, None], hp, 0.0).reshape(m * size_z, -1)
         both = fuse[:, None, None, None] & fuse[None, None, :, None]
         s = jnp.where(both, s, same * jnp.eye(size_z, dtype=z.dtype)[None, :, None])
-        factor, _ = linalg.cholesky(s.reshape(m * size_z, m * size_z))
+        s = linalg.settle(s)
+        factor = linalg.settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
         v = linalg.solve_lower(factor, hp)
         whitened = linalg.solve_lower(factor, jnp.where(fuse[:, None], nu, 0.0).reshape(-1))
+        v, whitened = linalg.settle((v, whitened))
         xi = _gram(v, whitened[:, None])[:, 0]
         if iteration == 0:
             pivots = jnp.diagonal(factor).reshape(m, size_z)
@@ -196,7 +200,6 @@ def augment(
     L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
     with the prior's term of (44); several in one scan are correlated through the robot.
     """
-    capacity = joint.alive.shape[0]
     mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
 
     def one(z_i: jax.Array, tag_i: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -210,10 +213,9 @@ def augment(
             own = undo @ own @ undo.T
         return landmark, by_pose, own
 
-    chosen = granted[:, None] & (slot[:, None] == jnp.arange(capacity)[None, :])
-    born, source = chosen.any(axis=0), jnp.argmax(chosen, axis=0)
-    landmark, by_pose, own = (part[source] for part in jax.vmap(one)(z, tag))
-    joint = slots.scatter(joint, born, landmark, by_pose, own, tag[source])
+    landmark, by_pose, own = jax.vmap(one)(z, tag)
+    joint = slots.scatter(joint, slot, granted, landmark, by_pose, own, tag)
+    born = jnp.zeros_like(joint.alive).at[slot].max(granted)
     return joint._replace(lin=linearize.born(joint.lin, born, joint.landmarks))
 
 
