@@ -216,6 +216,19 @@ def test_a_key_determines_the_world_and_vmap_is_a_loop():
     assert np.abs(first[0].pose - second[0].pose).min() > 0
 
 
+@pytest.mark.parametrize("noise_on", ["robot", "odometry"])
+def test_no_key_is_used_twice(noise_on):
+    scenario = world(10, noise_on=noise_on)
+    with jax.debug_key_reuse(True):
+        jax.jit(functools.partial(simulate, scenario))(jax.random.key(0))
+
+        def careless(key):
+            return jax.random.normal(key) + jax.random.normal(key)
+
+        with pytest.raises(jax.errors.KeyReuseError):
+            jax.jit(careless)(jax.random.key(0))
+
+
 def test_filters_get_the_precision_jax_is_set_to():
     scenario = world(10)
     off = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64

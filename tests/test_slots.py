@@ -109,7 +109,7 @@ def test_scatter_is_dense_augmentation_of_several_landmarks_at_once(size):
 def test_scatter_keeps_the_digits_of_a_covariance_far_below_the_unit_variance_of_padding():
     """Millimetres in float32: the 1 that stood in the slot must leave no rounding behind."""
     rng = np.random.default_rng(9)
-    born, landmarks, by_pose, own, tag = births(rng, [True, True, False, False])
+    slot, born, landmarks, by_pose, own, tag = births(rng, [True, True, False, False])
     joint = start()
     joint = joint._replace(cov=joint.cov.at[:3, :3].multiply(1e-8))
     dense = Dense(joint)
@@ -117,8 +117,15 @@ def test_scatter_keeps_the_digits_of_a_covariance_far_below_the_unit_variance_of
         dense.add(landmarks[i], by_pose[i], 1e-8 * own[i], tag[i])
     single = jax.tree.map(lambda a: np.asarray(a, "f4") if a.dtype == float else a, joint)
     part = [a.astype("f4") if a.dtype == float else a for a in (landmarks, by_pose, 1e-8 * own)]
-    out = scatter(single, born, *part, tag)
-    np.testing.assert_allclose(out.cov[:7, :7], dense.p, rtol=1e-5, atol=1e-5 * np.abs(dense.p).min())
+    out = scatter(single, slot, born, *part, tag)
+    np.testing.assert_allclose(out.cov[:7, :7], dense.p, rtol=1e-5, atol=1e-13)
+
+
+def test_scatter_does_not_depend_on_the_order_of_the_places():
+    part = births(np.random.default_rng(10), [True, False, True, True])
+    shuffled = [table[[3, 0, 1, 2]] for table in part]
+    for a, b in zip(scatter(start(), *part), scatter(start(), *shuffled), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_scatter_of_nothing_changes_nothing():

@@ -5,8 +5,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jaxslam.datasets.dataset import Dataset, make_log
 from jaxslam.datasets.lines import TextFile
@@ -20,8 +19,8 @@ SOURCE = (
     "map-building algorithm for real-time implementation, IEEE Transactions on Robotics and "
     "Automation 17(3), 2001; victoria_park.txt as distributed with GTSAM"
 )
-_ODOMETRY = "i j dx dy dtheta c_xx c_xy c_xt c_yy c_yt c_tt".split()
-_LANDMARK = "i j x y c_xx c_xy c_yy".split()
+_ODOMETRY = ("i", "j", "dx", "dy", "dtheta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt")
+_LANDMARK = ("i", "j", "x", "y", "c_xx", "c_xy", "c_yy")
 
 
 def victoria_park(
@@ -100,7 +99,9 @@ def victoria_park(
         ),
         time=np.arange(first, first + len(controls), dtype=np.float64),
         motion=pose_increment(odometry_file if odometry_cov is None else odometry_cov),
-        sensor=relative_position(landmark_noise.cov if measurement_cov is None else measurement_cov),
+        sensor=relative_position(
+            landmark_noise.cov if measurement_cov is None else measurement_cov
+        ),
         tags=names,
         filter_options={"update": "joint"},
         source=SOURCE,

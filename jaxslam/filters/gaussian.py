@@ -142,20 +142,24 @@ def correct(
         s = _innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
         if iteration == 0:
             marginal = s[jnp.arange(m), :, jnp.arange(m)]
-            distance = jnp.zeros(m, z.dtype) if gate is None else _squared_distance(nu, marginal)
-            inside = jnp.ones(m, bool) if gate is None else distance <= gate
-            fuse = known & inside
+            distance, positive = jax.vmap(_squared_distance)(nu, marginal)
+            inside = jnp.ones(m, bool) if gate is None else ~positive | (distance <= gate)
+            fuse = known & inside & positive
             innovation = nu
         hp = jnp.where(fuse[:, None, None], hp, 0.0).reshape(m * size_z, -1)
         both = fuse[:, None, None, None] & fuse[None, None, :, None]
         s = jnp.where(both, s, same * jnp.eye(size_z, dtype=z.dtype)[None, :, None])
         s = linalg.settle(s)
         factor = linalg.settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
-        v = linalg.solve_lower(factor, hp)
-        whitened = linalg.solve_lower(factor, jnp.where(fuse[:, None], nu, 0.0).reshape(-1))
-        v, whitened = linalg.settle((v, whitened))
+        # Measurements that are regular one by one can still be singular together.
+        regular = (jnp.diagonal(factor).reshape(m, size_z) > 0).all(axis=1)
+        keep = jnp.repeat(regular, size_z)
+        nu = jnp.where(fuse[:, None], nu, 0.0).reshape(-1)
+        v = jnp.where(keep[:, None], linalg.solve_lower(factor, hp), 0.0)
+        v, whitened = linalg.settle((v, jnp.where(keep, linalg.solve_lower(factor, nu), 0.0)))
         xi = _gram(v, whitened[:, None])[:, 0]
         if iteration == 0:
+            positive = positive & regular
             pivots = jnp.diagonal(factor).reshape(m, size_z)
             nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
         if iteration + 1 < iterations:
@@ -171,16 +175,15 @@ def correct(
     poses, landmarks = over_landmarks(
         joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(capacity, size_l)
     )
-    regular = (pivots > 0).all(axis=1)
     log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
     log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
     return joint._replace(pose=poses[0], landmarks=landmarks, cov=cov), Correction(
         innovation=innovation,
         innovation_cov=marginal,
         nis=jnp.where(fuse, nis, distance),
-        log_likelihood=jnp.where(fuse & regular, log_likelihood, 0.0),
+        log_likelihood=jnp.where(fuse & positive, log_likelihood, 0.0),
         inside=inside,
-        positive=regular,
+        positive=positive,
     )
 
 
@@ -254,10 +257,10 @@ def _innovation_cov(
     )
 
 
-def _squared_distance(nu: jax.Array, cov: jax.Array) -> jax.Array:
-    """ν_iᵀ S_i⁻¹ ν_i (m,), infinite where S_i is not positive definite."""
-    factor, positive = jax.vmap(linalg.cholesky)(cov)
-    return jnp.where(positive, (jax.vmap(linalg.solve_lower)(factor, nu) ** 2).sum(axis=1), jnp.inf)
+def _squared_distance(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """νᵀ S⁻¹ ν () and whether S (Z, Z) is positive definite; finite where it is not."""
+    factor, positive = linalg.cholesky(cov)
+    return (linalg.solve_lower(factor, nu) ** 2).sum(), positive
 
 
 def _joseph(

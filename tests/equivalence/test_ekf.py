@@ -1,5 +1,6 @@
 """What EKF-SLAM must equal: dense textbook updates in any chart, itself in other words, its limits."""
 
+import dataclasses
 import functools
 
 import jax
@@ -115,22 +116,33 @@ class Dense:
 CHARTS = list(charts.REGISTRY)
 
 
+def sloping():
+    """A robot on a slope that turns it, the more the further it is up: no symmetry to hide behind."""
+
+    def step(pose, u, w):
+        moved = MOTION.step(pose, u, w)
+        return moved.at[2].add(0.2 * jnp.sin(pose[0]) + 0.1 * pose[1] * w[0])
+
+    return dataclasses.replace(MOTION, step=step)
+
+
+@pytest.mark.parametrize("robot", [MOTION, sloping()], ids=["increment", "sloping"])
 @pytest.mark.parametrize("name", CHARTS)
-def test_prediction_is_a_p_at_plus_b_q_bt(name):
+def test_prediction_is_a_p_at_plus_b_q_bt(name, robot):
     chart, joint, u = charts.REGISTRY[name](), some_joint(), np.array([0.3, 0.4])
     dense = Dense(joint, chart)
-    ahead = STEP(joint.pose, u, np.zeros(2))
+    ahead = jax.jit(robot.step)(joint.pose, u, np.zeros(2))
     over = jax.vmap(chart.local, in_axes=(None, 0, None, 0))
 
     def error_after(both):
         pose, landmarks = dense.retract(both[: dense.size])
-        moved = MOTION.step(pose, u, both[dense.size :])
+        moved = robot.step(pose, u, both[dense.size :])
         dx, dl = over(ahead, joint.landmarks, moved, landmarks)
         return jnp.concatenate([dx[0], dl.ravel()])
 
     both = dense.jacobian(error_after, np.zeros(dense.size + 2))
     a, b = both[:, : dense.size], both[:, dense.size :]
-    filter = ekf_slam(MOTION, SENSOR, CAPACITY, chart=chart)
+    filter = ekf_slam(robot, SENSOR, CAPACITY, chart=chart)
     out = jax.jit(filter.predict)(joint, u, KEY)
     np.testing.assert_allclose(out.cov, a @ dense.p @ a.T + b @ Q @ b.T, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(out.cov, out.cov.T)

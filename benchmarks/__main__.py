@@ -1,0 +1,44 @@
+"""All benchmarks, one gate: `python -m benchmarks [--quick]`, or `make bench`.
+
+A table of every metric with the range it must lie in; the exit status is 1 if one is missed. Each
+part is also a program of its own: circle, victoria_park, real_data, speed.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+
+import jax
+
+from benchmarks import circle, real_data, speed, victoria_park
+from benchmarks.gate import Metric, report
+
+
+def command_seconds() -> list[Metric]:
+    """The main job as a user runs it, imports and compilation included."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "jaxslam", "consistency", "--out", folder]
+        began = time.perf_counter()
+        subprocess.run(command, check=True)
+    seconds = time.perf_counter() - began
+    return [Metric("jaxslam consistency, 100 runs [s]", seconds, high=60.0)]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks")
+    parser.add_argument("--quick", action="store_true", help="circle with 200 runs, not 1000")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    metrics = command_seconds()
+    metrics += speed.measure()
+    metrics += circle.measure(200 if options.quick else 1000)
+    metrics += victoria_park.measure()
+    metrics += real_data.measure()
+    print()
+    return report(metrics)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

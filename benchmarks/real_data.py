@@ -1,0 +1,88 @@
+"""Recorded data through the EKF, scored against the survey: `python -m benchmarks.real_data`.
+
+Bonn and MRCLAM are looked for in the folder JAXSLAM_DATA, by default ../shared/data beside the
+checkout, and left out where absent; Victoria Park comes with GTSAM. The map is brought onto the
+survey by the SE(2) motion that fits best. Seconds are of a second run, without compilation.
+"""
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import gtsam
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxslam
+from benchmarks.gate import Metric, report
+from jaxslam import datasets, se2
+from jaxslam.datasets import Dataset
+from jaxslam.filters import ekf_slam
+from jaxslam.types import Estimate, Status
+
+DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+GATES = {"bonn": 0.2, "mrclam robot 1": 0.5, "mrclam robot 2": 0.5, "mrclam robot 3": 0.5}
+"""Map RMSE [m]."""
+HEADER = "data T N measured fused rejected dropped NIS/dof RMSE[m] read[s] run[s]"
+
+
+def readers() -> list[Callable[[], Dataset]]:
+    found = [lambda: datasets.victoria_park(gtsam.findExampleDataFile("victoria_park.txt"))]
+    if (DATA / "bonn").is_dir():
+        found.append(lambda: datasets.bonn(DATA / "bonn"))
+    if (DATA / "mrclam1").is_dir():
+        found += [lambda n=n: datasets.mrclam(DATA / "mrclam1", n) for n in (1, 2, 3)]
+    return found
+
+
+def map_rmse(final: Estimate, landmarks: np.ndarray) -> float:
+    """Of the living landmarks, after the best SE(2) motion onto the survey [m]."""
+    alive = np.asarray(final.alive)
+    points, survey = final.points[alive], jnp.asarray(landmarks)[final.tag[alive]]
+    move = se2.align(points, survey)
+    apart = jax.vmap(se2.from_frame, in_axes=(None, 0))(move, points) - survey
+    return float(jnp.sqrt((apart**2).sum(axis=1).mean()))
+
+
+def measure() -> list[Metric]:
+    metrics = []
+    print("".join(f"{name:>{16 if i == 0 else 10}}" for i, name in enumerate(HEADER.split())))
+    for reader in readers():
+        begin = time.perf_counter()
+        data = reader()
+        read = time.perf_counter() - begin
+        ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
+
+        @jax.jit
+        def go(log, data=data, ekf=ekf):
+            trace = jaxslam.run(ekf, log, data.pose, data.pose_cov, jax.random.key(0))
+            nis = jnp.where(trace.info.status == Status.FUSED, trace.info.nis, 0.0).sum()
+            return ekf.estimate(trace.final), trace.info.status, nis / trace.info.dof.sum()
+
+        jax.block_until_ready(go(data.log))
+        begin = time.perf_counter()
+        final, status, nis = jax.block_until_ready(go(data.log))
+        seconds = time.perf_counter() - begin
+        rmse = np.nan if data.landmarks is None else map_rmse(final, data.landmarks)
+        fused, rejected = (int((status == s).sum()) for s in (Status.FUSED, Status.REJECTED))
+        counts = (data.steps, data.capacity, data.measurements, fused, rejected)
+        cells = [*(f"{n:,}" for n in (*counts, sum(data.dropped.values()))), f"{nis:.3f}"]
+        cells += ["-" if np.isnan(rmse) else f"{rmse:.4f}", f"{read:.2f}", f"{seconds:.2f}"]
+        print(f"{data.name:>16}" + "".join(f"{cell:>10}" for cell in cells), flush=True)
+        if data.name in GATES:
+            metrics.append(Metric(f"map RMSE of {data.name} [m]", rmse, high=GATES[data.name]))
+        metrics.append(Metric(f"NIS/dof of {data.name}", float(nis), low=0.7, high=1.3))
+    return metrics
+
+
+def main() -> list[Metric]:
+    argparse.ArgumentParser(prog="python -m benchmarks.real_data").parse_args()
+    jax.config.update("jax_enable_x64", True)
+    return measure()
+
+
+if __name__ == "__main__":
+    raise SystemExit(report(main()))
