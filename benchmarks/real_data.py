@@ -18,10 +18,11 @@ import numpy as np
 
 import jaxslam
 from benchmarks.gate import Metric, report
-from jaxslam import datasets, se2
+from jaxslam import datasets
+from jaxslam.consistency import align_map
 from jaxslam.datasets import Dataset
 from jaxslam.filters import ekf_slam
-from jaxslam.types import Estimate, Status
+from jaxslam.types import Status
 
 DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 GATES = {"bonn": 0.2, "mrclam robot 1": 0.5, "mrclam robot 2": 0.5, "mrclam robot 3": 0.5}
@@ -36,15 +37,6 @@ def readers() -> list[Callable[[], Dataset]]:
     if (DATA / "mrclam1").is_dir():
         found += [lambda n=n: datasets.mrclam(DATA / "mrclam1", n) for n in (1, 2, 3)]
     return found
-
-
-def map_rmse(final: Estimate, landmarks: np.ndarray) -> float:
-    """Of the living landmarks, after the best SE(2) motion onto the survey [m]."""
-    alive = np.asarray(final.alive)
-    points, survey = final.points[alive], jnp.asarray(landmarks)[final.tag[alive]]
-    move = se2.align(points, survey)
-    apart = jax.vmap(se2.from_frame, in_axes=(None, 0))(move, points) - survey
-    return float(jnp.sqrt((apart**2).sum(axis=1).mean()))
 
 
 def measure() -> list[Metric]:
@@ -66,7 +58,7 @@ def measure() -> list[Metric]:
         begin = time.perf_counter()
         final, status, nis = jax.block_until_ready(go(data.log))
         seconds = time.perf_counter() - begin
-        rmse = np.nan if data.landmarks is None else map_rmse(final, data.landmarks)
+        rmse = np.nan if data.landmarks is None else align_map(final, data.landmarks)[1]
         fused, rejected = (int((status == s).sum()) for s in (Status.FUSED, Status.REJECTED))
         counts = (data.steps, data.capacity, data.measurements, fused, rejected)
         cells = [*(f"{n:,}" for n in (*counts, sum(data.dropped.values()))), f"{nis:.3f}"]

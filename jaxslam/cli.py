@@ -146,6 +146,7 @@ def _run_dataset(options: argparse.Namespace, command: str) -> int:
         jax.block_until_ready(trace)
     seconds = time.perf_counter() - began
     last = jax.tree.map(lambda leaf: leaf[-1], trace.estimate)
+    nis = jnp.where(trace.info.status == Status.FUSED, trace.info.nis, 0.0).sum()
     summary: dict[str, Any] = {
         "dataset": data.name,
         "source": data.source,
@@ -158,9 +159,11 @@ def _run_dataset(options: argparse.Namespace, command: str) -> int:
             s.name.lower(): int(trace.info.tally(s).sum()) for s in Status if s != Status.EMPTY
         },
         "dropped by the reader": data.dropped,
-        "NIS / dof": float(trace.info.nis.sum() / jnp.maximum(trace.info.dof.sum(), 1)),
+        "corrections to the data": list(data.corrections),
+        "NIS / dof": float(nis / jnp.maximum(trace.info.dof.sum(), 1)),
         "log-likelihood": float(trace.info.log_likelihood.sum()),
-        "steps not positive definite": int((~trace.probe).sum()),
+        # P0 = 0 is singular until noise has entered; from then on P must stay positive definite.
+        "positive definite from step": 2 + int(np.max(np.flatnonzero(~trace.probe), initial=-1)),
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
@@ -177,13 +180,18 @@ def _run_dataset(options: argparse.Namespace, command: str) -> int:
         "map.png": figure.savefig,
     }
     for name, value in summary.items():
-        shown = (
-            ", ".join(f"{k} {v:,}" for k, v in value.items()) if isinstance(value, dict) else value
-        )
-        print(f"{name:30} {shown}")
+        print(f"{name:30} {_shown(value)}")
     written = report.write_files(options.out, files)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
+    if isinstance(value, list):
+        return "; ".join(_shown(part) for part in value) or "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _scenario(name: str, steps: int | None) -> Scenario:

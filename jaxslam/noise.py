@@ -1,4 +1,4 @@
-"""Noise covariances as the factories take them: an array, or a function of what they may depend on."""
+"""Noise covariances as factories take them: an array, or a function of what they depend on."""
 
 from collections.abc import Callable
 

@@ -33,8 +33,8 @@ class Motion:
     noise_cov: Callable[[Array, Array], Array]
     """(pose, u) -> (W, W)."""
     perturb: Callable[[Array, Array], Array] | None = None
-    """(u, w) -> u with step(pose, u, w) = step(pose, perturb(u, w), 0), where noise is of that kind;
-    a world that disturbs the odometry instead of the robot needs it."""
+    """(u, w) -> u with step(pose, u, w) = step(pose, perturb(u, w), 0), where noise is of that
+    kind; a world that disturbs the odometry instead of the robot needs it."""
     jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
     """(pose, u, w) -> by pose (3, 3), by u (3, U), by w (3, W); hand-derived, to verify against."""
 
@@ -101,7 +101,7 @@ class Chart:
     local: Callable[[Array, Array, Array, Array], tuple[Array, Array]]
     """(pose0, l0, pose, l) -> (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
     basis: Callable[[Array, Array], Basis] | None = None
-    """(pose, l) -> the derivative of retract at zero; None says identity, and spares the products."""
+    """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
 
 
 @dataclass(frozen=True, eq=False)

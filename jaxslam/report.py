@@ -1,4 +1,4 @@
-"""Results on paper: the table of a campaign, its JSON and CSV, and files that appear whole or not."""
+"""Results on paper: a campaign's table, JSON and CSV, and files that appear whole or not."""
 
 import csv
 import io
@@ -55,7 +55,8 @@ def table(campaign: Campaign) -> str:
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     text = [
         "  ".join(
-            c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths))
+            c.ljust(w) if i == 0 else c.rjust(w)
+            for i, (c, w) in enumerate(zip(line, widths, strict=True))
         )
         for line in lines
     ]

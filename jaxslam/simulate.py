@@ -47,7 +47,7 @@ class Scenario:
     """M measurement places a scan; default N. The nearest tags first get a place, and the landmarks
     in view beyond M are counted in `Truth.missed`."""
     filter_options: dict[str, Any] = field(default_factory=dict)
-    """keyword arguments of `filters.ekf_slam` that belong to the experiment (update, births, gate)."""
+    """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
     published: dict[str, float] = field(default_factory=dict)
     """figures of the paper, by the names of `consistency.Summary`."""
     source: str = ""

@@ -46,13 +46,13 @@ def empty(
 
 
 def find(tag: jax.Array, alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The slot (M,) of each wanted tag (M,), 0 where there is none, and whether there is one (M,)."""
+    """The slot (M,) of each wanted tag (M,), 0 where none, and whether there is one (M,)."""
     match = (wanted[:, None] == tag[None, :]) & alive[None, :]
     return jnp.argmax(match, axis=1).astype(jnp.int32), match.any(axis=1)
 
 
 def allocate(alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A free slot for each place that wants one: the first wish gets the lowest free slot, and so on.
+    """A free slot for each place that wants one: the first wish gets the lowest, and so on.
 
     alive (N,) and wanted (M,) bool -> slot (M,) int32, 0 where none, and granted (M,) bool.
     """
@@ -79,10 +79,9 @@ def scatter(
     own_cov: jax.Array,
     tag: jax.Array,
 ) -> Joint:
-    """Fill dead slots with m landmarks that depend on the map through the pose alone (Solà (35)-(38)).
+    """Fill dead slots with m landmarks that depend on the map through the pose: Solà (35)-(38).
 
-    With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM and P_LL = G P_RR Gᵀ + diag(own_cov), so
-    the landmarks of one scan are correlated with each other through the robot. Written as additions
+    With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM, P_LL = G P_RR Gᵀ + diag(own_cov); the landmarks of one scan are correlated with each other through the robot. Written as additions
     to the zeros (and the unit variance) of padding, O(m·D); places not granted add nothing.
 
     Args:
@@ -95,7 +94,7 @@ def scatter(
     rows = 3 + slot[:, None] * size + jnp.arange(size)[None, :]
     flat = rows.reshape(-1)
     gain = jnp.where(here[:, :, None], by_pose, 0.0).reshape(m * size, 3)
-    # R is zero at the new columns. With T = R + P_RR Gᵀ/2 there, G T + (G T)ᵀ is the cross-covariance
+    # R is zero at the new columns. With T = R + P_RR Gᵀ/2, G T + (G T)ᵀ is the cross-covariance
     # with the map and, where rows and columns are both new, G P_RR Gᵀ; symmetric to the last bit.
     half = joint.cov[:3].at[:, flat].add(0.5 * joint.cov[:3, :3] @ gain.T)
     cross = settle(total(gain[:, k, None] * half[k, None, :] for k in range(3)))

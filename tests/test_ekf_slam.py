@@ -123,7 +123,9 @@ def test_the_gate_rejects_by_the_mahalanobis_distance_of_the_place_alone(update)
     joint = with_landmarks(3)
     gated = updater(update=update, gate=9.0)
     cov, h = joint.cov, np.zeros((2, 9))
-    h[:, :3], h[:, 5:7] = SENSOR.observe_jacobians(*map(jnp.asarray, (joint.pose, joint.landmarks[1])))
+    h[:, :3], h[:, 5:7] = SENSOR.observe_jacobians(
+        *map(jnp.asarray, (joint.pose, joint.landmarks[1]))
+    )
     s = h @ cov @ h.T + R
     direction = np.linalg.cholesky(s) @ [0.6, 0.8]  # exactly one sigma
     for distance, status in ((2.999, Status.FUSED), (3.001, Status.REJECTED)):
@@ -240,7 +242,10 @@ def test_starting_where_the_robot_knows_exactly_where_it_is():
 
 def test_joint_nis_and_log_likelihood_are_the_dense_formulas():
     joint = with_landmarks(3)
-    seen = [(2, *(expected_z(joint, 2) + [0.1, -0.03])), (0, *(expected_z(joint, 0) + [-0.2, 0.05]))]
+    seen = [
+        (2, *(expected_z(joint, 2) + [0.1, -0.03])),
+        (0, *(expected_z(joint, 0) + [-0.2, 0.05])),
+    ]
     _, info = updater(update="joint")(joint, scan_of(*seen))
     h = np.zeros((4, 9))
     for i, slot in enumerate((2, 0)):
@@ -260,7 +265,10 @@ def test_joint_nis_and_log_likelihood_are_the_dense_formulas():
 
 def test_sequential_log_likelihood_is_that_of_its_innovations():
     joint = with_landmarks(3)
-    seen = [(2, *(expected_z(joint, 2) + [0.1, -0.03])), (0, *(expected_z(joint, 0) + [-0.2, 0.05]))]
+    seen = [
+        (2, *(expected_z(joint, 2) + [0.1, -0.03])),
+        (0, *(expected_z(joint, 0) + [-0.2, 0.05])),
+    ]
     _, info = updater()(joint, scan_of(*seen))
     nu, s = np.asarray(info.innovation), np.asarray(info.innovation_cov)
     total = sum(scipy.stats.multivariate_normal.logpdf(nu[i], cov=s[i]) for i in (0, 1))
@@ -307,7 +315,10 @@ def test_gradients_of_the_log_likelihood_are_differences(likelihood, cloister_lo
     _, slope = likelihood(at, cloister_log)
     for i, name in enumerate(PARAMETERS):
         step = 1e-6 * np.eye(len(at))[i]
-        ahead, behind = likelihood(at + step, cloister_log)[0], likelihood(at - step, cloister_log)[0]
+        ahead, behind = (
+            likelihood(at + step, cloister_log)[0],
+            likelihood(at - step, cloister_log)[0],
+        )
         numeric = (ahead - behind) / 2e-6
         assert abs(slope[i] - numeric) < 1e-5 * (1 + abs(numeric)), name
         assert abs(slope[i]) > 1e-2, name  # every parameter is reached
@@ -415,7 +426,9 @@ def test_run_predicts_then_updates_and_records_every_step(good_trace):
     state = filter.init(jnp.zeros(3), jnp.eye(3))
     predict = jax.jit(lambda s, u: filter.predict(s, u, KEY))
     for t in range(3):
-        state, info = updater()(predict(state, log.control[t]), jax.tree.map(lambda a: a[t], log.scan))
+        state, info = updater()(
+            predict(state, log.control[t]), jax.tree.map(lambda a: a[t], log.scan)
+        )
         np.testing.assert_allclose(trace.estimate.pose[t], state.pose, atol=1e-14)
         np.testing.assert_allclose(trace.estimate.pose_cov[t], state.cov[:3, :3], atol=1e-14)
         np.testing.assert_allclose(trace.info.log_likelihood[t], info.log_likelihood, atol=1e-11)

@@ -225,7 +225,12 @@ def test_check_covariance_refuses(case):
 
 @pytest.mark.parametrize(
     "value",
-    [np.zeros((2, 2)), [[1, 0], [0, 2]], outer([1, 1]), np.float32([[0.1, 0.05], [0.05, 0.1]]) ** 2],
+    [
+        np.zeros((2, 2)),
+        [[1, 0], [0, 2]],
+        outer([1, 1]),
+        np.float32([[0.1, 0.05], [0.05, 0.1]]) ** 2,
+    ],
     ids=["zero", "integers", "singular", "float32"],
 )
 def test_check_covariance_accepts(value):

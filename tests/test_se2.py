@@ -143,7 +143,9 @@ def test_group_laws(cases):
 
 def test_rotation_is_orthogonal_and_counter_clockwise(hard_angles):
     r = batched(se2.rotation, hard_angles)
-    np.testing.assert_allclose(r @ r.transpose(0, 2, 1), np.broadcast_to(np.eye(2), r.shape), atol=1e-15)
+    np.testing.assert_allclose(
+        r @ r.transpose(0, 2, 1), np.broadcast_to(np.eye(2), r.shape), atol=1e-15
+    )
     np.testing.assert_allclose(np.linalg.det(r), 1, atol=1e-15)
     np.testing.assert_allclose(se2.rotation(np.pi / 2) @ np.array([1.0, 0.0]), [0, 1], atol=1e-15)
 
@@ -218,7 +220,12 @@ def test_polar_at_the_origin_is_zero_with_zero_derivatives(dtype):
     points = np.array([[0, 0], [-0.0, 0], [-0.0, -0.0], [0, tiny], [tiny, -tiny]], dtype)
 
     def everything(p):
-        return se2.polar(p), jax.jacfwd(se2.polar)(p), jax.jacrev(se2.polar)(p), *se2.polar_jacobians(p)
+        return (
+            se2.polar(p),
+            jax.jacfwd(se2.polar)(p),
+            jax.jacrev(se2.polar)(p),
+            *se2.polar_jacobians(p),
+        )
 
     for part in jax.jit(jax.vmap(everything))(points):
         assert part.dtype == dtype

@@ -153,7 +153,9 @@ def test_where_the_noise_acts(drawn):
     scenario, truth, log = drawn
     path = nominal_path(scenario)
     if scenario.noise_on == "robot":  # the log knows the nominal control alone
-        np.testing.assert_array_equal(log.control, np.broadcast_to(scenario.controls, log.control.shape))
+        np.testing.assert_array_equal(
+            log.control, np.broadcast_to(scenario.controls, log.control.shape)
+        )
         assert np.abs(truth.pose[0] - path).max() > 0.1
         assert np.abs(truth.pose[0] - truth.pose[1]).max() > 0.1
     else:  # the robot follows the nominal path
@@ -169,7 +171,8 @@ def test_noise_may_depend_on_control_and_measurement():
         controls=controls,
         motion=motion.increment(lambda pose, u: jnp.diag(jnp.array([0.1, 0.2]) * u) ** 2),
         sensor=sensors.range_bearing(
-            lambda z: jnp.diag(jnp.stack([0.05 * z[0], 0.01 * jnp.ones_like(z[0])])) ** 2, mount=MOUNT
+            lambda z: jnp.diag(jnp.stack([0.05 * z[0], 0.01 * jnp.ones_like(z[0])])) ** 2,
+            mount=MOUNT,
         ),
     )
     truth, log = draw(scenario, runs=10)
@@ -371,7 +374,9 @@ def test_circle_is_the_published_benchmark():
 def test_circle_has_a_place_for_every_landmark_in_view_at_any_length(steps):
     scenario = circle(steps)
     controls = np.asarray(scenario.controls)[:, :2]
-    path = nominal_path(dataclasses.replace(scenario, controls=controls, motion=motion.increment(Q)))
+    path = nominal_path(
+        dataclasses.replace(scenario, controls=controls, motion=motion.increment(Q))
+    )
     distance = np.linalg.norm(path[:, None, :2] - np.asarray(scenario.landmarks), axis=2)
     assert ((distance > 1) & (distance < 5)).sum(axis=1).max() == scenario.places
 
@@ -397,7 +402,9 @@ def test_cloister_is_the_guides_simulation():
     # The robot walks around inside: one turn is 2π/0.05 steps of 0.1 m, a circle of radius 2 m.
     path = nominal_path(dataclasses.replace(scenario, controls=np.tile([0.1, 0.05], (126, 1))))
     np.testing.assert_allclose(np.hypot(*path[:, :2].T), 2, atol=0.06)
-    np.testing.assert_allclose(scenario.motion.noise_cov(jnp.zeros(3), jnp.zeros(2)), np.diag([1e-4, 4e-4]))
+    np.testing.assert_allclose(
+        scenario.motion.noise_cov(jnp.zeros(3), jnp.zeros(2)), np.diag([1e-4, 4e-4])
+    )
     z_cov = np.diag([0.01, np.deg2rad(1) ** 2])
     np.testing.assert_allclose(scenario.sensor.noise_cov(jnp.zeros(2)), z_cov)
     assert scenario.noise_on == "robot"

@@ -214,9 +214,14 @@ def test_gather_returns_a_landmark_and_its_rows():
 
 def test_operations_keep_float32():
     joint = start()
-    joint = joint._replace(**{k: getattr(joint, k).astype("f4") for k in ("pose", "landmarks", "cov")})
+    joint = joint._replace(
+        **{k: getattr(joint, k).astype("f4") for k in ("pose", "landmarks", "cov")}
+    )
     slot, born, landmarks, by_pose, own, tag = births(np.random.default_rng(8), [True] * 4)
     part = (slot, born, landmarks.astype("f4"), by_pose.astype("f4"), own.astype("f4"), tag)
-    for out in (jax.eval_shape(slots.scatter, joint, *part), jax.eval_shape(slots.remove, joint, born)):
+    for out in (
+        jax.eval_shape(slots.scatter, joint, *part),
+        jax.eval_shape(slots.remove, joint, born),
+    ):
         assert {out.pose.dtype, out.landmarks.dtype, out.cov.dtype} == {np.dtype("f4")}
         assert out.tag.dtype == np.int32

@@ -132,7 +132,9 @@ def test_noise_enters_through_the_control_where_the_model_says_so(made):
         pytest.skip("its noise does not act on the control")
     out = made.batched(*made.cases)
     np.testing.assert_allclose(out["perturbed"], out["step"], rtol=1e-13, atol=1e-13)
-    moved = np.abs(np.asarray(out["step"]) - made.batched(*made.cases[:2], 0 * made.cases[2])["step"])
+    moved = np.abs(
+        np.asarray(out["step"]) - made.batched(*made.cases[:2], 0 * made.cases[2])["step"]
+    )
     assert moved.max() > 1e-3  # the noise does move the robot
 
 

@@ -272,7 +272,9 @@ def test_a_landmark_at_the_robot_or_at_the_sensor_is_finite_with_all_derivatives
             assert leaf.dtype == dtype
             assert np.isfinite(leaf).all()
         if made.sensor.observe_jacobians is not None:
-            for leaf in made.sensor.observe_jacobians(jnp.asarray(pose[0]), jnp.asarray(landmark[0])):
+            for leaf in made.sensor.observe_jacobians(
+                jnp.asarray(pose[0]), jnp.asarray(landmark[0])
+            ):
                 assert np.isfinite(leaf).all()
 
 

@@ -242,7 +242,9 @@ def test_iterated_correction_finds_the_most_probable_state_and_counts_the_data_o
         nu[1] = np.arctan2(np.sin(nu[1]), np.cos(nu[1]))
         curvature = information + h.T @ np.linalg.inv(R) @ h
         # In units of standard deviations.
-        return np.linalg.solve(curvature, information @ xi - h.T @ np.linalg.solve(R, nu)), curvature
+        return np.linalg.solve(
+            curvature, information @ xi - h.T @ np.linalg.solve(R, nu)
+        ), curvature
 
     once, _ = updater()(joint, scan)
     many, _ = updater(iterations=6)(joint, scan)
@@ -310,7 +312,9 @@ def linear():
 
     def drive(**options):
         filter = ekf_slam(robot, offset, CAPACITY, **options)
-        step = jax.jit(lambda s, scan: filter.update(filter.predict(s, jnp.ones(3), KEY), scan, KEY))
+        step = jax.jit(
+            lambda s, scan: filter.update(filter.predict(s, jnp.ones(3), KEY), scan, KEY)
+        )
         state, infos = jax.jit(filter.init)(np.zeros(3), 0.2 * np.eye(3)), []
         for t in range(6):
             state, info = step(state, jax.tree.map(lambda part, t=t: part[t], scans))
@@ -333,7 +337,10 @@ def test_sequential_is_joint_on_a_linear_model(linear):
 
 @pytest.mark.parametrize("update", ["sequential", "joint"])
 def test_one_pass_is_five_passes_on_a_linear_model(linear, update):
-    (one, one_infos), (five, five_infos) = linear(update=update), linear(update=update, iterations=5)
+    (one, one_infos), (five, five_infos) = (
+        linear(update=update),
+        linear(update=update, iterations=5),
+    )
     assert_same(one, five, 1e-11)
     assert_same(one_infos, five_infos, 1e-11)
 
@@ -428,7 +435,9 @@ def test_float32_logs_give_float32_outputs_although_float64_is_on(logs, options)
     chart = charts.REGISTRY[options.get("chart", "euclidean")]()
     single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, take(logs[1], 0))
     out = jax.eval_shape(runner(5, **(options | {"chart": chart})), single)
-    kinds = {leaf.dtype for leaf in jax.tree.leaves(out) if jnp.issubdtype(leaf.dtype, jnp.floating)}
+    kinds = {
+        leaf.dtype for leaf in jax.tree.leaves(out) if jnp.issubdtype(leaf.dtype, jnp.floating)
+    }
     assert kinds == {np.dtype("f4")}
 
 
