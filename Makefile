@@ -7,6 +7,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# JAX spreads work over the cores itself; threads of the BLAS under its LAPACK calls only get in the way.
+export OPENBLAS_NUM_THREADS ?= 1
 
 .DELETE_ON_ERROR:
 .PHONY: consistency test check bench clean

@@ -152,7 +152,7 @@ def is_concrete(*values: Any) -> bool:
 
 
 def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
-    """Raise ValueError unless cov is a real, finite, symmetric, positive semi-definite (size, size).
+    """Raise ValueError unless cov is real, finite, symmetric, positive semi-definite (size, size).
 
     Values are looked at only where they are concrete; a tracer is checked for its shape alone.
     """

@@ -70,8 +70,8 @@ def monte_carlo(
     Returns:
         Campaign.
     Raises:
-        ValueError: on runs or block below 1, no filters, or a filter that does not fit the scenario;
-            before anything is traced.
+        ValueError: on runs or block below 1, no filters, or a filter that does not fit the
+            scenario; before anything is traced.
     """
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
         if value is not None and (not isinstance(value, int) or value < 1):

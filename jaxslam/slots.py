@@ -81,8 +81,9 @@ def scatter(
 ) -> Joint:
     """Fill dead slots with m landmarks that depend on the map through the pose: Solà (35)-(38).
 
-    With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM, P_LL = G P_RR Gᵀ + diag(own_cov); the landmarks of one scan are correlated with each other through the robot. Written as additions
-    to the zeros (and the unit variance) of padding, O(m·D); places not granted add nothing.
+    With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM, P_LL = G P_RR Gᵀ + diag(own_cov).
+    So the landmarks of one scan are correlated with each other through the robot. Written as
+    additions to the zeros (and the unit variance) of padding, O(m·D); places not granted add none.
 
     Args:
         slot: (m,) dead slots, all different where granted.

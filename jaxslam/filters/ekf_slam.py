@@ -10,6 +10,7 @@ from jaxslam import slots
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import gaussian
+from jaxslam.linalg import is_concrete
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.protocols import Associate, Chart, Filter, Linearizer, Motion, Prediction, Sensor
 from jaxslam.slots import Joint
@@ -206,7 +207,7 @@ def _check(
             raise ValueError(f"ekf_slam: expected {name} to be an integer >= 1, got {value!r}")
     if update not in ("sequential", "joint"):
         raise ValueError(f'ekf_slam: expected update "sequential" or "joint", got {update!r}')
-    if gate is not None and not gate > 0:
+    if gate is not None and is_concrete(gate) and not gate > 0:
         raise ValueError(f"ekf_slam: expected a gate above 0, got {gate}")
     pose, landmark = jnp.zeros(3), jnp.zeros(len(sensor.landmark))
     try:
