@@ -105,8 +105,7 @@ def errors_figure(
         axes.plot(step, scale * error[:, i], color=COLORS[1], lw=1.0, label="truth - estimate")
         axes.axhline(0.0, color=_INK, lw=0.6)
         axes.set(ylabel=name)
-    panels[0].legend(loc="upper left", frameon=False, ncols=2, fontsize="small")
-    panels[0].set_title(title)
+    _caption(panels[0], title)
     panels[-1].set(xlabel="step", xlim=(1, max(len(error), 2)))
     return figure
 
@@ -127,8 +126,9 @@ def nees_figure(campaign: Campaign, *, blocks: Sequence[str] = ("pose", "heading
             label = f"{name} ({summary.verdict})"
             axes.plot(step, curves[f"nees_{block}"], color=COLORS[i % 8], lw=1.0, label=label)
         axes.set(ylabel=f"{block} NEES (dof {DOF[block]})", yscale="log")
-    panels[0].legend(loc="upper left", frameon=False, fontsize="small", ncols=2)
-    panels[0].set_title(f"{campaign.scenario}: average NEES over {campaign.runs} runs")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(_few_digits)
+    _caption(panels[0], f"{campaign.scenario}, NEES over {campaign.runs} runs")
     panels[-1].set(xlabel="step", xlim=(1, max(campaign.steps, 2)))
     return figure
 
@@ -143,6 +143,24 @@ def _figure(width: float, height: float, panels: int) -> tuple[Figure, list[Axes
     return figure, list(grid[:, 0])
 
 
+def _caption(axes: Axes, title: str) -> None:
+    """Title on the left above the axes, legend below it, clear of the curves."""
+    axes.set_title(title, loc="left", pad=26)
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(-0.01, 0.99),
+        frameon=False,
+        ncols=4,
+        fontsize="small",
+        columnspacing=1.2,
+    )
+
+
+def _few_digits(x: float, _: int) -> str:
+    """Minor ticks of a logarithmic axis: 2, 3 and 5 of each decade."""
+    return f"{x:g}" if f"{x:.0e}"[0] in "235" else ""
+
+
 def _extent(*clouds: np.ndarray) -> float:
     """The larger side of the box around some points, or 1 where it has no size."""
     every = np.concatenate([cloud[:, :2] for cloud in clouds])
@@ -151,7 +169,7 @@ def _extent(*clouds: np.ndarray) -> float:
 
 def _heading_mark(axes: Axes, pose: np.ndarray, extent: float) -> None:
     """A triangle where the robot ends, pointing ahead."""
-    size = 0.03 * extent
+    size = 0.022 * extent
     shape = size * np.array([[1.2, 0.0], [-0.6, 0.6], [-0.6, -0.6], [1.2, 0.0]])
     c, s = np.cos(pose[2]), np.sin(pose[2])
     corners = shape @ np.array([[c, s], [-s, c]]) + pose[:2]
