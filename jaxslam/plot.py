@@ -156,7 +156,7 @@ def _caption(axes: Axes, title: str) -> None:
     )
 
 
-def _few_digits(x: float, _: int) -> str:
+def _few_digits(x: float, _: float) -> str:
     """Minor ticks of a logarithmic axis: 2, 3 and 5 of each decade."""
     return f"{x:g}" if f"{x:.0e}"[0] in "235" else ""
 
