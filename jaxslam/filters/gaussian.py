@@ -15,7 +15,7 @@ from jaxslam.protocols import Basis, Chart, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 
 # Up to this many rows the covariance update is written as outer products, which XLA fuses into one
-# pass over P; beyond, as one matrix product (see benchmarks/README.md).
+# pass over P; beyond, as one matrix product.
 _OUTER_PRODUCTS = 16
 
 

@@ -64,7 +64,6 @@ def assert_equal_at_every_step(states, steps):
 CASES = {
     "cloister": (cloister(200), {"update": "sequential", "gate": 9.0, "births": 1}),
     "circle": (circle(500), {"update": "joint"}),
-    "circle joint with gate": (circle(300), {"update": "joint", "gate": 3.0}),
     "cloister joint with gate": (
         dataclasses.replace(cloister(80), noise_on="odometry"),
         {"update": "joint", "gate": 5.0, "births": 3},

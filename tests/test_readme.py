@@ -1,0 +1,48 @@
+"""The README: its Python runs as it stands, and its reference names what there is."""
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+import jaxslam
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+MODULES = {name for name in jaxslam.__all__ if hasattr(getattr(jaxslam, name), "__path__")}
+
+
+def reference():
+    """(module, name) pairs of the reference table."""
+    table = README.split("## Reference")[1]
+    for row in re.findall(r"^\| `(jaxslam[.\w]*)` \|(.*)\|$", table, re.MULTILINE):
+        for name in re.findall(r"`(\w+)`", row[1]):
+            yield row[0], name
+
+
+@pytest.mark.filterwarnings("default")
+def test_the_readme_runs(capsys):
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len(blocks) == 2
+    code = "\n".join(blocks).replace("steps=500", "steps=12").replace("runs=100", "runs=3")
+    exec(compile(code, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "ekf" in printed
+    assert "invariant" in printed
+
+
+@pytest.mark.parametrize(("module", "name"), [p for p in reference() if p[1] != "f_jacobians"])
+def test_every_name_of_the_reference_exists_and_is_documented(module, name):
+    owner = importlib.import_module(module)
+    assert hasattr(owner, name)
+    if callable(getattr(owner, name)):
+        assert getattr(owner, name).__doc__
+
+
+def test_every_public_factory_is_in_the_reference():
+    listed = set(reference())
+    for module in sorted(MODULES):
+        package = getattr(jaxslam, module)
+        for name in getattr(package, "__all__", []):
+            if name != "REGISTRY":
+                assert (f"jaxslam.{module}", name) in listed
