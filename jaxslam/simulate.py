@@ -44,7 +44,7 @@ class Scenario:
     visible: Callable[[jax.Array, jax.Array], jax.Array] = everywhere
     """(pose, l) -> (): whether the sensor reports the landmark from there."""
     places: int | None = None
-    """M measurement places a scan; default N. The nearest tags first get a place, and the landmarks
+    """M measurement places a scan; default N. The lowest tags first get a place, and the landmarks
     in view beyond M are counted in `Truth.missed`."""
     filter_options: dict[str, Any] = field(default_factory=dict)
     """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
