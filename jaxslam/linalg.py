@@ -8,6 +8,7 @@ behind NaN; hence the unrolled factor below, which reports it and stays finite.
 import functools
 import operator
 from collections.abc import Iterable
+from numbers import Integral
 from typing import Any, TypeVar, cast
 
 import jax
@@ -149,6 +150,12 @@ def is_positive_definite(matrix: jax.Array) -> jax.Array:
 def is_concrete(*values: Any) -> bool:
     """Whether values can be looked at, i.e. no leaf is a tracer."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+        raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
 
 
 def check_covariance(name: str, cov: ArrayLike, size: int) -> None:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.consistency import Summary, Sums, score, summarize
+from jaxslam.linalg import check_count
 from jaxslam.protocols import Estimator, Filter
 from jaxslam.run import run
 from jaxslam.scenarios import ideal
@@ -74,14 +75,14 @@ def monte_carlo(
             scenario; before anything is traced.
     """
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
-        if value is not None and (not isinstance(value, int) or value < 1):
-            raise ValueError(f"monte_carlo: expected {name} to be an integer >= 1, got {value!r}")
+        if value is not None:
+            check_count(f"monte_carlo: {name}", value)
     if not filters:
         raise ValueError("monte_carlo: expected at least one filter")
     for name, candidate in filters.items():
         _check_fits(name, candidate, scenario)
     began = time.perf_counter()
-    block = min(block, runs)
+    runs, block = int(runs), min(int(block), int(runs))
     numbers = np.arange(-(-runs // block) * block).reshape(-1, block)
 
     def keys_of(which: jax.Array) -> tuple[jax.Array, jax.Array]:

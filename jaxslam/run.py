@@ -25,7 +25,7 @@ def run(
     """Drive a filter along a log: per row predict with the control, then update with the scan.
 
     Traceable: wrap it in `jax.jit`, `jax.vmap` over logs and keys, or `jax.grad`. The arithmetic
-    runs in the dtype of the log's controls.
+    runs in the wider dtype of the log's controls and measurements.
 
     Args:
         filter: made by a factory of `jaxslam.filters`.
@@ -47,7 +47,8 @@ def run(
         raise ValueError("run: the initial pose is not finite")
     check_covariance("run: pose_cov", pose_cov, 3)
     log = jax.tree.map(jnp.asarray, log)
-    dtype = log.control.dtype
+    dtype = jnp.result_type(log.control, log.scan.z)
+    log = Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))
     start = filter.init(jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype))
     keys = jax.random.split(key, (log.control.shape[0], 2))
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxslam.charts.right_invariant import right_invariant
 from jaxslam.filters.ekf_slam import ekf_slam
+from jaxslam.linalg import check_count
 from jaxslam.linearize.at_truth import at_truth
 from jaxslam.motion.increment import increment
 from jaxslam.motion.unicycle import unicycle
@@ -30,7 +31,7 @@ def circle(steps: int = 2500) -> Scenario:
     arXiv:2002.00878; `published` are its program's figures for the EKF over 100 runs,
     and empty where the number of steps is not theirs.
     """
-    _check_steps(steps)
+    check_count("steps", steps)
     v, omega = 0.25, np.deg2rad(1.5)
     radius = v / omega
     around = 2 * np.pi * np.arange(20) / 20
@@ -70,7 +71,7 @@ def cloister(steps: int = 200) -> Scenario:
     The noise is on the robot; `dataclasses.replace(…, noise_on="odometry")` gives the guide's way,
     which disturbs the estimator instead (see ERRATA).
     """
-    _check_steps(steps)
+    check_count("steps", steps)
     return Scenario(
         name="cloister",
         motion=increment(np.diag([0.01, 0.02]) ** 2),
@@ -106,11 +107,6 @@ def between_ranges(nearest: float, farthest: float) -> Callable[[jax.Array, jax.
         return (squared > nearest**2) & (squared < farthest**2)
 
     return visible
-
-
-def _check_steps(steps: int) -> None:
-    if not isinstance(steps, int) or steps < 1:
-        raise ValueError(f"expected steps to be an integer >= 1, got {steps!r}")
 
 
 SCENARIOS: dict[str, Callable[..., Scenario]] = {"circle": circle, "cloister": cloister}

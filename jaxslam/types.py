@@ -154,6 +154,8 @@ def _expect(name: str, value: Any, shape: tuple[int, ...], kind: type) -> None:
     if np.shape(value) != shape or -1 in shape:
         wanted = ", ".join("T or M" if n == -1 else str(n) for n in shape)
         raise ValueError(f"{name}: expected shape ({wanted}), got {np.shape(value)}")
+    if not hasattr(value, "dtype"):
+        raise ValueError(f"{name}: expected an array, got a {type(value).__name__}")
     dtype = jnp.result_type(value)
     if not jnp.issubdtype(dtype, kind):
         raise ValueError(f"{name}: expected {kind.__name__} values, got {dtype}")

@@ -448,3 +448,18 @@ def test_a_repeated_tag_that_escapes_the_check_under_jit_is_born_once(good_trace
     assert list(trace.info.status[0]) == [Status.BORN, Status.REPEATED, Status.BORN]
     assert list(trace.info.status[1]) == [Status.FUSED, Status.FUSED, Status.FUSED]
     assert list(trace.final.tag) == [0, 2, -1]
+
+
+@pytest.mark.parametrize("update", ["sequential", "joint"])
+@pytest.mark.parametrize(("steps", "places"), [(0, 2), (3, 0)])
+def test_a_log_without_rows_or_without_places_is_a_log(update, steps, places):
+    scan = Scan(
+        np.zeros((steps, places, 2)),
+        np.full((steps, places), -1, np.int32),
+        np.zeros((steps, places), bool),
+    )
+    filter = ekf_slam(MOTION, sensors.range_bearing(R), 1, update=update)
+    trace = run(filter, Log(np.zeros((steps, 2)), scan), np.zeros(3), np.zeros((3, 3)), KEY)
+    assert trace.estimate.pose.shape == (steps, 3)
+    assert not trace.info.log_likelihood.any()
+    assert not trace.final.alive.any()

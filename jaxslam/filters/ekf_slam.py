@@ -10,7 +10,7 @@ from jaxslam import slots
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import gaussian
-from jaxslam.linalg import is_concrete
+from jaxslam.linalg import check_count, is_concrete
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.protocols import Associate, Chart, Filter, Linearizer, Motion, Prediction, Sensor
 from jaxslam.slots import Joint
@@ -88,7 +88,7 @@ def ekf_slam(
         matched = scan.valid & (slot >= 0) & ~is_new
         is_new = scan.valid & is_new
         parts = (scan.z, jnp.maximum(slot, 0), matched)
-        if update == "joint":
+        if update == "joint" and scan.tag.shape[0] > 0:
             joint, done = correct(joint, *parts)
         else:
             # One measurement a pass: the place axis becomes time, with m = 1 inside.
@@ -203,8 +203,8 @@ def _check(
     births: int | None,
 ) -> None:
     for name, value in (("capacity", capacity), ("iterations", iterations), ("births", births)):
-        if value is not None and (not isinstance(value, int) or value < 1):
-            raise ValueError(f"ekf_slam: expected {name} to be an integer >= 1, got {value!r}")
+        if value is not None:
+            check_count(f"ekf_slam: {name}", value)
     if update not in ("sequential", "joint"):
         raise ValueError(f'ekf_slam: expected update "sequential" or "joint", got {update!r}')
     if gate is not None and is_concrete(gate) and not gate > 0:
