@@ -46,7 +46,8 @@ def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     A pivot not above n·eps times its diagonal entry counts as zero: its column of L is zero and the
     flag is False, so that a positive *semi*-definite A still gets a usable square root, and nothing
-    becomes NaN. Only the lower triangle is read. Non-finite input gives False.
+    becomes NaN (beyond 8×8, where LAPACK is called, L is then zero as a whole). Only the lower
+    triangle is read. Non-finite input gives False.
     """
     n = matrix.shape[-1]
     tolerance = n * float(jnp.finfo(matrix.dtype).eps)
@@ -177,6 +178,10 @@ def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
     scale = np.max(np.abs(values), initial=0.0)
     if np.max(np.abs(values - values.T), initial=0.0) > 1e-6 * scale:
         raise ValueError(f"{name}: the covariance is not symmetric")
+    if np.min(np.diagonal(values), initial=0.0) < 0:
+        raise ValueError(
+            f"{name}: the covariance is not positive semi-definite (negative variance)"
+        )
     smallest = np.min(np.linalg.eigvalsh(values), initial=np.inf)
     if smallest < -1e-6 * scale:
         raise ValueError(

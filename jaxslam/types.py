@@ -93,9 +93,9 @@ class Info(NamedTuple):
     dof: jax.Array
     """(M,) int: Z where fused, else 0."""
     innovation: jax.Array
-    """(M, Z) z ⊖ ẑ of fused and rejected places, else 0."""
+    """(M, Z) z ⊖ ẑ of places matched to a landmark (fused, rejected or singular), else 0."""
     innovation_cov: jax.Array
-    """(M, Z, Z) of fused and rejected places, else 0."""
+    """(M, Z, Z) S of the same places, else 0."""
     slot: jax.Array
     """(M,) int: the landmark slot corrected or born, -1 if none."""
     status: jax.Array

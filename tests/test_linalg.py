@@ -226,6 +226,7 @@ BAD = {
     "infinite": ([[np.inf, 0.0], [0.0, 1.0]], "thing: the covariance has a NaN or an infinity"),
     "asymmetric": ([[1.0, 0.1], [0.0, 1.0]], "thing: the covariance is not symmetric"),
     "negative": ([[1.0, 0.0], [0.0, -0.1]], "thing: the covariance is not positive semi-definite"),
+    "a variance below a large one": ([[1e6, 0.0], [0.0, -0.5]], "thing: .* positive semi-definite"),
     "indefinite": ([[1.0, 2.0], [2.0, 1.0]], "thing: the covariance is not positive semi-definite"),
     "complex": ([[1j, 0.0], [0.0, 1.0]], "thing: expected real numbers"),
     "boolean": ([[True, False], [False, True]], "thing: expected real numbers"),
