@@ -1,12 +1,14 @@
 """Angles on the circle, and the two entire functions that planar motion needs near zero turn."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-# Below this the power series is used. There its first dropped term is under 1e-16, and above it
-# the closed form, and its first two derivatives, lose at most a digit to cancellation.
+# Below this the power series is used. There the first term dropped from it and from its first two
+# derivatives is under 1e-16, and above it the closed form loses at most a digit to cancellation.
 _SERIES = 0.5
 
 
@@ -27,9 +29,7 @@ def sinc(x: ArrayLike) -> jax.Array:
     x = jnp.asarray(x)
     small = jnp.abs(x) < _SERIES
     x2 = jnp.where(small, x, 0.0) ** 2
-    series = _horner(
-        x2, [1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 6227020800]
-    )
+    series = _horner(x2, [(-1) ** k / math.factorial(2 * k + 1) for k in range(8)])
     far = jnp.where(small, 1.0, x)
     return jnp.where(small, series, jnp.sin(far) / far)
 
@@ -40,7 +40,7 @@ def sinc_slope(x: ArrayLike) -> jax.Array:
     small = jnp.abs(x) < _SERIES
     near = jnp.where(small, x, 0.0)
     series = near * _horner(
-        near**2, [-1 / 3, 1 / 30, -1 / 840, 1 / 45360, -1 / 3991680, 1 / 518918400]
+        near**2, [(-1) ** k * 2 * k / math.factorial(2 * k + 1) for k in range(1, 8)]
     )
     far = jnp.where(small, 1.0, x)
     return jnp.where(small, series, (jnp.cos(far) - jnp.sin(far) / far) / far)

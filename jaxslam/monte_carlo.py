@@ -202,5 +202,5 @@ def _check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
 
 def _divergence_limit(scenario: Scenario, spread: float, dtype: Any) -> float:
     """5 σ of the ideal spread, or, in a world without noise, what rounding can do."""
-    reach = 1.0 + float(np.max(np.abs(np.asarray(scenario.landmarks))))
+    reach = 1.0 + float(np.max(np.abs(np.asarray(scenario.landmarks)), initial=0.0))
     return max(5 * spread, 1000 * float(jnp.finfo(dtype).eps) * reach)

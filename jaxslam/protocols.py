@@ -50,13 +50,18 @@ class Free(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What the robot sees of one landmark."""
+    """What the robot sees of one landmark; with L = 0, an absolute sensor, of itself in the map.
+
+    An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
+    embed return (0,), position zeros that nothing reads, and K = 0. Each of its measurements
+    corrects the robot, whatever the tag.
+    """
 
     name: str
     measurements: tuple[str, ...]
     """What z holds, with units; its length is Z."""
     landmark: tuple[str, ...]
-    """What l holds, with units; its length is L."""
+    """What l holds, with units; its length is L, 0 for an absolute sensor."""
     observe: Callable[[Array, Array], Array]
     """(pose, l) -> z."""
     residual: Callable[[Array, Array], Array]
@@ -64,7 +69,7 @@ class Sensor:
     noise_cov: Callable[[Array], Array]
     """(z) -> (Z, Z)."""
     invert: Callable[[Array, Array, Array], Array]
-    """(pose, z, s) -> l, with observe(pose, invert(pose, z, s)) = z."""
+    """(pose, z, s) -> l, with observe(pose, invert(pose, z, s)) = z; a range is not negative."""
     position: Callable[[Array], Array]
     """(l) -> (2,) where the landmark stands."""
     embed: Callable[[Array, Array], Array]

@@ -66,3 +66,12 @@ def assert_jacobians(differences):
             np.testing.assert_allclose(by_hand[k], by_differences, rtol=0, atol=atol * scale)
 
     return check
+
+
+@pytest.fixture(scope="module")
+def quick_compilation():
+    """For modules that compile much and run little: XLA optimizes less, and rounds a little
+    differently, while they run."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

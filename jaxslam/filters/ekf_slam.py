@@ -36,6 +36,9 @@ def ekf_slam(
     Each step propagates the robot (14)-(17); each scan corrects (26)-(30), then starts its new
     landmarks (31)-(38). The state is a `slots.Joint`; `slots.remove` deletes landmarks from it.
 
+    Every valid measurement of an absolute sensor (L = 0: compass, position fix) corrects the robot,
+    whatever its tag, and has slot -1; `associate` and `births` do not apply, and the map is empty.
+
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`.
         capacity: landmark slots N. A new landmark that finds the map full is dropped and marked
@@ -84,9 +87,13 @@ def ekf_slam(
         return propagate(joint, u)
 
     def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
-        slot, is_new = associate(Prediction(joint.tag, joint.alive), scan)
-        matched = scan.valid & (slot >= 0) & ~is_new
-        is_new = scan.valid & is_new
+        if size_l > 0:
+            slot, is_new = associate(Prediction(joint.tag, joint.alive), scan)
+            matched = scan.valid & (slot >= 0) & ~is_new
+            is_new = scan.valid & is_new
+        else:
+            slot, is_new = jnp.full_like(scan.tag, -1), jnp.zeros_like(scan.valid)
+            matched = scan.valid
         parts = (scan.z, jnp.maximum(slot, 0), matched)
         if update == "joint" and scan.tag.shape[0] > 0:
             joint, done = correct(joint, *parts)
@@ -176,11 +183,13 @@ def _moments(joint: Joint, sensor: Sensor, chart: Chart) -> Estimate:
     if chart.basis is not None:
         basis = chart.basis(joint.pose, joint.landmarks[0])
         pose_cov = basis.pose @ pose_cov @ basis.pose.T
+    # The position of a landmark of zeros may be anything (of an inverse depth, 1000 km away).
+    unit = jnp.eye(2, dtype=point_covs.dtype)[None]
     return Estimate(
         pose=joint.pose,
         pose_cov=pose_cov,
         points=jnp.where(joint.alive[:, None], points, 0.0),
-        point_covs=point_covs,
+        point_covs=jnp.where(joint.alive[:, None, None], point_covs, unit),
         alive=joint.alive,
         tag=joint.tag,
     )
@@ -213,8 +222,13 @@ def _check(
     try:
         _, moved = jax.eval_shape(chart.retract, pose, landmark, pose, landmark)
         fits = moved.shape == landmark.shape
-    except (TypeError, ValueError):
+    except (IndexError, TypeError, ValueError):
         fits = False
+    if not fits and landmark.size == 0:
+        raise ValueError(
+            f"ekf_slam: the chart {chart.name} acts on landmarks, and the absolute sensor "
+            f"{sensor.name} has none"
+        )
     if not fits:
         raise ValueError(
             f"ekf_slam: the chart {chart.name} does not act on the {landmark.shape[0]}-parameter "

@@ -105,8 +105,9 @@ def correct(
     """Correct by m measurements at once, z (m, Z) of the landmarks in slot (m,): Solà (26)-(30).
 
     With S = H P Hᵀ + R = L Lᵀ and V = L⁻¹ H P: x ← x ⊞ Vᵀ L⁻¹ ν and P ← P - Vᵀ V, symmetric as it
-    stands. H is Z×(3+L) a measurement. Places not known (m,), outside the gate (ν_iᵀ S_ii⁻¹ ν_i
-    above it, each against the prior) or with a singular S do nothing.
+    stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot means nothing. Places
+    not known (m,), outside the gate (ν_iᵀ S_ii⁻¹ ν_i above it, each against the prior) or with a
+    singular S do nothing.
 
     Each further iteration linearizes at the newest estimate x_i = x ⊞ ξ_i but starts again from the
     prior: ξ_{i+1} = K (z - h(x_i) + H ξ_i) (Bell & Cathey 1993). joseph: P ← (I-KH)P(I-KH)ᵀ + KRKᵀ.
@@ -135,9 +136,11 @@ def correct(
             nu = nu + jnp.einsum("mzi,i->mz", by_pose, xi[:3])
             nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, xi_l)
         by_pose, by_landmark, nu = linalg.settle((by_pose, by_landmark, nu))
-        hp = linalg.total(
-            by_pose[:, :, k, None] * joint.cov[None, None, k] for k in range(3)
-        ) + linalg.total(by_landmark[:, :, k, None] * prior_rows[:, None, k] for k in range(size_l))
+        hp = linalg.total(by_pose[:, :, k, None] * joint.cov[None, None, k] for k in range(3))
+        if size_l > 0:
+            hp = hp + linalg.total(
+                by_landmark[:, :, k, None] * prior_rows[:, None, k] for k in range(size_l)
+            )
         hp = linalg.settle(hp)
         s = _innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
         if iteration == 0:
@@ -249,10 +252,11 @@ def _innovation_cov(
 ) -> jax.Array:
     """H P Hᵀ (m, Z, m, Z) of HP (m, Z, D): only the robot's and the seen landmarks' columns."""
     m, size_z, size_l = by_landmark.shape
+    own = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
+    if size_l == 0:
+        return own
     at_landmark = hp[:, :, 3:].reshape(m, size_z, capacity, size_l)[:, :, slot]
-    return linalg.total(
-        hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3)
-    ) + linalg.total(
+    return own + linalg.total(
         at_landmark[..., k, None] * by_landmark[None, None, :, :, k] for k in range(size_l)
     )
 

@@ -2,15 +2,32 @@
 
 from collections.abc import Callable
 
+from jaxslam.motion.ackermann import ackermann
 from jaxslam.motion.increment import increment
+from jaxslam.motion.odometry import odometry, odometry_control, odometry_noise
 from jaxslam.motion.pose_increment import pose_increment
 from jaxslam.motion.unicycle import unicycle
+from jaxslam.motion.velocity import velocity, velocity_noise
 from jaxslam.protocols import Motion
 
 REGISTRY: dict[str, Callable[..., Motion]] = {
+    "ackermann": ackermann,
     "increment": increment,
+    "odometry": odometry,
     "pose_increment": pose_increment,
     "unicycle": unicycle,
+    "velocity": velocity,
 }
 
-__all__ = ["REGISTRY", "increment", "pose_increment", "unicycle"]
+__all__ = [
+    "REGISTRY",
+    "ackermann",
+    "increment",
+    "odometry",
+    "odometry_control",
+    "odometry_noise",
+    "pose_increment",
+    "unicycle",
+    "velocity",
+    "velocity_noise",
+]

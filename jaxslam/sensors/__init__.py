@@ -3,12 +3,34 @@
 from collections.abc import Callable
 
 from jaxslam.protocols import Sensor
+from jaxslam.sensors.bearing_inverse_depth import bearing_inverse_depth
+from jaxslam.sensors.bearing_only import bearing_only
+from jaxslam.sensors.compass import compass
+from jaxslam.sensors.position_fix import position_fix
 from jaxslam.sensors.range_bearing import range_bearing
+from jaxslam.sensors.range_bearing_signature import range_bearing_signature
+from jaxslam.sensors.range_only import range_only
 from jaxslam.sensors.relative_position import relative_position
 
 REGISTRY: dict[str, Callable[..., Sensor]] = {
+    "bearing_inverse_depth": bearing_inverse_depth,
+    "bearing_only": bearing_only,
+    "compass": compass,
+    "position_fix": position_fix,
     "range_bearing": range_bearing,
+    "range_bearing_signature": range_bearing_signature,
+    "range_only": range_only,
     "relative_position": relative_position,
 }
 
-__all__ = ["REGISTRY", "range_bearing", "relative_position"]
+__all__ = [
+    "REGISTRY",
+    "bearing_inverse_depth",
+    "bearing_only",
+    "compass",
+    "position_fix",
+    "range_bearing",
+    "range_bearing_signature",
+    "range_only",
+    "relative_position",
+]

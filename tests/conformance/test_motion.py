@@ -10,6 +10,7 @@ import pytest
 from jaxslam.motion import REGISTRY
 
 DTYPES = [np.float32, np.float64]
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def random_covariance(rng, n):
@@ -28,11 +29,17 @@ def cases_of(model, hard_angles):
     u[:: max(1, n // 6)] = 0
     w[:: max(1, n // 3)] = 0
     pose[1:3, :2] *= 1e4
+    for k, unit in enumerate(model.controls):
+        if unit == "steering [rad]":  # wheels do not turn to the side, noise or not
+            u[:, k] = np.clip(u[:, k], -1, 1)
+            if unit in model.noises:
+                j = model.noises.index(unit)
+                w[:, j] = np.clip(u[:, k] + w[:, j], -1, 1) - u[:, k]
     return pose, u, w
 
 
 @pytest.fixture(scope="module", params=REGISTRY)
-def made(request, hard_angles):
+def made(request, hard_angles, quick_compilation):
     """A model of the registry with a random noise covariance, its cases, and one compiled call."""
     factory = REGISTRY[request.param]
     width = len(factory(lambda pose, u: None).noises)
@@ -87,7 +94,7 @@ def test_float32_agrees_with_float64(made):
     assert np.abs(turned).max() < 1e-5
     np.testing.assert_allclose(single["step"][:, :2], double["step"][:, :2], rtol=1e-6, atol=1e-5)
     for a, b in zip(single["forward"], double["forward"], strict=True):
-        np.testing.assert_allclose(a, b, atol=2e-5)
+        np.testing.assert_allclose(a, b, atol=3e-6)
 
 
 def test_jit_is_no_jit_and_vmap_is_a_loop(made):
@@ -97,34 +104,6 @@ def test_jit_is_no_jit_and_vmap_is_a_loop(made):
         one = made.model.step(pose, u, w)
         np.testing.assert_allclose(one, batched["step"][i], rtol=1e-13, atol=1e-13)
         np.testing.assert_array_equal(made.model.noise_cov(pose, u), batched["cov"][i])
-
-
-def test_forward_and_reverse_derivatives_agree(made):
-    out = made.batched(*made.cases)
-    for a, b in zip(out["forward"], out["reverse"], strict=True):
-        np.testing.assert_allclose(a.sum(axis=1), b, rtol=1e-12, atol=1e-12 * np.abs(a).max())
-
-
-def test_autodiff_is_differences(made, differences):
-    """Of every argument, whether or not the model brings hand-derived Jacobians."""
-    pose, u, w = made.cases
-    by_autodiff = made.batched(pose, u, w)["forward"]
-    for k, auto in enumerate(by_autodiff):
-        by_differences = differences(lambda *a: made.batched(*a)["step"], (pose, u, w), k)
-        atol = np.where(np.abs(pose).max(axis=1) > 100, 1e-4, 1e-8)[:, None, None]
-        assert np.all(np.abs(auto - by_differences) < atol * (1 + np.abs(auto)))
-
-
-def test_hand_jacobians_are_autodiff(made):
-    if made.model.jacobians is None:
-        pytest.skip("brings no hand-derived Jacobians")
-    hand = jax.jit(jax.vmap(made.model.jacobians))(*made.cases)
-    auto = made.batched(*made.cases)["forward"]
-    assert len(hand) == len(auto)
-    for a, b in zip(hand, auto, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
-    single = jax.eval_shape(jax.vmap(made.model.jacobians), *(a.astype("f4") for a in made.cases))
-    assert {j.dtype for j in single} == {np.dtype("f4")}
 
 
 def test_noise_enters_through_the_control_where_the_model_says_so(made):
@@ -141,6 +120,18 @@ def test_noise_enters_through_the_control_where_the_model_says_so(made):
 def test_no_control_and_no_noise_is_no_motion(made):
     pose, u, w = made.cases
     still = np.asarray(made.batched(pose, 0 * u, 0 * w)["step"])
+    np.testing.assert_allclose(still[:, :2], pose[:, :2], rtol=1e-15)
+    np.testing.assert_allclose(np.exp(1j * still[:, 2]), np.exp(1j * pose[:, 2]), atol=1e-15)
+
+
+def test_no_time_is_no_motion(made):
+    """Whatever the velocities and their noise."""
+    if "dt [s]" not in made.model.controls:
+        pytest.skip("its control is a displacement")
+    pose, u, w = made.cases
+    still = np.asarray(
+        made.batched(pose, u * [c != "dt [s]" for c in made.model.controls], w)["step"]
+    )
     np.testing.assert_allclose(still[:, :2], pose[:, :2], rtol=1e-15)
     np.testing.assert_allclose(np.exp(1j * still[:, 2]), np.exp(1j * pose[:, 2]), atol=1e-15)
 

@@ -1,0 +1,108 @@
+"""A car steered at its front wheels, known by the pose of the laser it carries."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam import se2
+from jaxslam.linalg import is_concrete
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Motion
+
+
+def ackermann(
+    noise_cov: NoiseCov,
+    wheelbase: ArrayLike = 2.83,
+    sensor: ArrayLike = (3.78, 0.5),
+    encoder: ArrayLike = 0.76,
+) -> Motion:
+    """u = (v_e [m/s], steering α [rad], Δt [s]), noise added to v_e and α; exact arc.
+
+    v_e is the speed of the rear wheel with the encoder, H to the left of the axle's centre. The
+    centre moves at v = v_e/(1 - (H/L) tan α) and the car turns at ω = v tan α/L. The pose is that
+    of a sensor fixed at (a ahead, b left) of the centre, with the car's heading:
+
+        pose ← pose ∘ (-a, -b, 0) ∘ exp(vΔt, 0, ωΔt) ∘ (a, b, 0) = pose ∘ exp((v - ωb)Δt, ωaΔt, ωΔt)
+
+    the twist being the centre's, seen at the sensor. The Euler step of this is the published model,
+
+        x + Δt(v cos θ - ω(a sin θ + b cos θ)),  y + Δt(v sin θ + ω(a cos θ - b sin θ)),  θ + Δt ω
+
+    of Guivant & Nebot, IEEE Trans. Robotics and Automation 17(3), 2001. The defaults are the truck
+    they drove through Victoria Park.
+
+    Precondition, not checked: |α| < π/2 and |α| < atan(L/|H|), noise included. At the second bound
+    the car turns about the encoder's wheel, whose speed then says nothing about the car's.
+
+    Args:
+        noise_cov: (2, 2) covariance of w on (v_e, α), or a function of (pose, u).
+        wheelbase: L [m], from the rear to the front axle; positive.
+        sensor: (2,) = (a, b) [m].
+        encoder: H [m]; negative on the right, 0 where v_e is the centre's speed.
+    Raises:
+        ValueError: if noise_cov is not a (2, 2) covariance, or a length is not finite or has the
+            wrong shape, or wheelbase is not positive.
+    """
+    _check_lengths(wheelbase, sensor, encoder)
+
+    def rates(u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """By the curvature κ = tan α/L: v; its gain v/v_e; the sensor's twist over v, (3,)."""
+        a, b = jnp.asarray(sensor, u.dtype)
+        curvature = jnp.tan(u[1]) / jnp.asarray(wheelbase, u.dtype)
+        gain = 1 / (1 - jnp.asarray(encoder, u.dtype) * curvature)
+        return u[0] * gain, gain, jnp.stack([1 - curvature * b, curvature * a, curvature])
+
+    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+        v, _, direction = rates(perturb(u, w))
+        return se2.boxplus(pose, u[2] * v * direction)
+
+    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+        return jnp.stack([u[0] + w[0], u[1] + w[1], u[2]])
+
+    def jacobians(
+        pose: jax.Array, u: jax.Array, w: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        dt, tan = u[2], jnp.tan(u[1] + w[1])
+        v, gain, direction = rates(perturb(u, w))
+        by_pose, by_move = se2.compose_jacobians(pose, se2.exp(dt * v * direction))
+        (by_twist,) = se2.exp_jacobians(dt * v * direction)
+        # dv/dκ = v·gain·H, dκ/dα = (1 + tan² α)/L, and the direction is linear in κ.
+        a, b = jnp.asarray(sensor, u.dtype)
+        slope = jnp.asarray(encoder, u.dtype) * gain * direction + jnp.stack(
+            [-b, a, jnp.ones_like(a)]
+        )
+        by_alpha = v * slope * (1 + tan**2) / jnp.asarray(wheelbase, u.dtype)
+        by_rates = jnp.stack([dt * gain * direction, dt * by_alpha, v * direction], axis=1)
+        by_control = by_move @ by_twist @ by_rates
+        return by_pose, by_control, by_control[:, :2]
+
+    return Motion(
+        name="ackermann",
+        controls=("v_e [m/s]", "steering [rad]", "dt [s]"),
+        noises=("v_e [m/s]", "steering [rad]"),
+        step=step,
+        noise_cov=noise_model("ackermann", noise_cov, 2),
+        perturb=perturb,
+        jacobians=jacobians,
+    )
+
+
+def _check_lengths(wheelbase: ArrayLike, sensor: ArrayLike, encoder: ArrayLike) -> None:
+    for what, value, shape in (
+        ("wheelbase", wheelbase, ()),
+        ("sensor", sensor, (2,)),
+        ("encoder", encoder, ()),
+    ):
+        concrete = is_concrete(value)
+        given = np.shape(value) if concrete else jnp.asarray(value).shape
+        if given != shape:
+            raise ValueError(f"ackermann: expected {what} of shape {shape}, got {given}")
+        if concrete:
+            values = np.asarray(value)
+            if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+                raise ValueError(f"ackermann: {what} is not a real number, but {values.dtype}")
+            if not np.all(np.isfinite(values)):
+                raise ValueError(f"ackermann: {what} is not finite")
+    if is_concrete(wheelbase) and not np.asarray(wheelbase) > 0:
+        raise ValueError(f"ackermann: expected a positive wheelbase, got {wheelbase!r}")

@@ -1,0 +1,105 @@
+"""Turn, drive, turn again: how wheel odometry tells one pose from the next."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from numpy.typing import ArrayLike
+
+from jaxslam import se2
+from jaxslam.angles import wrap
+from jaxslam.noise import NoiseCov, check_alpha, noise_model
+from jaxslam.protocols import Motion
+
+
+def odometry(noise_cov: NoiseCov) -> Motion:
+    """u = (rot1 [rad], trans [m], rot2 [rad]), noise added to it: Notes 3, odometry model.
+
+    With the direction of travel h = θ + rot1 + w1,
+
+        pose ← (x + (trans+w2) cos h, y + (trans+w2) sin h, wrap(h + rot2 + w3)).
+
+    `odometry_control` gives u between two poses, `odometry_noise` a covariance that grows with u.
+    Thrun, Burgard & Fox, Probabilistic Robotics (2005), ch. 5.4.
+
+    Args:
+        noise_cov: (3, 3) covariance of w = (w1, w2, w3), or a function of (pose, u).
+    Raises:
+        ValueError: if noise_cov is not a (3, 3) covariance.
+    """
+
+    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+        rot1, trans, rot2 = perturb(u, w)
+        facing = jnp.stack([pose[0], pose[1], pose[2] + rot1])
+        return se2.compose(facing, jnp.stack([trans, jnp.zeros_like(trans), rot2]))
+
+    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+        return u + w
+
+    def jacobians(
+        pose: jax.Array, u: jax.Array, w: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        h, d = pose[2] + u[0] + w[0], u[1] + w[1]
+        c, s = jnp.cos(h), jnp.sin(h)
+        turned = jnp.stack([-d * s, d * c, jnp.ones_like(d)])  # by θ and by rot1 alike
+        by_pose = jnp.eye(3, dtype=pose.dtype).at[:, 2].set(turned)
+        by_noise = jnp.zeros((3, 3), pose.dtype).at[:, 0].set(turned)
+        by_noise = by_noise.at[0, 1].set(c).at[1, 1].set(s).at[2, 2].set(1)
+        return by_pose, by_noise, by_noise
+
+    return Motion(
+        name="odometry",
+        controls=("rot1 [rad]", "trans [m]", "rot2 [rad]"),
+        noises=("rot1 [rad]", "trans [m]", "rot2 [rad]"),
+        step=step,
+        noise_cov=noise_model("odometry", noise_cov, 3),
+        perturb=perturb,
+        jacobians=jacobians,
+    )
+
+
+def odometry_noise(alpha: ArrayLike) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """(pose, u) -> the diagonal (3, 3) covariance of `odometry`'s noise, from four constants.
+
+        var rot1  = α1 rot1² + α2 trans²
+        var trans = α3 trans² + α4 (rot1² + rot2²)
+        var rot2  = α1 rot2² + α2 trans²
+
+    Units: α1, α3 none, α2 [rad²/m²], α4 [m²/rad²]. Variances, as in Probabilistic Robotics, Table
+    5.6. Backing up as rot1 = ±π counts as that much turning; (0, -d, 0) does not.
+
+    Args:
+        alpha: (4,) α1 … α4, not negative.
+    Raises:
+        ValueError: if alpha is not four finite numbers >= 0.
+    """
+    check_alpha("odometry_noise", alpha, 4)
+
+    def noise(pose: jax.Array, u: jax.Array) -> jax.Array:
+        a1, a2, a3, a4 = jnp.asarray(alpha, pose.dtype)
+        rot1, trans, rot2 = u[0] ** 2, u[1] ** 2, u[2] ** 2
+        return jnp.diag(
+            jnp.stack(
+                [a1 * rot1 + a2 * trans, a3 * trans + a4 * (rot1 + rot2), a1 * rot2 + a2 * trans]
+            )
+        )
+
+    return noise
+
+
+def odometry_control(before: jax.Array, after: jax.Array) -> jax.Array:
+    """The u = (rot1, trans, rot2) of `odometry` that leads from one pose to another: Notes 3.
+
+        rot1  = wrap(atan2(y' - y, x' - x) - θ)
+        trans = √((x' - x)² + (y' - y)²)
+        rot2  = wrap(θ' - θ - rot1)
+
+    trans >= 0, so a robot that backs up turns by π first and last. Without translation rot1 has no
+    value: u is (0, 0, wrap(θ' - θ)) with finite derivatives.
+
+    Args:
+        before, after: poses (3,) in one frame, the odometry's own for instance.
+    """
+    trans, bearing = se2.polar(se2.to_frame(before, after[:2]))
+    rot1 = wrap(bearing)  # arctan2 of (-0, x < 0) is -π, which no wrapped angle is
+    return jnp.stack([rot1, trans, wrap(after[2] - before[2] - rot1)])

@@ -1,0 +1,144 @@
+"""Direction of a landmark that is held as a ray from its first sighting and an inverse distance."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam import se2
+from jaxslam.angles import wrap
+from jaxslam.linalg import is_concrete
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Sensor
+from jaxslam.sensors.mounting import NO_OFFSET, mounting
+from jaxslam.sensors.prior import FreeLike, prior
+
+_FAR = 1e-6
+"""[1/m] below this inverse distance `position` places a landmark as if it had this one."""
+
+_NEAR = 1e-6
+"""[m] below this distance `embed` starts a landmark as if it had this one."""
+
+
+def bearing_inverse_depth(
+    noise_cov: NoiseCov,
+    mount: ArrayLike = NO_OFFSET,
+    min_distance: ArrayLike = 1.0,
+    free: FreeLike | None = None,
+) -> Sensor:
+    """z = (bearing [rad]) of l = (x0 [m], y0 [m], alpha [rad], rho [1/m]), Solà 2.3.6.
+
+    p0 = (x0, y0) is where the sensor first saw the landmark from, α the direction in the map, ρ the
+    inverse of the distance (46), (49). From another place t_S, S = pose ∘ mount, the line of sight,
+    scaled by ρ, is (51)
+
+        v = ρ(p0 - t_S) + (cos α, sin α)        z = bearing of R(θ_S)ᵀ v
+
+    which is linear in ρ and regular at ρ = 0, a landmark at infinity, and below: the noise may take
+    the estimate of a far landmark there. (The unscaled (50) is singular at 0, and for ρ < 0 it has
+    the opposite direction.) Where v = 0, z is 0 with zero derivatives. invert is (53),
+    l = (t_S, wrap(θ_S + z), s), with s = (inverse depth [1/m]).
+
+    position is (48), p0 + (cos α, sin α)/ρ_c, with ρ_c = max(ρ, 1e-6): a landmark at infinity or
+    beyond stands 1000 km off in its direction. Its derivative by ρ is -1/ρ_c² also where ρ is cut
+    off, so that a covariance taken through it is huge there, as it should be, and not zero. embed
+    bounds the distance below by 1e-6 m.
+
+    Args:
+        noise_cov: (1, 1) covariance of the bearing, or a function of z.
+        mount: (3,) pose of the sensor on the robot, Solà's S.
+        min_distance: [m] the least distance of a landmark, Solà's d_min (47). The prior of s then
+            has mean 1/(2 d_min) and σ 1/(4 d_min), so that 2 σ span 0 to 1/d_min.
+        free: mean (1,) and covariance (1, 1) of s to use instead.
+    Raises:
+        ValueError: if noise_cov is not a (1, 1) covariance, mount not a finite (3,), min_distance
+            not positive and finite, or free not a Gaussian of positive variance.
+    """
+    sensor_pose, sensor_pose_jacobian = mounting("bearing_inverse_depth", mount)
+    by_distance = _bounded_by(min_distance)
+
+    def sight(frame: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """v, and the frame's axes at the map's origin, where v is a point."""
+        v = landmark[3] * (landmark[:2] - frame[:2]) + _direction(landmark[2])
+        return v, frame.at[:2].set(0.0)
+
+    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+        v, axes = sight(sensor_pose(pose), landmark)
+        return se2.polar(se2.to_frame(axes, v))[1:]
+
+    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+        return wrap(z - z_hat)
+
+    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+        frame = sensor_pose(pose)
+        return jnp.concatenate([frame[:2], wrap(frame[2:] + z), s])
+
+    def position(landmark: jax.Array) -> jax.Array:
+        # max(ρ, _FAR) with slope 1 everywhere. Added to the cut value, not to ρ, the term is an
+        # exact zero: in float32 ρ + (_FAR - ρ) could be 0.
+        inverse = landmark[3]
+        cut = jax.lax.stop_gradient(jnp.maximum(inverse, _FAR))
+        inverse = cut + (inverse - jax.lax.stop_gradient(inverse))
+        return landmark[:2] + _direction(landmark[2]) / inverse
+
+    def embed(pose: jax.Array, point: jax.Array) -> jax.Array:
+        origin = sensor_pose(pose)[:2]
+        distance, alpha = se2.polar(point - origin)
+        inverse = 1.0 / jnp.maximum(distance, _NEAR)
+        return jnp.stack([origin[0], origin[1], alpha, inverse])
+
+    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+        frame = sensor_pose(pose)
+        v, axes = sight(frame, landmark)
+        by_axes, by_v = se2.to_frame_jacobians(axes, v)
+        outer = se2.polar_jacobians(se2.to_frame(axes, v))[0][1:]
+        c, s = _direction(landmark[2])
+        by_frame = jnp.stack([-landmark[3] * by_v[:, 0], -landmark[3] * by_v[:, 1], by_axes[:, 2]])
+        by_alpha = by_v @ jnp.stack([-s, c])
+        by_inverse = by_v @ (landmark[:2] - frame[:2])
+        by_landmark = jnp.concatenate(
+            [landmark[3] * by_v, by_alpha[:, None], by_inverse[:, None]], axis=1
+        )
+        return outer @ by_frame.T @ sensor_pose_jacobian(pose), outer @ by_landmark
+
+    def invert_jacobians(
+        pose: jax.Array, z: jax.Array, s: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        eye = jnp.eye(4, dtype=pose.dtype)
+        return eye[:, :3] @ sensor_pose_jacobian(pose), eye[:, 2:3], eye[:, 3:]
+
+    return Sensor(
+        name="bearing_inverse_depth",
+        measurements=("bearing [rad]",),
+        landmark=("x0 [m]", "y0 [m]", "alpha [rad]", "rho [1/m]"),
+        observe=observe,
+        residual=residual,
+        noise_cov=noise_model("bearing_inverse_depth", noise_cov, 1),
+        invert=invert,
+        position=position,
+        embed=embed,
+        free=prior("bearing_inverse_depth", by_distance if free is None else free, 1),
+        observe_jacobians=observe_jacobians,
+        invert_jacobians=invert_jacobians,
+    )
+
+
+def _direction(alpha: jax.Array) -> jax.Array:
+    return jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])
+
+
+def _bounded_by(min_distance: ArrayLike) -> FreeLike:
+    """The prior of an inverse distance in [0, 1/min_distance]."""
+    if np.ndim(min_distance) != 0:
+        raise ValueError("bearing_inverse_depth: expected one min_distance, got an array")
+    if is_concrete(min_distance):
+        value = np.asarray(min_distance)
+        real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
+        if not (real and np.isfinite(value) and value > 0):
+            raise ValueError(
+                f"bearing_inverse_depth: expected 0 < min_distance < inf, got {min_distance!r}"
+            )
+        sigma = 0.25 / float(value)
+        return (2 * sigma,), ((sigma * sigma,),)
+    spread = 0.25 / jnp.asarray(min_distance)
+    return (2 * spread)[None], (spread**2)[None, None]

@@ -1,0 +1,57 @@
+"""The robot's position in the map: a satellite receiver, a total station."""
+
+import jax
+import jax.numpy as jnp
+from numpy.typing import ArrayLike
+
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Free, Sensor
+from jaxslam.sensors.mounting import NO_OFFSET, mounting
+
+
+def position_fix(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
+    """z = (x [m], y [m]) of the antenna: t + R(θ) t_mount, the translation of pose ∘ mount.
+
+    An absolute sensor (GPS in Williams' list of observations): there is no landmark, L = 0, and
+    `invert`, `embed` and `position` (zeros) only complete the record; nothing reads them.
+
+    Args:
+        noise_cov: (2, 2) covariance of z, or a function of z.
+        mount: (3,) pose of the antenna on the robot; its angle does not matter.
+    Raises:
+        ValueError: if noise_cov is not a (2, 2) covariance or mount not a finite (3,).
+    """
+    sensor_pose, sensor_pose_jacobian = mounting("position_fix", mount)
+
+    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+        return sensor_pose(pose)[:2]
+
+    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+        return z - z_hat
+
+    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+        return jnp.zeros(0, pose.dtype)
+
+    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return sensor_pose_jacobian(pose)[:2], jnp.zeros((2, 0), pose.dtype)
+
+    def invert_jacobians(
+        pose: jax.Array, z: jax.Array, s: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        none = jnp.zeros((0, 3), pose.dtype)
+        return none, none[:, :2], none[:, :0]
+
+    return Sensor(
+        name="position_fix",
+        measurements=("x [m]", "y [m]"),
+        landmark=(),
+        observe=observe,
+        residual=residual,
+        noise_cov=noise_model("position_fix", noise_cov, 2),
+        invert=invert,
+        position=lambda landmark: jnp.zeros(2, landmark.dtype),
+        embed=lambda pose, point: jnp.zeros(0, pose.dtype),
+        free=Free(jnp.zeros(0), jnp.zeros((0, 0))),
+        observe_jacobians=observe_jacobians,
+        invert_jacobians=invert_jacobians,
+    )

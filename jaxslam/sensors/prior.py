@@ -1,0 +1,46 @@
+"""The prior of what a measurement cannot see: Solà's s ~ N(s̄, S), checked once, by the factory."""
+
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam.linalg import check_covariance, is_concrete
+from jaxslam.protocols import Free
+
+FreeLike = Free | tuple[ArrayLike, ArrayLike]
+
+
+def prior(name: str, free: FreeLike, size: int) -> Free:
+    """free = (mean (size,), cov (size, size)), as a `Free` that any dtype can be taken from.
+
+    Raises ValueError unless the mean is finite and the covariance positive definite; a traced part
+    is checked for its shape alone.
+    """
+    try:
+        mean, cov = free
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected free = (mean, covariance), got {free!r}") from None
+    mean, cov = _held(mean), _held(cov)
+    if mean.shape != (size,):
+        raise ValueError(f"{name}: expected a prior mean of shape ({size},), got {mean.shape}")
+    if is_concrete(mean) and not (_is_real(mean) and np.all(np.isfinite(mean))):
+        raise ValueError(f"{name}: the mean of the prior is not finite")
+    check_covariance(f"{name}: prior", cov, size)
+    if is_concrete(cov) and not np.linalg.eigvalsh(np.asarray(cov, np.float64))[0] > 0:
+        raise ValueError(f"{name}: the prior's variance must be positive")
+    return Free(mean, cov)
+
+
+def _held(values: Any) -> jax.Array:
+    """On the host in float64, not in the width JAX has when the factory is called."""
+    if not is_concrete(values):
+        return jnp.asarray(values)
+    array = np.asarray(values)
+    return cast(jax.Array, array.astype(np.float64) if _is_real(array) else array)
+
+
+def _is_real(array: Any) -> bool:
+    return bool(np.issubdtype(array.dtype, np.number)) and not np.iscomplexobj(array)

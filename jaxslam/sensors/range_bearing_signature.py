@@ -1,0 +1,76 @@
+"""Distance and direction of a landmark that also shows a number: a reflectivity, a diameter."""
+
+import jax
+import jax.numpy as jnp
+from numpy.typing import ArrayLike
+
+from jaxslam import se2
+from jaxslam.angles import wrap
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Free, Sensor
+from jaxslam.sensors.mounting import NO_OFFSET, mounting
+
+
+def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
+    """z = (range [m], bearing [rad], signature [1]) of l = (x, y, signature): D = 3 + 3N.
+
+    polar(to_frame(pose ∘ mount, (x, y))) as in `range_bearing`, and the signature as it is: the
+    landmarks of three parameters that Tacher counts. The signature is in the map, estimated like a
+    coordinate; to recognize landmarks by it is the association's affair. embed knows no signature
+    and gives 0. A landmark exactly at the sensor gives z = (0, 0, signature), not NaN.
+
+    Args:
+        noise_cov: (3, 3) covariance of (range, bearing, signature), or a function of z.
+        mount: (3,) pose of the sensor on the robot, Solà's S.
+    Raises:
+        ValueError: if noise_cov is not a (3, 3) covariance or mount not a finite (3,).
+    """
+    sensor_pose, sensor_pose_jacobian = mounting("range_bearing_signature", mount)
+
+    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+        seen = se2.polar(se2.to_frame(sensor_pose(pose), landmark[:2]))
+        return jnp.concatenate([seen, landmark[2:]])
+
+    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+        return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1]), z[2] - z_hat[2]])
+
+    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+        point = se2.from_frame(sensor_pose(pose), se2.rectangular(z[:2]))
+        return jnp.concatenate([point, z[2:]])
+
+    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+        frame = sensor_pose(pose)
+        by_frame, by_point = se2.to_frame_jacobians(frame, landmark[:2])
+        (outer,) = se2.polar_jacobians(se2.to_frame(frame, landmark[:2]))
+        by_pose = jnp.zeros((3, 3), pose.dtype)
+        by_pose = by_pose.at[:2].set(outer @ by_frame @ sensor_pose_jacobian(pose))
+        return by_pose, _beside_one(outer @ by_point)
+
+    def invert_jacobians(
+        pose: jax.Array, z: jax.Array, s: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        by_frame, by_point = se2.from_frame_jacobians(sensor_pose(pose), se2.rectangular(z[:2]))
+        (inner,) = se2.rectangular_jacobians(z[:2])
+        by_pose = jnp.zeros((3, 3), pose.dtype)
+        by_pose = by_pose.at[:2].set(by_frame @ sensor_pose_jacobian(pose))
+        return by_pose, _beside_one(by_point @ inner), jnp.zeros((3, 0), pose.dtype)
+
+    return Sensor(
+        name="range_bearing_signature",
+        measurements=("range [m]", "bearing [rad]", "signature [1]"),
+        landmark=("x [m]", "y [m]", "signature [1]"),
+        observe=observe,
+        residual=residual,
+        noise_cov=noise_model("range_bearing_signature", noise_cov, 3),
+        invert=invert,
+        position=lambda landmark: landmark[:2],
+        embed=lambda pose, point: jnp.concatenate([point, jnp.zeros_like(point[:1])]),
+        free=Free(jnp.zeros(0), jnp.zeros((0, 0))),
+        observe_jacobians=observe_jacobians,
+        invert_jacobians=invert_jacobians,
+    )
+
+
+def _beside_one(block: jax.Array) -> jax.Array:
+    """diag(block, 1), (3, 3)."""
+    return jnp.eye(3, dtype=block.dtype).at[:2, :2].set(block)

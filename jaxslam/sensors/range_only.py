@@ -1,0 +1,77 @@
+"""Distance of a point landmark, without its direction: a radio beacon, a sonar's echo."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam import se2
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Sensor
+from jaxslam.sensors.mounting import NO_OFFSET, mounting
+from jaxslam.sensors.prior import FreeLike, prior
+
+ANY_DIRECTION = ((0.0,), ((np.pi**2 / 3,),))
+"""The Gaussian with the mean and the variance of a direction uniform on (-π, π]."""
+
+
+def range_only(
+    noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET, free: FreeLike = ANY_DIRECTION
+) -> Sensor:
+    """z = (range [m]) of l = (x, y): |l - t_S| with S = pose ∘ mount, the first row of Solà (63).
+
+    invert is (64) with s = (bearing [rad]) in the sensor's frame in place of what was not measured:
+    from_frame(S, rectangular((z, s))), z >= 0. A landmark exactly at the sensor gives z = 0 with
+    zero derivatives, not NaN.
+
+    One Gaussian in x and y cannot hold a ring. With the default prior the linearized landmark is an
+    ellipse along the ring's tangent ahead of the sensor, and a filter that starts from it is no
+    honest one; give a narrower prior where the world offers one.
+
+    Args:
+        noise_cov: (1, 1) covariance of the range, or a function of z.
+        mount: (3,) pose of the sensor on the robot, Solà's S.
+        free: mean (1,) and covariance (1, 1) of the bearing [rad], Solà (39).
+    Raises:
+        ValueError: if noise_cov is not a (1, 1) covariance, mount not a finite (3,) or free not a
+            Gaussian of positive variance.
+    """
+    sensor_pose, sensor_pose_jacobian = mounting("range_only", mount)
+
+    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+        return se2.polar(se2.to_frame(sensor_pose(pose), landmark))[:1]
+
+    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+        return z - z_hat
+
+    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+        return se2.from_frame(sensor_pose(pose), se2.rectangular(jnp.concatenate([z, s])))
+
+    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+        frame = sensor_pose(pose)
+        by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
+        outer = se2.polar_jacobians(se2.to_frame(frame, landmark))[0][:1]
+        return outer @ by_frame @ sensor_pose_jacobian(pose), outer @ by_point
+
+    def invert_jacobians(
+        pose: jax.Array, z: jax.Array, s: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        frame, seen = sensor_pose(pose), jnp.concatenate([z, s])
+        by_frame, by_point = se2.from_frame_jacobians(frame, se2.rectangular(seen))
+        by_polar = by_point @ se2.rectangular_jacobians(seen)[0]
+        return by_frame @ sensor_pose_jacobian(pose), by_polar[:, :1], by_polar[:, 1:]
+
+    return Sensor(
+        name="range_only",
+        measurements=("range [m]",),
+        landmark=("x [m]", "y [m]"),
+        observe=observe,
+        residual=residual,
+        noise_cov=noise_model("range_only", noise_cov, 1),
+        invert=invert,
+        position=lambda landmark: landmark,
+        embed=lambda pose, point: point,
+        free=prior("range_only", free, 1),
+        observe_jacobians=observe_jacobians,
+        invert_jacobians=invert_jacobians,
+    )
