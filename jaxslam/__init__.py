@@ -10,6 +10,7 @@ from jaxslam import (
     charts,
     consistency,
     filters,
+    linearity,
     linearize,
     motion,
     scenarios,
@@ -18,9 +19,11 @@ from jaxslam import (
     slots,
     stats,
 )
+from jaxslam.linearity import linearity_index
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.run import run
 from jaxslam.simulate import Scenario, simulate
+from jaxslam.verify import verify_jacobians
 
 __all__ = [
     "Scenario",
@@ -28,6 +31,8 @@ __all__ = [
     "charts",
     "consistency",
     "filters",
+    "linearity",
+    "linearity_index",
     "linearize",
     "monte_carlo",
     "motion",
@@ -38,4 +43,5 @@ __all__ = [
     "simulate",
     "slots",
     "stats",
+    "verify_jacobians",
 ]

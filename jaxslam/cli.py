@@ -1,10 +1,12 @@
 """The command `jaxslam`: the only place that parses arguments or configures JAX."""
 
 import argparse
+import os
 import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import plot, report, se2
+from jaxslam import motion, plot, report, se2, sensors, userfile, verify
 from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS
 from jaxslam.filters.ekf_slam import ekf_slam
@@ -28,11 +30,12 @@ from jaxslam.types import Status
 _T = TypeVar("_T")
 
 USAGE_ERROR = 2
+FAILED = 1
 INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; 0 on success, 2 on bad input, 130 when interrupted."""
+    """Run the command; 0 on success, 1 for a wrong model, 2 on bad input, 130 if interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         options = _parser().parse_args(arguments)
@@ -80,6 +83,25 @@ def _parser() -> argparse.ArgumentParser:
     drive.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
     drive.add_argument("--robot", type=int, help="which robot, where a data set has several")
     drive.set_defaults(command=_run_dataset)
+
+    check = commands.add_parser(
+        "verify",
+        help="is a Jacobian right? of every model, or of your own file",
+        description="Hold Jacobians by forward and reverse autodiff, by hand and by differences "
+        "against each other. Without a file: every motion model and sensor of jaxslam. Exit status "
+        "1 if anything fails, 2 if the file cannot be used. Prints a table or report, writes JSON.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    check.add_argument(
+        "target",
+        metavar="FILE.py[:NAME]",
+        nargs="?",
+        help="a file that defines a Motion, a Sensor, or a function f and its f_jacobian",
+    )
+    check.add_argument("--states", type=int, default=24, help="random states beside the hard ones")
+    check.add_argument("--seed", type=int, default=0, help="of the random states")
+    check.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
+    check.set_defaults(command=_verify, dtype="float64")
 
     for command in (judge, drive):
         command.add_argument("--dtype", default="float64", choices=["float32", "float64"])
@@ -186,6 +208,43 @@ def _run_dataset(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
+def _verify(options: argparse.Namespace, command: str) -> int:
+    began = time.perf_counter()
+    report.check_writable(options.out)
+    ask = partial(verify.verify_jacobians, count=options.states, seed=options.seed)
+    if options.target is None:
+        reports = _verify_all(ask)
+        print(verify.table(reports))
+    else:
+        reports = userfile.verify_file(options.target, ask)
+    details = reports if options.target else [r for r in reports if not r.passed]
+    print("\n".join(["", *(str(r) for r in details)]) if details else "")
+    passed = all(r.passed for r in reports)
+    content = {
+        "command": command,
+        "passed": passed,
+        "reports": [r.as_dict() for r in reports],
+        "seconds": round(time.perf_counter() - began, 2),
+        "versions": report.versions(),
+    }
+    written = report.write_files(options.out, {"verify.json": report.json_text(content)})
+    print(f"{content['seconds']:.1f} s; wrote {written[0]}")
+    return 0 if passed else FAILED
+
+
+def _verify_all(ask: Callable[..., verify.Report]) -> list[verify.Report]:
+    models = motion.REGISTRY | sensors.REGISTRY
+    reports = []
+    with (
+        _Progress(f"{len(models)} models", "models") as progress,
+        ThreadPoolExecutor(os.cpu_count()) as pool,  # compilation takes most of the time
+    ):
+        for done in pool.map(lambda factory: ask(verify.build(factory)), models.values()):
+            reports.append(done)
+            progress(len(reports), len(models))
+    return reports
+
+
 def _shown(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
@@ -208,8 +267,8 @@ def _pick(kind: str, name: str, known: Mapping[str, _T]) -> _T:
 class _Progress:
     """A bar on a terminal; silent where the output is not one."""
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    def __init__(self, what: str, unit: str = "runs") -> None:
+        self._what, self._unit = what, unit
         self._began = time.perf_counter()
         self._shown = sys.stderr.isatty()
 
@@ -224,7 +283,7 @@ class _Progress:
         filled = round(30 * done / total)
         spent = time.perf_counter() - self._began
         bar = "█" * filled + "░" * (30 - filled)
-        self._draw(f"{self._what}: {bar} {done:,}/{total:,} runs, {spent:.0f} s")
+        self._draw(f"{self._what}: {bar} {done:,}/{total:,} {self._unit}, {spent:.0f} s")
 
     def __exit__(self, *_: object) -> None:
         self._draw("")

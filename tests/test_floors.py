@@ -18,8 +18,8 @@ FLOORS = [
     "types protocols slots noise derivatives",
     "motion sensors charts linearize association",
     "filters run simulate",
-    "consistency monte_carlo verify scenarios",
-    "datasets plot report cli __main__",
+    "consistency monte_carlo verify linearity scenarios",
+    "datasets plot report userfile cli __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
 ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
@@ -28,7 +28,7 @@ ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
 KEPT = {
     "matplotlib": {"plot"},
     "argparse": {"cli"},
-    "jax.config": {"cli", "__main__"},
+    "jax.config": {"cli", "__main__", "verify"},  # verify: float64 within a block, then as before
 }
 
 

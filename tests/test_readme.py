@@ -23,7 +23,7 @@ def reference():
 @pytest.mark.filterwarnings("default")
 def test_the_readme_runs(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     code = "\n".join(blocks).replace("steps=500", "steps=12").replace("runs=100", "runs=3")
     exec(compile(code, "README.md", "exec"), {})
     printed = capsys.readouterr().out

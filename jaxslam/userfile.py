@@ -1,0 +1,185 @@
+"""A user's own Python file: the models and claimed Jacobians it defines, loaded because named."""
+
+import contextlib
+import dataclasses
+import importlib.util
+import inspect
+import io
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.verify import Check, Report, build
+from jaxslam.verify.trouble import is_users, told
+
+CLAIMS = ("_jacobian", "_jacobians")
+"""A function of the name f + one of these claims the Jacobian of f."""
+
+
+class UnusableFile(ValueError):
+    """A file that cannot be loaded, or that defines nothing to verify."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """Something of a user's file to verify: the arguments of `verify_jacobians`."""
+
+    name: str
+    model: Motion | Sensor | Callable[..., Any]
+    jacobian: Callable[..., Any] | None = None
+    arguments: Mapping[str, Sequence[str] | int] | None = None
+    outputs: Sequence[str] | None = None
+
+
+class Printed(io.TextIOBase):
+    """Stands in for standard output, and remembers which line of a user's file wrote to it."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        """"file.py:12", in order, each once"""
+
+    def write(self, text: str) -> int:
+        """Swallow the text; note where it came from."""
+        frame = sys._getframe(1)
+        while frame.f_back is not None and not is_users(frame.f_code.co_filename):
+            frame = frame.f_back
+        place = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
+        if place not in self.lines:
+            self.lines.append(place)
+        return len(text)
+
+
+@contextlib.contextmanager
+def watched() -> Iterator[Printed]:
+    """Within the block, what is printed is noted rather than shown."""
+    printed = Printed()
+    with contextlib.redirect_stdout(printed):
+        yield printed
+
+
+def load(target: str) -> list[Target]:
+    """What `file.py` or `file.py:name` defines that can be verified, in its own order.
+
+    Taken are objects of the kinds `Motion` and `Sensor`; factories annotated to return one, whose
+    only required parameter is a noise covariance; and functions f beside which an f_jacobian (or
+    f_jacobians) stands, whose sizes may be given as f_arguments = {"pose": ("x [m]", …), …} and
+    f_outputs = ("range [m]", …).
+
+    Raises:
+        UnusableFile: with the line, if the file is missing, does not import, or has nothing.
+    """
+    path, name = _split(target)
+    module = _import(path)
+    found = [t for key in vars(module) if (t := _target(module, key)) is not None]
+    if name:
+        found = [t for t in found if t.name == name]
+        if not found and hasattr(module, name):
+            raise UnusableFile(
+                f"{path.name}: {name} is neither a Motion nor a Sensor nor a factory"
+                f" of one, and there is no {name}{CLAIMS[0]}"
+            )
+        if not found:
+            raise UnusableFile(f"{path.name}: there is no {name}")
+    if not found:
+        raise UnusableFile(
+            f"{path.name}: defines nothing to verify: no Motion, no Sensor, no function f with an "
+            "f_jacobian"
+        )
+    return found
+
+
+def verify_file(target: str, ask: Callable[..., Report]) -> list[Report]:
+    """Reports on all that `load` finds in a file; `ask` is `verify_jacobians` with its options.
+
+    Raises UnusableFile as `load` does, and if nothing of what it found can be verified.
+    """
+    with watched() as printed:
+        targets = load(target)
+    notes = tuple(f"{line} prints when the file is loaded" for line in printed.lines)
+    reports, unusable = [], []
+    for one in targets:
+        try:
+            reports.append(_verified(one, ask))
+        except ValueError as error:
+            unusable.append(str(error))
+            check = Check("can be verified", False, str(error))
+            reports.append(Report(one.name, "function", checks=(check,)))
+    if len(unusable) == len(targets):
+        raise UnusableFile("; ".join(unusable))
+    return [dataclasses.replace(reports[0], notes=notes), *reports[1:]]
+
+
+def _verified(target: Target, ask: Callable[..., Report]) -> Report:
+    """The report on a target; a model that prints as it runs is not pure, and is told so."""
+    with watched() as printed:
+        report = ask(
+            target.model, target.jacobian, arguments=target.arguments, outputs=target.outputs
+        )
+    where = ", ".join(printed.lines)
+    quiet = Check("prints nothing", not where, f"{where} prints" if where else "")
+    return dataclasses.replace(report, model=target.name, checks=(*report.checks, quiet))
+
+
+def _split(target: str) -> tuple[Path, str]:
+    file, colon, name = target.rpartition(":")
+    if not colon or not file.endswith(".py"):
+        file, name = target, ""
+    path = Path(file)
+    if path.suffix != ".py":
+        raise UnusableFile(f"{file}: expected a Python file, FILE.py or FILE.py:NAME")
+    if not path.is_file():
+        raise UnusableFile(f"{file}: no such file")
+    return path, name
+
+
+def _import(path: Path) -> ModuleType:
+    name = f"_jaxslam_user_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path.resolve())
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    sys.path.insert(0, str(path.resolve().parent))  # it may import its neighbours
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise UnusableFile(f"{path.name}:{error.lineno}: {error.msg}") from error
+    except (Exception, SystemExit) as error:
+        raise UnusableFile(f"does not import: {told(error)}") from error
+    finally:
+        sys.path.pop(0)
+        del sys.modules[name]
+    return module
+
+
+def _target(module: ModuleType, name: str) -> Target | None:
+    value = getattr(module, name)
+    if isinstance(value, Motion | Sensor):
+        return Target(name, value)
+    if not callable(value) or isinstance(value, type):
+        return None
+    claims = [getattr(module, name + end) for end in CLAIMS if hasattr(module, name + end)]
+    if claims:
+        arguments = getattr(module, f"{name}_arguments", None)
+        return Target(name, value, claims[0], arguments, getattr(module, f"{name}_outputs", None))
+    if getattr(value, "__module__", "") == module.__name__ and _makes_a_model(value):
+        try:
+            return Target(name, build(value))
+        except Exception as error:
+            raise UnusableFile(f"the factory {name}: {told(error)}") from error
+    return None
+
+
+def _makes_a_model(factory: Callable[..., Any]) -> bool:
+    """Whether it says so, as in `def mine(noise_cov, mount=…) -> Sensor`."""
+    try:
+        signature = inspect.signature(factory)
+    except (TypeError, ValueError):
+        return False
+    returns = signature.return_annotation
+    required = [p for p in signature.parameters.values() if p.default is p.empty]
+    named = returns if isinstance(returns, str) else getattr(returns, "__name__", "")
+    return named.rpartition(".")[2] in ("Motion", "Sensor") and len(required) == 1

@@ -1,0 +1,98 @@
+"""Difference quotients with an error estimate: the Jacobian that sees only a function's values."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+Batch = Callable[..., NDArray[np.generic]]
+"""Arrays (B, n), one an argument, -> values (B, m)."""
+
+_HALVINGS = 24
+_LARGEST = 0.25
+_ORDERS = 6
+
+
+class Quotient(NamedTuple):
+    """A Jacobian by differences, and how far it can be trusted."""
+
+    value: Values
+    """(S, m, n)"""
+    error: Values
+    """(S, m, n) estimated; inf where the quotients do not converge."""
+
+
+def quotients(
+    function: Batch,
+    arguments: tuple[Values, ...],
+    which: int,
+    periods: Values,
+    halvings: int = _HALVINGS,
+) -> Quotient:
+    """∂f/∂argument at S samples: central differences, Richardson's extrapolation, its error.
+
+    Steps h = ¼, ⅛, … are extrapolated to h → 0 (orders 2, 4, …, as in Ridders 1982); of all entries
+    of the tableau the one with the least estimated error is kept, where the estimate joins the
+    change from its neighbours to the rounding of f and of the argument over h.
+
+    Args:
+        function: float64 in and out, all columns, steps and samples in one call.
+        arguments: (S, n_k) each.
+        which: the argument to differentiate by.
+        periods: (m,) period of an output on a circle, inf on a line; a jump by one is undone.
+        halvings: how many steps.
+    """
+    x = arguments[which]
+    count, n = x.shape
+    if n == 0:
+        none = np.zeros((count, len(periods), 0))
+        return Quotient(none, none)
+    steps = _LARGEST * 0.5 ** np.arange(halvings)
+    moves = steps[:, None, None] * np.eye(n)  # (H, n, n)
+    ends = x[:, None, None, None] + np.stack([moves, -moves])[None]  # (S, 2, H, n, n)
+    flat = [np.repeat(a, 2 * halvings * n, axis=0) for a in arguments]
+    flat[which] = ends.reshape(-1, n)
+    values = np.asarray(function(*flat), np.float64).reshape(count, 2, halvings, n, -1)
+    rise = values[:, 0] - values[:, 1]
+    turns = np.where(np.isfinite(periods), periods, 1.0)
+    whole = turns * np.round(rise / turns)
+    rise = np.where(np.isfinite(periods), rise - whole, rise)
+    # The step that was taken, rounding of x ± h included.
+    width = (ends[:, 0] - ends[:, 1])[:, :, np.arange(n), np.arange(n)]  # (S, H, n)
+    level = np.moveaxis(rise / width[..., None], 1, 0)  # (H, S, n, m)
+    eps = np.finfo(np.float64).eps
+    size = np.abs(values).max(axis=(1, 2)) + np.abs(level).max(axis=0) * np.abs(x)[:, :, None]
+    rounding = eps * size[None] / steps[:, None, None, None]
+
+    best = level[0]
+    least = np.full(best.shape, np.inf)
+    for order in range(1, _ORDERS):
+        factor = 4.0**order
+        finer = (factor * level[1:] - level[:-1]) / (factor - 1)
+        change = np.maximum(np.abs(finer - level[1:]), np.abs(finer - level[:-1]))
+        error = change + rounding[order:]
+        error = np.where(np.isfinite(error), error, np.inf)
+        pick = np.argmin(error, axis=0)[None]
+        candidate = np.take_along_axis(error, pick, axis=0)[0]
+        better = candidate < least
+        best = np.where(better, np.take_along_axis(finer, pick, axis=0)[0], best)
+        least = np.where(better, candidate, least)
+        level = finer
+    return Quotient(np.swapaxes(best, 1, 2), np.swapaxes(least, 1, 2))
+
+
+def complex_step(
+    function: Batch, arguments: tuple[Values, ...], which: int, step: float = 1e-30
+) -> Values:
+    """∂f/∂argument (S, m, n) as Im f(x + ih)/h: no cancellation (Squire & Trapp 1998).
+
+    Only for a function that is analytic and takes complex numbers; the caller makes sure.
+    """
+    x = arguments[which]
+    count, n = x.shape
+    flat = [np.repeat(a, n, axis=0).astype(np.complex128) for a in arguments]
+    flat[which] = (x[:, None] + 1j * step * np.eye(n)).reshape(-1, n)
+    values = np.asarray(function(*flat)).reshape(count, n, -1)
+    return np.swapaxes(values.imag / step, 1, 2)

@@ -1,0 +1,213 @@
+"""What a verification says: findings on Jacobians, other checks, and their text."""
+
+import math
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+_SHOWN = 3
+"""wrong entries of a Jacobian that are shown with their values; the others by name"""
+
+
+@dataclass(frozen=True)
+class WrongEntry:
+    """An entry of a Jacobian on which the methods differ, and where they do worst."""
+
+    row: str
+    """the output, with its unit"""
+    column: str
+    """the entry of the argument, with its unit"""
+    states: int
+    """at how many states it is wrong"""
+    precision: str
+    """float64 or float32: where it is worst"""
+    label: str
+    """what is special about that state"""
+    state: dict[str, list[float]]
+    values: dict[str, float]
+    """the entry there, by each method"""
+    dissent: tuple[str, ...]
+    """the methods that disagree with the others there"""
+
+    def lines(self, samples: int) -> Iterator[str]:
+        """For a human."""
+        odd = (
+            f"{' and '.join(self.dissent)} {'disagrees' if len(self.dissent) == 1 else 'disagree'}"
+        )
+        who = f"{odd} with the others" if self.dissent else "no two agree"
+        yield f"entry ({self.row}, {self.column}): {who}, at {self.states} of {samples} states"
+        yield "  " + ", ".join(f"{how} {value:.9g}" for how, value in self.values.items())
+        at = ", ".join(f"{k} = ({', '.join(f'{v:.6g}' for v in x)})" for k, x in self.state.items())
+        yield f"  {self.precision}, {self.label}: {at}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One Jacobian: how far the ways of computing it differ, and where they must not."""
+
+    function: str
+    argument: str
+    passed: bool
+    methods: tuple[str, ...]
+    """the ways it was computed: jacfwd, jacrev, hand, differences"""
+    absolute: float
+    """worst difference among jacfwd, jacrev and hand, float64"""
+    relative: float
+    """the same over the largest entry of the Jacobian's row at that state"""
+    tolerance: float
+    float32: float | None
+    """the worst relative difference in float32; None where it was not computed"""
+    float32_tolerance: float
+    differences: float | None
+    """worst relative difference from the quotients, where they converge"""
+    differences_tolerance: float
+    quotient: str
+    """complex step, or central differences"""
+    samples: int
+    no_derivative: int
+    """samples at which the quotients do not converge, so that they say nothing"""
+    worst_state: dict[str, Any]
+    """label, entry and state where a difference is largest beside its tolerance"""
+    wrong_entries: tuple[WrongEntry, ...]
+    """every entry outside its tolerance at some state, the one that is so at most states first"""
+
+    @property
+    def name(self) -> str:
+        """As in "observe by pose"."""
+        return f"{self.function} by {self.argument}"
+
+    def lines(self) -> Iterator[str]:
+        """For a human, more of it where it failed."""
+        single = "" if self.float32 is None else f", float32 {_short(self.float32)}"
+        quotient = ""
+        if self.differences is not None:
+            quotient = f", {self.quotient} {_short(self.differences)}"
+        odd = f" ({self.no_derivative} without a derivative)" if self.no_derivative else ""
+        verdict = "ok  " if self.passed else "FAIL"
+        worst = f"worst {_short(self.absolute)} abs, {_short(self.relative)} rel"
+        yield f"{verdict}  {self.name}: {worst}{single}{quotient}; {self.samples} states{odd}"
+        for entry in self.wrong_entries[:_SHOWN]:
+            yield from (f"      {line}" for line in entry.lines(self.samples))
+        if len(self.wrong_entries) > _SHOWN:
+            rest = ", ".join(f"({e.row}, {e.column})" for e in self.wrong_entries[_SHOWN:])
+            yield f"      and {rest}"
+
+
+@dataclass(frozen=True)
+class Check:
+    """Something other than a Jacobian that must hold."""
+
+    name: str
+    passed: bool
+    detail: str = ""
+
+    def lines(self) -> Iterator[str]:
+        """For a human."""
+        detail = f": {self.detail}" if self.detail else ""
+        yield f"{'ok  ' if self.passed else 'FAIL'}  {self.name}{detail}"
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that was found out about one model; `print` it, or ask `passed`."""
+
+    model: str
+    kind: str
+    findings: tuple[Finding, ...] = ()
+    checks: tuple[Check, ...] = ()
+    linearity: float | None = None
+    """of a model: median of `linearity_index` over the random states, for standard deviations of
+    0.1 (0.05 of [rad] and [1/m])"""
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing failed, and anything was looked at."""
+        return bool(self.findings or self.checks) and self.failures == 0
+
+    @property
+    def failures(self) -> int:
+        """How many Jacobians and other checks failed."""
+        verdicts = [f.passed for f in self.findings] + [c.passed for c in self.checks]
+        return verdicts.count(False)
+
+    def __str__(self) -> str:
+        """The report for a human."""
+        verdict = "verified" if self.passed else f"{self.failures} FAILED"
+        head = f"{self.kind} {self.model}: {verdict}"
+        lines = [head]
+        for finding in self.findings:
+            lines += [f"  {line}" for line in finding.lines()]
+        for check in self.checks:
+            if not check.passed:
+                lines += [f"  {line}" for line in check.lines()]
+        held = "; ".join(check.name for check in self.checks if check.passed)
+        if held:
+            lines += textwrap.wrap(f"  ok    {held}", 100, subsequent_indent=" " * 8)
+        lines += [f"  note  {note}" for note in self.notes]
+        if self.linearity is not None:
+            lines.append(f"  linearity index {self.linearity:.3g}, median (3 σ of 0.1 m, 0.05 rad)")
+        return "\n".join(lines)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: names, numbers, strings; None for what is not finite."""
+        plain: dict[str, Any] = _plain(
+            {
+                "model": self.model,
+                "kind": self.kind,
+                "passed": self.passed,
+                "jacobians": [asdict(finding) for finding in self.findings],
+                "checks": [asdict(check) for check in self.checks],
+                "linearity_index": self.linearity,
+                "notes": self.notes,
+            }
+        )
+        return plain
+
+
+def table(reports: Sequence[Report]) -> str:
+    """One line a model: worst relative differences of its Jacobians, and what it came to."""
+    head = ("", "Jacobians", "float64", "float32", "differences", "checks", "linearity", "")
+    lines = [head]
+    for report in reports:
+        lines.append(
+            (
+                report.model,
+                str(len(report.findings)),
+                _worst([f.relative for f in report.findings]),
+                _worst([f.float32 for f in report.findings]),
+                _worst([f.differences for f in report.findings]),
+                str(len(report.checks)),
+                "-" if report.linearity is None else f"{report.linearity:.3g}",
+                "ok" if report.passed else f"{report.failures} FAILED",
+            )
+        )
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    text = [
+        "  ".join(
+            cell.ljust(width) if i in (0, len(head) - 1) else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]
+    return "\n".join([text[0], "-" * max(map(len, text)), *text[1:]])
+
+
+def _worst(values: Sequence[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return _short(max(known)) if known else "-"
+
+
+def _short(value: float) -> str:
+    return f"{value:.1e}" if value else "0"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value

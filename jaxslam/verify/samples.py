@@ -1,0 +1,192 @@
+"""Where models are tried: random states, and the ones where planar models go wrong."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxslam.protocols import Sensor
+from jaxslam.verify.subject import POSE, Argument
+
+Values = NDArray[np.float64]
+
+FAR = 1e5
+"""Metres from the origin: survey coordinates."""
+OUT_OF_SIGHT = 16.0
+"""Metres from robot to a far landmark, along each axis."""
+NEAR = 2.0**-10
+"""Metres from robot to landmark; a power of two, so that the offset is exact in float32 too."""
+_SEAM = 1e-9
+
+# One coordinate at a time takes these, whatever the others are. 0.499 and 0.501 lie on both sides
+# of where `angles.sinc` changes from its series to the closed form.
+_HARD = {
+    "[rad]": (0.0, _SEAM, -_SEAM, 1e-4, np.pi - _SEAM, _SEAM - np.pi, np.pi, np.pi / 2),
+    "[rad/s]": (0.0, _SEAM, -_SEAM, 1e-4, 0.499, 0.501),
+    "[m/s]": (0.0, _SEAM),
+    "[m]": (0.0,),
+    "[s]": (0.0,),
+    "[1/m]": (0.0, _SEAM, -_SEAM, -0.5),
+}
+
+
+Group = tuple[str, tuple[Values, ...]]
+"""A label, and states (S, n) an argument."""
+
+
+class Samples(NamedTuple):
+    """S states: an array (S, n) an argument, and what is special about each."""
+
+    values: tuple[Values, ...]
+    labels: tuple[str, ...]
+
+
+def of_arguments(arguments: tuple[Argument, ...], count: int, seed: int) -> Samples:
+    """By the units: random, each coordinate at its hard values, near, far, and zero."""
+    rng = np.random.default_rng(seed)
+    base = tuple(_draw(rng, argument, count) for argument in arguments)
+    groups: list[Group] = [("random", base)]
+    for k, argument in enumerate(arguments):
+        groups += list(_one_at_a_time(base, k, argument))
+        if not _is_place(argument):
+            groups.append((f"zero {argument.name}", _replaced(base, k, 0.0 * base[k][:4], 4)))
+    others = [k for k, argument in enumerate(arguments) if not _is_place(argument)]
+    if len(others) > 1:
+        still = tuple(a[:2] * (k not in others) for k, a in enumerate(base))
+        groups.append((f"zero {' and '.join(arguments[k].name for k in others)}", still))
+    places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
+    if places:
+        shift = np.zeros((2, 2)) + [[FAR, -FAR], [-FAR, FAR]]
+        groups.append(("large coordinates", tuple(_shifted(base, places, shift))))
+    for k in places[1:]:
+        for distance in (NEAR, 2.0**-4):
+            close = base[k][:2].copy()
+            close[:, :2] = base[places[0]][:2, :2] + distance * np.array([[1, 0.5], [-0.25, 1]])
+            groups.append((f"{arguments[k].name} close", _replaced(base, k, close, 2)))
+    return _joined(groups)
+
+
+def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
+    """States (pose, landmark) for `observe`, and (pose, measurement, free) for `invert`.
+
+    Landmarks are placed by the sensor's own `embed` and `invert`, seen first from another pose than
+    the present one; every coordinate of theirs also takes its hard values.
+    """
+    rng = np.random.default_rng(seed)
+    embed = jax.jit(jax.vmap(sensor.embed))
+    place = jax.jit(jax.vmap(sensor.invert))
+
+    def at(poses: Values, points: Values) -> Values:
+        return np.asarray(embed(poses, points), np.float64)
+
+    pose = _draw(rng, Argument("pose", POSE), count)
+    elsewhere = _draw(rng, Argument("pose", POSE), count)
+    offset = rng.normal(size=(count, 2)) * 4
+    first = pose.copy()
+    first[:, :2] = np.round(first[:, :2] * 64) / 64
+    landmark = at(elsewhere, pose[:, :2] + offset)
+    base = (pose, landmark)
+    groups: list[Group] = [("random", base)]
+    for k, argument in enumerate((Argument("pose", POSE), Argument("landmark", sensor.landmark))):
+        groups += list(_one_at_a_time(base, k, argument))
+
+    mean = np.asarray(sensor.free.mean, np.float64)
+    root = np.linalg.cholesky(np.asarray(sensor.free.cov, np.float64)) if len(mean) else mean
+    s = mean + rng.normal(size=(count, len(mean))) @ np.reshape(root, (len(mean), len(mean))).T
+    spread = np.stack([_one(rng, name, count) for name in sensor.measurements], axis=1)
+    metres = np.array([name.endswith("[m]") for name in sensor.measurements])
+    z = np.where(metres, np.abs(spread), spread)
+    few = slice(0, 4)
+    if sensor.landmark:
+        turn = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=1)
+        close = first[few, :2] + NEAR * np.sign(offset[few])
+        ahead = pose[few, :2] - 5 * turn[few]
+        groups += [
+            ("landmark close to the robot", (first[few], at(first[few], close))),
+            ("landmark behind, on the seam", (pose[few], at(elsewhere[few], ahead))),
+            ("landmark at the robot", (pose[few], at(pose[few], pose[few, :2]))),
+            ("landmark far", (pose[few], at(pose[few], pose[few, :2] + OUT_OF_SIGHT))),
+        ]
+        for label, scale in (("landmark close to the sensor", NEAR), ("landmark at the sensor", 0)):
+            seen = np.where(metres, z[few] * scale, z[few])
+            near = np.asarray(place(pose[few], seen, s[few] * scale), np.float64)
+            groups.append((label, (pose[few], near)))
+    there = np.array([[FAR, -FAR], [-FAR, FAR]])
+    away = pose[:2].copy()
+    away[:, :2] += there
+    groups.append(("large coordinates", (away, at(away, away[:, :2] + offset[:2]))))
+    observed = _joined(groups)
+
+    back: list[Group] = [("random", (pose, z, s))]
+    back += list(_one_at_a_time((pose, z, s), 0, Argument("pose", POSE)))
+    back += list(_one_at_a_time((pose, z, s), 1, Argument("measurement", sensor.measurements)))
+    back.append(("zero measurement", (pose[few], 0 * z[few], s[few])))
+    if len(mean):
+        back.append(("free coordinates zero", (pose[few], z[few], 0 * s[few])))
+    back.append(("large coordinates", (away, z[:2], s[:2])))
+    return observed, _joined(back)
+
+
+def _one(rng: np.random.Generator, name: str, count: int) -> Values:
+    """(count,) draws of a coordinate by its unit."""
+    unit = name.split(" ")[-1]
+    if "steering" in name:  # a wheel does not turn to the side
+        return rng.uniform(-0.8, 0.8, count)
+    if unit == "[rad]":
+        return rng.uniform(-np.pi, np.pi, count)
+    if unit == "[deg]":
+        return rng.uniform(-180, 180, count)
+    if unit == "[s]":
+        return np.abs(rng.normal(size=count))
+    if unit == "[1/m]":
+        return 0.3 + 0.2 * rng.normal(size=count)
+    return rng.normal(size=count) * (3.0 if unit == "[m]" else 1.0)
+
+
+def _draw(rng: np.random.Generator, argument: Argument, count: int) -> Values:
+    columns = [_one(rng, name, count) for name in argument.entries]
+    table = np.stack(columns, axis=1) if columns else np.zeros((count, 0))
+    table = argument.scale * table
+    if argument.scale != 1:  # noise: half of the states are nominal
+        table[::2] = 0
+    return table
+
+
+def _is_place(argument: Argument) -> bool:
+    return argument.entries[:2] == POSE[:2]
+
+
+def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> Iterable[Group]:
+    for column, name in enumerate(argument.entries):
+        hard = np.array(_HARD.get(name.split(" ")[-1], ()))
+        if "steering" in name:
+            hard = hard[np.abs(hard) < 1]
+        if len(hard) and argument.scale == 1:
+            count = len(hard)
+            rows = np.arange(count) % len(base[which])
+            moved = base[which][rows].copy()
+            moved[:, column] = hard
+            for i, value in enumerate(hard):
+                here = tuple(a[rows[i : i + 1]] for a in base)
+                label = f"{argument.name} {name.split(' ')[0]} = {value:.4g}"
+                yield label, _replaced(here, which, moved[i : i + 1], 1)
+
+
+def _replaced(base: tuple[Values, ...], which: int, new: Values, count: int) -> tuple[Values, ...]:
+    return tuple(new[:count] if k == which else a[:count] for k, a in enumerate(base))
+
+
+def _shifted(base: tuple[Values, ...], places: list[int], shift: Values) -> Iterable[Values]:
+    for k, a in enumerate(base):
+        rows = a[: len(shift)].copy()
+        if k in places:
+            rows[:, :2] += shift
+        yield rows
+
+
+def _joined(groups: list[Group]) -> Samples:
+    labels = tuple(label for label, parts in groups for _ in range(len(parts[0])))
+    parts = zip(*(parts for _, parts in groups), strict=True)
+    return Samples(tuple(np.concatenate(part) for part in parts), labels)

@@ -1,0 +1,135 @@
+"""What is verified: functions whose arguments and outputs have names, of a model or alone."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxslam.protocols import Motion, Sensor
+
+POSE = ("x [m]", "y [m]", "theta [rad]")
+POINT = ("x [m]", "y [m]")
+GLOSSARY = {
+    "pose": POSE,
+    "frame": POSE,
+    "landmark": POINT,
+    "l": POINT,
+    "point": POINT,
+}
+"""What an argument of that name holds, unless its user says otherwise."""
+
+_PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
+
+
+@dataclass(frozen=True)
+class Argument:
+    """One argument of a function, its entries named with units."""
+
+    name: str
+    entries: tuple[str, ...]
+    scale: float = 1.0
+    """of its samples; noise is small"""
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of vectors, and the Jacobians claimed for it."""
+
+    name: str
+    call: Callable[..., jax.Array]
+    arguments: tuple[Argument, ...]
+    outputs: tuple[str, ...]
+    hand: Callable[..., Any] | None = None
+    """arguments -> one Jacobian an argument (None where none is claimed), or, for a claim about the
+    first argument or all of them side by side, one array."""
+
+    @property
+    def periods(self) -> NDArray[np.float64]:
+        """(m,) of outputs on a circle, inf of those on a line."""
+        return periods(self.outputs)
+
+
+def periods(names: Sequence[str]) -> NDArray[np.float64]:
+    """2π of what is in [rad], 360 of [deg], inf of all else, (m,)."""
+    return np.array([_PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
+
+
+def motion_functions(motion: Motion) -> tuple[Function]:
+    """`step` by pose, control and noise."""
+    arguments = (
+        Argument("pose", POSE),
+        Argument("control", motion.controls),
+        Argument("noise", motion.noises, scale=0.1),
+    )
+    return (Function("step", motion.step, arguments, POSE, motion.jacobians),)
+
+
+def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
+    """`observe` by pose and landmark; `invert` by pose, measurement and what is free."""
+    pose, landmark = Argument("pose", POSE), Argument("landmark", sensor.landmark)
+    free = tuple(f"s[{k}]" for k in range(len(sensor.free.mean)))
+    inverse = (pose, Argument("measurement", sensor.measurements), Argument("free", free))
+    return (
+        Function(
+            "observe",
+            sensor.observe,
+            (pose, landmark),
+            sensor.measurements,
+            sensor.observe_jacobians,
+        ),
+        Function("invert", sensor.invert, inverse, sensor.landmark, sensor.invert_jacobians),
+    )
+
+
+def plain_function(
+    call: Callable[..., jax.Array],
+    jacobian: Callable[..., Any] | None,
+    arguments: Mapping[str, Sequence[str] | int] | None = None,
+    outputs: Sequence[str] | None = None,
+) -> Function:
+    """Any function of vectors, by the names of its parameters.
+
+    Raises ValueError where the size of an argument is neither given nor known by its name.
+    """
+    name = getattr(call, "__name__", type(call).__name__)
+    given = dict(arguments or {})
+    if given and not _has_signature(call):
+        parameters = list(given)
+    else:
+        parameters = [
+            p.name
+            for p in inspect.signature(call).parameters.values()
+            if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+        ]
+    if unknown := [key for key in given if key not in parameters]:
+        raise ValueError(
+            f"{name}: no parameter {', '.join(unknown)}; it has {', '.join(parameters) or 'none'}"
+        )
+    if not parameters:
+        raise ValueError(f"{name}: takes no argument to differentiate by")
+    named = []
+    for parameter in parameters:
+        entries = given.get(parameter, GLOSSARY.get(parameter))
+        if entries is None:
+            raise ValueError(
+                f"{name}: how long is its argument {parameter!r}? Say so with arguments="
+                f'{{"{parameter}": ("v [m/s]", …)}}, or in a file with {name}_arguments = …'
+            )
+        if isinstance(entries, int):
+            entries = tuple(f"{parameter}[{k}]" for k in range(entries))
+        if isinstance(entries, str) or not all(isinstance(entry, str) for entry in entries):
+            raise ValueError(f"{name}: {parameter}: expected a tuple of names, got {entries!r}")
+        named.append(Argument(parameter, tuple(entries)))
+    return Function(name, call, tuple(named), tuple(outputs or ()), jacobian)
+
+
+def _has_signature(call: Callable[..., Any]) -> bool:
+    try:
+        inspect.signature(call)
+    except (TypeError, ValueError):
+        return False
+    return True

@@ -1,0 +1,121 @@
+"""Every Jacobian of every registered model, four ways, and proof that the verifier would notice."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxslam import motion, sensors
+from jaxslam.protocols import Motion
+from jaxslam.verify import build, verify_jacobians
+from jaxslam.verify.judge import judge
+from jaxslam.verify.verifier import FLOAT32_TOLERANCE, TOLERANCE, examine
+
+MODELS = motion.REGISTRY | sensors.REGISTRY
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def made(request):
+    """A registered model, all that was computed about it, and what that was judged to be."""
+    model = build(MODELS[request.param])
+    examined = examine(model)
+    findings = [f for one in examined.evaluated for f in judge(one, TOLERANCE, FLOAT32_TOLERANCE)]
+    return SimpleNamespace(
+        model=model,
+        findings=findings,
+        checks=examined.checks,
+        evaluated=examined.evaluated,
+        labels=[one.samples.labels for one in examined.evaluated],
+    )
+
+
+def test_everything_is_verified(made):
+    assert [str(f.wrong_entries) for f in made.findings if not f.passed] == []
+    assert [(c.name, c.detail) for c in made.checks if not c.passed] == []
+    assert len(made.checks) >= 8
+
+
+def test_hand_is_autodiff_at_every_sample(made):
+    """To 1e-12 in float64 and 1e-5 in float32, relative to the row; every argument is claimed."""
+    functions = [e.function for e in made.evaluated]
+    assert len(made.findings) == sum(len(f.arguments) for f in functions)
+    for finding in made.findings:
+        assert finding.methods == ("jacfwd", "jacrev", "hand", "differences")
+        assert finding.relative <= 1e-12
+        assert finding.float32 <= 1e-5
+        assert finding.samples >= 30
+        # A state without a derivative is a landmark at the robot or the sensor, nothing else.
+        assert finding.no_derivative <= 8
+
+
+def test_hard_states_are_among_the_samples(made):
+    labels = {label for group in made.labels for label in group}
+    for part in ("random", "pose theta = 3.142", "pose theta = -3.142", "large coordinates"):
+        assert part in labels
+    if isinstance(made.model, Motion):
+        assert "zero control" in labels
+        assert "zero control and noise" in labels
+        rates = [c.split(" ")[0] for c in made.model.controls if c.endswith("[rad/s]")]
+        assert all(f"control {rate} = 0" in labels for rate in rates)
+    elif made.model.landmark:
+        at = ("close to the robot", "close to the sensor", "at the robot", "behind, on the seam")
+        assert all(f"landmark {where}" in labels for where in at)
+        if "rho [1/m]" in made.model.landmark:
+            assert {"landmark rho = 0", "landmark rho = -0.5"} <= labels
+
+
+def mutations(jacobian):
+    """(row, column, mutant) of every entry of (S, m, n): sign flipped, and 1 % off.
+
+    An entry that is zero everywhere has neither; it is given a hundredth of its row instead.
+    """
+    for i in range(jacobian.shape[1]):
+        row = np.abs(jacobian[:, i]).max(axis=1, initial=0)
+        for j in range(jacobian.shape[2]):
+            entry = jacobian[:, i, j]
+            wrong = [-entry, 1.01 * entry] if entry.any() else [np.where(row > 0, row, 1) / 100]
+            for values in wrong:
+                mutant = jacobian.copy()
+                mutant[:, i, j] = values
+                yield i, j, mutant
+
+
+def test_every_wrong_entry_is_caught_and_named(made):
+    tried = 0
+    for evaluated in made.evaluated:
+        function = evaluated.function
+        for k, evaluation in enumerate(evaluated.by_argument):
+            for i, j, mutant in mutations(evaluation.methods["hand"]):
+                changed = evaluation._replace(methods=evaluation.methods | {"hand": mutant})
+                by_argument = list(evaluated.by_argument)
+                by_argument[k] = changed
+                findings = judge(
+                    evaluated._replace(by_argument=tuple(by_argument)), TOLERANCE, FLOAT32_TOLERANCE
+                )
+                assert [f.passed for f in findings] == [n != k for n in range(len(findings))]
+                (wrong,) = findings[k].wrong_entries
+                name = (function.outputs[i], function.arguments[k].entries[j])
+                assert (wrong.row, wrong.column) == name
+                assert wrong.dissent == ("hand",)
+                tried += 1
+    assert tried >= 4
+
+
+@pytest.mark.parametrize("name", ["velocity", "range_bearing"])
+def test_a_wrong_model_is_caught_from_end_to_end(name):
+    """The same through the front door, for two entries of two models."""
+    model = build(MODELS[name])
+    field = "jacobians" if isinstance(model, Motion) else "observe_jacobians"
+    right = getattr(model, field)
+
+    def wrong(*arguments):
+        first, *others = right(*arguments)
+        return (first.at[0, -1].multiply(-1.0).at[0, 0].multiply(1.01), *others)
+
+    report = verify_jacobians(dataclasses.replace(model, **{field: wrong}))
+    assert [f.name for f in report.findings if not f.passed] == [report.findings[0].name]
+    named = {(e.row.split(" ")[0], e.column) for e in report.findings[0].wrong_entries}
+    first = "x" if isinstance(model, Motion) else "range"
+    assert named == {(first, "x [m]"), (first, "theta [rad]")}
+    assert f"{first} [m], x [m]): hand disagrees with the others" in str(report)

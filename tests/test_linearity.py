@@ -1,0 +1,216 @@
+"""The linearity index: closed forms, brute force, units, and the guide's claim on inverse depth."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam import motion, sensors
+from jaxslam.linearity import motion_linearity, sensor_linearity
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+DTYPES = [np.float32, np.float64]
+
+
+def curved(x):
+    """An ellipse's worth of bend in two inputs, and a straight output."""
+    return jnp.stack([jnp.sin(x[0]) * jnp.exp(x[1] / 2), x[0] - 3 * x[1], x[0] * x[1]])
+
+
+def linearity_index(f, x, cov, **options):
+    """Compiled, which is quicker than op by op."""
+
+    def go(x, cov):
+        return jaxslam.linearity_index(f, x, cov, **options)
+
+    return jax.jit(go)(x, jnp.asarray(cov))
+
+
+X, COV = np.array([0.4, -0.3]), np.array([[0.04, 0.01], [0.01, 0.09]])
+
+
+def test_a_linear_function_has_index_zero():
+    out = linearity_index(lambda x: jnp.stack([2 * x[0] - x[1], x[1] + 5]), X, COV)
+    assert out.hessian == 0
+    assert out.sampled < 1e-14
+
+
+@pytest.mark.parametrize("sigmas", [1.0, 3.0])
+def test_a_parabola_has_its_closed_form(sigmas):
+    """f = x²: bend n²σ², reach 2|x|nσ."""
+    x, sigma = 1.5, 0.2
+    out = linearity_index(lambda x: x**2, np.array([x]), np.array([[sigma**2]]), sigmas=sigmas)
+    for value in (out.hessian, out.sampled, out.hessian_rows[0], out.sampled_rows[0]):
+        np.testing.assert_allclose(value, sigmas * sigma / (2 * x), rtol=1e-12)
+
+
+def test_noise_that_hides_the_bend_lowers_it():
+    x, sigma, noise = 1.5, 0.2, 0.7
+    out = linearity_index(
+        lambda x: x**2, np.array([x]), np.array([[sigma**2]]), noise_cov=[[noise**2]]
+    )
+    reach = 3 * np.hypot(2 * x * sigma, noise)
+    np.testing.assert_allclose([out.hessian, out.sampled], 9 * sigma**2 / reach, rtol=1e-12)
+
+
+def test_against_brute_force():
+    """Every direction and radius of the region, in NumPy."""
+
+    def f(x):
+        return np.stack([np.sin(x[:, 0]) * np.exp(x[:, 1] / 2), x[:, 0] * x[:, 1]], axis=1)
+
+    a, b = X
+    e = np.exp(b / 2)
+    slope = np.array([[np.cos(a) * e, np.sin(a) * e / 2], [b, a]])
+    around = np.linspace(0, 2 * np.pi, 721)
+    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
+    for sigmas in (1.0, 0.01):
+        worst = np.zeros(2)
+        for radius in np.linspace(0, sigmas, 41):
+            delta = radius * circle @ np.linalg.cholesky(COV).T
+            bend = np.abs(f(X + delta) - f(X[None]) - delta @ slope.T)
+            worst = np.maximum(worst, bend.max(axis=0))
+        reach = sigmas * np.sqrt(np.einsum("ij,jk,ik->i", slope, COV, slope))
+        out = linearity_index(curved, X, COV, sigmas=sigmas)
+        rows = np.array([0, 2])
+        # The points tried are inside the region, and among them is nearly the worst one.
+        assert np.all(out.sampled_rows[rows] <= worst / reach * 1.001)
+        np.testing.assert_allclose(out.sampled_rows[rows], worst / reach, rtol=0.02)
+    # In the small region the Hessian is all there is.
+    np.testing.assert_allclose(out.hessian_rows[rows], worst / reach, rtol=2e-3)
+    assert out.hessian == out.hessian_rows.max()
+
+
+def test_units_do_not_matter():
+    scale = np.array([1000.0, 0.01])
+
+    def rescaled(y):
+        return curved(y / scale)
+
+    one = linearity_index(curved, X, COV)
+    other = linearity_index(rescaled, X * scale, COV * np.outer(scale, scale))
+    np.testing.assert_allclose(other.hessian_rows, one.hessian_rows, rtol=1e-10, atol=1e-13)
+
+
+def test_a_known_input_does_not_count():
+    out = linearity_index(curved, X, np.diag([0.04, 0.0]))
+    alone = linearity_index(lambda a: curved(jnp.stack([a[0], X[1]])), X[:1], [[0.04]])
+    np.testing.assert_allclose(out.hessian_rows, alone.hessian_rows, rtol=1e-12)
+    nothing = linearity_index(curved, X, np.zeros((2, 2)))
+    assert nothing.hessian == nothing.sampled == 0
+
+
+def test_where_there_is_a_bend_and_no_slope():
+    def distance(x):
+        return jnp.stack([x[0] ** 2 + x[1] ** 2])
+
+    out = linearity_index(distance, np.zeros(2), np.eye(2))
+    assert np.isinf(out.hessian)
+    assert np.isinf(out.sampled)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_jit_vmap_dtype_and_gradient(dtype):
+    states = np.array([X, [1.0, 2.0], [0.0, 0.0]], dtype)
+    cov = COV.astype(dtype)
+    batch = jax.jit(jax.vmap(lambda x: linearity_index(curved, x, cov)))(states)
+    for leaf in batch:
+        assert leaf.dtype == dtype
+    alone = jax.jit(lambda x: jax.lax.map(lambda x: jaxslam.linearity_index(curved, x, COV), x))(
+        states.astype(np.float64)
+    )
+    for i in range(len(states)):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], alone)
+        rtol = 1e-4 if dtype == np.float32 else 1e-10
+        np.testing.assert_allclose(batch.hessian[i], one.hessian, rtol=rtol)
+        np.testing.assert_allclose(batch.sampled[i], one.sampled, rtol=rtol)
+
+    def worst(cov):
+        out = linearity_index(curved, states[0], cov)
+        return out.hessian + out.sampled
+
+    slope = jax.jit(jax.grad(worst))(cov)
+    assert np.isfinite(slope).all()
+    singular = jax.jit(jax.grad(worst))(np.diag([0.04, 0.0]).astype(dtype))
+    assert np.isfinite(singular).all()
+
+
+def test_angles_are_compared_on_the_circle():
+    """A heading next to the seam bends no more than one far from it."""
+    robot = motion.velocity(np.diag([0.1, 0.05, 0.05]) ** 2)
+    u, cov = np.array([1.0, 0.3, 0.5]), np.diag([0.1, 0.1, 0.2]) ** 2
+    of = jax.jit(lambda pose: motion_linearity(robot, pose, u, cov))
+    usual, seam = of(np.array([1.0, 2.0, 0.5])), of(np.array([1.0, 2.0, np.pi - 1e-3]))
+    assert usual.sampled_rows[2] < 1e-12
+    assert seam.sampled_rows[2] < 1e-12
+
+    laser = sensors.range_bearing(np.diag([0.1, 0.05]) ** 2)
+    pose, cov = np.zeros(3), np.diag([0.01, 0.01, 0.1, 0.01, 0.01]) ** 2
+    of = jax.jit(lambda point: sensor_linearity(laser, pose, point, cov))
+    behind, ahead = of(np.array([-3.0, 1e-9])), of(np.array([3.0, 1e-9]))
+    np.testing.assert_allclose(behind.sampled, ahead.sampled, rtol=0.05)
+    noisy = sensor_linearity(laser, pose, np.array([3.0, 0.0]), cov, with_noise=True)
+    assert noisy.hessian < ahead.hessian
+
+
+# --- Solà 2.3.6: inverse depth is near-linear where range is not ---------------------------------
+
+NEAREST = 2.0
+
+
+RHO, SIGMA = 0.5 / NEAREST, 0.25 / NEAREST
+
+
+@jax.jit
+def from_the_side(baseline):
+    """Indices of the bearing from a robot that went sideways, by inverse depth and by range.
+
+    The landmark was first seen straight ahead from the origin. Its inverse distance has the guide's
+    prior, 1/(2 d_min) ± 1/(4 d_min); its range, the same to first order.
+    """
+    pose = jnp.stack([0.0, baseline, 0.0])
+    inverse = sensors.bearing_inverse_depth([[1e-4]], min_distance=NEAREST)
+    by_inverse = sensor_linearity(
+        inverse, pose, np.array([0.0, 0, 0, RHO]), np.diag([0, 0, 0, 0, 0, 0, SIGMA**2])
+    )
+    cov = np.diag([0, 0, 0, (SIGMA / RHO**2) ** 2, 0])
+    point = np.array([1 / RHO, 0.0])
+    return by_inverse, sensor_linearity(sensors.bearing_only([[1e-4]]), pose, point, cov)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.25])
+def test_inverse_depth_is_near_linear_where_range_is_not(share):
+    """f(ρ) = -atan(ρ b) has |f''/f'| = 2ρb²/(1 + ρ²b²), f(d) = -atan(b/d) has 2d/(d² + b²)."""
+    prior = sensors.bearing_inverse_depth([[1e-4]], min_distance=NEAREST).free
+    np.testing.assert_allclose([prior.mean[0], prior.cov[0, 0]], [RHO, SIGMA**2])
+    b, d, sigma_d = share * NEAREST, 1 / RHO, SIGMA / RHO**2
+    by_inverse, by_range = from_the_side(b)
+    closed_inverse = 3 * SIGMA * RHO * b**2 / (1 + (RHO * b) ** 2)
+    closed_range = 3 * sigma_d * d / (d**2 + b**2)
+    np.testing.assert_allclose(by_inverse.hessian, closed_inverse, rtol=1e-9)
+    np.testing.assert_allclose(by_range.hessian, closed_range, rtol=1e-9)
+    assert by_inverse.hessian < 0.03
+    assert by_range.hessian > 1.4  # it bends as far as it rises
+    assert by_inverse.sampled < 0.04
+    assert by_range.sampled > 1.4
+
+
+# --- bad input ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"x": np.eye(2)}, "state of shape"),
+        ({"cov": np.eye(3)}, r"shape \(2, 2\)"),
+        ({"cov": -np.eye(2)}, "negative variance"),
+        ({"cov": np.diag([1.0, np.nan])}, "NaN"),
+        ({"sigmas": 0.0}, "above 0"),
+        ({"noise_cov": np.eye(2)}, r"shape \(3, 3\)"),
+    ],
+)
+def test_bad_input_is_refused(change, why):
+    arguments = {"f": curved, "x": X, "cov": COV} | change
+    with pytest.raises(ValueError, match=why):
+        jaxslam.linearity_index(**arguments)

@@ -1,0 +1,191 @@
+"""`jaxslam verify FILE`: what a user's file may hold, and what is said when it is no good."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from jaxslam import userfile
+from jaxslam.cli import main
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture
+def verify(tmp_path, capsys):
+    """Run `jaxslam verify` on a file of that text: exit status, output, errors, JSON."""
+
+    def go(text, name=""):
+        path = tmp_path / "mine.py"
+        path.write_text(text, encoding="utf-8")
+        return on(str(path) + name)
+
+    def on(target):
+        status = main(["verify", target, "--out", str(tmp_path / "out")])
+        printed = capsys.readouterr()
+        result = tmp_path / "out" / "verify.json"
+        content = json.loads(result.read_text(encoding="utf-8")) if result.exists() else None
+        return status, printed.out, printed.err, content
+
+    go.on = on
+    return go
+
+
+GOOD = """
+import jax.numpy as jnp
+
+def f(pose, u):
+    return pose[:2] + u[0] * jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+
+def f_jacobian(pose, u):
+    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    by_pose = jnp.stack([jnp.stack([1.0, 0.0, -u[0] * s]), jnp.stack([0.0, 1.0, u[0] * c])])
+    return by_pose, jnp.stack([c, s])[:, None]
+
+f_arguments = {"u": ("forward [m]",)}
+f_outputs = ("x [m]", "y [m]")
+"""
+
+
+def test_a_right_claim_passes(verify):
+    status, out, err, content = verify(GOOD)
+    assert status == 0, out + err
+    assert "function f: verified" in out
+    assert content["passed"] is True
+    assert [j["argument"] for j in content["reports"][0]["jacobians"]] == ["pose", "u"]
+    assert content["command"].startswith("jaxslam verify ")
+
+
+def test_a_wrong_entry_is_named_and_fails(verify):
+    status, out, _, content = verify(GOOD.replace("-u[0] * s", "u[0] * s"))
+    assert status == 1
+    assert "entry (x [m], theta [rad]): hand disagrees with the others" in out
+    (wrong,) = content["reports"][0]["jacobians"][0]["wrong_entries"]
+    assert (wrong["row"], wrong["column"], wrong["dissent"]) == ("x [m]", "theta [rad]", ["hand"])
+
+
+def test_williams_and_the_notes_are_caught(verify):
+    """The two slips of the sources, by name; nothing else of Williams' is wrong."""
+    status, out, _, content = verify.on(str(EXAMPLES / "williams_range_bearing.py"))
+    assert status == 1
+    wrong = [j["wrong_entries"] for j in content["reports"][0]["jacobians"]]
+    entries = [{(e["row"], e["column"]) for e in part} for part in wrong]
+    assert entries == [{("range [m]", "x [m]"), ("range [m]", "y [m]")}, set()]
+    assert {tuple(e["dissent"]) for e in wrong[0]} == {("hand",)}
+
+    status, out, _, content = verify.on(str(EXAMPLES / "notes_velocity.py"))
+    assert status == 1
+    by_pose = content["reports"][0]["jacobians"][0]["wrong_entries"]
+    slips = {("theta [rad]", "theta [rad]"), ("y [m]", "theta [rad]")}
+    assert {(e["row"], e["column"]) for e in by_pose[:2]} == slips
+    usual = [e for e in by_pose if e["label"] == "random"]
+    assert {(e["row"], e["column"]) for e in usual} == slips
+    assert {tuple(e["dissent"]) for e in usual} == {("hand",)}
+    assert "notes_velocity.py:19: a value is not, " in out  # v/ω at ω = 0
+    assert "prints" in out  # the check that it prints nothing was made, and passed
+    assert "FAIL  prints" not in out
+
+
+MODELS = """
+import numpy as np
+import jaxslam
+from jaxslam.protocols import Motion, Sensor
+
+robot = jaxslam.motion.unicycle(0.01 * np.eye(2))
+
+def laser(noise_cov, mount=(0.0, 0.0, 0.0)) -> Sensor:
+    return jaxslam.sensors.range_bearing(noise_cov, mount)
+
+def helper(x):
+    return x
+"""
+
+
+def test_models_and_factories_are_found(verify):
+    status, out, _, content = verify(MODELS)
+    assert status == 0, out
+    assert [(r["kind"], r["model"]) for r in content["reports"]] == [
+        ("motion", "robot"),
+        ("sensor", "laser"),
+    ]
+
+
+def test_one_of_them_by_name(verify):
+    status, _, _, content = verify(MODELS, ":laser")
+    assert status == 0
+    assert [r["model"] for r in content["reports"]] == ["laser"]
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "why"),
+    [
+        ("import nothing_of_this_name\n", "", "mine.py:1: ModuleNotFoundError"),
+        ("x = 1\nx = = 2\n", "", "mine.py:2: invalid syntax"),
+        ("x = 1\n\nraise RuntimeError('not today')\n", "", "mine.py:3: RuntimeError: not today"),
+        ("import sys\nsys.exit(3)\n", "", "mine.py:2: SystemExit"),
+        ("x = 1\n", "", "mine.py: defines nothing to verify"),
+        ("", "", "mine.py: defines nothing to verify"),
+        (GOOD, ":g", "there is no g"),
+        (GOOD.replace("f_jacobian", "f_slope"), ":f", "there is no f_jacobian"),
+        (GOOD.replace("f_arguments", "g_arguments"), "", "how long is its argument 'u'"),
+        (MODELS.replace("return jaxslam.sensors", "return 1 / jaxslam.sensors"), "", "mine.py:9: "),
+    ],
+)
+def test_an_unusable_file_is_refused(verify, text, name, why):
+    status, _, err, content = verify(text, name)
+    assert status == 2
+    assert why in err
+    assert content is None  # nothing half-written
+
+
+def test_no_file_and_no_python_file(verify, tmp_path):
+    for target, why in (("missing.py", "no such file"), (str(tmp_path), "expected a Python file")):
+        status, _, err, _ = verify.on(target)
+        assert status == 2
+        assert why in err
+
+
+def test_printing_is_caught_with_its_line(verify):
+    status, out, _, _ = verify("print('hello')\n" + GOOD)
+    assert status == 0
+    assert "hello" not in out
+    assert "mine.py:1 prints when the file is loaded" in out
+
+    inside = GOOD.replace("    return pose[:2]", "    print('called')\n    return pose[:2]")
+    status, out, _, _ = verify(inside)
+    assert status == 1
+    assert "called" not in out
+    assert "prints nothing: mine.py:5 prints" in out
+
+
+def test_what_is_wrong_beside_jacobians_is_told_with_its_line(verify):
+    branch = GOOD.replace(
+        "    return pose[:2]", "    if u[0] > 0:\n        u = 2 * u\n    return pose[:2]"
+    )
+    status, out, _, _ = verify(branch)
+    assert status == 1
+    assert "f is traceable: mine.py:5: " in out
+    assert "hand" in out  # the claim was compared with differences all the same
+
+    status, out, _, _ = verify(GOOD.replace("pose[:2] + u[0]", "pose[:2] + jnp.sqrt(u[0])"))
+    assert status == 1
+    assert "mine.py:5: a value is not" in out
+
+    status, out, _, _ = verify(GOOD.replace('("x [m]", "y [m]")', '("x [m]",)'))
+    assert status == 1
+    assert "(2,) where an array of shape (1,) is expected" in out
+
+
+def test_neighbours_can_be_imported_and_nothing_stays_behind(verify, tmp_path):
+    (tmp_path / "neighbour.py").write_text("LENGTH = 2.0\n")
+    before = list(sys.path)
+    status, *_ = verify("from neighbour import LENGTH\n" + GOOD)
+    assert status == 0
+    assert sys.path == before
+    assert not [name for name in sys.modules if name.startswith("_jaxslam_user")]
+    sys.modules.pop("neighbour")
+
+
+def test_a_path_with_a_name_is_split():
+    assert userfile._split(str(EXAMPLES / "notes_velocity.py") + ":move")[1] == "move"

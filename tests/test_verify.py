@@ -1,0 +1,400 @@
+"""`verify_jacobians`: what it finds, in whom, and that it never raises over a model."""
+
+import dataclasses
+import json
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import motion, sensors
+from jaxslam.verify import build, differences, verify_jacobians
+
+
+def by_name(report, name):
+    (check,) = [c for c in report.checks if c.name == name]
+    return check
+
+
+def failed(report):
+    names = [c.name for c in report.checks if not c.passed]
+    return sorted(names + [f.name for f in report.findings if not f.passed])
+
+
+# --- differences --------------------------------------------------------------------------------
+
+
+def smooth(x):
+    return np.stack([np.sin(x[:, 0]) * np.exp(x[:, 1]), x[:, 0] ** 3 / x[:, 1]], axis=1)
+
+
+def smooth_jacobian(x):
+    a, b = x[:, 0], x[:, 1]
+    return np.stack(
+        [
+            np.stack([np.cos(a) * np.exp(b), np.sin(a) * np.exp(b)], axis=1),
+            np.stack([3 * a**2 / b, -(a**3) / b**2], axis=1),
+        ],
+        axis=1,
+    )
+
+
+def test_quotients_and_their_error():
+    rng = np.random.default_rng(0)
+    x = np.stack([rng.normal(size=50), rng.uniform(1, 2, 50)], axis=1)
+    value, error = differences.quotients(smooth, (x,), 0, np.full(2, np.inf))
+    off = np.abs(value - smooth_jacobian(x))
+    assert off.max() < 1e-10
+    assert error.max() < 1e-8
+    assert np.all(off <= 10 * error)
+
+
+def test_quotients_know_where_there_is_no_derivative():
+    x = np.array([[0.0], [1e-9], [1.0]])
+
+    def root(x):
+        return np.sqrt(np.abs(x))
+
+    value, error = differences.quotients(root, (x,), 0, np.full(1, np.inf))
+    assert np.all(~(error[:2, 0, 0] < 1e-3 * np.abs(value[:2, 0, 0])))
+    np.testing.assert_allclose(value[2, 0, 0], 0.5, atol=1e-10)
+
+
+def test_quotients_cross_the_seam_of_a_circle():
+    def wrapped(x):
+        return np.angle(np.exp(1j * 2 * x))
+
+    x = np.array([[np.pi / 2], [-np.pi / 2 + 1e-9], [0.3]])
+    value, _ = differences.quotients(wrapped, (x,), 0, np.array([2 * np.pi]))
+    np.testing.assert_allclose(value, 2, atol=1e-9)
+
+
+def test_complex_step_is_exact():
+    x = np.array([[0.7, 1.3]])
+    np.testing.assert_allclose(
+        differences.complex_step(smooth, (x,), 0), smooth_jacobian(x), rtol=1e-15
+    )
+
+
+def test_complex_step_is_used_where_the_function_allows_it():
+    def analytic(point):
+        return jnp.stack([point[0] * jnp.sin(point[1])])
+
+    def not_analytic(point):  # takes complex numbers, and loses the imaginary part
+        return jnp.stack([point[0] * jnp.sin(jnp.real(point[1])), point[0]])
+
+    assert verify_jacobians(analytic).findings[0].quotient == "complex step"
+    report = verify_jacobians(not_analytic)
+    assert report.findings[0].quotient == "differences"
+    assert report.passed
+
+
+# --- who is wrong -------------------------------------------------------------------------------
+
+
+def observe(pose, landmark):
+    dx, dy = landmark - pose[:2]
+    return jnp.stack([jnp.hypot(dx, dy), jnp.arctan2(dy, dx) - pose[2]])
+
+
+OUTPUTS = ("range [m]", "bearing [rad]")
+
+
+def test_a_right_claim_passes_however_it_is_returned():
+    def parts(pose, landmark):
+        return jax.jacfwd(observe, argnums=(0, 1))(pose, landmark)
+
+    def side_by_side(pose, landmark):
+        return jnp.concatenate(parts(pose, landmark), axis=1)
+
+    def first(pose, landmark):
+        return parts(pose, landmark)[0]
+
+    def second(pose, landmark):
+        return None, parts(pose, landmark)[1]
+
+    for claim, claimed in ((parts, 2), (side_by_side, 2), (first, 1), (second, 1)):
+        report = verify_jacobians(observe, claim, outputs=OUTPUTS)
+        assert report.passed, str(report)
+        assert sum("hand" in f.methods for f in report.findings) == claimed
+
+
+def test_a_wrong_derivative_rule_is_the_autodiffs_fault():
+    @jax.custom_jvp
+    def square(x):
+        return x**2
+
+    @square.defjvp
+    def _(primals, tangents):
+        return square(primals[0]), 3 * primals[0] * tangents[0]
+
+    def f(point):
+        return jnp.stack([square(point[0]), point[1]])
+
+    def claim(point):
+        return jnp.array([[2 * point[0], 0], [0, 1]])
+
+    report = verify_jacobians(f, claim)
+    (wrong,) = report.findings[0].wrong_entries
+    assert (wrong.row, wrong.column) == ("f[0]", "x [m]")
+    assert wrong.dissent == ("jacfwd", "jacrev")  # the differences side with the claim
+
+
+def test_an_entry_wrong_in_float32_only_is_found():
+    def claim(point):
+        slip = 1e-3 if point.dtype == jnp.float32 else 0.0
+        return jnp.array([[2 * point[0] * (1 + slip), 0.0]], point.dtype)
+
+    report = verify_jacobians(lambda point: point[:1] ** 2, claim)
+    (wrong,) = report.findings[0].wrong_entries
+    assert wrong.precision == "float32"
+    assert wrong.dissent == ("hand",)
+
+
+def test_a_heading_is_compared_on_the_circle():
+    """Neither wrapped nor unwrapped angles are an error, where the output says that it is one."""
+
+    def unwrapped(pose):
+        return pose[2:] * 2 + 7
+
+    def wrapped(pose):
+        return jnp.arctan2(jnp.sin(2 * pose[2:]), jnp.cos(2 * pose[2:]))
+
+    for f in (unwrapped, wrapped):
+        assert verify_jacobians(f, outputs=("heading [rad]",)).passed
+
+
+def test_own_states_are_used_and_named():
+    def f(v):
+        return jnp.sqrt(v)
+
+    states = [np.array([[1.0], [4.0]])]
+    report = verify_jacobians(
+        f, lambda v: 0.5 / jnp.sqrt(v)[:, None], arguments={"v": 1}, states=states
+    )
+    assert report.passed
+    assert report.findings[0].samples == 2
+    assert verify_jacobians(f, arguments={"v": ("area [m^2]",)}).passed is False  # √ of negatives
+
+
+# --- models that misbehave ----------------------------------------------------------------------
+
+
+def test_a_branch_on_a_tracer_is_named_and_the_claim_still_checked():
+    def f(point):
+        if point[0] > 0:
+            return point * 2
+        return point * 3
+
+    def claim(point):
+        return (2.0 if point[0] > 0 else 4.0) * jnp.eye(2)
+
+    report = verify_jacobians(f, claim)
+    here = "test_verify.py:"
+    traceable = by_name(report, "f is traceable")
+    assert not traceable.passed
+    assert here in traceable.detail
+    assert "jnp.where" in traceable.detail
+    assert {(e.row, e.column) for e in report.findings[0].wrong_entries} == {
+        ("f[0]", "x [m]"),
+        ("f[1]", "y [m]"),
+    }
+    assert all(e.dissent for e in report.findings[0].wrong_entries)
+    assert "jacfwd" not in report.findings[0].methods
+
+
+def test_a_claim_that_branches_is_still_compared():
+    def claim(point):
+        return 2 * jnp.eye(2) if point[0] > 0 else 2.5 * jnp.eye(2)
+
+    report = verify_jacobians(lambda point: 2 * point, claim)
+    assert len(report.findings[0].wrong_entries) == 2
+    assert any("is traceable" in name for name in failed(report))
+
+
+def test_nan_is_reported_with_line_and_state():
+    def f(point):
+        return jnp.sqrt(point[:1])  # here
+
+    report = verify_jacobians(f)
+    check = by_name(report, "f and its derivatives are finite")
+    assert not check.passed
+    assert "test_verify.py:" in check.detail
+    assert "a value is not" in check.detail
+    assert "point = (" in check.detail
+
+
+def test_a_gradient_that_is_nan_is_reported():
+    report = verify_jacobians(
+        lambda point: jnp.sqrt(point[:1] ** 2 + point[1:] ** 2),
+        states=[np.array([[0.0, 0], [1, 1]])],
+    )
+    (name,) = [n for n in failed(report) if "finite" in n]
+    assert "jacfwd by point is not" in by_name(report, name).detail
+
+
+@pytest.mark.parametrize(
+    ("claim", "why"),
+    [
+        (lambda point: jnp.eye(3), r"\(3, 3\) by point; expected \(2, 2\)"),
+        (lambda point: (jnp.eye(2), jnp.eye(2)), "2 Jacobians where the function has 1"),
+        (lambda point: 1 / 0, "ZeroDivisionError"),
+    ],
+)
+def test_an_unusable_claim_is_reported_and_the_rest_goes_on(claim, why):
+    report = verify_jacobians(lambda point: 2 * point, claim)
+    (name,) = failed(report)
+    assert "can be used" in name
+    assert re.search(why, by_name(report, name).detail)
+    assert report.findings[0].passed
+
+
+def test_a_function_of_another_shape_is_reported():
+    for f in (lambda point: point[0], lambda point: (point, point), lambda point: 1.0):
+        report = verify_jacobians(f)
+        assert not report.passed
+        assert "is expected" in str(report)
+    report = verify_jacobians(observe, outputs=("range [m]",))
+    assert "(2,) where an array of shape (1,)" in str(report)
+
+
+def test_a_function_that_raises_is_reported_with_its_line():
+    def f(point):
+        raise RuntimeError("no such thing")
+
+    report = verify_jacobians(f)
+    assert not report.passed
+    assert "test_verify.py:" in str(report)
+    assert "no such thing" in str(report)
+
+
+def test_hidden_state_is_found():
+    calls = []
+
+    def f(point):
+        calls.append(1)
+        return point * len(calls)
+
+    assert "f is pure" in failed(verify_jacobians(f))
+
+
+def test_a_lost_dtype_is_found():
+    robot = build(motion.increment)
+    wide = dataclasses.replace(robot, step=lambda *a: robot.step(*a) + np.zeros(3))
+    assert "step keeps the dtype" in failed(verify_jacobians(wide))
+
+
+# --- models -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def laser():
+    return build(sensors.range_bearing)
+
+
+def change(model, **fields):
+    return failed(verify_jacobians(dataclasses.replace(model, **fields)))
+
+
+def test_a_residual_that_does_not_wrap_is_found(laser):
+    names = change(laser, residual=lambda z, z_hat: z - z_hat)
+    assert "the residual is a difference, wrapped on the circle" in names
+
+
+def test_a_residual_the_wrong_way_round_is_found(laser):
+    assert change(laser, residual=lambda z, z_hat: laser.residual(z_hat, z)) == [
+        "the residual is a difference, wrapped on the circle"
+    ]
+
+
+def test_a_residual_with_an_offset_is_found(laser):
+    names = change(laser, residual=lambda z, z_hat: laser.residual(z, z_hat) + 0.1)
+    assert "the residual is zero at equality" in names
+    assert "the residual is antisymmetric" in names
+
+
+def test_an_inverse_in_the_wrong_frame_is_found(laser):
+    """The guide's slip (64): the point is taken in the robot's frame, not the sensor's."""
+    bare = sensors.range_bearing(0.01 * np.eye(2))
+    names = change(laser, invert=bare.invert, invert_jacobians=bare.invert_jacobians)
+    assert names == [
+        "invert undoes observe, within what is free",
+        "observe undoes invert, whatever is free",
+    ]
+
+
+def test_an_inverse_that_ignores_what_is_free_is_found():
+    camera = build(sensors.bearing_only)
+    stuck = dataclasses.replace(
+        camera, invert=lambda pose, z, s: camera.invert(pose, z, 3 + 0 * s), invert_jacobians=None
+    )
+    assert failed(verify_jacobians(stuck)) == ["invert undoes observe, within what is free"]
+
+
+def test_bad_noise_is_found(laser):
+    names = change(laser, noise_cov=lambda z: jnp.diag(jnp.stack([z[1], z[1] ** 2])))
+    assert names == ["noise covariance"]
+    robot = build(motion.unicycle)
+    assert change(robot, noise_cov=lambda pose, u: jnp.array([[1.0, 0.5], [0, 1]])) == [
+        "noise covariance"
+    ]
+
+
+def test_a_heading_out_of_range_and_a_wrong_perturb_are_found():
+    robot = build(motion.increment)
+    assert change(robot, perturb=lambda u, w: u - w) == [
+        "step(pose, u, w) = step(pose, perturb(u, w), 0)"
+    ]
+    names = change(
+        robot, step=lambda pose, u, w: robot.step(pose, u, w) + jnp.array([0, 0, 2 * jnp.pi])
+    )
+    assert "the heading is wrapped to (-π, π]" in names
+
+
+def test_a_sensor_whose_embed_fails_is_still_looked_at(laser):
+    def embed(pose, point):
+        raise NotImplementedError("later")
+
+    report = verify_jacobians(dataclasses.replace(laser, embed=embed))
+    assert [f for f in report.findings if f.function == "observe"]
+    assert "later" in str(report)
+    assert not report.passed
+
+
+# --- house --------------------------------------------------------------------------------------
+
+
+def test_float64_is_used_and_given_back():
+    with jax.enable_x64(False):
+        report = verify_jacobians(observe, outputs=OUTPUTS)
+        assert jnp.zeros(1).dtype == jnp.float32
+    assert report.findings[0].relative < 1e-12
+    assert report.findings[0].differences < 1e-6
+
+
+def test_the_report_is_json_and_text():
+    report = verify_jacobians(observe, lambda pose, landmark: jnp.zeros((2, 3)), outputs=OUTPUTS)
+    content = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    assert content["passed"] is False
+    wrong = content["jacobians"][0]["wrong_entries"]
+    assert {"row": "range [m]", "column": "x [m]"}.items() <= wrong[0].items()
+    assert "observe by pose" in str(report)
+
+
+@pytest.mark.parametrize(
+    ("call", "why"),
+    [
+        (lambda: verify_jacobians(lambda speed: speed), "how long is its argument 'speed'"),
+        (lambda: verify_jacobians(observe, arguments={"landmarks": 2}), "no parameter landmarks"),
+        (lambda: verify_jacobians(lambda: jnp.ones(2)), "takes no argument"),
+        (lambda: verify_jacobians(observe, count=1), "count >= 2"),
+        (lambda: verify_jacobians(observe, tolerance=0.0), "above 0"),
+        (lambda: verify_jacobians(observe, states=[np.zeros((4, 3))]), "expected states of shapes"),
+        (lambda: verify_jacobians(observe, arguments={"pose": "xyz"}), "a tuple of names"),
+    ],
+)
+def test_bad_requests_are_refused(call, why):
+    with pytest.raises(ValueError, match=why):
+        call()
