@@ -1,7 +1,7 @@
 """All benchmarks, one gate: `python -m benchmarks [--quick]`, or `make bench`.
 
 A table of every metric with the range it must lie in; the exit status is 1 if one is missed. Each
-part is also a program of its own: circle, victoria_park, real_data, speed.
+part is also a program of its own: circle, victoria_park, real_data, speed, gradient.
 """
 
 import argparse
@@ -12,7 +12,7 @@ import time
 
 import jax
 
-from benchmarks import circle, real_data, speed, victoria_park
+from benchmarks import circle, gradient, real_data, speed, victoria_park
 from benchmarks.gate import Metric, report
 
 
@@ -33,6 +33,7 @@ def main() -> int:
     jax.config.update("jax_enable_x64", True)
     metrics = command_seconds()
     metrics += speed.measure()
+    metrics += gradient.measure()
     metrics += circle.measure(200 if options.quick else 1000)
     metrics += victoria_park.measure()
     metrics += real_data.measure()

@@ -232,6 +232,10 @@ def _verify(options: argparse.Namespace, command: str) -> int:
     return 0 if passed else FAILED
 
 
+def _verify_one(ask: Callable[..., verify.Report], factory: Callable[..., Any]) -> verify.Report:
+    return ask(verify.build(factory))
+
+
 def _verify_all(ask: Callable[..., verify.Report]) -> list[verify.Report]:
     models = motion.REGISTRY | sensors.REGISTRY
     reports = []
@@ -239,9 +243,14 @@ def _verify_all(ask: Callable[..., verify.Report]) -> list[verify.Report]:
         _Progress(f"{len(models)} models", "models") as progress,
         ThreadPoolExecutor(os.cpu_count()) as pool,  # compilation takes most of the time
     ):
-        for done in pool.map(lambda factory: ask(verify.build(factory)), models.values()):
-            reports.append(done)
-            progress(len(reports), len(models))
+        tasks = [pool.submit(_verify_one, ask, factory) for factory in models.values()]
+        try:
+            for task in tasks:
+                reports.append(task.result())
+                progress(len(reports), len(models))
+        except BaseException:  # an interrupt: what has not begun need not
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     return reports
 
 

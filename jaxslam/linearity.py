@@ -67,7 +67,12 @@ def linearity_index(
     point = point.astype(jnp.result_type(point, float))
     if point.ndim != 1:
         raise ValueError(f"linearity_index: expected a state of shape (n,), got {point.shape}")
+    if is_concrete(point) and not np.all(np.isfinite(np.asarray(point))):
+        raise ValueError("linearity_index: the state is not finite")
     check_covariance("linearity_index: cov", cov, point.shape[0])
+    shape = jax.eval_shape(f, point).shape
+    if len(shape) != 1:
+        raise ValueError(f"linearity_index: expected f to return (m,), got shape {shape}")
     if is_concrete(sigmas) and not 0 < sigmas < np.inf:
         raise ValueError(f"linearity_index: expected sigmas above 0, got {sigmas}")
     root, _ = cholesky(jnp.asarray(cov, point.dtype))
@@ -94,6 +99,11 @@ def linearity_index(
     if residual is not None:  # a change by more than half a turn is one the other way round
         away = jax.vmap(lambda gap: difference(gap, jnp.zeros_like(gap)))(away)
     by_sampling = jnp.max(jnp.abs(away), axis=0, initial=0.0)
+    # What rounding of f can do is no bend.
+    rounding = (
+        16 * jnp.finfo(point.dtype).eps * (jnp.abs(centre) + jnp.abs(tries @ slope.T).max(axis=0))
+    )
+    by_sampling = jnp.where(by_sampling <= rounding, 0.0, by_sampling)
 
     index, sampled = (_over(part, sigmas, reach2) for part in (by_hessian, by_sampling))
     return Linearity(index.max(initial=0.0), sampled.max(initial=0.0), index, sampled)
@@ -152,9 +162,9 @@ def sensor_linearity(
 
 def _over(bend: jax.Array, sigmas: float, reach2: jax.Array) -> jax.Array:
     """bend / (n_σ √reach²); 0/0 = 0, and inf where there is a bend alone. Finite gradients."""
-    steep = reach2 > 0
-    ratio = bend / (sigmas * jnp.sqrt(jnp.where(steep, reach2, 1.0)))
-    return jnp.where(steep, ratio, jnp.where(bend > 0, jnp.inf, 0.0))
+    flat = reach2 == 0
+    ratio = bend / (sigmas * jnp.sqrt(jnp.where(flat, 1.0, reach2)))
+    return jnp.where(flat, jnp.where(bend > 0, jnp.inf, 0.0), ratio)
 
 
 def _fixed(n: int, dtype: Any) -> jax.Array:

@@ -21,6 +21,7 @@ def run(
     key: jax.Array,
     *,
     probe: Callable[[Any], Any] | None = None,
+    checkpoint: bool = False,
 ) -> Trace:
     """Drive a filter along a log: per row predict with the control, then update with the scan.
 
@@ -34,6 +35,10 @@ def run(
         pose_cov: (3, 3) how well that is known; zero is allowed.
         key: a PRNG key, split into two a step; a filter without randomness ignores them.
         probe: called with the filter's own state after each update; what it returns is stacked.
+        checkpoint: for reverse mode over long logs: keep one state a step instead of every
+            intermediate of every step, and compute each step again on the way back. The same
+            numbers, for about one more forward run; T filter states of memory. Without reverse mode
+            it does nothing. `compiled.memory_analysis().temp_size_in_bytes` measures what it saves.
     Returns:
         Trace with estimates and infos of leading axis T, and the final state.
     Raises:
@@ -58,5 +63,7 @@ def run(
         state, info = filter.update(state, scan, key_update)
         return state, (filter.estimate(state), info, () if probe is None else probe(state))
 
-    final, (estimate, info, probed) = jax.lax.scan(step, start, (log, keys))
+    # What a scan runs cannot be merged with its own recomputation, so no barrier is needed.
+    body = jax.checkpoint(step, prevent_cse=False) if checkpoint else step
+    final, (estimate, info, probed) = jax.lax.scan(body, start, (log, keys))
     return Trace(estimate, info, final, probed)

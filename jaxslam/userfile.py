@@ -19,6 +19,10 @@ CLAIMS = ("_jacobian", "_jacobians")
 """A function of the name f + one of these claims the Jacobian of f."""
 
 
+ABOUT = ("arguments", "outputs", "states")
+"""f_arguments, f_outputs, f_states: what `verify_jacobians` is told about f."""
+
+
 class UnusableFile(ValueError):
     """A file that cannot be loaded, or that defines nothing to verify."""
 
@@ -32,6 +36,7 @@ class Target:
     jacobian: Callable[..., Any] | None = None
     arguments: Mapping[str, Sequence[str] | int] | None = None
     outputs: Sequence[str] | None = None
+    states: Sequence[Any] | None = None
 
 
 class Printed(io.TextIOBase):
@@ -66,7 +71,7 @@ def load(target: str) -> list[Target]:
     Taken are objects of the kinds `Motion` and `Sensor`; factories annotated to return one, whose
     only required parameter is a noise covariance; and functions f beside which an f_jacobian (or
     f_jacobians) stands, whose sizes may be given as f_arguments = {"pose": ("x [m]", …), …} and
-    f_outputs = ("range [m]", …).
+    f_outputs = ("range [m]", …), and states to try it at as f_states = (array (S, n), …).
 
     Raises:
         UnusableFile: with the line, if the file is missing, does not import, or has nothing.
@@ -86,7 +91,7 @@ def load(target: str) -> list[Target]:
     if not found:
         raise UnusableFile(
             f"{path.name}: defines nothing to verify: no Motion, no Sensor, no function f with an "
-            "f_jacobian"
+            "f_jacobian, no factory whose result is annotated as -> Motion or -> Sensor"
         )
     return found
 
@@ -116,7 +121,12 @@ def _verified(target: Target, ask: Callable[..., Report]) -> Report:
     """The report on a target; a model that prints as it runs is not pure, and is told so."""
     with watched() as printed:
         report = ask(
-            target.model, target.jacobian, arguments=target.arguments, outputs=target.outputs
+            target.model,
+            target.jacobian,
+            arguments=target.arguments,
+            outputs=target.outputs,
+            states=target.states,
+            name=target.name,
         )
     where = ", ".join(printed.lines)
     quiet = Check("prints nothing", not where, f"{where} prints" if where else "")
@@ -162,9 +172,11 @@ def _target(module: ModuleType, name: str) -> Target | None:
     if not callable(value) or isinstance(value, type):
         return None
     claims = [getattr(module, name + end) for end in CLAIMS if hasattr(module, name + end)]
+    if len(claims) > 1:
+        raise UnusableFile(f"there are both {name}_jacobian and {name}_jacobians: which is it?")
     if claims:
-        arguments = getattr(module, f"{name}_arguments", None)
-        return Target(name, value, claims[0], arguments, getattr(module, f"{name}_outputs", None))
+        about = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
+        return Target(name, value, claims[0], *about)
     if getattr(value, "__module__", "") == module.__name__ and _makes_a_model(value):
         try:
             return Target(name, build(value))

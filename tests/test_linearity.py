@@ -136,6 +136,17 @@ def test_jit_vmap_dtype_and_gradient(dtype):
     assert np.isfinite(singular).all()
 
 
+@pytest.mark.parametrize("sigma", [1e-3, 1e-6])
+def test_rounding_is_no_bend(sigma):
+    """In float32 a region may be too small for the bend of f to show."""
+
+    def distance(x):
+        return jnp.hypot(x[0], x[1])[None]
+
+    out = linearity_index(distance, np.array([3.0, 4.0], "f4"), np.eye(2, dtype="f4") * sigma**2)
+    assert out.sampled < 1.5 * out.hessian
+
+
 def test_angles_are_compared_on_the_circle():
     """A heading next to the seam bends no more than one far from it."""
     robot = motion.velocity(np.diag([0.1, 0.05, 0.05]) ** 2)
@@ -207,6 +218,8 @@ def test_inverse_depth_is_near_linear_where_range_is_not(share):
         ({"cov": -np.eye(2)}, "negative variance"),
         ({"cov": np.diag([1.0, np.nan])}, "NaN"),
         ({"sigmas": 0.0}, "above 0"),
+        ({"x": np.array([np.nan, 1])}, "not finite"),
+        ({"f": lambda x: x[0]}, r"return \(m,\)"),
         ({"noise_cov": np.eye(2)}, r"shape \(3, 3\)"),
     ],
 )

@@ -129,6 +129,8 @@ def test_one_of_them_by_name(verify):
         (GOOD, ":g", "there is no g"),
         (GOOD.replace("f_jacobian", "f_slope"), ":f", "there is no f_jacobian"),
         (GOOD.replace("f_arguments", "g_arguments"), "", "how long is its argument 'u'"),
+        (GOOD + "\nf_jacobians = f_jacobian\n", "", "which is it?"),
+        (GOOD + "\nf_states = (1.0,)\n", "", "expected states of shapes (S, 3), (S, 1)"),
         (MODELS.replace("return jaxslam.sensors", "return 1 / jaxslam.sensors"), "", "mine.py:9: "),
     ],
 )
@@ -175,6 +177,21 @@ def test_what_is_wrong_beside_jacobians_is_told_with_its_line(verify):
     status, out, _, _ = verify(GOOD.replace('("x [m]", "y [m]")', '("x [m]",)'))
     assert status == 1
     assert "(2,) where an array of shape (1,) is expected" in out
+
+
+def test_states_of_the_file_are_used(verify):
+    states = "\nimport numpy as np\nf_states = (np.ones((5, 3)), np.ones((5, 1)))\n"
+    status, out, _, content = verify(GOOD.replace("u[0] * s", "jnp.sqrt(u[0]) * s") + states)
+    assert status == 0, out  # it is right at u = 1
+    assert content["reports"][0]["jacobians"][0]["samples"] == 5
+
+
+def test_an_exit_inside_a_model_is_no_success(verify):
+    status, out, _, _ = verify(
+        GOOD.replace("    return pose[:2]", "    import sys; sys.exit(0)\n    return pose[:2]")
+    )
+    assert status == 1
+    assert "mine.py:5: SystemExit" in out
 
 
 def test_neighbours_can_be_imported_and_nothing_stays_behind(verify, tmp_path):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -44,11 +45,12 @@ def smooth_jacobian(x):
 def test_quotients_and_their_error():
     rng = np.random.default_rng(0)
     x = np.stack([rng.normal(size=50), rng.uniform(1, 2, 50)], axis=1)
-    value, error = differences.quotients(smooth, (x,), 0, np.full(2, np.inf))
+    value, error, kink = differences.quotients(smooth, (x,), 0, np.full(2, np.inf))
     off = np.abs(value - smooth_jacobian(x))
     assert off.max() < 1e-10
     assert error.max() < 1e-8
     assert np.all(off <= 10 * error)
+    assert not kink.any()
 
 
 def test_quotients_know_where_there_is_no_derivative():
@@ -57,7 +59,7 @@ def test_quotients_know_where_there_is_no_derivative():
     def root(x):
         return np.sqrt(np.abs(x))
 
-    value, error = differences.quotients(root, (x,), 0, np.full(1, np.inf))
+    value, error, kink = differences.quotients(root, (x,), 0, np.full(1, np.inf))
     assert np.all(~(error[:2, 0, 0] < 1e-3 * np.abs(value[:2, 0, 0])))
     np.testing.assert_allclose(value[2, 0, 0], 0.5, atol=1e-10)
 
@@ -67,8 +69,27 @@ def test_quotients_cross_the_seam_of_a_circle():
         return np.angle(np.exp(1j * 2 * x))
 
     x = np.array([[np.pi / 2], [-np.pi / 2 + 1e-9], [0.3]])
-    value, _ = differences.quotients(wrapped, (x,), 0, np.array([2 * np.pi]))
+    value, _, kink = differences.quotients(wrapped, (x,), 0, np.array([2 * np.pi]))
     np.testing.assert_allclose(value, 2, atol=1e-9)
+    assert not kink.any()
+
+
+def test_quotients_see_a_kink_where_they_converge():
+    def f(x):
+        return np.stack([np.abs(x[:, 0]), x[:, 0] * np.abs(x[:, 0])], axis=1)
+
+    value, error, kink = differences.quotients(
+        f, (np.array([[0.0], [1e-3]]),), 0, np.full(2, np.inf)
+    )
+    np.testing.assert_array_equal(kink[:, :, 0], [[True, False], [False, False]])
+
+
+def test_a_fast_turn_is_not_aliased():
+    def heading(x):
+        return np.angle(np.exp(1j * 1000 * x))
+
+    value, _, _ = differences.quotients(heading, (np.array([[0.3]]),), 0, np.array([2 * np.pi]))
+    np.testing.assert_allclose(value, 1000, rtol=1e-7)
 
 
 def test_complex_step_is_exact():
@@ -115,7 +136,12 @@ def test_a_right_claim_passes_however_it_is_returned():
     def second(pose, landmark):
         return None, parts(pose, landmark)[1]
 
-    for claim, claimed in ((parts, 2), (side_by_side, 2), (first, 1), (second, 1)):
+    def in_numpy(pose, landmark):
+        (dx, dy), r = landmark - pose[:2], np.hypot(*(landmark - pose[:2]))
+        return [[-dx / r, -dy / r, 0], [dy / r**2, -dx / r**2, -1]]
+
+    claims = ((parts, 2), (side_by_side, 2), (first, 1), (second, 1), (in_numpy, 1))
+    for claim, claimed in claims:
         report = verify_jacobians(observe, claim, outputs=OUTPUTS)
         assert report.passed, str(report)
         assert sum("hand" in f.methods for f in report.findings) == claimed
@@ -209,9 +235,11 @@ def test_a_claim_that_branches_is_still_compared():
     def claim(point):
         return 2 * jnp.eye(2) if point[0] > 0 else 2.5 * jnp.eye(2)
 
-    report = verify_jacobians(lambda point: 2 * point, claim)
+    report = verify_jacobians(lambda point: 2 * point, claim, name="double")
     assert len(report.findings[0].wrong_entries) == 2
-    assert any("is traceable" in name for name in failed(report))
+    assert failed(report) == ["double by point"]
+    check = by_name(report, "the Jacobian claimed for double is called state by state")
+    assert "test_verify.py:" in check.detail
 
 
 def test_nan_is_reported_with_line_and_state():
@@ -241,6 +269,8 @@ def test_a_gradient_that_is_nan_is_reported():
         (lambda point: jnp.eye(3), r"\(3, 3\) by point; expected \(2, 2\)"),
         (lambda point: (jnp.eye(2), jnp.eye(2)), "2 Jacobians where the function has 1"),
         (lambda point: 1 / 0, "ZeroDivisionError"),
+        (lambda point: None, "is a `return` missing"),
+        (lambda point: sys.exit(0), "SystemExit"),
     ],
 )
 def test_an_unusable_claim_is_reported_and_the_rest_goes_on(claim, why):
@@ -268,6 +298,35 @@ def test_a_function_that_raises_is_reported_with_its_line():
     assert not report.passed
     assert "test_verify.py:" in str(report)
     assert "no such thing" in str(report)
+
+
+def test_a_function_that_exits_or_is_complex_is_reported():
+    assert "SystemExit" in str(verify_jacobians(lambda point: sys.exit(0)))
+    assert "complex" in str(verify_jacobians(lambda point: point * 1j))
+
+
+def test_a_kink_is_nobodys_fault():
+    """Any slope between the two sides will do; next to it, only the right one."""
+
+    def claim(point):
+        return jnp.where(point[0] >= 0, 1.0, -1.0).reshape(1, 1) * jnp.array([[1.0, 0.0]])
+
+    def f(point):
+        return jnp.abs(point[:1])
+
+    report = verify_jacobians(f, claim)
+    assert report.passed, str(report)
+    assert report.findings[0].no_derivative > 0
+    assert not verify_jacobians(f, lambda point: -claim(point)).passed
+
+
+def test_a_claim_just_off_is_the_claims_fault():
+    report = verify_jacobians(
+        lambda point: jnp.sin(point[:1]),
+        lambda point: jnp.stack([jnp.cos(point[0]) * (1 + 3e-8), 0.0])[None],
+    )
+    (wrong,) = report.findings[0].wrong_entries
+    assert wrong.dissent == ("hand",)
 
 
 def test_hidden_state_is_found():
@@ -333,6 +392,28 @@ def test_an_inverse_that_ignores_what_is_free_is_found():
     assert failed(verify_jacobians(stuck)) == ["invert undoes observe, within what is free"]
 
 
+def test_a_squared_range_is_tried_only_where_it_can_be_measured(laser):
+    """A sensor whose `invert` takes a root: no measurement is invented that it could not have made."""
+
+    def squared(z):
+        return jnp.stack([z[0] ** 2, z[1]])
+
+    def root(z):
+        there = z[0] > 0
+        return jnp.stack([jnp.where(there, jnp.sqrt(jnp.where(there, z[0], 1.0)), 0.0), z[1]])
+
+    sensor = dataclasses.replace(
+        laser,
+        measurements=("r2 [m2]", "bearing [rad]"),
+        observe=lambda pose, landmark: squared(laser.observe(pose, landmark)),
+        invert=lambda pose, z, s: laser.invert(pose, root(z), s),
+        observe_jacobians=None,
+        invert_jacobians=None,
+    )
+    report = verify_jacobians(sensor)
+    assert report.passed, str(report)
+
+
 def test_bad_noise_is_found(laser):
     names = change(laser, noise_cov=lambda z: jnp.diag(jnp.stack([z[1], z[1] ** 2])))
     assert names == ["noise covariance"]
@@ -393,6 +474,9 @@ def test_the_report_is_json_and_text():
         (lambda: verify_jacobians(observe, tolerance=0.0), "above 0"),
         (lambda: verify_jacobians(observe, states=[np.zeros((4, 3))]), "expected states of shapes"),
         (lambda: verify_jacobians(observe, arguments={"pose": "xyz"}), "a tuple of names"),
+        (lambda: verify_jacobians(observe, arguments=("pose", "l")), "name: entries"),
+        (lambda: verify_jacobians(observe, outputs="x [m]"), "outputs as a tuple"),
+        (lambda: verify_jacobians(observe, seed=-1), "a seed between"),
     ],
 )
 def test_bad_requests_are_refused(call, why):

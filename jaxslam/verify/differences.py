@@ -13,6 +13,10 @@ Batch = Callable[..., NDArray[np.generic]]
 _HALVINGS = 24
 _LARGEST = 0.25
 _ORDERS = 6
+_FINE = 20
+"""the halving at which sides are compared: h = 2.4e-7"""
+_KINK = 0.05
+"""how far the two sides may differ, relative"""
 
 
 class Quotient(NamedTuple):
@@ -22,6 +26,8 @@ class Quotient(NamedTuple):
     """(S, m, n)"""
     error: Values
     """(S, m, n) estimated; inf where the quotients do not converge."""
+    kink: NDArray[np.bool_]
+    """(S, m, n) whether the slopes on the two sides differ"""
 
 
 def quotients(
@@ -37,6 +43,10 @@ def quotients(
     of the tableau the one with the least estimated error is kept, where the estimate joins the
     change from its neighbours to the rounding of f and of the argument over h.
 
+    Where the slopes to the left and to the right differ there is no derivative, though the central
+    quotients may converge: `kink` says so. On a circle, steps that turn by more than half of it
+    tell nothing.
+
     Args:
         function: float64 in and out, all columns, steps and samples in one call.
         arguments: (S, n_k) each.
@@ -48,7 +58,7 @@ def quotients(
     count, n = x.shape
     if n == 0:
         none = np.zeros((count, len(periods), 0))
-        return Quotient(none, none)
+        return Quotient(none, none, none.astype(bool))
     steps = _LARGEST * 0.5 ** np.arange(halvings)
     moves = steps[:, None, None] * np.eye(n)  # (H, n, n)
     ends = x[:, None, None, None] + np.stack([moves, -moves])[None]  # (S, 2, H, n, n)
@@ -56,14 +66,21 @@ def quotients(
     flat[which] = ends.reshape(-1, n)
     values = np.asarray(function(*flat), np.float64).reshape(count, 2, halvings, n, -1)
     rise = values[:, 0] - values[:, 1]
-    turns = np.where(np.isfinite(periods), periods, 1.0)
-    whole = turns * np.round(rise / turns)
-    rise = np.where(np.isfinite(periods), rise - whole, rise)
+    rise = on_circle(rise, periods)
     # The step that was taken, rounding of x ± h included.
     width = (ends[:, 0] - ends[:, 1])[:, :, np.arange(n), np.arange(n)]  # (S, H, n)
     level = np.moveaxis(rise / width[..., None], 1, 0)  # (H, S, n, m)
+    fine = min(_FINE, halvings - 1)
+    aliased = np.abs(level[fine]) * 2 * steps[:, None, None, None] > periods / 2
+    level = np.where(aliased, np.nan, level)
+    centre = np.asarray(function(*arguments), np.float64)[:, None, None]  # (S, 1, 1, m)
+    sides = on_circle(values - centre[:, None], periods)[:, :, fine]  # (S, 2, n, m)
+    turn = np.abs(sides[:, 0] + sides[:, 1])
+    kink = turn > _KINK * np.abs(sides).max(axis=(1, 2, 3), initial=0.0)[:, None, None]
+    kink &= turn > 100 * np.finfo(np.float64).eps * (1 + np.abs(values).max(axis=(1, 2)))
     eps = np.finfo(np.float64).eps
-    size = np.abs(values).max(axis=(1, 2)) + np.abs(level).max(axis=0) * np.abs(x)[:, :, None]
+    slope = np.fmax.reduce(np.abs(level), axis=0)
+    size = np.abs(values).max(axis=(1, 2)) + slope * np.abs(x)[:, :, None]
     rounding = eps * size[None] / steps[:, None, None, None]
 
     best = level[0]
@@ -80,7 +97,15 @@ def quotients(
         best = np.where(better, np.take_along_axis(finer, pick, axis=0)[0], best)
         least = np.where(better, candidate, least)
         level = finer
-    return Quotient(np.swapaxes(best, 1, 2), np.swapaxes(least, 1, 2))
+    return Quotient(*(np.swapaxes(part, 1, 2) for part in (best, least, kink)))
+
+
+def on_circle(difference: Values, periods: Values) -> Values:
+    """Differences (…, m) less the whole periods in them."""
+    turns = np.where(np.isfinite(periods), periods, 1.0)
+    return np.where(
+        np.isfinite(periods), difference - turns * np.round(difference / turns), difference
+    )
 
 
 def complex_step(

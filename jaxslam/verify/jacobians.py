@@ -98,7 +98,7 @@ class _Evaluator:
         """Whether JAX can trace the function; the check that says so is made here."""
         try:
             jax.eval_shape(self.function.call, *(a[0] for a in self.arguments))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self.checks.append(Check(f"{self.function.name} is traceable", False, told(error)))
             return False
         self.checks.append(Check(f"{self.function.name} is traceable", True))
@@ -110,10 +110,13 @@ class _Evaluator:
         call = self.function.call
         try:
             out = jax.eval_shape(call, *first) if self.traceable else call(*first)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self.checks.append(Check(f"{name} can be called", False, told(error)))
             return None
         shape = getattr(out, "shape", None)
+        if np.issubdtype(getattr(out, "dtype", float), np.complexfloating):
+            self.checks.append(Check(f"{name} returns its shape", False, "returns complex numbers"))
+            return None
         wanted = f"({len(named)},)" if named else "(m,)"
         if shape is None or len(shape) != 1 or (named and shape != (len(named),)):
             got = type(out).__name__ if shape is None else shape
@@ -145,7 +148,7 @@ class _Evaluator:
             return {}
         try:
             forward, reverse = self.both_modes(*arguments)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             name = f"{self.function.name} can be differentiated in {arguments[0].dtype}"
             if all(check.name != name for check in self.checks):
                 self.checks.append(Check(name, False, told(error)))
@@ -158,9 +161,13 @@ class _Evaluator:
     def _add_hand(
         self, double: dict[str, list[Values | None]], single: dict[str, list[Values | None]]
     ) -> None:
-        hand = self.function.hand
-        if hand is None:
+        if self.function.hand is None:
             return
+        claim = self.function.hand
+
+        def hand(*arguments: Any) -> Any:
+            return _as_claim(claim(*arguments))
+
         name = f"the Jacobian claimed for {self.function.name}"
         try:
             first = [jnp.asarray(a[0]) for a in self.arguments]
@@ -170,7 +177,7 @@ class _Evaluator:
             except (jax.errors.JAXTypeError, TypeError) as error:
                 shaped = self._split(hand(*first))  # raises again if it is not about tracing
                 batch = _looped(hand)
-                self.checks.append(Check(f"{name} is traceable", False, told(error)))
+                self.checks.append(Check(f"{name} is called state by state", True, told(error)))
             for into, dtype in ((double, np.float64), (single, np.float32)):
                 parts = self._split(batch(*(a.astype(dtype) for a in self.arguments)))
                 into["hand"] = [
@@ -178,7 +185,7 @@ class _Evaluator:
                 ]
             claimed = sum(part is not None for part in shaped)
             self.checks.append(Check(f"{name} has its shape", True, f"{claimed} claimed"))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self.checks.append(Check(f"{name} can be used", False, told(error)))
 
     def _split(self, claim: Any) -> list[Any]:
@@ -213,13 +220,14 @@ class _Evaluator:
         if self.traceable and arguments[which].shape[1] and not np.isfinite(circle).any():
             try:
                 exact = complex_step(self.values, arguments, which)
-            except Exception:
+            except (Exception, SystemExit):
                 return found, "differences"
             # Only where differences confirm it: `abs` or a comparison spoils it silently.
             off = np.abs(exact - found.value) > 10 * found.error + 1e-9 * np.abs(found.value)
             if np.isfinite(exact).all() and not off[found.error < np.inf].any():
                 rounding = 1e-14 * np.abs(exact).max(axis=2, keepdims=True, initial=0)
-                return Quotient(exact, np.broadcast_to(rounding, exact.shape)), "complex step"
+                error = np.broadcast_to(rounding, exact.shape)
+                return Quotient(exact, error, found.kink), "complex step"
         return found, "differences"
 
 
@@ -241,6 +249,16 @@ def _in_chunks(batch: Callable[..., Any]) -> Callable[..., Any]:
 def _of_argument(methods: dict[str, list[Values | None]], k: int) -> dict[str, Values]:
     parts = {name: jacobians[k] for name, jacobians in methods.items()}
     return {name: part for name, part in parts.items() if part is not None}
+
+
+def _as_claim(claim: Any) -> Any:
+    """A claim as one array, or as a tuple of them; a list of numbers is an array."""
+    if claim is None:
+        raise ValueError("returns None: is a `return` missing?")
+    if isinstance(claim, list):
+        nested = all(isinstance(row, list | tuple) for row in claim)
+        return jnp.asarray(claim) if nested else tuple(claim)
+    return claim
 
 
 def _worst_gap(methods: dict[str, Values], reference: dict[str, Values]) -> Values:

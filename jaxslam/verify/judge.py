@@ -45,13 +45,17 @@ def _only(evaluated: Evaluated, rows: NDArray[np.intp]) -> Evaluated:
             {how: jacobian[rows] for how, jacobian in evaluation.methods.items()},
             {how: jacobian[rows] for how, jacobian in evaluation.single.items()},
             evaluation.single_error[rows] if evaluation.single_error.ndim else np.zeros(()),
-            evaluation.quotient and Quotient(*(part[rows] for part in evaluation.quotient)),
+            evaluation.quotient and _rows_of(evaluation.quotient, rows),
             evaluation.how,
         )
         for evaluation in evaluated.by_argument
     )
     kept = Samples(tuple(a[rows] for a in samples.values), tuple(samples.labels[i] for i in rows))
     return evaluated._replace(samples=kept, by_argument=by_argument)
+
+
+def _rows_of(quotient: Quotient, rows: NDArray[np.intp]) -> Quotient:
+    return Quotient(quotient.value[rows], quotient.error[rows], quotient.kink[rows])
 
 
 class _Compared(NamedTuple):
@@ -74,20 +78,23 @@ def _compare(evaluation: Evaluation, tolerance: float, float32_tolerance: float)
     (gap, scale), (gap32, scale32) = _spread(evaluation.methods), _spread(evaluation.single)
     away, excess_away, lost = np.zeros_like(gap), np.zeros_like(gap), 0
     if evaluation.quotient is not None:
-        value, error = evaluation.quotient
+        value, error, kink = evaluation.quotient
         away = np.max([np.abs(m - value) for m in evaluation.methods.values()], axis=0)
-        trusted = (error <= _CONVERGED * scale) | (error <= _NOTHING)
+        own = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
+        trusted = ((error <= _CONVERGED * own) | (error <= _NOTHING)) & ~kink
         away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
         excess_away = _over(away, DIFFERENCES_TOLERANCE * scale + 10 * error)
-        # Where there is no derivative, rounding may decide what autodiff returns; its two modes
-        # then differ, and nobody can be held against them.
-        kink = ~trusted.all(axis=(1, 2), keepdims=True)
-        lost = int(kink.sum())
+        # At a kink any slope between those of the two sides will do. Elsewhere, if the quotients do
+        # not converge, rounding may decide what autodiff returns; where its two modes differ,
+        # nobody can be held against them.
+        odd = ~trusted.all(axis=(1, 2), keepdims=True)
+        lost = int(odd.sum())
         for g, methods, size, limit in (
             (gap, evaluation.methods, scale, tolerance),
             (gap32, evaluation.single, scale32, float32_tolerance),
         ):
-            g[np.broadcast_to(kink & _modes_differ(methods, size, limit), g.shape)] = 0.0
+            if g.size:
+                g[kink | (odd & _modes_differ(methods, size, limit))] = 0.0
         if gap.size and lost == len(gap):
             excess_away = np.full_like(gap, np.inf)  # no state holds anything: not a pass
     relative, relative32 = _over(gap, scale), _over(gap32, scale32)
@@ -223,6 +230,11 @@ def _dissent(values: dict[str, float], room: float, near: float) -> tuple[str, .
         allowed = near if "differences" in (a, b) else room
         return abs(values[a] - values[b]) <= allowed
 
-    camps = {a: frozenset(b for b in values if a == b or agree(a, b)) for a in values}
+    alone = {"differences": frozenset(["differences"])} if "differences" in values else {}
+    camps = {
+        a: frozenset(b for b in values if a == b or agree(a, b))
+        for a in values
+        if a != "differences"  # to their tolerance they would agree with a claim just off, too
+    } | alone
     best = max(camps.values(), key=lambda camp: (len(camp), "differences" in camp))
     return tuple(name for name in values if name not in best)

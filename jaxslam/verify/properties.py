@@ -99,7 +99,6 @@ def of_sensor(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check
         # that the sensor could have made.
         regular = np.array(["zero" not in label and "= 0" not in label for label in inverse.labels])
         few = tuple(a[regular] for a in inverse.values)
-        few = (few[0], _possible(few[1], sensor), few[2])
         size = 1 + np.abs(few[0]).max()
         return _exactly(np.asarray(jax.jit(jax.vmap(again))(*few)) / size)
 
@@ -107,12 +106,6 @@ def of_sensor(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check
     yield from _guarded(
         "invert undoes observe, within what is free", lambda: _inverted(sensor, seen)
     )
-
-
-def _possible(z: Values, sensor: Sensor) -> Values:
-    """Ranges are positive."""
-    ranges = np.array([name.startswith("range") for name in sensor.measurements])
-    return np.where(ranges, np.maximum(np.abs(z), 1e-3), z)
 
 
 def _inverted(sensor: Sensor, seen: Samples) -> str:
@@ -198,7 +191,7 @@ def _on_circle(difference: Any, circle: Values) -> str:
     turn = np.where(np.isfinite(circle), circle, 1.0)
     off = np.where(np.isfinite(circle), off - turn * np.round(off / turn), off)
     worst = float(np.max(np.abs(np.where(np.isnan(off), np.inf, off)), initial=0.0))
-    return "" if worst <= _ROUNDING else f"off by {worst:.3g}"
+    return "" if worst <= _ROUNDING else f"off by {worst:.3g}, relative to the coordinates"
 
 
 def _exactly(difference: Any) -> str:
@@ -242,7 +235,7 @@ def _line_of_nan(function: Function, state: tuple[Values, ...], what: str) -> st
     try:  # jax says on standard output what it found
         with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
             call(*(jnp.asarray(a) for a in state))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         return line_of(error)
     return ""
 
@@ -276,6 +269,6 @@ def _guarded(name: str, run: Callable[[], str]) -> Iterator[Check]:
     """The check of that name: passed if run returns "", else what it says or raises."""
     try:
         trouble = run()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         trouble = told(error)
     yield Check(name, not trouble, trouble)

@@ -37,7 +37,7 @@ class WrongEntry:
         )
         who = f"{odd} with the others" if self.dissent else "no two agree"
         yield f"entry ({self.row}, {self.column}): {who}, at {self.states} of {samples} states"
-        yield "  " + ", ".join(f"{how} {value:.9g}" for how, value in self.values.items())
+        yield "  " + ", ".join(f"{how} {value:.12g}" for how, value in self.values.items())
         at = ", ".join(f"{k} = ({', '.join(f'{v:.6g}' for v in x)})" for k, x in self.state.items())
         yield f"  {self.precision}, {self.label}: {at}"
 

@@ -95,9 +95,8 @@ def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
     mean = np.asarray(sensor.free.mean, np.float64)
     root = np.linalg.cholesky(np.asarray(sensor.free.cov, np.float64)) if len(mean) else mean
     s = mean + rng.normal(size=(count, len(mean))) @ np.reshape(root, (len(mean), len(mean))).T
-    spread = np.stack([_one(rng, name, count) for name in sensor.measurements], axis=1)
+    z = np.asarray(jax.jit(jax.vmap(sensor.observe))(pose, landmark), np.float64)
     metres = np.array([name.endswith("[m]") for name in sensor.measurements])
-    z = np.where(metres, np.abs(spread), spread)
     few = slice(0, 4)
     if sensor.landmark:
         turn = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=1)
@@ -112,7 +111,8 @@ def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
         for label, scale in (("landmark close to the sensor", NEAR), ("landmark at the sensor", 0)):
             seen = np.where(metres, z[few] * scale, z[few])
             near = np.asarray(place(pose[few], seen, s[few] * scale), np.float64)
-            groups.append((label, (pose[few], near)))
+            if np.isfinite(near).all():  # where it is not, that is `invert`'s fault
+                groups.append((label, (pose[few], near)))
     there = np.array([[FAR, -FAR], [-FAR, FAR]])
     away = pose[:2].copy()
     away[:, :2] += there

@@ -90,12 +90,17 @@ def plain_function(
     jacobian: Callable[..., Any] | None,
     arguments: Mapping[str, Sequence[str] | int] | None = None,
     outputs: Sequence[str] | None = None,
+    name: str | None = None,
 ) -> Function:
     """Any function of vectors, by the names of its parameters.
 
     Raises ValueError where the size of an argument is neither given nor known by its name.
     """
-    name = getattr(call, "__name__", type(call).__name__)
+    name = name or str(getattr(call, "__name__", type(call).__name__))
+    if arguments is not None and not isinstance(arguments, Mapping):
+        raise ValueError(f"{name}: expected its arguments as {{name: entries}}, got {arguments!r}")
+    if isinstance(outputs, str):
+        raise ValueError(f"{name}: expected its outputs as a tuple of names, got {outputs!r}")
     given = dict(arguments or {})
     if given and not _has_signature(call):
         parameters = list(given)

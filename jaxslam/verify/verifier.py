@@ -33,6 +33,7 @@ def verify_jacobians(
     arguments: Mapping[str, Sequence[str] | int] | None = None,
     outputs: Sequence[str] | None = None,
     states: Sequence[ArrayLike] | None = None,
+    name: str | None = None,
     count: int = 24,
     seed: int = 0,
     tolerance: float = TOLERANCE,
@@ -66,6 +67,7 @@ def verify_jacobians(
         outputs: for a function: the names of its outputs with units; [rad] is on the circle.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
             sensor those of `observe`.
+        name: for a function: what to call it, default its own name.
         count: random states.
         seed: of the random states.
         tolerance, float32_tolerance: relative, of autodiff and hand against each other.
@@ -78,7 +80,14 @@ def verify_jacobians(
     if not tolerance > 0 or not float32_tolerance > 0:
         raise ValueError("verify_jacobians: expected tolerances above 0")
     examined = examine(
-        model, jacobian, arguments=arguments, outputs=outputs, states=states, count=count, seed=seed
+        model,
+        jacobian,
+        arguments=arguments,
+        outputs=outputs,
+        states=states,
+        name=name,
+        count=count,
+        seed=seed,
     )
     with np.errstate(all="ignore"):
         findings = [
@@ -107,19 +116,22 @@ def examine(
     arguments: Mapping[str, Sequence[str] | int] | None = None,
     outputs: Sequence[str] | None = None,
     states: Sequence[ArrayLike] | None = None,
+    name: str | None = None,
     count: int = 24,
     seed: int = 0,
 ) -> Examined:
     """All Jacobians of a model at all states, and the other checks; as `verify_jacobians`."""
     if count < 2:
         raise ValueError(f"verify_jacobians: expected count >= 2, got {count}")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"verify_jacobians: expected a seed between 0 and 2³²-1, got {seed}")
     functions: tuple[subject.Function, ...]
     if isinstance(model, Motion):
         kind, name, functions = "motion", model.name, subject.motion_functions(model)
     elif isinstance(model, Sensor):
         kind, name, functions = "sensor", model.name, subject.sensor_functions(model)
     else:
-        function = subject.plain_function(model, jacobian, arguments, outputs)
+        function = subject.plain_function(model, jacobian, arguments, outputs, name)
         kind, name, functions = "function", function.name, (function,)
     given = None if states is None else _given(functions[0], states)
     with _float64(), np.errstate(all="ignore"):
@@ -151,7 +163,7 @@ def _of_model(model: Any, drawn: tuple[Samples, ...]) -> Iterator[Check]:
             yield from properties.of_motion(model, drawn[0])
         elif isinstance(model, Sensor):
             yield from properties.of_sensor(model, *drawn)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         yield Check("the rest of the checks", False, told(error))
 
 
@@ -172,7 +184,7 @@ def _typical_linearity(model: Any, examined: Examined) -> float | None:
 
     try:
         return float(np.median(np.asarray(jax.jit(jax.vmap(index))(*states))))
-    except Exception:  # what is wrong with the model is in the checks
+    except (Exception, SystemExit):  # what is wrong with the model is in the checks
         return None
 
 
@@ -186,7 +198,10 @@ def _drawn(
     if isinstance(model, Sensor):
         try:
             return samples.of_sensor(model, count, seed)
-        except Exception:  # a sensor whose `embed` fails is tried at states drawn by units alone
+        except (
+            Exception,
+            SystemExit,
+        ):  # a sensor whose `embed` fails is tried at states drawn by units alone
             pass
     return tuple(samples.of_arguments(f.arguments, count, seed) for f in functions)
 

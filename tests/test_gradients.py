@@ -1,0 +1,146 @@
+"""The gradient of a whole run: through 200 steps, by every parameter of robot and sensor together."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import motion, sensors
+from jaxslam.filters import ekf_slam
+from jaxslam.run import run
+from jaxslam.scenarios import cloister
+from jaxslam.simulate import simulate
+from jaxslam.stats import sigma_gate
+from jaxslam.types import Status
+
+KEY = jax.random.key(0)
+WHEELBASE, SPEED, DT = 0.5, 1.0, 0.1
+PARAMETERS = {
+    "speed noise [m/s]": 0.1,
+    "steering noise [rad]": 0.09,
+    "range noise [m]": 0.1,
+    "bearing noise [rad]": np.deg2rad(1.0),
+    "mount x [m]": 0.05,
+    "mount y [m]": -0.03,
+    "mount turn [rad]": 0.02,
+    "wheelbase [m]": WHEELBASE,
+}
+AT = np.array(list(PARAMETERS.values()))
+
+
+def models(p):
+    """A small car without offsets, and a mounted sensor, from the parameters."""
+    car = motion.ackermann(jnp.diag(p[:2]) ** 2, wheelbase=p[7], sensor=(0.0, 0.0), encoder=0.0)
+    return car, sensors.range_bearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
+
+
+def world():
+    """The cloister, its circle of 0.1 m and 0.05 rad a step driven by the car, its own noise on it."""
+    car, sensor = models(AT)
+    steering = np.arctan(0.05 * WHEELBASE / (SPEED * DT))
+    controls = np.tile([SPEED, steering, DT], (200, 1))
+    return dataclasses.replace(cloister(), motion=car, sensor=sensor, controls=controls)
+
+
+def log_likelihood(p, log, *, capacity=36, gate=None, checkpoint=False):
+    """Σ over the run, and the statuses; births as the scenario has them.
+
+    No gate by default: the likelihood jumps where a measurement crosses it, and has no derivative
+    there that differences could agree with.
+    """
+    car, sensor = models(p)
+    filter = ekf_slam(car, sensor, capacity, births=1, gate=gate)
+    start = cloister()
+    info = run(filter, log, start.pose, start.pose_cov, KEY, checkpoint=checkpoint).info
+    return info.log_likelihood.sum(), info.status
+
+
+@pytest.fixture(scope="module")
+def log():
+    return jax.device_get(jax.jit(lambda key: simulate(world(), key))(jax.random.key(4)))[1]
+
+
+@pytest.fixture(scope="module")
+def compiled(log):
+    """Value, statuses and gradient, without and with checkpoint."""
+    return {
+        checkpoint: jax.jit(
+            jax.value_and_grad(
+                lambda p, log, checkpoint=checkpoint: log_likelihood(p, log, checkpoint=checkpoint),
+                has_aux=True,
+            )
+        )
+        .lower(AT, log)
+        .compile()
+        for checkpoint in (False, True)
+    }
+
+
+@pytest.fixture(scope="module")
+def gradient(compiled, log):
+    return np.asarray(compiled[False](AT, log)[1])
+
+
+def test_the_gradient_of_200_steps_is_that_of_central_differences(log, compiled, gradient):
+    value = jax.jit(lambda p: log_likelihood(p, log)[0])
+    (total, status), _ = compiled[False](AT, log)
+    counts = np.bincount(np.asarray(status).ravel(), minlength=len(Status))
+    assert counts[Status.BORN] == 36  # one a step, then all of them are fused
+    assert counts[Status.FUSED] == 200 * 36 - counts[Status.DEFERRED] - 36
+    assert float(total) == pytest.approx(float(value(AT)), rel=1e-12)
+    assert np.isfinite(gradient).all()
+    for i, name in enumerate(PARAMETERS):
+        # Fourth order, so that a step wide enough for rounding is narrow enough for curvature.
+        step = 3e-4 * max(abs(AT[i]), 0.1) * np.eye(len(AT))[i]
+        ends = [float(value(AT + k * step)) for k in (-2, -1, 1, 2)]
+        numeric = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step[i])
+        assert abs(gradient[i] - numeric) < 1e-5 * max(abs(numeric), 1.0), name
+        assert abs(gradient[i]) > 1.0, name  # every parameter is reached
+
+
+def test_checkpoint_changes_memory_and_no_number(compiled, gradient, log):
+    (total, status), again = compiled[True](AT, log)
+    (expected, expected_status), _ = compiled[False](AT, log)
+    np.testing.assert_allclose(total, expected, rtol=1e-10)
+    np.testing.assert_array_equal(status, expected_status)
+    np.testing.assert_allclose(again, gradient, rtol=1e-10)
+    bytes_without, bytes_with = (
+        compiled[checkpoint].memory_analysis().temp_size_in_bytes for checkpoint in (False, True)
+    )
+    state = 8 * (3 + 2 * 36) ** 2
+    assert bytes_with < bytes_without / 2
+    assert bytes_with < 1.5 * 200 * state
+
+
+@pytest.fixture(scope="module")
+def gated():
+    """In float32, with the 3 σ gate and a map six landmarks too small."""
+    return jax.jit(
+        jax.value_and_grad(
+            lambda p, log: log_likelihood(p, log, capacity=30, gate=sigma_gate(3)), has_aux=True
+        )
+    )
+
+
+@pytest.mark.parametrize("case", ["full scans", "every third scan empty", "no measurement at all"])
+def test_gradients_are_finite_in_float32_with_gate_overflow_and_empty_scans(gated, log, case):
+    """Also with P0 = 0, which is where the cloister starts."""
+    valid = np.array(log.scan.valid)
+    if case == "every third scan empty":
+        valid[::3] = False
+    elif case == "no measurement at all":
+        valid[:] = False
+    single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, log)
+    single = single._replace(scan=single.scan._replace(valid=valid))
+    (total, status), slope = gated(AT.astype("f4"), single)
+    assert slope.dtype == np.float32
+    assert np.isfinite(total)
+    assert np.isfinite(slope).all()
+    counts = np.bincount(np.asarray(status).ravel(), minlength=len(Status))
+    if case == "no measurement at all":
+        assert counts[Status.EMPTY] == status.size
+        assert not np.asarray(slope).any()
+    else:
+        assert all(counts[[Status.FUSED, Status.BORN, Status.REJECTED, Status.OVERFLOW]])
