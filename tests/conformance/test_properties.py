@@ -1,0 +1,224 @@
+"""Laws that hold for whatever numbers: angles, SE(2), errors, and a change of map frame."""
+
+import functools
+
+import hypothesis.strategies as st
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from jaxslam import angles, charts, motion, se2, sensors
+from jaxslam.verify import build
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+law = settings(max_examples=60, deadline=None, derandomize=True)
+
+
+def number(low, high):
+    return st.floats(low, high, allow_subnormal=False)
+
+
+def vector(*ranges):
+    return st.tuples(*(number(low, high) for low, high in ranges)).map(np.array)
+
+
+METRES, ANGLE = (-100.0, 100.0), (-np.pi, np.pi)
+poses = vector(METRES, METRES, ANGLE)
+points = vector(METRES, METRES)
+twists = vector((-10, 10), (-10, 10), (-3.1, 3.1))
+many_turns = number(-1e4, 1e4)
+
+
+@functools.cache
+def compiled(function):
+    return jax.jit(function)
+
+
+def call(function, *arguments):
+    return np.asarray(compiled(function)(*arguments))
+
+
+def assert_close(a, b, angular=(), atol=1e-9):
+    """Coordinates to 1e-9, of up to a few hundred metres; angles on the circle."""
+    off = np.asarray(a) - np.asarray(b)
+    for k in angular:
+        off[k] -= 2 * np.pi * np.round(off[k] / (2 * np.pi))
+    assert np.abs(off).max(initial=0) < atol, (a, b)
+
+
+def assert_same_pose(a, b, atol=1e-9):
+    assert_close(a, b, angular=[2], atol=atol)
+
+
+# --- angles -------------------------------------------------------------------------------------
+
+
+@law
+@given(many_turns, st.integers(-1000, 1000))
+def test_wrap_is_periodic_and_idempotent(angle, turns):
+    once = call(angles.wrap, angle)
+    assert -np.pi < once <= np.pi
+    assert call(angles.wrap, once) == once
+    assert_close([call(angles.wrap, angle + 2 * np.pi * turns)], [once], angular=[0])
+    assert_close([once], [angle], angular=[0])
+
+
+@law
+@given(many_turns, many_turns)
+def test_wrap_is_additive_on_the_circle(a, b):
+    inside = call(angles.wrap, call(angles.wrap, a) + call(angles.wrap, b))
+    assert_close([inside], [call(angles.wrap, a + b)], angular=[0])
+
+
+@law
+@given(number(-50, 50))
+def test_sinc_is_even_and_its_slope_odd(x):
+    assert call(angles.sinc, x) == call(angles.sinc, -x)
+    assert call(angles.sinc_slope, x) == -call(angles.sinc_slope, -x)
+    assert abs(call(angles.sinc, x) * x - np.sin(x)) < 1e-14
+    assert abs(call(angles.sinc_slope, x) * x + call(angles.sinc, x) - np.cos(x)) < 1e-14
+
+
+# --- SE(2) --------------------------------------------------------------------------------------
+
+
+@law
+@given(poses, poses, poses)
+def test_se2_is_a_group(a, b, c):
+    left = call(se2.compose, call(se2.compose, a, b), c)
+    assert_same_pose(left, call(se2.compose, a, call(se2.compose, b, c)))
+    for first, second in ((a, call(se2.inverse, a)), (call(se2.inverse, a), a)):
+        assert_same_pose(call(se2.compose, first, second), np.zeros(3))
+    assert_same_pose(call(se2.compose, a, np.zeros(3)), a)
+    assert_same_pose(call(se2.compose, a, call(se2.between, a, b)), b)
+
+
+@law
+@given(poses, twists)
+def test_exp_log_and_adjoint(a, tau):
+    assert_close(call(se2.log, call(se2.exp, tau)), tau)
+    assert_same_pose(call(se2.exp, call(se2.log, a)), a, 1e-8)
+    moved = call(se2.exp, call(se2.adjoint, a) @ tau)
+    assert_same_pose(call(se2.compose, a, call(se2.exp, tau)), call(se2.compose, moved, a), 1e-8)
+
+
+@law
+@given(poses, poses, twists)
+def test_boxplus_and_boxminus_undo_each_other(a, b, tau):
+    assert_same_pose(call(se2.boxplus, b, call(se2.boxminus, a, b)), a, 1e-8)
+    assert_close(call(se2.boxminus, call(se2.boxplus, a, tau), a), tau, atol=1e-8)
+
+
+@law
+@given(poses, points)
+def test_frames_and_polar_coordinates_undo_each_other(frame, point):
+    assert_close(call(se2.to_frame, frame, call(se2.from_frame, frame, point)), point)
+    assert_close(call(se2.from_frame, frame, call(se2.to_frame, frame, point)), point)
+    assert_close(call(se2.rectangular, call(se2.polar, point)), point)
+
+
+@law
+@given(poses, st.lists(points, min_size=2, max_size=2))
+def test_align_finds_the_motion(carried, pair):
+    cloud = np.array([*pair, pair[0] + [3.0, 0.0], pair[0] + [0.0, 4.0]])
+    moved = np.stack([call(se2.from_frame, carried, p) for p in cloud])
+    assert_same_pose(call(se2.align, cloud, moved), carried, 1e-8)
+
+
+# --- ⊞ and ⊖ on every type ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", charts.REGISTRY)
+@law
+@given(pose=poses, other=poses, point=points, other_point=points, dx=twists, dl=points)
+def test_charts_undo_themselves(name, pose, other, point, other_point, dx, dl):
+    chart = CHARTS[name]
+    moved = compiled(chart.retract)(pose, point, dx, dl)
+    back, back_l = compiled(chart.local)(pose, point, *moved)
+    assert_close(back, dx, atol=1e-8)
+    assert_close(back_l, dl, atol=1e-8)
+    error = compiled(chart.local)(pose, point, other, other_point)
+    there, there_l = compiled(chart.retract)(pose, point, *error)
+    assert_same_pose(there, other, 1e-7)
+    assert_close(there_l, other_point, atol=1e-7)
+
+
+CHARTS = {name: make() for name, make in charts.REGISTRY.items()}
+SENSORS = {name: build(factory) for name, factory in sensors.REGISTRY.items()}
+MOTIONS = {name: build(factory) for name, factory in motion.REGISTRY.items()}
+
+
+def drawn(names, scale=1.0):
+    """A strategy for a vector by the units of its entries."""
+    ranges = {"[rad]": ANGLE, "[s]": (0.0, 5.0), "[1/m]": (0.01, 1.0)}
+
+    def one(name):
+        low, high = ranges.get(name.split(" ")[-1], (-10.0, 10.0))
+        if "steering" in name:
+            low, high = -0.8, 0.8
+        return low * scale, high * scale
+
+    return vector(*(one(name) for name in names))
+
+
+def angular(names):
+    return [k for k, name in enumerate(names) if name.endswith("[rad]")]
+
+
+@pytest.mark.parametrize("name", sensors.REGISTRY)
+@law
+@given(data=st.data())
+def test_residual_takes_back_what_was_added(name, data):
+    sensor = SENSORS[name]
+    z, d = (data.draw(drawn(sensor.measurements, scale)) for scale in (1.0, 0.99))
+    assert_close(call(sensor.residual, z + d, z), d)
+
+
+# --- a change of map frame --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", motion.REGISTRY)
+@law
+@given(carried=poses, pose=poses, data=st.data())
+def test_motion_is_the_same_in_every_map_frame(name, carried, pose, data):
+    model = MOTIONS[name]
+    u, w = data.draw(drawn(model.controls)), data.draw(drawn(model.noises, 0.1))
+    moved = call(model.step, call(se2.compose, carried, pose), u, w)
+    assert_same_pose(moved, call(se2.compose, carried, call(model.step, pose, u, w)), 1e-8)
+
+
+def carry_landmark(carried, landmark, names):
+    """Its first two entries are a place; its angles turn with the map; the rest stays."""
+    out = np.array(landmark)
+    out[:2] = call(se2.from_frame, carried, landmark[:2])
+    for k in angular(names):
+        out[k] += carried[2]
+    return out
+
+
+@pytest.mark.parametrize("name", sensors.REGISTRY)
+@law
+@given(carried=poses, pose=poses, offset=points, data=st.data())
+def test_observations_are_the_same_in_every_map_frame(name, carried, pose, offset, data):
+    """And what is seen of the robot itself moves with the frame."""
+    sensor = SENSORS[name]
+    landmark = data.draw(drawn(sensor.landmark))
+    there = call(se2.compose, carried, pose)
+    seen = angular(sensor.measurements)
+    if not sensor.landmark:
+        z = call(sensor.observe, pose, landmark)
+        expected = {1: lambda: z + carried[2], 2: lambda: call(se2.from_frame, carried, z)}[
+            len(z)
+        ]()
+        assert_close(call(sensor.observe, there, landmark), expected, seen, 1e-8)
+        return
+    landmark[:2] = pose[:2] + offset + np.where(np.abs(offset).max() < 2, 3.0, 0.0)
+    if "rho [1/m]" in sensor.landmark:  # away from where the line of sight vanishes
+        landmark[3] = 0.5 / (1 + np.linalg.norm(offset))
+    moved = carry_landmark(carried, landmark, sensor.landmark)
+    z = call(sensor.observe, pose, landmark)
+    assert_close(call(sensor.observe, there, moved), z, seen, 1e-8)
+    s = np.asarray(sensor.free.mean)
+    new = carry_landmark(carried, call(sensor.invert, pose, z, s), sensor.landmark)
+    assert_close(call(sensor.invert, there, z, s), new, angular(sensor.landmark), 1e-7)
