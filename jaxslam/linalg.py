@@ -79,6 +79,25 @@ def _cholesky_lapack(matrix: jax.Array, tolerance: float) -> tuple[jax.Array, ja
     return jnp.where(positive, jnp.linalg.cholesky(safe, symmetrize_input=False), 0.0), positive
 
 
+def root_psd(matrix: jax.Array) -> jax.Array:
+    """Lower L (n, n) with L Lᵀ = A for a positive semi-definite A of any size, singular or not.
+
+    Cholesky column by column; a pivot that is rounding next to its diagonal entry gives a column of
+    zeros. Gradients are finite.
+    """
+    n = matrix.shape[-1]
+    floor = n * float(jnp.finfo(matrix.dtype).eps) * jnp.abs(jnp.diagonal(matrix))
+
+    def column(rest: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pivot = rest[j, j]
+        good = pivot > floor[j]
+        root = jnp.sqrt(jnp.where(good, pivot, 1.0))
+        own = jnp.where(good & (jnp.arange(n) >= j), rest[:, j] / root, 0.0)
+        return rest - own[:, None] * own[None, :], own
+
+    return jax.lax.scan(column, matrix, jnp.arange(n))[1].T
+
+
 def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
     """L⁻¹ B for lower L (n, n) and B (n, …); rows whose pivot is zero come out zero."""
     n = factor.shape[-1]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.linalg import check_covariance, cholesky, is_concrete
+from jaxslam.linalg import check_covariance, is_concrete, root_psd
 from jaxslam.protocols import Motion, Sensor
 
 _DIRECTIONS = 64
@@ -16,7 +16,7 @@ _RADII = (1.0, 0.5)
 
 
 class Linearity(NamedTuple):
-    """0 is linear; 1 bends as far as it rises; inf bends where it has no slope."""
+    """0 is linear; 1 bends as far as it rises; inf bends where it has no (finite) slope."""
 
     hessian: jax.Array
     """() the worst output, to second order"""
@@ -63,10 +63,7 @@ def linearity_index(
     Raises:
         ValueError: if cov or noise_cov is no covariance of the right size, or sigmas not above 0.
     """
-    point = jnp.asarray(x)
-    point = point.astype(jnp.result_type(point, float))
-    if point.ndim != 1:
-        raise ValueError(f"linearity_index: expected a state of shape (n,), got {point.shape}")
+    point = _vector("linearity_index: state", x)
     if is_concrete(point) and not np.all(np.isfinite(np.asarray(point))):
         raise ValueError("linearity_index: the state is not finite")
     check_covariance("linearity_index: cov", cov, point.shape[0])
@@ -75,20 +72,23 @@ def linearity_index(
         raise ValueError(f"linearity_index: expected f to return (m,), got shape {shape}")
     if is_concrete(sigmas) and not 0 < sigmas < np.inf:
         raise ValueError(f"linearity_index: expected sigmas above 0, got {sigmas}")
-    root, _ = cholesky(jnp.asarray(cov, point.dtype))
+    root = root_psd(jnp.asarray(cov, point.dtype))
 
     def g(xi: jax.Array) -> jax.Array:
         return f(point + root @ xi)
 
     zero = jnp.zeros_like(point)
-    slope, bend = jax.jacfwd(g)(zero), jax.jacfwd(jax.jacfwd(g))(zero)
+    jacobian, bend = jax.jacfwd(f)(point), jax.jacfwd(jax.jacfwd(g))(zero)
+    slope = jacobian @ root
     rows = slope.shape[0]
     reach2 = jnp.sum(slope**2, axis=1)
     if noise_cov is not None:
         check_covariance("linearity_index: noise_cov", noise_cov, rows)
         reach2 = reach2 + jnp.diagonal(jnp.asarray(noise_cov, point.dtype))
-    values, vectors = jnp.linalg.eigh(bend)  # of (m, n, n) symmetric matrices
+    smooth = jnp.isfinite(bend).all(axis=(1, 2))
+    values, vectors = jnp.linalg.eigh(jnp.where(smooth[:, None, None], bend, 0.0))  # (m, n, n)
     by_hessian = sigmas**2 / 2 * jnp.max(jnp.abs(values), axis=1, initial=0.0)
+    by_hessian = jnp.where(smooth, by_hessian, jnp.inf)
 
     axes = jnp.concatenate([jnp.eye(len(zero), dtype=point.dtype), _fixed(len(zero), point.dtype)])
     own = jnp.swapaxes(jax.lax.stop_gradient(vectors), 1, 2).reshape(-1, len(zero))
@@ -99,10 +99,9 @@ def linearity_index(
     if residual is not None:  # a change by more than half a turn is one the other way round
         away = jax.vmap(lambda gap: difference(gap, jnp.zeros_like(gap)))(away)
     by_sampling = jnp.max(jnp.abs(away), axis=0, initial=0.0)
-    # What rounding of f can do is no bend.
-    rounding = (
-        16 * jnp.finfo(point.dtype).eps * (jnp.abs(centre) + jnp.abs(tries @ slope.T).max(axis=0))
-    )
+    # What rounding of f, and of the points themselves, can do is no bend.
+    moved = jnp.abs(centre) + jnp.abs(tries @ slope.T).max(axis=0)
+    rounding = 16 * jnp.finfo(point.dtype).eps * (moved + jnp.abs(jacobian) @ jnp.abs(point))
     by_sampling = jnp.where(by_sampling <= rounding, 0.0, by_sampling)
 
     index, sampled = (_over(part, sigmas, reach2) for part in (by_hessian, by_sampling))
@@ -113,8 +112,8 @@ def motion_linearity(
     motion: Motion, pose: ArrayLike, u: ArrayLike, pose_cov: ArrayLike, *, sigmas: float = 3.0
 ) -> Linearity:
     """`linearity_index` of `step` by pose and noise, covariance blockdiag(pose_cov, Q(pose, u))."""
-    at = jnp.asarray(pose)
-    control = jnp.asarray(u, at.dtype)
+    at = _vector("motion_linearity: pose", pose, 3)
+    control = _vector("motion_linearity: u", u, len(motion.controls)).astype(at.dtype)
     check_covariance("motion_linearity: pose_cov", pose_cov, 3)
     noise = motion.noise_cov(at, control)
     cov = jax.scipy.linalg.block_diag(jnp.asarray(pose_cov, at.dtype), noise)
@@ -147,8 +146,9 @@ def sensor_linearity(
 
     with_noise: whether a bend below the sensor's own noise counts as none (R in the reach).
     """
-    at = jnp.asarray(pose)
-    x = jnp.concatenate([at, jnp.asarray(landmark, at.dtype)])
+    at = _vector("sensor_linearity: pose", pose, 3)
+    own = _vector("sensor_linearity: landmark", landmark, len(sensor.landmark))
+    x = jnp.concatenate([at, own.astype(at.dtype)])
     noise = sensor.noise_cov(sensor.observe(x[:3], x[3:])) if with_noise else None
     return linearity_index(
         lambda x: sensor.observe(x[:3], x[3:]),
@@ -160,11 +160,22 @@ def sensor_linearity(
     )
 
 
+def _vector(name: str, value: ArrayLike, size: int | None = None) -> jax.Array:
+    """As floating point, (n,); ValueError where it is not."""
+    out = jnp.asarray(value)
+    if out.ndim != 1 or size not in (None, out.shape[0]):
+        expected = "(n,)" if size is None else f"({size},)"
+        raise ValueError(f"{name}: expected shape {expected}, got {out.shape}")
+    return out.astype(jnp.result_type(out, float))
+
+
 def _over(bend: jax.Array, sigmas: float, reach2: jax.Array) -> jax.Array:
-    """bend / (n_σ √reach²); 0/0 = 0, and inf where there is a bend alone. Finite gradients."""
-    flat = reach2 == 0
-    ratio = bend / (sigmas * jnp.sqrt(jnp.where(flat, 1.0, reach2)))
-    return jnp.where(flat, jnp.where(bend > 0, jnp.inf, 0.0), ratio)
+    """bend / (n_σ √reach²); 0/0 = 0, and inf where there is a bend alone or f is not finite."""
+    defined = jnp.isfinite(bend) & jnp.isfinite(reach2)
+    flat = defined & (reach2 == 0)
+    bend, reach2 = jnp.where(defined, bend, 0.0), jnp.where(defined & ~flat, reach2, 1.0)
+    ratio = jnp.where(flat & (bend > 0), jnp.inf, bend / (sigmas * jnp.sqrt(reach2)))
+    return jnp.where(defined, jnp.where(flat & (bend == 0), 0.0, ratio), jnp.inf)
 
 
 def _fixed(n: int, dtype: Any) -> jax.Array:

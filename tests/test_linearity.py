@@ -110,6 +110,65 @@ def test_where_there_is_a_bend_and_no_slope():
     assert np.isinf(out.sampled)
 
 
+def test_a_singular_covariance_of_many_inputs():
+    """Beyond 8 inputs too, a direction that is known counts for nothing, and the others do count."""
+    n, rank = 12, 5
+    spread = np.random.default_rng(0).normal(size=(n, rank))
+
+    def f(x):
+        return jnp.stack([(x**2).sum(), x[0] * x[11]])
+
+    x = np.arange(1.0, n + 1) / n
+    out = linearity_index(f, x, spread @ spread.T)
+    # The same in coordinates of the range alone: x + spread y, y ~ N(0, I).
+    alone = linearity_index(lambda y: f(x + spread @ y), np.zeros(rank), np.eye(rank))
+    assert alone.hessian > 0.1
+    np.testing.assert_allclose(out.hessian_rows, alone.hessian_rows, rtol=1e-9)
+
+    def worst(scale):
+        return linearity_index(f, x, scale * spread @ spread.T).hessian
+
+    assert np.isfinite(jax.grad(worst)(1.0))
+
+
+@pytest.mark.parametrize("far", [1e3, 1e5, 1e7])
+def test_far_from_the_origin_a_linear_function_is_linear_in_float32(far):
+    x = np.array([far, -far, 1.0], "f4")
+    cov = np.diag([0.1, 0.1, 0.1]).astype("f4")
+    out = linearity_index(lambda x: jnp.stack([x[0] + x[1], 3 * x[2]]), x, cov)
+    assert out.hessian == out.sampled == 0
+
+
+def test_no_slope_to_compare_with_is_inf_not_nan():
+    """The other outputs keep their own figures."""
+
+    def f(x):
+        return jnp.stack([jnp.sqrt(x[0] ** 2 + x[1] ** 2), x[0] - x[1], x[0] + x[0] ** 2])
+
+    out = linearity_index(f, np.zeros(2), 0.01 * np.eye(2))
+    assert np.isinf(out.hessian_rows[0])
+    assert np.isinf(out.sampled_rows[0])
+    for rows in (out.hessian_rows, out.sampled_rows):
+        np.testing.assert_allclose(rows[1:], [0.0, 0.3], rtol=1e-9, atol=1e-15)
+    assert np.isinf(
+        linearity_index(jnp.log, np.array([0.2]), [[0.04]]).sampled
+    )  # 0.2 - 3 * 0.2 < 0
+
+
+def test_whole_numbers_are_as_good_as_any():
+    """A pose of integers does not round the control, the landmark or the noise."""
+    robot, u, cov = motion.velocity(np.diag([0.1, 0.05, 0.05]) ** 2), [1.5, 0.3, 0.5], np.eye(3) / 9
+    whole = motion_linearity(robot, np.array([1, 2, 0]), u, cov)
+    np.testing.assert_array_equal(
+        whole.hessian_rows, motion_linearity(robot, [1.0, 2.0, 0.0], u, cov).hessian_rows
+    )
+    laser, cov = sensors.range_bearing(np.diag([0.1, 0.05]) ** 2), np.eye(5) / 100
+    np.testing.assert_array_equal(
+        sensor_linearity(laser, np.array([0, 0, 1]), [2.5, 0.5], cov).hessian_rows,
+        sensor_linearity(laser, [0.0, 0.0, 1.0], [2.5, 0.5], cov).hessian_rows,
+    )
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_jit_vmap_dtype_and_gradient(dtype):
     states = np.array([X, [1.0, 2.0], [0.0, 0.0]], dtype)
@@ -213,7 +272,7 @@ def test_inverse_depth_is_near_linear_where_range_is_not(share):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"x": np.eye(2)}, "state of shape"),
+        ({"x": np.eye(2)}, "state: expected shape"),
         ({"cov": np.eye(3)}, r"shape \(2, 2\)"),
         ({"cov": -np.eye(2)}, "negative variance"),
         ({"cov": np.diag([1.0, np.nan])}, "NaN"),
@@ -227,3 +286,18 @@ def test_bad_input_is_refused(change, why):
     arguments = {"f": curved, "x": X, "cov": COV} | change
     with pytest.raises(ValueError, match=why):
         jaxslam.linearity_index(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("pose", "other", "why"),
+    [
+        (np.zeros(2), np.ones(3), r"pose: expected shape \(3,\)"),
+        (np.zeros(3), np.ones(5), r"(u|landmark): expected shape"),
+        (np.zeros((1, 3)), np.ones(3), r"pose: expected shape"),
+    ],
+)
+def test_bad_shapes_of_a_models_input_are_refused(pose, other, why):
+    with pytest.raises(ValueError, match=why):
+        motion_linearity(motion.velocity(np.eye(3)), pose, other, np.eye(3))
+    with pytest.raises(ValueError, match=why):
+        sensor_linearity(sensors.range_bearing(np.eye(2)), pose, other, np.eye(5))
