@@ -15,8 +15,9 @@ from pathlib import Path
 import jax
 
 from benchmarks.gate import Metric, report
+from jaxslam.family import FILTERS
 from jaxslam.run import run
-from jaxslam.scenarios import FILTERS, cloister
+from jaxslam.scenarios import cloister
 from jaxslam.simulate import simulate
 
 RUNS = 64

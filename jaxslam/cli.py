@@ -18,12 +18,13 @@ import numpy as np
 from jaxslam import motion, plot, report, se2, sensors, userfile, verify
 from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS
+from jaxslam.family import FILTERS
 from jaxslam.filters.ekf_slam import ekf_slam
 from jaxslam.linalg import is_positive_definite
 from jaxslam.monte_carlo import Campaign, monte_carlo
-from jaxslam.protocols import Filter
+from jaxslam.protocols import Candidate, Filter
 from jaxslam.run import run
-from jaxslam.scenarios import FILTERS, SCENARIOS
+from jaxslam.scenarios import SCENARIOS
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.types import Status
 
@@ -71,6 +72,12 @@ def _parser() -> argparse.ArgumentParser:
     judge.add_argument("--steps", type=int, help="steps of each; default: the scenario's own")
     judge.add_argument("--block", type=int, default=32, help="runs computed together; sets memory")
     judge.add_argument("--seed", type=int, default=0, help="of every draw")
+    judge.add_argument(
+        "--bound",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also the posterior Cramér-Rao bound",
+    )
     judge.set_defaults(command=_consistency)
 
     drive = commands.add_parser(
@@ -112,14 +119,20 @@ def _parser() -> argparse.ArgumentParser:
 def _consistency(options: argparse.Namespace, command: str) -> int:
     scenario = _scenario(options.scenario, options.steps)
     names = list(FILTERS) if options.filters == "all" else options.filters.split(",")
-    filters = {name: _pick("filter", name, FILTERS)(scenario) for name in names}
+    filters = {name: _filter(name, scenario) for name in names}
     if not 0 <= options.seed < 2**32:
         raise ValueError(f"expected a seed between 0 and 2³²-1, got {options.seed}")
     report.check_writable(options.out)
     key = jax.random.key(options.seed)
     with _Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress:
         campaign = monte_carlo(
-            scenario, filters, options.runs, key, block=options.block, progress=progress
+            scenario,
+            filters,
+            options.runs,
+            key,
+            block=options.block,
+            bound=options.bound,
+            progress=progress,
         )
     print(report.table(campaign))
     written = report.write_files(options.out, _campaign_files(campaign, scenario, options, command))
@@ -136,6 +149,7 @@ def _campaign_files(
     truth, log = jax.jit(partial(simulate, scenario))(key_world)
     candidate = FILTERS[name](scenario)
     filter = candidate if isinstance(candidate, Filter) else candidate(truth)
+    assert isinstance(filter, Filter)
     trace = run(filter, log, scenario.pose, scenario.pose_cov, key_filter)
     title = f"{scenario.name}, {name}, run 0 of seed {options.seed}"
     figures = {
@@ -265,6 +279,17 @@ def _shown(value: Any) -> str:
 def _scenario(name: str, steps: int | None) -> Scenario:
     make = _pick("scenario", name, SCENARIOS)
     return make() if steps is None else make(steps)
+
+
+def _filter(name: str, scenario: Scenario) -> Candidate:
+    """A filter of the family for a scenario, or ValueError by name if it cannot run there."""
+    make = _pick("filter", name, FILTERS)
+    try:
+        return make(scenario, watch=True)
+    except ValueError as error:
+        raise ValueError(
+            f"filter {name!r} cannot run scenario {scenario.name!r}: {error}"
+        ) from error
 
 
 def _pick(kind: str, name: str, known: Mapping[str, _T]) -> _T:

@@ -18,6 +18,10 @@ from numpy.typing import ArrayLike
 
 _T = TypeVar("_T")
 
+# Up to this many rows a product AᵀB is written as outer products, which XLA fuses into one pass
+# over the result; beyond, as one matrix product.
+_OUTER_PRODUCTS = 16
+
 # Up to this size factors are unrolled into fused elementwise code, beyond it LAPACK is called.
 _UNROLLED = 8
 
@@ -34,6 +38,18 @@ def settle(values: _T) -> _T:
     of D entries would be solved for anew at each of the D² entries of the covariance it updates.
     """
     return cast(_T, jax.lax.optimization_barrier(values))
+
+
+def gram(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Aᵀ B of A (k, D), B (k, E), for small k."""
+    if a.shape[0] > _OUTER_PRODUCTS or a.shape[0] == 0:
+        return a.T @ b
+    return total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
+
+
+def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A B of A (n, k), B (k, D), for small k."""
+    return gram(a.T, b)
 
 
 def symmetrize(matrix: jax.Array) -> jax.Array:
@@ -86,6 +102,8 @@ def root_psd(matrix: jax.Array) -> jax.Array:
     zeros. Gradients are finite.
     """
     n = matrix.shape[-1]
+    if n == 0:
+        return matrix
     floor = n * float(jnp.finfo(matrix.dtype).eps) * jnp.abs(jnp.diagonal(matrix))
 
     def column(rest: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -96,6 +114,29 @@ def root_psd(matrix: jax.Array) -> jax.Array:
         return rest - own[:, None] * own[None, :], own
 
     return jax.lax.scan(column, matrix, jnp.arange(n))[1].T
+
+
+def triangular_root(wide: jax.Array) -> jax.Array:
+    """Lower L (n, n) with L Lᵀ = A Aᵀ and a diagonal not below zero, of A (n, m), m >= n.
+
+    Householder reflections from the right, row by row; nothing is squared, so half the digits of a
+    covariance suffice. A may lack rank, and gradients are finite there.
+    """
+    n, m = wide.shape
+
+    def reflect(rest: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
+        ahead = jnp.where(jnp.arange(m) >= i, rest[i], 0.0)
+        square = jnp.sum(ahead**2)
+        there = square > 0
+        length = jnp.sqrt(jnp.where(there, square, 1.0))
+        # To -sign(a_i)·length, away from where a_i - length would cancel; then the sign is turned.
+        sign = jnp.where(ahead[i] >= 0, 1.0, -1.0).astype(rest.dtype)
+        axis = ahead.at[i].add(sign * length)
+        scale = jnp.where(there, 1.0 / (length * (length + jnp.abs(ahead[i]))), 0.0)
+        rest = rest - (rest @ axis * scale)[:, None] * axis[None, :]
+        return rest.at[:, i].multiply(jnp.where(there, -sign, 1.0)), None
+
+    return jnp.tril(jax.lax.scan(reflect, wide, jnp.arange(n))[0][:, :n])
 
 
 def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:

@@ -17,16 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.consistency import Summary, Sums, score, summarize
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.consistency import Score, Summary, Tally, posterior_bound, score, summarize
 from jaxslam.linalg import check_count
-from jaxslam.protocols import Estimator, Filter
+from jaxslam.protocols import Candidate, Chart, Estimator, Filter
 from jaxslam.run import run
-from jaxslam.scenarios import ideal
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.types import Log, Truth
-
-Candidate = Filter | Callable[[Truth], Filter | Estimator]
-"""A filter, or a function of the run's truth that returns a filter or an estimator."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class Campaign:
 
     scenario: str
     source: str
-    published: dict[str, float]
+    published: dict[str, dict[str, float]]
     steps: int
     runs: int
     dtype: str
@@ -56,6 +53,7 @@ def monte_carlo(
     *,
     block: int = 32,
     workers: int | None = None,
+    bound: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
@@ -66,6 +64,7 @@ def monte_carlo(
         runs: how many worlds; run i has key fold_in(key, i).
         key: a PRNG key.
         block: runs vmapped together; the last block is padded, and the padding not counted.
+        bound: also take the posterior Cramér-Rao bound of every run, at the price of one more EKF.
         workers: blocks in flight at once, default the number of CPUs (1 on an accelerator).
         progress: called with (runs done, runs) after each block, in order.
     Returns:
@@ -94,19 +93,20 @@ def monte_carlo(
 
     def judge(
         candidate: Candidate, world: tuple[Truth, Log], which: jax.Array, limit: jax.Array
-    ) -> Sums:
-        def one(truth: Truth, log: Log, key: jax.Array) -> Sums:
-            trace = _estimator(candidate, truth, scenario)(log, key)
-            return score(trace, truth, scenario.sensor, limit)
+    ) -> Score:
+        def one(truth: Truth, log: Log, key: jax.Array) -> Score:
+            method, chart = _estimator(candidate, truth, scenario)
+            return score(method(log, key), truth, scenario.sensor, limit, chart)
 
-        each = jax.vmap(one)(*world, keys_of(which)[1])
-        counts = which < runs
-        return Sums(*jax.tree.map(lambda leaf: _sum_where(counts, leaf), each))
+        each: Score = jax.vmap(one)(*world, keys_of(which)[1])
+        return each._replace(sums=_added(each.sums, which < runs))
 
-    def spread(which: jax.Array) -> jax.Array:
-        truth, log = simulate(scenario, keys_of(which[None])[0][0])
-        trace = _estimator(ideal(scenario), truth, scenario)(log, key)
-        return jnp.sqrt(jnp.trace(trace.estimate.pose_cov[-1, :2, :2]))
+    def least(world: tuple[Truth, Log], which: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        one = partial(posterior_bound, scenario)
+        cov = jax.vmap(one)(*world, keys_of(which)[1]).pose_cov
+        position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)
+        sums = _added({"position": position, "heading": cov[:, :, 2, 2]}, which < runs)
+        return sums, jnp.sqrt(position[0, -1])
 
     if workers is None:
         workers = os.cpu_count() or 1 if jax.default_backend() == "cpu" else 1
@@ -114,9 +114,9 @@ def monte_carlo(
     with ThreadPoolExecutor(workers) as pool:
         jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
             "": (draw, (which,)),
-            " ideal": (spread, (which[0],)),
         }
         world = jax.eval_shape(draw, which)
+        jobs[" bound"] = (least, (world, which))
         limit_shape = jax.ShapeDtypeStruct((), world[0].pose.dtype)
         for name, candidate in filters.items():
             jobs[f"f {name}"] = (partial(judge, candidate), (world, which, limit_shape))
@@ -128,31 +128,36 @@ def monte_carlo(
             )
         )
         compile_seconds = time.perf_counter() - began
-        limit = _divergence_limit(scenario, float(compiled[" ideal"](which[0])), limit_shape.dtype)
+        spread = float(compiled[" bound"](compiled[""](which), which)[1])
+        limit = _divergence_limit(scenario, spread, limit_shape.dtype)
 
-        def work(numbers_of_block: np.ndarray) -> dict[str, Sums]:
+        def work(numbers_of_block: np.ndarray) -> tuple[dict[str, Score], dict[str, Any]]:
             which = jnp.asarray(numbers_of_block)
             world = compiled[""](which)
             at = jnp.asarray(limit, limit_shape.dtype)
-            return {
+            scores = {
                 name: jax.device_get(compiled[f"f {name}"](world, which, at)) for name in filters
             }
+            return scores, jax.device_get(compiled[" bound"](world, which)[0]) if bound else {}
 
-        totals: dict[str, Sums] = {}
+        tallies = {name: Tally() for name in filters}
+        bounds: dict[str, np.ndarray] = {}
         pending = [pool.submit(work, part) for part in numbers]
         try:
             for i, future in enumerate(pending):
-                for name, sums in future.result().items():
-                    wide = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), sums)
-                    totals[name] = (
-                        jax.tree.map(np.add, totals[name], wide) if name in totals else wide
-                    )
+                scores, bound_sums = future.result()
+                here = min(block, runs - i * block)
+                for name, tally in tallies.items():
+                    tally.add(_first(here, scores[name]))
+                for name, total in bound_sums.items():
+                    bounds[name] = bounds.get(name, 0.0) + np.asarray(total, np.float64)
                 if progress is not None:
-                    progress(min((i + 1) * block, runs), runs)
+                    progress(i * block + here, runs)
         except BaseException:
             for future in pending:
                 future.cancel()
             raise
+    mean_bound = {name: total / runs for name, total in bounds.items()} or None
     return Campaign(
         scenario=scenario.name,
         source=scenario.source,
@@ -161,27 +166,42 @@ def monte_carlo(
         runs=runs,
         dtype=str(limit_shape.dtype),
         divergence_limit=limit,
-        filters={name: summarize(total) for name, total in totals.items()},
+        filters={name: summarize(tally, mean_bound) for name, tally in tallies.items()},
         seconds=time.perf_counter() - began,
         compile_seconds=compile_seconds,
     )
 
 
-def _sum_where(counts: jax.Array, each: jax.Array) -> jax.Array:
-    """The sum over the leading axis, of what counts."""
-    mask = counts.reshape(-1, *(1,) * (each.ndim - 1))
-    return jnp.where(mask, each, jnp.zeros_like(each)).sum(axis=0)
+def _added(each: dict[str, jax.Array], counts: jax.Array) -> dict[str, jax.Array]:
+    """The sums over the leading axis, of what counts."""
+
+    def one(leaf: jax.Array) -> jax.Array:
+        mask = counts.reshape(-1, *(1,) * (leaf.ndim - 1))
+        return jnp.where(mask, leaf, jnp.zeros_like(leaf)).sum(axis=0)
+
+    return {name: one(leaf) for name, leaf in each.items()}
 
 
-def _estimator(candidate: Candidate, truth: Truth, scenario: Scenario) -> Estimator:
+def _first(runs: int, scores: Score) -> Score:
+    """The scores of the first runs of a block, which its sums are already of."""
+    per_run: Score = jax.tree.map(lambda leaf: leaf[:runs], scores._replace(sums={}))
+    return per_run._replace(sums=scores.sums)
+
+
+def _estimator(candidate: Candidate, truth: Truth, scenario: Scenario) -> tuple[Estimator, Chart]:
+    """What runs, and the chart of its errors."""
     method = candidate if isinstance(candidate, Filter) else candidate(truth)
     if not isinstance(method, Filter):
-        return method
+        return method, euclidean()
+
+    def learnt(state: Any) -> Any:
+        watch = getattr(state, "watch", ())
+        return watch.information if watch else ()
 
     def drive(log: Log, key: jax.Array) -> Any:
-        return run(method, log, scenario.pose, scenario.pose_cov, key)
+        return run(method, log, scenario.pose, scenario.pose_cov, key, probe=learnt)
 
-    return drive
+    return drive, method.chart
 
 
 def _check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jaxslam.types import Estimate, Info, Log, Scan, Trace
+from jaxslam.slots import Joint
+from jaxslam.types import Estimate, Info, Log, Scan, Trace, Truth
 
 Array = jax.Array
 
@@ -89,8 +90,8 @@ class Basis(NamedTuple):
     """(3, 3) ∂pose/∂dx."""
     cross: Array
     """(L, 3) ∂l/∂dx."""
-    landmark: Array
-    """(L, L) ∂l/∂dl."""
+    landmark: Array | None
+    """(L, L) ∂l/∂dl; None says identity, without products."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,23 +108,39 @@ class Chart:
     """(pose0, l0, pose, l) -> (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
     basis: Callable[[Array, Array], Basis] | None = None
     """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
+    motion_apart: bool = False
+    """whether a correction splits off what it says of the last motion, and moves the robot by that
+    in a world that stands still: the way of a map that is composed with the motion afterwards."""
 
 
 @dataclass(frozen=True, eq=False)
 class Linearizer:
-    """Where Jacobians are taken, with a memory of its own inside the filter's state."""
+    """What affine function with added noise stands for a model, near a Gaussian.
+
+    First-order linearizers evaluate Jacobians somewhere; statistical ones fit to the covariance.
+    Each may keep a memory of its own inside the filter's state, `joint.lin`. Derivatives are by the
+    *coordinates* of pose and landmark; covariances come in, as everywhere, in the filter's chart.
+    """
 
     name: str
-    init: Callable[[int, Array], Any]
-    """(capacity, pose) -> memory, a pytree of arrays of fixed shape."""
-    motion: Callable[[Any, Motion, Array, Array], tuple[Array, Array, Any]]
-    """(memory, motion, pose, u) -> by pose (3, 3), by w (3, W), memory; at w = 0."""
-    observe: Callable[[Any, Sensor, Array, Array, Array, Array], tuple[Array, Array]]
-    """(memory, sensor, slot (), tag (), pose, l) -> by pose (Z, 3), by l (Z, L)."""
-    invert: Callable[[Any, Sensor, Array, Array, Array, Array], tuple[Array, Array, Array]]
-    """(memory, sensor, tag (), pose, z, s) -> by pose (L, 3), by z (L, Z), by s (L, K)."""
-    born: Callable[[Any, Array, Array], Any]
-    """(memory, born (N,) bool, landmarks (N, L)) -> memory, after new landmarks entered the map."""
+    init: Callable[[Array, Array], Any]
+    """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
+    motion: Callable[[Joint, Motion, Chart, Array, Array], tuple[Array, Array, Array, Any]]
+    """(joint, motion, chart, u, P of the robot (3, 3)) -> the new pose, its derivative by the old
+    one (3, 3), the covariance that the noise adds to it (3, 3), memory."""
+    observe: Callable[
+        [Joint, Sensor, Chart, Array, Array, Array, Array], tuple[Array, Array, Array, Array]
+    ]
+    """(joint, sensor, chart, slot (), pose, l, P of robot and landmark (3+L, 3+L)) -> the expected
+    z, its derivatives by pose (Z, 3) and by l (Z, L), a covariance that belongs to the noise of
+    the measurement (Z, Z)."""
+    invert: Callable[[Joint, Sensor, Chart, Array, Array, Array], tuple[Array, Array, Array]]
+    """(joint, sensor, chart, tag (), z, P of the robot (3, 3)) -> the new l, its derivative by the
+    pose (L, 3), its covariance for a known pose (L, L)."""
+    born: Callable[[Joint, Array], Any]
+    """(joint, born (N,) bool) -> memory, after new landmarks entered the map."""
+    euclidean: bool = False
+    """whether it is meant for the Euclidean chart and landmarks that are points (x, y) alone."""
 
 
 class Prediction(NamedTuple):
@@ -159,3 +176,7 @@ class Filter:
 
 Estimator = Callable[[Log, Array], Trace]
 """(log, key) -> trace: what the harness runs; `partial(run, filter, …)`, or a batch method."""
+
+Candidate = Filter | Callable[[Truth], Filter | Estimator]
+"""What a campaign tries: a filter, or a function of the run's truth that returns a filter or an
+estimator."""

@@ -13,54 +13,43 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.consistency import DOF, LEVEL, Measure, Summary
+from jaxslam.consistency import DOF, LANDMARK_DOF, LEVEL, LEVELS, Measure, Summary
 from jaxslam.monte_carlo import Campaign
 from jaxslam.types import Estimate
 
 ROWS = (
-    ("nees_pose", "pose NEES", f"{DOF['pose']}"),
+    ("nees_pose", "pose NEES (x, y, θ)", f"{DOF['pose']}"),
+    ("nees_own", "pose NEES, own error", f"{DOF['pose']}"),
     ("nees_position", "position NEES", f"{DOF['position']}"),
     ("nees_heading", "heading NEES", f"{DOF['heading']}"),
+    ("nees_landmarks", "landmark NEES", f"{LANDMARK_DOF}"),
     ("nis_per_dof", "NIS / dof", "1"),
+    ("autocorrelation", "innovation autocorr., lag 1", "0"),
+    ("coverage_95_pose", "pose in 95 % ellipsoid", "0.95"),
+    ("noncredibility", "noncredibility [dB]", "0"),
+    ("inclination", "inclination [dB]", "0"),
     ("rmse_position", "position RMSE [m]", ""),
+    ("bound_ratio_position", "  over Cramér-Rao bound", ">= 1"),
     ("rmse_heading_deg", "heading RMSE [°]", ""),
+    ("bound_ratio_heading", "  over Cramér-Rao bound", ">= 1"),
     ("rmse_landmarks", "landmark RMSE [m]", ""),
+    ("unobservable", "unobservable directions", "3"),
+    ("rotation_information", "learnt of a turn [1/rad²]", "0"),
     ("log_likelihood", "log-likelihood", ""),
 )
 """Measure, its name in the table, and what an honest filter shows."""
 
+_COLUMNS = 5
+
 
 def table(campaign: Campaign) -> str:
-    """The campaign for a human: one column a filter, one row a measure, and the verdicts."""
+    """The campaign for a human: one column a filter, one row a measure, and the verdicts.
+
+    Filters beyond the fifth start a further table.
+    """
     names = list(campaign.filters)
-    lines = [["", "honest", *names]]
-    lines.append(["verdict", "consistent", *(s.verdict for s in campaign.filters.values())])
-    for key, label, honest in ROWS:
-        cells = [_cell(s.measures.get(key)) for s in campaign.filters.values()]
-        lines.append([label, honest, *cells])
-        if key in campaign.published:
-            note = [f"{campaign.published[key]:.4g}" if n == "ekf" else "" for n in names]
-            if any(note):
-                lines.append(["  published", "", *note])
-    bands = [_band(s.nis_band) for s in campaign.filters.values()]
-    lines.append([f"NIS / dof, {LEVEL:.0%} band", "", *bands])
-    for block in DOF:
-        shares = [f"{s.inside[block]:.1%}" if block in s.inside else "-" for s in _of(campaign)]
-        lines.append([f"steps in {block} band", f"{LEVEL:.1%}", *shares])
-    always = ("runs", "not_finite", "divergent")
-    for key in _of(campaign)[0].counts:
-        counts = [s.counts[key] for s in _of(campaign)]
-        if key in always or any(counts):
-            lines.append([key.replace("_", " "), "", *(f"{count:,}" for count in counts)])
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    text = [
-        "  ".join(
-            c.ljust(w) if i == 0 else c.rjust(w)
-            for i, (c, w) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
-    text.insert(1, "-" * len(text[0]))
+    parts = [names[i : i + _COLUMNS] for i in range(0, len(names), _COLUMNS)]
+    text = "\n\n".join(_columns(campaign, part) for part in parts)
     title = f"{campaign.scenario}: {campaign.runs} runs × {campaign.steps} steps, {campaign.dtype}"
     notes = [
         f"NEES is not divided by its dof, which is the honest value. ±: {LEVEL:.0%} interval over",
@@ -68,9 +57,21 @@ def table(campaign: Campaign) -> str:
         "below (pessimistic). divergent: final position error over "
         f"{campaign.divergence_limit:.3g} m, 5 σ of the ideal EKF.",
     ]
+    notes += not_finite(campaign)
     if campaign.published:
         notes.append(f"published: {campaign.source}")
-    return "\n".join([title, "", *text, "", *notes])
+    return "\n".join([title, "", text, "", *notes])
+
+
+def not_finite(campaign: Campaign) -> list[str]:
+    """A sentence on each filter that was not finite in some runs, with the numbers of those."""
+    out = []
+    for name, summary in campaign.filters.items():
+        lost = summary.not_finite_runs
+        if lost:
+            shown = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
+            out.append(f"{name} was not finite in {len(lost)} of {campaign.runs} runs: {shown}")
+    return out
 
 
 def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> str:
@@ -81,6 +82,9 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
             "measures": {key: _finite(measure._asdict()) for key, measure in s.measures.items()},
             "nis_band": s.nis_band,
             "steps_inside_band": s.inside,
+            "coverage": {block: _numbers(share) for block, share in s.coverage.items()},
+            "autocorrelation": _numbers(s.autocorrelation),
+            "not_finite_runs": s.not_finite_runs,
             "counts": s.counts,
         }
         for name, s in campaign.filters.items()
@@ -95,6 +99,7 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
         "seed": seed,
         "command": command,
         "nees_convention": "not divided by dof",
+        "coverage_levels": LEVELS,
         "level": LEVEL,
         "divergence_limit_m": campaign.divergence_limit,
         "seconds": round(campaign.seconds, 3),
@@ -193,6 +198,39 @@ def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], Any]]) 
     return [folder / name for name in files]
 
 
+def _columns(campaign: Campaign, names: list[str]) -> str:
+    summaries = [campaign.filters[name] for name in names]
+    lines = [["", "honest", *names]]
+    lines.append(["verdict", "consistent", *(s.verdict for s in summaries)])
+    for key, label, honest in ROWS:
+        cells = [_cell(s.measures.get(key)) for s in summaries]
+        if any(cell != "-" for cell in cells):
+            lines.append([label, honest, *cells])
+        note = [campaign.published.get(name, {}).get(key) for name in names]
+        if any(figure is not None for figure in note):
+            figures = ["" if figure is None else f"{figure:.4g}" for figure in note]
+            lines.append(["  published", "", *figures])
+    lines.append([f"NIS / dof, {LEVEL:.0%} band", "", *(_band(s.nis_band) for s in summaries)])
+    for block in DOF:
+        shares = [f"{s.inside[block]:.1%}" if block in s.inside else "-" for s in summaries]
+        lines.append([f"steps in {block} band", f"{LEVEL:.1%}", *shares])
+    always = ("runs", "not_finite", "divergent")
+    for key in summaries[0].counts:
+        counts = [s.counts[key] for s in summaries]
+        if key in always or any(counts):
+            lines.append([key.replace("_", " "), "", *(f"{count:,}" for count in counts)])
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    text = [
+        "  ".join(
+            c.ljust(w) if i == 0 else c.rjust(w)
+            for i, (c, w) in enumerate(zip(line, widths, strict=True))
+        )
+        for line in lines
+    ]
+    text.insert(1, "-" * len(text[0]))
+    return "\n".join(text)
+
+
 def _of(campaign: Campaign) -> list[Summary]:
     return list(campaign.filters.values())
 
@@ -207,6 +245,10 @@ def _cell(measure: Measure | None) -> str:
 
 def _band(band: tuple[float, float] | None) -> str:
     return "-" if band is None else f"[{band[0]:.4f}, {band[1]:.4f}]"
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _finite(values: dict[str, float]) -> dict[str, float | None]:

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.linalg import check_covariance, cholesky
+from jaxslam.angles import wrap
+from jaxslam.linalg import check_covariance, is_concrete, root_psd
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.types import Log, Scan, Truth
 
@@ -31,13 +32,13 @@ class Scenario:
     motion: Motion
     sensor: Sensor
     landmarks: ArrayLike
-    """(N, L) true landmarks; the tag of one is its row."""
+    """(N, L) true landmarks; the tag of one is its row. May be traced: maps vary under `vmap`."""
     controls: ArrayLike
     """(T, U) nominal controls."""
     pose: ArrayLike = (0.0, 0.0, 0.0)
-    """(3,) true pose before the first control; a filter starts there too."""
+    """(3,) what a filter is told of the pose before the first control."""
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    """(3, 3) what a filter is told of that pose."""
+    """(3, 3) how far from there, by a Gaussian draw, the robot truly starts."""
     noise_on: Literal["robot", "odometry"] = "robot"
     """"robot": the noise moves the true robot, and the log holds the nominal control. "odometry":
     the true robot follows the nominal control, and the noise is on the control in the log."""
@@ -48,8 +49,8 @@ class Scenario:
     in view beyond M are counted in `Truth.missed`."""
     filter_options: dict[str, Any] = field(default_factory=dict)
     """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
-    published: dict[str, float] = field(default_factory=dict)
-    """figures of the paper, by the names of `consistency.Summary`."""
+    published: dict[str, dict[str, float]] = field(default_factory=dict)
+    """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
     source: str = ""
     """where the experiment is published."""
 
@@ -79,10 +80,12 @@ def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
     campaign all get the same draws.
     """
     dtype = jnp.result_type(float)
-    start = jnp.asarray(scenario.pose, dtype)
     controls = jnp.asarray(scenario.controls, dtype)
     landmarks = jnp.asarray(scenario.landmarks, dtype)
-    key_motion, key_scan = jax.random.split(key)
+    key_motion, key_scan, key_start = jax.random.split(key, 3)
+    start = jnp.asarray(scenario.pose, dtype)
+    start = start + _draw(jnp.asarray(scenario.pose_cov, dtype), _normals(key_start, start))
+    start = start.at[2].set(wrap(start[2]))
     poses, logged = _drive(scenario, start, controls, key_motion)
 
     count = landmarks.shape[0]
@@ -107,7 +110,7 @@ def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
         valid=valid,
     )
     missed = seen.sum(axis=1) - valid.sum(axis=1)
-    return Truth(poses, landmarks, missed), Log(logged, scan)
+    return Truth(poses, landmarks, missed, start), Log(logged, scan)
 
 
 def _drive(
@@ -139,10 +142,13 @@ def _normals(key: jax.Array, like: jax.Array) -> jax.Array:
 
 def _draw(cov: jax.Array, normal: jax.Array) -> jax.Array:
     """N(0, cov) from standard normals; cov may be singular or zero."""
-    return cholesky(cov)[0] @ normal
+    return root_psd(cov) @ normal
 
 
 def _check_table(name: str, values: ArrayLike, columns: int) -> None:
+    shape = np.shape(values)
+    if len(shape) == 2 and shape[1] == columns and shape[0] > 0 and not is_concrete(values):
+        return  # a tracer, as when maps are drawn under vmap
     table = np.asarray(values)
     if table.ndim != 2 or table.shape[1] != columns or table.shape[0] == 0:
         raise ValueError(f"{name}: expected shape (at least 1, {columns}), got {table.shape}")

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam.linalg import settle, symmetrize, total
+from jaxslam.linalg import cholesky, settle, symmetrize, total, triangular_root
 
 
 class Joint(NamedTuple):
@@ -21,20 +21,62 @@ class Joint(NamedTuple):
     landmarks: jax.Array
     """(N, L)"""
     cov: jax.Array
-    """(D, D) covariance of the error in the filter's chart, robot first."""
+    """(D, D) covariance of the error in the filter's chart, robot first; of a square-root filter a
+    root X of it, X Xᵀ = P"""
     alive: jax.Array
     """(N,) bool"""
     tag: jax.Array
     """(N,) int32, -1 where dead"""
     lin: Any
     """the linearizer's memory"""
+    watch: Any = ()
+    """a `Watch` of the directions that should stay unobservable, where one is kept"""
+    last: Any = ()
+    """(3, D) covariance of the error (x, y, θ) of the last motion with all errors, where the chart
+    corrects that first"""
+
+
+class Watch(NamedTuple):
+    """What the filter's own linearized system does to the three degrees of freedom of its frame.
+
+    A direction begins at the robot, goes where the transition matrices take it, and enters a new
+    landmark as its first measurement says; so it is unobservable as long as no later measurement
+    sees it, and the directions that none sees are the unobservable subspace.
+    """
+
+    directions: jax.Array
+    """(D, 3) in the filter's chart; rows of the robot begin as the unit matrix"""
+    information: jax.Array
+    """(3, 3) Σ (H n)ᵀ R⁻¹ (H n) of all corrections"""
+    scale: jax.Array
+    """(3,) Σ of the same with absolute values, what rounding is measured by"""
+    turn: jax.Array
+    """(3,) the combination of directions that turns everything about the origin by 1 rad"""
 
 
 def empty(
-    pose: jax.Array, pose_cov: jax.Array, capacity: int, landmark_size: int, lin: Any = ()
+    pose: jax.Array,
+    pose_cov: jax.Array,
+    capacity: int,
+    landmark_size: int,
+    lin: Any = (),
+    *,
+    square_root: bool = False,
+    turn: jax.Array | None = None,
+    motion_apart: bool = False,
 ) -> Joint:
-    """A robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero."""
+    """A robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero.
+
+    turn: (3,) how the robot moves when all turns about the origin, in the filter's chart; where
+    given, a `Watch` is kept.
+    """
     size = 3 + capacity * landmark_size
+    if square_root:
+        pose_cov = cholesky(pose_cov)[0]
+    watch: Any = ()
+    if turn is not None:
+        information = jnp.zeros((3, 3), pose.dtype)
+        watch = Watch(jnp.eye(size, 3, dtype=pose.dtype), information, information[0], turn)
     return Joint(
         pose=pose,
         landmarks=jnp.zeros((capacity, landmark_size), pose.dtype),
@@ -42,6 +84,8 @@ def empty(
         alive=jnp.zeros(capacity, bool),
         tag=jnp.full(capacity, -1, jnp.int32),
         lin=lin,
+        watch=watch,
+        last=jnp.zeros((3, size), pose.dtype) if motion_apart else (),
     )
 
 
@@ -70,6 +114,21 @@ def gather(joint: Joint, slot: jax.Array) -> tuple[jax.Array, jax.Array]:
     return landmark, jax.lax.dynamic_slice_in_dim(joint.cov, 3 + slot * size, size)
 
 
+def robot_cov(joint: Joint, square_root: bool = False) -> jax.Array:
+    """P of the robot, (3, 3)."""
+    return joint.cov[:3] @ joint.cov[:3].T if square_root else joint.cov[:3, :3]
+
+
+def local_cov(joint: Joint, slot: jax.Array, square_root: bool = False) -> jax.Array:
+    """P of the robot and the landmark of a slot (), (3+L, 3+L)."""
+    size = joint.landmarks.shape[1]
+    rows = jnp.concatenate([joint.cov[:3], gather(joint, slot)[1]])
+    if square_root:
+        return rows @ rows.T
+    own = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
+    return jnp.concatenate([rows[:, :3], own], axis=1)
+
+
 def scatter(
     joint: Joint,
     slot: jax.Array,
@@ -78,12 +137,15 @@ def scatter(
     by_pose: jax.Array,
     own_cov: jax.Array,
     tag: jax.Array,
+    *,
+    square_root: bool = False,
 ) -> Joint:
     """Fill dead slots with m landmarks that depend on the map through the pose: Solà (35)-(38).
 
     With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM, P_LL = G P_RR Gᵀ + diag(own_cov).
     So the landmarks of one scan are correlated with each other through the robot. Written as
     additions to the zeros (and the unit variance) of padding, O(m·D); places not granted add none.
+    Of a square root X, X_L = G X_R beside a root of own_cov in the columns of the slot.
 
     Args:
         slot: (m,) dead slots, all different where granted.
@@ -95,23 +157,34 @@ def scatter(
     rows = 3 + slot[:, None] * size + jnp.arange(size)[None, :]
     flat = rows.reshape(-1)
     gain = jnp.where(here[:, :, None], by_pose, 0.0).reshape(m * size, 3)
-    # R is zero at the new columns. With T = R + P_RR Gᵀ/2, G T + (G T)ᵀ is the cross-covariance
-    # with the map and, where rows and columns are both new, G P_RR Gᵀ; symmetric to the last bit.
-    half = joint.cov[:3].at[:, flat].add(0.5 * joint.cov[:3, :3] @ gain.T)
-    cross = settle(total(gain[:, k, None] * half[k, None, :] for k in range(3)))
-    own = jnp.where(here[:, :, None], symmetrize(own_cov), 0.0)
+    blocks = rows[:, :, None], rows[:, None, :]
     # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
     cov = joint.cov.at[flat, flat].add(-jnp.repeat(granted, size).astype(gain.dtype))
-    cov = cov.at[flat].add(cross).at[:, flat].add(cross.T)
+    if square_root:
+        root = jax.vmap(lambda cov: cholesky(cov)[0])(symmetrize(own_cov))
+        cov = cov.at[flat].add(total(gain[:, k, None] * joint.cov[None, k] for k in range(3)))
+        cov = cov.at[blocks].add(jnp.where(here[:, :, None], root, 0.0))
+    else:
+        # R is zero at the new columns. With T = R + P_RR Gᵀ/2, G T + (G T)ᵀ is the cross-covariance
+        # with the map and, where rows and columns are both new, G P_RR Gᵀ; symmetric to the bit.
+        half = joint.cov[:3].at[:, flat].add(0.5 * joint.cov[:3, :3] @ gain.T)
+        cross = settle(total(gain[:, k, None] * half[k, None, :] for k in range(3)))
+        cov = cov.at[flat].add(cross).at[:, flat].add(cross.T)
+        cov = cov.at[blocks].add(jnp.where(here[:, :, None], symmetrize(own_cov), 0.0))
+    watch = joint.watch
+    if watch:
+        grown = watch.directions.at[flat].add(gain @ watch.directions[:3])
+        watch = watch._replace(directions=grown)
     return joint._replace(
         landmarks=joint.landmarks.at[slot].add(jnp.where(here, landmarks, 0.0)),
-        cov=cov.at[rows[:, :, None], rows[:, None, :]].add(own),
+        cov=cov,
         alive=joint.alive.at[slot].max(granted),
         tag=joint.tag.at[slot].max(jnp.where(granted, tag, -1).astype(jnp.int32)),
+        watch=watch,
     )
 
 
-def remove(joint: Joint, dead: jax.Array) -> Joint:
+def remove(joint: Joint, dead: jax.Array, *, square_root: bool = False) -> Joint:
     """Forget the landmarks of the slots dead (N,) bool: marginalize them out and free their slots.
 
     In covariance form the marginal is what is left when rows and columns are dropped (Solà Table 1,
@@ -120,9 +193,19 @@ def remove(joint: Joint, dead: jax.Array) -> Joint:
     size = joint.landmarks.shape[1]
     keep = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(~dead, size)])
     eye = jnp.eye(joint.cov.shape[0], dtype=joint.cov.dtype)
+    if square_root:
+        wide = [jnp.where(keep[:, None], joint.cov, 0.0), jnp.where(keep[:, None], 0.0, eye)]
+        cov = triangular_root(jnp.concatenate(wide, axis=1))
+    else:
+        cov = jnp.where(keep[:, None] & keep[None, :], joint.cov, eye)
+    watch = joint.watch
+    if watch:
+        left = jnp.where(keep[:, None], watch.directions, 0.0)
+        watch = watch._replace(directions=left)
     return joint._replace(
         landmarks=jnp.where(dead[:, None], 0.0, joint.landmarks),
-        cov=jnp.where(keep[:, None] & keep[None, :], joint.cov, eye),
+        cov=cov,
         alive=joint.alive & ~dead,
         tag=jnp.where(dead, -1, joint.tag),
+        watch=watch,
     )

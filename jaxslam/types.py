@@ -65,6 +65,8 @@ class Truth(NamedTuple):
     """(N, L) true landmarks, in the order of their tags."""
     missed: jax.Array
     """(T,) int: landmarks in view for which the scan had no place."""
+    start: jax.Array
+    """(3,) true pose before the first control."""
 
 
 class Estimate(NamedTuple):

@@ -3,7 +3,6 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
@@ -271,7 +270,7 @@ def test_the_ideal_ekf_takes_them_too(name):
 
     def ideal(key):
         truth, log = simulate(scenario, key)
-        at_truth = linearize.at_truth(truth, jnp.asarray(START))
+        at_truth = linearize.at_truth(truth)
         filter = ekf_slam(scenario.motion, scenario.sensor, 1, linearize=at_truth)
         return run(filter, log, START, SPREAD, key).estimate
 

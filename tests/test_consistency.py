@@ -45,7 +45,7 @@ def synthetic(rng, runs, claimed=1.0, singular=0):
         alive=np.tile([True, False, True], (runs, STEPS, 1)),
         tag=np.tile(tag, (runs, STEPS, 1)),
     )
-    truth = Truth(pose + error, landmarks, np.zeros((runs, STEPS), int))
+    truth = Truth(pose + error, landmarks, np.zeros((runs, STEPS), int), np.zeros((runs, 3)))
     return Trace(estimate, info, (), ()), truth, error
 
 
@@ -56,7 +56,12 @@ def _scores(trace, truth, limit):
 
 def summed(trace, truth, limit=1e9):
     each = _scores(*jax.tree.map(jnp.asarray, (trace, truth)), jnp.asarray(limit))
-    return jax.tree.map(lambda leaf: np.asarray(leaf).sum(axis=0), each)
+    tally = consistency.Tally()
+    # In two parts, as blocks come.
+    for part in (slice(0, 2), slice(2, None)):
+        scores = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[part], each)
+        tally.add(scores._replace(sums=jax.tree.map(lambda leaf: leaf.sum(axis=0), scores.sums)))
+    return tally
 
 
 def plain_nees(error, cov):

@@ -18,8 +18,8 @@ FLOORS = [
     "types protocols slots noise derivatives",
     "motion sensors charts linearize association",
     "filters run simulate",
-    "consistency monte_carlo verify linearity scenarios",
-    "datasets plot report userfile cli __main__",
+    "consistency monte_carlo verify linearity scenarios family",
+    "datasets plot page report userfile cli __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
 ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import filters, motion, run, scenarios, simulate
+from jaxslam import family, filters, motion, run, simulate
 from jaxslam.monte_carlo import monte_carlo
 
 SHORT = worlds.ring(steps=12)
@@ -82,7 +82,7 @@ def test_functions_of_the_truth_and_estimators_run_too(in_one_block):
         return lambda log, key: run(ekf, log, SHORT.pose, SHORT.pose_cov, key)
 
     campaign = monte_carlo(
-        SHORT, {"ideal": scenarios.ideal(SHORT), "estimator": estimator}, 10, worlds.key(), block=10
+        SHORT, {"ideal": family.ideal(SHORT), "estimator": estimator}, 10, worlds.key(), block=10
     )
     same(campaign.filters["estimator"], in_one_block.filters["ekf"])
     assert campaign.filters["ideal"].measures["nees_pose"].value > 0
@@ -148,8 +148,8 @@ def lineup():
     world = worlds.ring()
     candidates = {
         "ekf": worlds.ekf(world),
-        "right_invariant": scenarios.FILTERS["right_invariant"](world),
-        "ideal": scenarios.ideal(world),
+        "right_invariant": family.FILTERS["right_invariant"](world),
+        "ideal": family.ideal(world),
     } | {name: make(world) for name, make in worlds.WRONG.items()}
     return monte_carlo(world, candidates, 200, worlds.key(), block=100).filters
 

@@ -33,9 +33,9 @@ def transposed_motion(scenario):
     """Propagates Fᵀ P F (the slip in the Notes' EKF)."""
     right = linearize.at_estimate()
 
-    def motion_at(memory, model, pose, u):
-        by_pose, by_noise, memory = right.motion(memory, model, pose, u)
-        return by_pose.T, by_noise, memory
+    def motion_at(*arguments):
+        moved, by_pose, noise, memory = right.motion(*arguments)
+        return moved, by_pose.T, noise, memory
 
     return ekf(scenario, linearize=dataclasses.replace(right, motion=motion_at))
 

@@ -38,7 +38,7 @@ def right_invariant() -> Chart:
         return Basis(
             pose=eye.at[0, 2].set(-pose[1]).at[1, 2].set(pose[0]),
             cross=cross.at[0, 2].set(-landmark[1]).at[1, 2].set(landmark[0]),
-            landmark=jnp.eye(2, dtype=pose.dtype),
+            landmark=None,
         )
 
     return Chart(name="right_invariant", retract=retract, local=local, basis=basis)

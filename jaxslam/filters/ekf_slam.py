@@ -6,10 +6,10 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from jaxslam import slots
+from jaxslam import linalg, slots
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters import gaussian
+from jaxslam.filters import gaussian, propagation
 from jaxslam.linalg import check_count, is_concrete
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.protocols import Associate, Chart, Filter, Linearizer, Motion, Prediction, Sensor
@@ -30,6 +30,8 @@ def ekf_slam(
     iterations: int = 1,
     joseph: bool = False,
     births: int | None = None,
+    square_root: bool = False,
+    watch: bool = False,
 ) -> Filter:
     """Extended Kalman filter SLAM in a map of fixed capacity (Solà 2).
 
@@ -54,17 +56,27 @@ def ekf_slam(
         joseph: Joseph's form of the covariance update; dearer, and safer in float32.
         births: at most so many new landmarks a scan, the rest `Status.DEFERRED`; the guide starts
             one. Default no limit.
+        square_root: hold a root X of P = X Xᵀ instead of P, in which float32 goes as far as float64
+            does in P; the same filter, dearer (the prediction is O(N³)).
+        watch: keep a `slots.Watch` in the state, which campaigns report.
     Raises:
         ValueError: on a capacity, iterations or births below 1, a gate not above 0, an unknown
-            update, or a chart that does not fit the sensor's landmarks.
+            update, a chart or linearizer that does not fit the sensor's landmarks or one another,
+            Joseph's form of a square root, or several iterations of a statistical linearizer.
     """
     chart = chart or euclidean()
     linearize = linearize or at_estimate()
     associate = associate or known_association()
     _check(sensor, chart, capacity, update, gate, iterations, births)
+    _check_parts(sensor, chart, linearize, iterations, joseph, square_root)
     size_l, size_z = len(sensor.landmark), len(sensor.measurements)
-    propagate = partial(gaussian.propagate, motion=motion, chart=chart, linearize=linearize)
-    augment = partial(gaussian.augment, sensor=sensor, chart=chart, linearize=linearize)
+    propagate = partial(
+        propagation.propagate,
+        motion=motion,
+        chart=chart,
+        linearize=linearize,
+        square_root=square_root,
+    )
     correct = partial(
         gaussian.correct,
         sensor=sensor,
@@ -73,15 +85,33 @@ def ekf_slam(
         gate=gate,
         iterations=iterations,
         joseph=joseph,
+        square_root=square_root,
+    )
+    augment = partial(
+        gaussian.augment,
+        sensor=sensor,
+        chart=chart,
+        linearize=linearize,
+        square_root=square_root,
     )
 
     def init(pose: jax.Array, pose_cov: jax.Array) -> Joint:
-        lin = linearize.init(capacity, pose)
-        joint = slots.empty(pose, pose_cov, capacity, size_l, lin)
-        if chart.basis is None:
-            return joint
-        undo = jnp.linalg.inv(chart.basis(pose, joint.landmarks[0]).pose)
-        return joint._replace(cov=joint.cov.at[:3, :3].set(undo @ pose_cov @ undo.T))
+        ground = jnp.zeros((capacity, size_l), pose.dtype)
+        turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
+        if chart.basis is not None:
+            undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
+            pose_cov, turn = undo @ pose_cov @ undo.T, undo @ turn
+        lin = linearize.init(pose, ground)
+        return slots.empty(
+            pose,
+            pose_cov,
+            capacity,
+            size_l,
+            lin,
+            square_root=square_root,
+            turn=turn if watch else None,
+            motion_apart=chart.motion_apart,
+        )
 
     def predict(joint: Joint, u: jax.Array, key: jax.Array) -> Joint:
         return propagate(joint, u)
@@ -146,7 +176,8 @@ def ekf_slam(
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:
-        return _moments(joint, sensor, chart)
+        cov = joint.cov @ joint.cov.T if square_root else joint.cov
+        return _moments(joint._replace(cov=cov), sensor, chart)
 
     return Filter(
         name="ekf_slam",
@@ -174,8 +205,10 @@ def _moments(joint: Joint, sensor: Sensor, chart: Chart) -> Estimate:
         by_landmark = jax.jacfwd(sensor.position)(landmark)
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)
-            cross = basis.cross @ by_robot.T @ basis.landmark.T
-            own = basis.landmark @ own @ basis.landmark.T + cross + cross.T
+            if basis.landmark is not None:
+                own, by_robot = basis.landmark @ own @ basis.landmark.T, basis.landmark @ by_robot
+            cross = basis.cross @ by_robot.T
+            own = own + cross + cross.T
             own = own + basis.cross @ pose_cov @ basis.cross.T
         return sensor.position(landmark), by_landmark @ own @ by_landmark.T
 
@@ -234,3 +267,22 @@ def _check(
             f"ekf_slam: the chart {chart.name} does not act on the {landmark.shape[0]}-parameter "
             f"landmarks of the sensor {sensor.name}"
         )
+
+
+def _check_parts(
+    sensor: Sensor,
+    chart: Chart,
+    linearize: Linearizer,
+    iterations: int,
+    joseph: bool,
+    square_root: bool,
+) -> None:
+    if linearize.euclidean and (chart.basis is not None or len(sensor.landmark) != 2):
+        raise ValueError(
+            f"ekf_slam: the linearizer {linearize.name} is for the Euclidean chart and landmarks "
+            f"(x, y), not for the chart {chart.name} and the landmarks of {sensor.name}"
+        )
+    if linearize.name == "unscented" and iterations > 1:
+        raise ValueError("ekf_slam: the linearizer unscented does not iterate")
+    if joseph and square_root:
+        raise ValueError("ekf_slam: Joseph's form is of a covariance, not of its square root")

@@ -1,22 +1,22 @@
-"""The atoms of every Kalman-type SLAM filter on a `Joint`: propagate, correct, augment.
+"""The atoms of every Kalman-type SLAM filter on a `Joint`: correct and augment.
 
-Each exploits that a motion touches the robot alone, and a measurement the robot and one landmark:
-no dense D×D product is formed. They take the models as records, so one set of equations serves
-every sensor, chart and linearizer. `filters.ekf_slam` binds them.
+With `filters.propagation`, they exploit that a motion touches the robot alone, and a measurement
+the robot and one landmark: no dense D×D product is formed. They take the models as records, so one
+set of equations serves every sensor, chart and linearizer. `filters.ekf_slam` binds them.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg, slots
-from jaxslam.protocols import Basis, Chart, Linearizer, Motion, Sensor
-from jaxslam.slots import Joint
+from jaxslam import linalg, se2, slots
+from jaxslam.filters.propagation import step_ahead
+from jaxslam.protocols import Basis, Chart, Linearizer, Sensor
+from jaxslam.slots import Joint, Watch
 
-# Up to this many rows the covariance update is written as outer products, which XLA fuses into one
-# pass over P; beyond, as one matrix product.
-_OUTER_PRODUCTS = 16
+_TINY = 1e-30
 
 
 class Correction(NamedTuple):
@@ -36,59 +36,6 @@ class Correction(NamedTuple):
     """(m,) bool: its innovation covariance is positive definite"""
 
 
-def propagate(
-    joint: Joint, u: jax.Array, *, motion: Motion, chart: Chart, linearize: Linearizer
-) -> Joint:
-    """Robot motion, O(N) in a chart whose landmarks stand still: Solà (14)-(17).
-
-    pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the error of
-    the landmarks moves too, with A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block.
-    """
-    by_pose, by_noise, lin = linearize.motion(joint.lin, motion, joint.pose, u)
-    pose = motion.step(joint.pose, u, jnp.zeros(by_noise.shape[1], joint.pose.dtype))
-    noise = motion.noise_cov(joint.pose, u)
-    if chart.basis is None:
-        robot = _matmul(by_pose, joint.cov[:3])
-        own = _matmul(robot[:, :3], by_pose.T) + _matmul(_matmul(by_noise, noise), by_noise.T)
-        robot = jnp.concatenate([linalg.symmetrize(own), robot[:, 3:]], axis=1)
-        cov = joint.cov.at[:3].set(robot).at[:, :3].set(robot.T)
-    else:
-        over_map = jax.vmap(chart.basis, in_axes=(None, 0))
-        before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
-        cov = _propagate_in_chart(joint, by_pose, by_noise, noise, before, after)
-    return joint._replace(pose=pose, cov=cov, lin=lin)
-
-
-def _propagate_in_chart(
-    joint: Joint,
-    by_pose: jax.Array,
-    by_noise: jax.Array,
-    noise: jax.Array,
-    before: Basis,
-    after: Basis,
-) -> jax.Array:
-    capacity, size = joint.landmarks.shape
-    undo = linalg.inverse(after.pose[0])
-    pose_pose = undo @ by_pose @ before.pose[0]
-    pose_noise = undo @ by_noise
-    own = jax.vmap(linalg.inverse)(after.landmark)
-    alive = joint.alive[:, None, None]
-    land_pose = jnp.where(alive, own @ (before.cross - after.cross @ pose_pose), 0.0)
-    land_land = jnp.where(alive, own @ before.landmark, jnp.eye(size, dtype=own.dtype))
-    land_noise = jnp.where(alive, -own @ after.cross @ pose_noise, 0.0)
-
-    def rows(matrix: jax.Array) -> jax.Array:
-        blocks = matrix[3:].reshape(capacity, size, -1)
-        moved = jnp.einsum("nij,jd->nid", land_pose, matrix[:3])
-        moved = moved + linalg.total(
-            land_land[:, :, k, None] * blocks[:, k, None, :] for k in range(size)
-        )
-        return jnp.concatenate([pose_pose @ matrix[:3], moved.reshape(capacity * size, -1)])
-
-    gain = jnp.concatenate([pose_noise, land_noise.reshape(capacity * size, -1)])
-    return linalg.symmetrize(rows(rows(joint.cov).T) + gain @ noise @ gain.T)
-
-
 def correct(
     joint: Joint,
     z: jax.Array,
@@ -101,6 +48,7 @@ def correct(
     gate: float | None = None,
     iterations: int = 1,
     joseph: bool = False,
+    square_root: bool = False,
 ) -> tuple[Joint, Correction]:
     """Correct by m measurements at once, z (m, Z) of the landmarks in slot (m,): Solà (26)-(30).
 
@@ -111,22 +59,30 @@ def correct(
 
     Each further iteration linearizes at the newest estimate x_i = x ⊞ ξ_i but starts again from the
     prior: ξ_{i+1} = K (z - h(x_i) + H ξ_i) (Bell & Cathey 1993). joseph: P ← (I-KH)P(I-KH)ᵀ + KRKᵀ.
+
+    square_root: of P = X Xᵀ, X ← X - Vᵀ (L + N)⁻¹ H X, R = N Nᵀ (Andrews 1968, "A square root
+    formulation of the Kalman covariance equations", AIAA Journal 6(6)).
     """
     m, size_z = z.shape
     capacity, size_l = joint.landmarks.shape
     prior_l, prior_rows = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)
-    noise = jax.vmap(sensor.noise_cov)(z)
+    local_cov = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
+    own_noise = jax.vmap(sensor.noise_cov)(z)
     same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
     over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
 
     pose, landmark = joint.pose, prior_l
     xi = jnp.zeros(joint.cov.shape[0], z.dtype)
     for iteration in range(iterations):
-        by_pose, by_landmark = jax.vmap(linearize.observe, in_axes=(None, None, 0, 0, None, 0))(
-            joint.lin, sensor, slot, joint.tag[slot], pose, landmark
-        )
-        predicted = jax.vmap(sensor.observe, in_axes=(None, 0))(pose, landmark)
-        nu = jax.vmap(sensor.residual)(z, predicted)
+        expected, by_pose, by_landmark, rest = jax.vmap(
+            lambda at, landmark, cov, pose=pose: linearize.observe(
+                joint, sensor, chart, at, pose, landmark, cov
+            )
+        )(slot, landmark, local_cov)
+        noise = own_noise + rest
+        nu = jax.vmap(sensor.residual)(z, expected)
+        if iteration == 0:
+            seen = by_pose, by_landmark
         xi_l = xi[3:].reshape(capacity, size_l)[slot]
         if chart.basis is not None:
             by_pose, by_landmark = _in_chart(
@@ -141,7 +97,9 @@ def correct(
             hp = hp + linalg.total(
                 by_landmark[:, :, k, None] * prior_rows[:, None, k] for k in range(size_l)
             )
-        hp = linalg.settle(hp)
+        hp = hx = linalg.settle(hp)
+        if square_root:
+            hp = linalg.settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
         s = _innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
         if iteration == 0:
             marginal = s[jnp.arange(m), :, jnp.arange(m)]
@@ -160,7 +118,7 @@ def correct(
         nu = jnp.where(fuse[:, None], nu, 0.0).reshape(-1)
         v = jnp.where(keep[:, None], linalg.solve_lower(factor, hp), 0.0)
         v, whitened = linalg.settle((v, jnp.where(keep, linalg.solve_lower(factor, nu), 0.0)))
-        xi = _gram(v, whitened[:, None])[:, 0]
+        xi = linalg.gram(v, whitened[:, None])[:, 0]
         if iteration == 0:
             positive = positive & regular
             pivots = jnp.diagonal(factor).reshape(m, size_z)
@@ -173,14 +131,39 @@ def correct(
     if joseph:
         fused_noise = jnp.where(fuse[:, None, None, None], same * noise[:, :, None], 0.0)
         cov = _joseph(joint.cov, hp, s, fused_noise, factor, v)
+    elif square_root:
+        root = jax.vmap(lambda cov: linalg.cholesky(cov)[0])(noise)
+        unit = jnp.eye(size_z, dtype=z.dtype)
+        root = same * jnp.where(fuse[:, None, None], root, unit)[:, :, None]
+        root = factor + root.reshape(m * size_z, m * size_z)
+        hx = jnp.where(fuse[:, None, None], hx, 0.0).reshape(m * size_z, -1)
+        cov = joint.cov - linalg.gram(v, linalg.settle(linalg.solve_lower(root, hx)))
     else:
-        cov = joint.cov - _gram(v, v)
+        cov = joint.cov - linalg.gram(v, v)
+    last, step = joint.last, jnp.zeros(3, z.dtype)
+    apart = not isinstance(joint.last, tuple)
+    if apart:
+        seen_last = _along(by_pose, by_landmark, *_split(last.T, capacity), slot)
+        seen_last = jnp.where(fuse[:, None, None], seen_last, 0.0).reshape(m * size_z, 3)
+        seen_last = jnp.where(keep[:, None], linalg.solve_lower(factor, seen_last), 0.0)
+        step = linalg.gram(seen_last, whitened[:, None])[:, 0]
+        xi = xi - _lifted(chart, joint, step)
+        last = last - linalg.gram(seen_last, v)
     poses, landmarks = over_landmarks(
         joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(capacity, size_l)
     )
+    landmarks = jnp.where(joint.alive[:, None], landmarks, 0.0)
     log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
     log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
-    return joint._replace(pose=poses[0], landmarks=landmarks, cov=cov), Correction(
+    watch = joint.watch
+    if watch:
+        directions = _in_coordinates(chart, joint)
+        watch = _informed(watch, directions, *seen, slot, own_noise, fuse & positive)
+    ahead = se2.to_frame(joint.pose, joint.pose[:2] + step[:2])
+    joint = joint._replace(pose=poses[0], landmarks=landmarks, cov=cov, watch=watch, last=last)
+    if apart:
+        joint = step_ahead(joint, jnp.concatenate([ahead, step[2:]]), chart, square_root)
+    return joint, Correction(
         innovation=innovation,
         innovation_cov=marginal,
         nis=jnp.where(fuse, nis, distance),
@@ -200,29 +183,100 @@ def augment(
     sensor: Sensor,
     chart: Chart,
     linearize: Linearizer,
+    square_root: bool = False,
 ) -> Joint:
     """Start landmarks from measurements z (m, Z) in free slots (m,), where granted (m,).
 
     L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
     with the prior's term of (44); several in one scan are correlated through the robot.
     """
-    mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
+    robot = slots.robot_cov(joint, square_root)
 
     def one(z_i: jax.Array, tag_i: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        landmark = sensor.invert(joint.pose, z_i, mean)
-        by_pose, by_z, by_s = linearize.invert(joint.lin, sensor, tag_i, joint.pose, z_i, mean)
-        own = by_z @ sensor.noise_cov(z_i) @ by_z.T + by_s @ cov_s @ by_s.T
+        landmark, by_pose, own = linearize.invert(joint, sensor, chart, tag_i, z_i, robot)
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)
-            undo = linalg.inverse(basis.landmark)
-            by_pose = undo @ (by_pose @ basis.pose - basis.cross)
-            own = undo @ own @ undo.T
+            by_pose = by_pose @ basis.pose - basis.cross
+            if basis.landmark is not None:
+                undo = linalg.inverse(basis.landmark)
+                by_pose, own = undo @ by_pose, undo @ own @ undo.T
         return landmark, by_pose, own
 
     landmark, by_pose, own = jax.vmap(one)(z, tag)
-    joint = slots.scatter(joint, slot, granted, landmark, by_pose, own, tag)
+    joint = slots.scatter(
+        joint, slot, granted, landmark, by_pose, own, tag, square_root=square_root
+    )
     born = jnp.zeros_like(joint.alive).at[slot].max(granted)
-    return joint._replace(lin=linearize.born(joint.lin, born, joint.landmarks))
+    return joint._replace(lin=linearize.born(joint, born))
+
+
+def _along(
+    by_pose: jax.Array,
+    by_landmark: jax.Array,
+    robot: jax.Array,
+    landmarks: jax.Array,
+    slot: jax.Array,
+) -> jax.Array:
+    """H times directions: of the robot (3, k) and of each landmark (N, L, k); (m, Z, k)."""
+    own = landmarks[slot]
+    terms = [by_pose[:, :, i, None] * robot[None, None, i] for i in range(3)]
+    terms += [by_landmark[:, :, i, None] * own[:, None, i] for i in range(own.shape[1])]
+    return linalg.total(terms)
+
+
+def _split(directions: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
+    """Rows (D, k) as those of the robot (3, k) and of each landmark (N, L, k)."""
+    return directions[:3], directions[3:].reshape(capacity, -1, directions.shape[1])
+
+
+def _lifted(chart: Chart, joint: Joint, step: jax.Array) -> jax.Array:
+    """The errors (D,) that a step (3,) of the robot alone is, in the chart."""
+    if chart.basis is None:
+        return jnp.concatenate([step, jnp.zeros_like(joint.landmarks).reshape(-1)])
+    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
+    robot = linalg.inverse(basis.pose[0]) @ step
+    own = -basis.cross @ robot
+    if basis.landmark is not None:
+        own = jnp.einsum("nij,nj->ni", jax.vmap(linalg.inverse)(basis.landmark), own)
+    return jnp.concatenate([robot, jnp.where(joint.alive[:, None], own, 0.0).reshape(-1)])
+
+
+def _in_coordinates(chart: Chart, joint: Joint) -> tuple[jax.Array, jax.Array]:
+    """The watched directions in coordinates: of the pose (3, 3) and of each landmark (N, L, 3)."""
+    robot, landmarks = _split(joint.watch.directions, joint.landmarks.shape[0])
+    if chart.basis is None:
+        return robot, landmarks
+    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
+    if basis.landmark is not None:
+        landmarks = jnp.einsum("nij,njk->nik", basis.landmark, landmarks)
+    return basis.pose[0] @ robot, landmarks + basis.cross @ robot
+
+
+def _informed(
+    watch: Watch,
+    directions: tuple[jax.Array, jax.Array],
+    by_pose: jax.Array,
+    by_landmark: jax.Array,
+    slot: jax.Array,
+    noise: jax.Array,
+    fused: jax.Array,
+) -> Watch:
+    """The watch with what these measurements say along its directions; all in coordinates."""
+
+    def whiten(cov: jax.Array, y: jax.Array) -> jax.Array:
+        return linalg.solve_lower(linalg.cholesky(cov)[0], y)
+
+    signed = _along(by_pose, by_landmark, *directions, slot)
+    robot, landmarks = directions
+    size = _along(jnp.abs(by_pose), jnp.abs(by_landmark), jnp.abs(robot), jnp.abs(landmarks), slot)
+    signed = jax.vmap(whiten)(noise, signed)
+    size = size / jnp.sqrt(jnp.maximum(jnp.diagonal(noise, axis1=1, axis2=2), _TINY))[:, :, None]
+    signed, size = (jnp.where(fused[:, None, None], part, 0.0) for part in (signed, size))
+    return watch._replace(
+        information=watch.information
+        + (signed[:, :, :, None] * signed[:, :, None, :]).sum(axis=(0, 1)),
+        scale=watch.scale + (size**2).sum(axis=(0, 1)),
+    )
 
 
 def _in_chart(
@@ -244,7 +298,8 @@ def _in_chart(
             jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
         )(pose, landmarks, dx, dl)
         basis = Basis(by_dx[0], by_dl[0], by_dl[1])
-    return by_pose @ basis.pose + by_landmark @ basis.cross, by_landmark @ basis.landmark
+    by_chart = by_pose @ basis.pose + by_landmark @ basis.cross
+    return by_chart, by_landmark if basis.landmark is None else by_landmark @ basis.landmark
 
 
 def _innovation_cov(
@@ -277,15 +332,3 @@ def _joseph(
     left = cov - gain @ hp
     left_h = hp.T - gain @ (s.reshape(rows, rows) - noise)
     return linalg.symmetrize(left - left_h @ gain.T + gain @ noise @ gain.T)
-
-
-def _gram(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Aᵀ B of A (k, D), B (k, E)."""
-    if a.shape[0] > _OUTER_PRODUCTS:
-        return a.T @ b
-    return linalg.total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
-
-
-def _matmul(a: jax.Array, b: jax.Array) -> jax.Array:
-    """A B of A (n, k), B (k, D), small n and k, as outer products."""
-    return _gram(a.T, b)

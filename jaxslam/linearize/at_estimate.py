@@ -1,11 +1,10 @@
 """Jacobians at the current estimate: the standard EKF."""
 
-from typing import Any
-
 import jax
 
-from jaxslam import derivatives
-from jaxslam.protocols import Linearizer, Motion, Sensor
+from jaxslam.linearize import first_order
+from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.slots import Joint
 
 Array = jax.Array
 
@@ -13,24 +12,32 @@ Array = jax.Array
 def at_estimate() -> Linearizer:
     """Every Jacobian at the newest estimate of its arguments (Solà (13), (25), (33)); no memory."""
 
-    def motion_at(memory: Any, motion: Motion, pose: Array, u: Array) -> tuple[Array, Array, Any]:
-        return (*derivatives.motion_jacobians(motion, pose, u), memory)
+    def motion_at(
+        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
+    ) -> tuple[Array, Array, Array, tuple[()]]:
+        return (*first_order.motion_at(motion, joint.pose, u, joint.pose), ())
 
     def observe_at(
-        memory: Any, sensor: Sensor, slot: Array, tag: Array, pose: Array, landmark: Array
-    ) -> tuple[Array, Array]:
-        return derivatives.observe_jacobians(sensor, pose, landmark)
+        joint: Joint,
+        sensor: Sensor,
+        chart: Chart,
+        slot: Array,
+        pose: Array,
+        landmark: Array,
+        cov: Array,
+    ) -> tuple[Array, Array, Array, Array]:
+        return first_order.observe_at(sensor, pose, landmark, pose, landmark)
 
     def invert_at(
-        memory: Any, sensor: Sensor, tag: Array, pose: Array, z: Array, s: Array
+        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
     ) -> tuple[Array, Array, Array]:
-        return derivatives.invert_jacobians(sensor, pose, z, s)
+        return first_order.invert_at(sensor, joint.pose, z, joint.pose, z)
 
     return Linearizer(
         name="at_estimate",
-        init=lambda capacity, pose: (),
+        init=lambda pose, landmarks: (),
         motion=motion_at,
         observe=observe_at,
         invert=invert_at,
-        born=lambda memory, born, landmarks: memory,
+        born=lambda joint, born: joint.lin,
     )

@@ -6,6 +6,7 @@ from jaxslam.motion.ackermann import ackermann
 from jaxslam.motion.increment import increment
 from jaxslam.motion.odometry import odometry, odometry_control, odometry_noise
 from jaxslam.motion.pose_increment import pose_increment
+from jaxslam.motion.substeps import substeps
 from jaxslam.motion.unicycle import unicycle
 from jaxslam.motion.velocity import velocity, velocity_noise
 from jaxslam.protocols import Motion
@@ -27,6 +28,7 @@ __all__ = [
     "odometry_control",
     "odometry_noise",
     "pose_increment",
+    "substeps",
     "unicycle",
     "velocity",
     "velocity_noise",

@@ -122,7 +122,8 @@ def test_zero_error_is_the_place_itself(made, at_zero):
 def test_basis_is_the_derivative_of_retract_at_zero(made, out, at_zero, differences):
     (_, _, pose_dx, pose_dl), (_, _, land_dx, land_dl) = at_zero["slopes"]
     eye3, eye2 = (np.broadcast_to(np.eye(n), (len(pose_dx), n, n)) for n in (3, 2))
-    by_pose, cross, by_landmark = at_zero["basis"] or (eye3, np.zeros_like(land_dx), eye2)
+    by_pose, cross, by_landmark = at_zero["basis"] or (eye3, np.zeros_like(land_dx), None)
+    by_landmark = eye2 if by_landmark is None else by_landmark
     np.testing.assert_allclose(by_pose, pose_dx, atol=1e-12)
     np.testing.assert_allclose(cross, land_dx, atol=1e-12)
     np.testing.assert_allclose(by_landmark, land_dl, atol=1e-12)

@@ -1,0 +1,1 @@
+"""Published consistency experiments, reproduced: `python -m benchmarks.consistency`."""

@@ -1,0 +1,165 @@
+"""The observability experiment of Huang et al. 2010 over many maps, since maps differ a lot."""
+
+import dataclasses
+import time
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.consistency.markdown import Section, table
+from benchmarks.gate import Metric
+from jaxslam.consistency import score
+from jaxslam.family import FILTERS
+from jaxslam.plot import COLORS
+from jaxslam.protocols import Filter
+from jaxslam.run import run
+from jaxslam.scenarios import loop, loop_landmarks
+from jaxslam.simulate import simulate
+
+NAMES = ("ekf", "ideal", "fej", "oc", "right_invariant", "robocentric")
+MEASURES = ("nees_pose", "nees_own", "square_position", "square_heading", "unobservable")
+PLACES = 12
+PUBLISHED = {
+    "map A, 2500 steps": {"ekf": 38.8, "ideal": 3.58, "fej": 17.5, "oc": 33.0},
+    "map B, 800 steps": {"ekf": 23.8, "ideal": 3.0, "fej": 3.3, "oc": 3.5},
+}
+
+
+def measure(maps: int = 100, runs: int = 10, steps: int = 2500, seed: int = 0):
+    """Section, metrics and figure: `runs` runs on each of `maps` maps."""
+    began = time.perf_counter()
+    per_map = campaign(maps, runs, steps, seed)
+    nees = {name: np.nanmean(per_map[name]["nees_pose"], axis=1) for name in NAMES}
+    rows = []
+    for name in NAMES:
+        low, quarter, middle, rest, high = np.quantile(nees[name], [0, 0.25, 0.5, 0.75, 1])
+        own = np.nanmean(per_map[name]["nees_own"])
+        error = nees[name].std(ddof=1) / np.sqrt(maps)
+        rows.append(
+            [
+                name,
+                f"{middle:.2f}",
+                f"{quarter:.2f} to {rest:.2f}",
+                f"{low:.2f} to {high:.2f}",
+                f"{nees[name].mean():.2f} ± {error:.2g}",
+                f"{own:.2f}",
+                f"{np.sqrt(per_map[name]['square_position'].mean()):.3f}",
+                f"{np.rad2deg(np.sqrt(per_map[name]['square_heading'].mean())):.2f}",
+                f"{np.nanmin(per_map[name]['unobservable']):.0f}",
+            ]
+        )
+    header = ["filter", "median map", "quartiles", "range", "mean ± standard error", "own error"]
+    header += ["position RMSE [m]", "heading RMSE [°]", "unobservable"]
+    published = "; ".join(
+        f"{where}: " + ", ".join(f"{name} {value:g}" for name, value in figures.items())
+        for where, figures in PUBLISHED.items()
+    )
+    text = (
+        f"{maps} maps × {runs} runs × {steps} steps, seed {seed}, "
+        f"{time.perf_counter() - began:.0f} s. Pose NEES (dof 3, not divided), averaged over the "
+        f"runs and steps of a map:\n\n{table(header, rows)}\n\nThe authors' own released program, "
+        f"50 runs on one map each: {published}.\n\n![Pose NEES by map and filter](loop.png)"
+    )
+    middle = {name: float(np.median(nees[name])) for name in NAMES}
+    metrics = [
+        Metric(
+            "loop, FEJ between ideal and EKF, median map",
+            middle["fej"],
+            middle["ideal"] * 0.97,
+            middle["ekf"],
+        )
+    ]
+    metrics.append(
+        Metric(
+            "loop, OC between ideal and EKF, median map",
+            middle["oc"],
+            middle["ideal"] * 0.97,
+            middle["ekf"],
+        )
+    )
+    metrics.append(
+        Metric(
+            "loop, right-invariant own NEES / dof, mean",
+            float(np.nanmean(per_map["right_invariant"]["nees_own"])) / 3,
+            high=1.3,
+        )
+    )
+    for name in NAMES:
+        expected = 2 if name == "ekf" else 3
+        found = per_map[name]["unobservable"]
+        metrics.append(
+            Metric(
+                f"loop, {name}, unobservable directions, all runs",
+                float(found.min()),
+                expected,
+                float(expected),
+            )
+        )
+    return (
+        Section("loop", "Observability and consistency over 100 maps", text),
+        metrics,
+        figure(nees),
+    )
+
+
+def campaign(maps: int, runs: int, steps: int, seed: int, block: int = 50):
+    """{filter: {measure: (maps, runs)}}."""
+    world = dataclasses.replace(loop(steps), places=PLACES)
+    landmarks = np.repeat([loop_landmarks(seed + i) for i in range(maps)], runs, axis=0)
+    keys = jax.random.split(jax.random.key(seed), maps * runs)
+
+    def one(name, landmarks, key):
+        here = dataclasses.replace(world, landmarks=landmarks)
+        key_world, key_filter = jax.random.split(key)
+        truth, log = simulate(here, key_world)
+        candidate = FILTERS[name](world, watch=True)
+        filter = candidate if isinstance(candidate, Filter) else candidate(truth)
+        trace = run(
+            filter,
+            log,
+            here.pose,
+            here.pose_cov,
+            key_filter,
+            probe=lambda joint: joint.watch.information,
+        )
+        scores = score(trace, truth, here.sensor, jnp.asarray(jnp.inf), filter.chart)
+        kept = {
+            m: jnp.where(scores.measures[m][1], scores.measures[m][0], jnp.nan) for m in MEASURES
+        }
+        return kept, truth.missed.sum()
+
+    out = {}
+    for name in NAMES:
+        go = jax.jit(jax.vmap(partial(one, name)))
+        parts = []
+        for start in range(0, maps * runs, block):
+            part = slice(start, start + block)
+            kept, missed = jax.device_get(go(landmarks[part], keys[part]))
+            assert missed.sum() == 0, "a scan had too few places"
+            parts.append(kept)
+        out[name] = {m: np.concatenate([p[m] for p in parts]).reshape(maps, runs) for m in MEASURES}
+    return out
+
+
+def figure(nees: dict[str, np.ndarray]) -> Figure:
+    """Cumulative distribution over maps of the average pose NEES."""
+    picture = Figure(figsize=(6.5, 4.0), dpi=150, layout="constrained")
+    axes = picture.subplots()
+    for i, (name, values) in enumerate(nees.items()):
+        share = (np.arange(len(values)) + 0.5) / len(values)
+        axes.step(np.sort(values), share, where="mid", color=COLORS[i], lw=1.6, label=name)
+    axes.axvline(3.0, color="#333333", lw=0.8, ls="--", label="honest: 3")
+    axes.set(
+        xscale="log",
+        xlabel="average pose NEES of a map (dof 3)",
+        ylabel="share of maps",
+        ylim=(0, 1),
+    )
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.grid(color="#dddddd", lw=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize="small")
+    return picture

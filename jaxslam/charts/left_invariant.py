@@ -1,0 +1,41 @@
+"""The error of the left-invariant filter, in the robot's frame: the published counter-example."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import se2
+from jaxslam.angles import wrap
+from jaxslam.protocols import Basis, Chart
+
+
+def left_invariant() -> Chart:
+    """(R, t, l) ← (R, t, l)·exp(ξ), the group SE_{1+N}(2) acting from the right of the estimate.
+
+    With dx = (ρ, φ): θ ← θ + φ, t ← t + R V(φ) ρ, l ← l + R V(φ) dl, V as in `se2.exp`. The errors
+    of robot and landmarks are held in the estimated robot's frame, so a correction of its heading
+    turns them all; the directions that no sensor sees depend on the estimate, as in the standard
+    EKF. UKF-M (Brossard et al. 2020) shows that this choice is worse. Landmarks l = (x, y) only.
+    """
+
+    def retract(
+        pose: jax.Array, landmark: jax.Array, dx: jax.Array, dl: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        shift = se2.exp(jnp.concatenate([dl, dx[2:]]))[:2]
+        return se2.boxplus(pose, dx), landmark + se2.rotation(pose[2]) @ shift
+
+    def local(
+        pose0: jax.Array, landmark0: jax.Array, pose: jax.Array, landmark: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        shift = se2.rotation(pose0[2]).T @ (landmark - landmark0)
+        turn = wrap(pose[2:] - pose0[2:])
+        return se2.boxminus(pose, pose0), se2.log(jnp.concatenate([shift, turn]))[:2]
+
+    def basis(pose: jax.Array, landmark: jax.Array) -> Basis:
+        turn = se2.rotation(pose[2])
+        return Basis(
+            pose=jnp.eye(3, dtype=pose.dtype).at[:2, :2].set(turn),
+            cross=jnp.zeros((2, 3), pose.dtype),
+            landmark=turn,
+        )
+
+    return Chart(name="left_invariant", retract=retract, local=local, basis=basis)

@@ -1,0 +1,41 @@
+"""The error of robocentric mapping: everything as the robot sees it."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import se2
+from jaxslam.angles import wrap
+from jaxslam.protocols import Basis, Chart
+
+
+def robocentric() -> Chart:
+    """The world's origin b = pose⁻¹ and the landmarks m = Rᵀ(l - t), seen from the robot, add up.
+
+    b ← b + dx and m ← m + dl, so pose ← (b + dx)⁻¹ and l ← (b + dx)⁻¹ ∘ (m + dl). What a sensor on
+    the robot measures does not depend on dx at all, hence no measurement can inform about the
+    frame, and the errors of the map are small where the robot is. The last motion stays a variable
+    of its own until the update has corrected it, and only then moves the map into the new frame
+    (`motion_apart`): added to m instead, the turns of many corrections would blow the map up.
+    Castellanos, Martinez-Cantin, Tardós, Neira, "Robocentric map joining: improving the consistency
+    of EKF-SLAM", Robotics and Autonomous Systems 55(1), 2007. Landmarks l = (x, y) only.
+    """
+
+    def retract(
+        pose: jax.Array, landmark: jax.Array, dx: jax.Array, dl: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        moved = se2.inverse(se2.inverse(pose) + dx)
+        return moved, se2.from_frame(moved, se2.to_frame(pose, landmark) + dl)
+
+    def local(
+        pose0: jax.Array, landmark0: jax.Array, pose: jax.Array, landmark: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        dx = se2.inverse(pose) - se2.inverse(pose0)
+        dl = se2.to_frame(pose, landmark) - se2.to_frame(pose0, landmark0)
+        return jnp.concatenate([dx[:2], wrap(dx[2:])]), dl
+
+    def basis(pose: jax.Array, landmark: jax.Array) -> Basis:
+        (by_origin,) = se2.inverse_jacobians(se2.inverse(pose))
+        by_frame, by_point = se2.from_frame_jacobians(pose, se2.to_frame(pose, landmark))
+        return Basis(pose=by_origin, cross=by_frame @ by_origin, landmark=by_point)
+
+    return Chart(name="robocentric", retract=retract, local=local, basis=basis, motion_apart=True)

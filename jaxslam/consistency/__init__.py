@@ -1,0 +1,26 @@
+"""Is a filter honest? Scores of runs, their averages with bands and intervals, and a verdict."""
+
+from jaxslam.consistency.alignment import align_map
+from jaxslam.consistency.bound import posterior_bound
+from jaxslam.consistency.credibility import credibility
+from jaxslam.consistency.score import DOF, LAGS, LANDMARK_DOF, LEVELS, Score, score
+from jaxslam.consistency.summary import LEVEL, Measure, Summary, Tally, interval, judge, summarize
+
+__all__ = [
+    "DOF",
+    "LAGS",
+    "LANDMARK_DOF",
+    "LEVEL",
+    "LEVELS",
+    "Measure",
+    "Score",
+    "Summary",
+    "Tally",
+    "align_map",
+    "credibility",
+    "interval",
+    "judge",
+    "posterior_bound",
+    "score",
+    "summarize",
+]

@@ -1,0 +1,43 @@
+"""How far a claimed covariance is from the actual one: Li & Zhao's noncredibility."""
+
+import numpy as np
+
+
+def credibility(
+    errors: np.ndarray, covs: np.ndarray, regular: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Each run's noncredibility index and inclination, (runs,) each, NaN for a run without one.
+
+    At each step, with the actual mean square error Σ = mean over runs of e eᵀ and the ratio
+    ρ = (eᵀ P⁻¹ e)/(eᵀ Σ⁻¹ e) of a run, the index is the mean of 10 |log10 ρ| and the inclination
+    that of 10 log10 ρ: decibels, 0 for a credible filter, a positive inclination for an optimistic
+    one. X. R. Li, Z. Zhao, "Measuring estimator's credibility: noncredibility index", FUSION 2006.
+
+    Args:
+        errors: (runs, K, n).
+        covs: (runs, K, n, n) as claimed.
+        regular: (runs, K) whether that has an inverse; the others are left out.
+    Returns:
+        None unless some step has at least 2n + 2 runs: Σ is made of them.
+    """
+    size = errors.shape[2]
+    total, count = np.zeros((2, errors.shape[0])), np.zeros(errors.shape[0])
+    for step in range(errors.shape[1]):
+        runs = np.flatnonzero(regular[:, step])
+        if len(runs) < 2 * size + 2:
+            continue
+        e = errors[runs, step]
+        actual = e.T @ e / len(runs)
+        if np.linalg.matrix_rank(actual) < size:
+            continue
+        claimed = np.einsum("ri,ri->r", e, np.linalg.solve(covs[runs, step], e[:, :, None])[..., 0])
+        fair = np.einsum("ri,ri->r", e, np.linalg.solve(actual, e.T).T)
+        with np.errstate(divide="ignore"):
+            decibels = 10 * np.log10(claimed / fair)
+        runs, decibels = runs[np.isfinite(decibels)], decibels[np.isfinite(decibels)]
+        total[:, runs] += [np.abs(decibels), decibels]
+        count[runs] += 1
+    if not count.any():
+        return None
+    index, inclination = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return index, inclination

@@ -1,0 +1,243 @@
+"""A campaign's verdict on a filter: averages, bands, intervals, from the scores of its runs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.stats
+
+from jaxslam.consistency.credibility import credibility
+from jaxslam.consistency.score import DOF, DROPS, Score
+from jaxslam.stats import chi2_quantile, t_quantile
+
+LEVEL = 0.95
+"""of every band and interval."""
+
+
+COUNTS = tuple(status.name.lower() for status in DROPS) + ("missed", "singular_steps")
+"""The sums that are reported as counts."""
+
+
+class Tally:
+    """The scores of a campaign so far: sums, and what is kept of each run, in order.
+
+    Sums are taken in float64 on the host. Snapshots are kept of the first `shots` runs.
+    """
+
+    def __init__(self, shots: int = 2048) -> None:
+        self.sums: dict[str, np.ndarray] = {}
+        self._kept: list[Score] = []
+        self._snapshots: list[Any] = []
+        self._room = shots
+
+    def add(self, scores: Score) -> None:
+        """Scores of further runs: per-run leaves with a leading axis, sums already added up."""
+        for name, value in scores.sums.items():
+            self.sums[name] = self.sums.get(name, 0.0) + np.asarray(value, np.float64)
+        runs = len(scores.finite)
+        if self._room > 0:
+            finite = np.asarray(scores.finite)[: self._room]
+            shots = [np.asarray(leaf)[: self._room][finite] for leaf in scores.snapshots]
+            self._snapshots.append(shots)
+            self._room -= runs
+        self._kept.append(scores._replace(sums={}, snapshots=((), (), ())))
+
+    def flags(self, name: str) -> np.ndarray:
+        """(runs,) finite or divergent, by run."""
+        return np.concatenate([np.asarray(getattr(s, name)) for s in self._kept])
+
+    def measures(self) -> dict[str, np.ndarray]:
+        """(runs,) each run's average, NaN where it has none."""
+        out = {}
+        for name in self._kept[0].measures:
+            values, defined = (
+                np.concatenate([np.asarray(s.measures[name][i]) for s in self._kept])
+                for i in (0, 1)
+            )
+            out[name] = np.where(defined, values.astype(np.float64), np.nan)
+        return out
+
+    def snapshots(self) -> list[np.ndarray]:
+        """Errors (R, K, 3), covariances (R, K, 3, 3), regular (R, K), of the first finite runs."""
+        return [np.concatenate(parts) for parts in zip(*self._snapshots, strict=True)]
+
+
+class Measure(NamedTuple):
+    """A figure over all runs, with its 95 % interval from the spread between runs."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a campaign says of one filter."""
+
+    verdict: str
+    """consistent, optimistic, pessimistic, diverged or undecided; see `judge`."""
+    measures: dict[str, Measure]
+    """Each with its interval over the runs; names without a number (nothing to average) are absent.
+
+    NEES, none divided by its dof: nees_pose (3), nees_position (2), nees_heading (1) in (x, y, θ),
+    nees_own (3) of the pose in the filter's own error coordinates, nees_landmarks (2) averaged over
+    landmarks and steps. nis_per_dof (1). coverage_95_pose, _position, _heading: share of steps with
+    the truth in the 95 % ellipsoid. noncredibility and inclination [dB] (0). autocorrelation of
+    innovations at lag 1 (0). rmse_position [m], rmse_heading_deg [°], rmse_landmarks [m] (final
+    map, unaligned); bound_ratio_position and _heading: those over the posterior Cramér-Rao bound
+    (at least 1). unobservable (3) and rotation_information [1/rad²] (0): the dimension of the
+    filter's unobservable subspace, and what it has learnt of a turn of the whole frame.
+    log_likelihood (mean a run).
+    """
+    nis_band: tuple[float, float] | None
+    """95 % band of nis_per_dof from the summed degrees of freedom; None without a measurement."""
+    inside: dict[str, float]
+    """share of steps whose average NEES lies in its band, by block; 0.95 is honest."""
+    curves: dict[str, np.ndarray]
+    """(T,) averages over runs: nees_* with *_low and *_high bands (NaN where no run has one),
+    rmse_position, rmse_heading_deg, nis_per_dof, rotation_information, and runs_* that count."""
+    coverage: dict[str, np.ndarray]
+    """by block: share of runs' steps with the truth in the ellipsoid of each of `LEVELS`."""
+    autocorrelation: np.ndarray
+    """(LAGS,) of whitened innovations at lags of 1, 2, … steps; NaN without pairs."""
+    counts: dict[str, int]
+    """runs (finite), not_finite, divergent, singular_steps, and dropped measurements by reason."""
+    per_run: dict[str, np.ndarray]
+    """(runs,) each run's own average of each measure, NaN where it has none: squares, radians."""
+    not_finite_runs: list[int]
+    """the numbers of the runs that are not finite; run i has key fold_in(key, i)."""
+
+
+def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Summary:
+    """Averages, bands and verdict from the scores of a campaign (host numbers, float64).
+
+    bound: position [m²] and heading [rad²], (T,) each, the mean bound over the runs.
+    """
+    sums, finite = tally.sums, tally.flags("finite")
+    runs = int(finite.sum())
+    curves: dict[str, np.ndarray] = {}
+    inside: dict[str, float] = {}
+    coverage: dict[str, np.ndarray] = {}
+    for block, dof in DOF.items():
+        count = sums[f"regular_{block}"]
+        mean = _ratio(sums[f"nees_{block}"], count)
+        low, high = _bands(count, dof)
+        curves |= {f"nees_{block}": mean, f"nees_{block}_low": low, f"nees_{block}_high": high}
+        curves[f"runs_{block}"] = count
+        has = count > 0
+        if has.any():
+            inside[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
+        coverage[block] = _ratio(sums[f"coverage_{block}"], sums[f"coverage_runs_{block}"])
+    curves["rmse_position"] = np.sqrt(_ratio(sums["square_position"], np.asarray(runs)))
+    curves["rmse_heading_deg"] = np.rad2deg(
+        np.sqrt(_ratio(sums["square_heading"], np.asarray(runs)))
+    )
+    curves["nis_per_dof"] = _ratio(sums["nis"], sums["nis_dof"])
+    if "rotation_information" in sums:
+        curves["rotation_information"] = _ratio(sums["rotation_information"], np.asarray(runs))
+
+    per_run = tally.measures()
+    shot = credibility(*tally.snapshots())
+    if shot is not None:
+        per_run |= {"noncredibility": shot[0], "inclination": shot[1]}
+    measures: dict[str, Measure] = {}
+    for name, values in per_run.items():
+        measure = interval(values)
+        if measure is not None:
+            measures |= _as_reported(name, measure)
+    for name, key, one in (
+        ("position", "rmse_position", 1.0),
+        ("heading", "rmse_heading_deg", np.rad2deg(1.0)),
+    ):
+        if bound is not None and key in measures and bound[name].mean() > 0:
+            least = one * np.sqrt(bound[name].mean())
+            measures[f"bound_ratio_{name}"] = Measure(*(x / least for x in measures[key]))
+            curves[key.replace("rmse", "bound")] = one * np.sqrt(bound[name])
+    total_dof = float(np.sum(sums["nis_dof"]))
+    nis_band = None
+    if total_dof > 0:
+        measures["nis_per_dof"] = measures["nis_per_dof"]._replace(
+            value=float(np.sum(sums["nis"])) / total_dof
+        )
+        tail = (1 - LEVEL) / 2
+        nis_band = (
+            chi2_quantile(tail, total_dof) / total_dof,
+            chi2_quantile(1 - tail, total_dof) / total_dof,
+        )
+    counts = {
+        "runs": runs,
+        "not_finite": int((~finite).sum()),
+        "divergent": int(tally.flags("divergent").sum()),
+    }
+    counts |= {name: int(value) for name, value in sums.items() if name in COUNTS}
+    return Summary(
+        verdict=judge(measures, counts),
+        measures=measures,
+        nis_band=nis_band,
+        inside=inside,
+        curves=curves,
+        coverage=coverage,
+        autocorrelation=_ratio(sums["autocorrelation"][:, 0], sums["autocorrelation"][:, 1]),
+        counts=counts,
+        per_run=per_run,
+        not_finite_runs=np.flatnonzero(~finite).tolist(),
+    )
+
+
+def judge(measures: dict[str, Measure], counts: dict[str, int]) -> str:
+    """The verdict, from the time-averaged NEES of the pose; errors in (x, y, θ), dof 3.
+
+    Each run gives one time average, and runs are independent, so their mean has a t interval
+    although NEES is correlated in time. consistent: 3 lies in the 95 % interval; optimistic: the
+    interval lies above 3; pessimistic: below. diverged: over half of the runs are not finite or
+    divergent. undecided: under two runs have a NEES.
+    """
+    lost = counts["not_finite"] + counts["divergent"]
+    if lost > 0.5 * (counts["runs"] + counts["not_finite"]):
+        return "diverged"
+    nees = measures.get("nees_pose")
+    if nees is None or not np.isfinite(nees.low):
+        return "undecided"
+    if nees.low > DOF["pose"]:
+        return "optimistic"
+    return "pessimistic" if nees.high < DOF["pose"] else "consistent"
+
+
+def interval(values: np.ndarray | Sequence[float]) -> Measure | None:
+    """Mean of independent runs with its t interval, NaN left out; None where nothing is left."""
+    there = np.asarray(values, np.float64)
+    there = there[np.isfinite(there)]
+    if there.size == 0:
+        return None
+    mean = float(there.mean())
+    if there.size < 2:
+        return Measure(mean, -np.inf, np.inf)
+    half = t_quantile(0.5 + LEVEL / 2, there.size - 1) * there.std(ddof=1) / np.sqrt(there.size)
+    return Measure(mean, mean - float(half), mean + float(half))
+
+
+def _as_reported(name: str, measure: Measure) -> dict[str, Measure]:
+    """Mean squares become root mean squares, radians degrees; an interval's ends go along."""
+    kind, _, what = name.partition("_")
+    if kind != "square":
+        return {name: measure}
+    low, high = max(measure.low, 0.0), measure.high
+    roots = np.sqrt([measure.value, low, high])
+    if what == "heading":
+        return {"rmse_heading_deg": Measure(*np.rad2deg(roots).tolist())}
+    return {f"rmse_{what}": Measure(*roots.tolist())}
+
+
+def _ratio(total: Any, count: np.ndarray) -> np.ndarray:
+    safe = np.where(count > 0, count, 1.0)
+    return np.where(count > 0, np.asarray(total, np.float64) / safe, np.nan)
+
+
+def _bands(count: np.ndarray, dof: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two-sided chi-square band of the mean of count χ²_dof variables, step by step."""
+    tail = (1 - LEVEL) / 2
+    safe = np.maximum(count, 1)
+    edges = [scipy.stats.chi2.ppf(p, dof * safe) / safe for p in (tail, 1 - tail)]
+    low, high = (np.where(count > 0, edge, np.nan) for edge in edges)
+    return low, high

@@ -1,0 +1,75 @@
+"""First-estimates Jacobians: every state is linearized at one place for good."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.linearize import first_order
+from jaxslam.linearize.first_order import turned
+from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.slots import Joint
+
+Array = jax.Array
+
+
+class First(NamedTuple):
+    """Where everything was first estimated to be."""
+
+    pose: Array
+    """(3,) of this step, as predicted, before any measurement of it"""
+    landmarks: Array
+    """(N, L) as they entered the map"""
+
+
+def first_estimate() -> Linearizer:
+    """FEJ: the pose of a step at its prediction, a landmark at its first estimate.
+
+    With x̂_k the predicted pose of step k and x̂_k⁺ the corrected one, the transition becomes
+    F = [I, J(p̂_{k+1} - p̂_k); 0, 1], J = [0, -1; 1, 0], in place of J(p̂_{k+1} - p̂_k⁺), and
+    H = H(x̂_k, first l̂). So each state has one value in all Jacobians, and the linearized system
+    keeps the three unobservable directions of the true one, at the price of linearizing at first
+    estimates, which may be poor. Huang, Mourikis, Roumeliotis, "Analysis and improvement of the
+    consistency of extended Kalman filter based SLAM", ICRA 2008; IJRR 29(5), 2010.
+
+    The process noise is that of the standard EKF. Euclidean chart and point landmarks only.
+    """
+
+    def motion_at(
+        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
+    ) -> tuple[Array, Array, Array, First]:
+        moved, by_pose, noise = first_order.motion_at(motion, joint.pose, u, joint.pose)
+        by_pose = turned(by_pose, joint.pose[:2] - joint.lin.pose[:2])
+        return moved, by_pose, noise, joint.lin._replace(pose=moved)
+
+    def observe_at(
+        joint: Joint,
+        sensor: Sensor,
+        chart: Chart,
+        slot: Array,
+        pose: Array,
+        landmark: Array,
+        cov: Array,
+    ) -> tuple[Array, Array, Array, Array]:
+        first = joint.lin
+        return first_order.observe_at(sensor, pose, landmark, first.pose, first.landmarks[slot])
+
+    def invert_at(
+        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
+    ) -> tuple[Array, Array, Array]:
+        landmark, by_pose, own = first_order.invert_at(sensor, joint.pose, z, joint.pose, z)
+        return landmark, turned(by_pose, joint.pose[:2] - joint.lin.pose[:2]), own
+
+    def born(joint: Joint, born: Array) -> First:
+        landmarks = jnp.where(born[:, None], joint.landmarks, joint.lin.landmarks)
+        return First(joint.lin.pose, landmarks)
+
+    return Linearizer(
+        name="first_estimate",
+        init=First,
+        motion=motion_at,
+        observe=observe_at,
+        invert=invert_at,
+        born=born,
+        euclidean=True,
+    )

@@ -1,0 +1,49 @@
+"""What first-order linearizers share: a model and its Jacobians, each at a place of its own."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import derivatives
+from jaxslam.linalg import matmul
+from jaxslam.protocols import Motion, Sensor
+
+
+def motion_at(
+    motion: Motion, pose: jax.Array, u: jax.Array, at: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """f(pose, u, 0), and ∂f/∂pose (3, 3) and W Q Wᵀ (3, 3) with the Jacobians at another pose."""
+    by_pose, by_noise = derivatives.motion_jacobians(motion, at, u)
+    moved = motion.step(pose, u, jnp.zeros(by_noise.shape[1], pose.dtype))
+    noise = motion.noise_cov(pose, u)
+    return moved, by_pose, matmul(matmul(by_noise, noise), by_noise.T)
+
+
+def observe_at(
+    sensor: Sensor,
+    pose: jax.Array,
+    landmark: jax.Array,
+    at_pose: jax.Array,
+    at_landmark: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """h(pose, l), its Jacobians at another pose and landmark, and no added noise (Z, Z)."""
+    by_pose, by_landmark = derivatives.observe_jacobians(sensor, at_pose, at_landmark)
+    expected = sensor.observe(pose, landmark)
+    return expected, by_pose, by_landmark, jnp.zeros((expected.shape[0],) * 2, expected.dtype)
+
+
+def invert_at(
+    sensor: Sensor, pose: jax.Array, z: jax.Array, at_pose: jax.Array, at_z: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """g(pose, z, s̄), ∂g/∂pose (L, 3) and G_z R G_zᵀ + G_s S G_sᵀ (L, L), Jacobians elsewhere.
+
+    The noise is that of z: Solà (32)-(38), with the prior's term of (44).
+    """
+    mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
+    by_pose, by_z, by_s = derivatives.invert_jacobians(sensor, at_pose, at_z, mean)
+    own = by_z @ sensor.noise_cov(z) @ by_z.T + by_s @ cov_s @ by_s.T
+    return sensor.invert(pose, z, mean), by_pose, own
+
+
+def turned(by_pose: jax.Array, offset: jax.Array) -> jax.Array:
+    """The derivative of a point by the pose (·, 3), the turn's lever longer by an offset (2,)."""
+    return by_pose.at[:2, 2].add(jnp.stack([-offset[1], offset[0]]))

@@ -1,0 +1,85 @@
+"""Observability-constrained linearization points: the nearest ones that gain no heading."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.linearize import first_order
+from jaxslam.linearize.first_order import turned
+from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.slots import Joint
+
+Array = jax.Array
+
+
+class Constraint(NamedTuple):
+    """The lever arms of a turn of everything, as the linearized system has carried them."""
+
+    pose: Array
+    """(3,) of this step, as predicted"""
+    robot: Array
+    """(2,) α [m]: the turn moves the robot by J α"""
+    landmarks: Array
+    """(N, 2) β_i [m]: and the landmarks by J β_i"""
+
+
+def observability() -> Linearizer:
+    """OC: linearization points as near to the estimates as the constraint on their system allows.
+
+    A turn of everything, (Jα, 1, Jβ_1, …) in the errors of robot position, heading and landmarks,
+    J = [0, -1; 1, 0], stays invisible if every H of step k is taken at a landmark l* with
+    l*_i - p̂_k = β_i - α_k, while F, taken between p* and p̂_{k+1}, carries
+    α_{k+1} = α_k + p̂_{k+1} - p*. Both are met by l*_i = β_i - α_k + p*; p* and all l*_i together
+    are the solution of min |p̂_k⁺ - p*|² + Σ_i |l̂_i - l*_i|² over the n landmarks of the map,
+
+        p* = p̂_k⁺ + Σ_i (l̂_i - p̂_k⁺ - β_i + α_k)/(1 + n),
+
+    for n = 1 half way between. Huang, Mourikis, Roumeliotis, "Observability-based rules for
+    designing consistent EKF SLAM estimators", IJRR 29(5), 2010, state it for one landmark. The
+    process noise is that of the standard EKF. Euclidean chart and point landmarks only.
+    """
+
+    def motion_at(
+        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
+    ) -> tuple[Array, Array, Array, Constraint]:
+        old = joint.lin
+        moved, by_pose, noise = first_order.motion_at(motion, joint.pose, u, joint.pose)
+        arms = joint.landmarks - joint.pose[None, :2] - old.landmarks + old.robot[None]
+        arms = jnp.where(joint.alive[:, None], arms, 0.0)
+        shift = arms.sum(axis=0) / (1 + joint.alive.sum())
+        robot = old.robot + moved[:2] - joint.pose[:2] - shift
+        return moved, turned(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
+
+    def observe_at(
+        joint: Joint,
+        sensor: Sensor,
+        chart: Chart,
+        slot: Array,
+        pose: Array,
+        landmark: Array,
+        cov: Array,
+    ) -> tuple[Array, Array, Array, Array]:
+        own = joint.lin
+        at_landmark = own.pose[:2] + own.landmarks[slot] - own.robot
+        return first_order.observe_at(sensor, pose, landmark, own.pose, at_landmark)
+
+    def invert_at(
+        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
+    ) -> tuple[Array, Array, Array]:
+        return first_order.invert_at(sensor, joint.pose, z, joint.pose, z)
+
+    def born(joint: Joint, born: Array) -> Constraint:
+        arms = joint.lin.robot[None] + joint.landmarks - joint.pose[None, :2]
+        landmarks = jnp.where(born[:, None], arms, joint.lin.landmarks)
+        return Constraint(joint.lin.pose, joint.lin.robot, landmarks)
+
+    return Linearizer(
+        name="observability",
+        init=lambda pose, landmarks: Constraint(pose, pose[:2], landmarks),
+        motion=motion_at,
+        observe=observe_at,
+        invert=invert_at,
+        born=born,
+        euclidean=True,
+    )

@@ -1,0 +1,169 @@
+"""Statistical linearization by the unscented transform, in any chart."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import linalg
+from jaxslam.linalg import is_concrete
+from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.slots import Joint
+
+Array = jax.Array
+
+
+class Regression(NamedTuple):
+    """y ≈ mean + slope · ξ + rest, ξ ~ N(0, L Lᵀ), as sigma points see y."""
+
+    mean: Array
+    """(m,)"""
+    slope: Array
+    """(m, n) times L; that is, by the standard normals"""
+    rest: Array
+    """(m, m) covariance of y that no affine function of ξ has"""
+
+
+def unscented(alpha: float | None = None) -> Linearizer:
+    """The UKF: sigma points of the robot, or of robot and one landmark, retracted by the chart.
+
+    With n variables and P = L Lᵀ, points at 0 and ±α√n L_j, weights 1/(2α²n) and, for the centre,
+    1 - 1/α² for means and that + 3 - α² for covariances (UKF-M: Brossard, Barrau, Bonnabel, "A Code
+    for Unscented Kalman Filtering on Manifolds", ICRA 2020). The fit's slope takes the place of the
+    Jacobian, and what it leaves unexplained counts as noise; so the correction is that of a UKF on
+    the whole map, of which sigma points touch only robot and landmark, and P may be singular.
+    As there, a predicted pose and a new landmark are those of the centre. In the charts
+    `right_invariant` and `left_invariant` this is their UKF on SE_{1+N}(2).
+
+    Args:
+        alpha: spread of the sigma points; default 1e-3 in float64, as theirs, with which the UKF is
+            an EKF but for rounding, and 0.1 in float32, which has no digits for less. 1 reaches
+            √n σ.
+    Raises:
+        ValueError: unless 0 < alpha <= 1.
+    """
+    if alpha is not None and is_concrete(alpha) and not 0 < alpha <= 1:
+        raise ValueError(f"unscented: expected alpha in (0, 1], got {alpha}")
+
+    def fit(f: Callable[[Array], Array], root: Array) -> Regression:
+        return regress(f, root, alpha if alpha is not None else _spread(root))
+
+    def motion_at(
+        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
+    ) -> tuple[Array, Array, Array, tuple[()]]:
+        pose, width = joint.pose, len(motion.noises)
+        ground = jnp.zeros(joint.landmarks.shape[1], pose.dtype)
+        moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
+        root = _root(cov)
+        root_noise = linalg.root_psd(motion.noise_cov(pose, u))
+
+        def f(xi: Array) -> Array:
+            start, _ = chart.retract(pose, ground, xi[:3], ground)
+            return chart.local(moved, ground, motion.step(start, u, xi[3:]), ground)[0]
+
+        by = fit(f, jax.scipy.linalg.block_diag(root, root_noise))
+        by_pose = by_variables(by.slope[:, :3], root)
+        noise = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        if chart.basis is not None:
+            after = chart.basis(moved, ground).pose
+            by_pose = after @ by_pose @ linalg.inverse(chart.basis(pose, ground).pose)
+            noise = after @ noise @ after.T
+        return moved, by_pose, noise, ()
+
+    def observe_at(
+        joint: Joint,
+        sensor: Sensor,
+        chart: Chart,
+        slot: Array,
+        pose: Array,
+        landmark: Array,
+        cov: Array,
+    ) -> tuple[Array, Array, Array, Array]:
+        root = _root(cov)
+        centre = sensor.observe(pose, landmark)
+
+        def h(xi: Array) -> Array:
+            return sensor.residual(
+                sensor.observe(*chart.retract(pose, landmark, xi[:3], xi[3:])), centre
+            )
+
+        by = fit(h, root)
+        slope = by_variables(by.slope, root)
+        by_pose, by_landmark = slope[:, :3], slope[:, 3:]
+        if chart.basis is not None:
+            basis = chart.basis(pose, landmark)
+            if basis.landmark is not None:
+                by_landmark = by_landmark @ linalg.inverse(basis.landmark)
+            by_pose = (by_pose - by_landmark @ basis.cross) @ linalg.inverse(basis.pose)
+        return centre + by.mean, by_pose, by_landmark, by.rest
+
+    def invert_at(
+        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
+    ) -> tuple[Array, Array, Array]:
+        pose, size_z = joint.pose, z.shape[0]
+        mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
+        centre = sensor.invert(pose, z, mean)
+        still = jnp.zeros_like(centre)
+        root = _root(cov)
+        own_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
+
+        def g(xi: Array) -> Array:
+            seen_from, _ = chart.retract(pose, still, xi[:3], still)
+            landmark = sensor.invert(seen_from, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
+            return chart.local(pose, centre, seen_from, landmark)[1]
+
+        by = fit(g, jax.scipy.linalg.block_diag(root, *own_roots))
+        by_pose = by_variables(by.slope[:, :3], root)
+        own = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        if chart.basis is not None:
+            basis = chart.basis(pose, centre)
+            if basis.landmark is not None:
+                by_pose, own = basis.landmark @ by_pose, basis.landmark @ own @ basis.landmark.T
+            by_pose = (basis.cross + by_pose) @ linalg.inverse(basis.pose)
+        return centre, by_pose, own
+
+    return Linearizer(
+        name="unscented",
+        init=lambda pose, landmarks: (),
+        motion=motion_at,
+        observe=observe_at,
+        invert=invert_at,
+        born=lambda joint, born: joint.lin,
+    )
+
+
+def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> Regression:
+    """The unscented transform of f: (n,) -> (m,), f(0) = 0, over ξ ~ N(0, L Lᵀ), L = root (n, n).
+
+    With o_j and e_j the odd and even parts of f at α√n L_j, the transform's sums come to
+    mean = Σ e_j/(α²n), slope·L = (o_j/(α√n))_j and rest = Σ e_j e_jᵀ/(α²n) + (2 - α²) mean meanᵀ,
+    in which nothing large cancels.
+    """
+    reach2 = alpha**2 * root.shape[0]
+    points = jnp.sqrt(reach2) * root.T
+    ahead, back = jax.vmap(f)(points), jax.vmap(f)(-points)
+    odd, even = (ahead - back) / 2, (ahead + back) / 2
+    mean = even.sum(axis=0) / reach2
+    rest = linalg.gram(even, even) / reach2 + (2 - alpha**2) * mean[:, None] * mean[None, :]
+    return Regression(mean, odd.T / jnp.sqrt(reach2), rest)
+
+
+def by_variables(slope: Array, root: Array) -> Array:
+    """H with H L = slope (m, n), for a regular lower L (n, n)."""
+    return linalg.solve_lower(root.T[::-1, ::-1], slope.T[::-1])[::-1].T
+
+
+def _root(cov: Array) -> Array:
+    """A regular root of P: what is known exactly counts as known to about the square root of eps.
+
+    Along it the slope is then the derivative; a column of zeros would leave it undetermined.
+    """
+    root = linalg.cholesky(cov)[0]
+    floor = float(jnp.finfo(cov.dtype).eps) ** 0.5
+    pivots = jnp.diagonal(root)
+    return root + jnp.diag(jnp.where(pivots > floor, 0.0, floor))
+
+
+def _spread(root: Array) -> float:
+    return 1e-3 if root.dtype == jnp.float64 else 0.1

@@ -1,0 +1,214 @@
+"""The family: what each variant must keep invisible, what it must equal, what it refuses."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import charts, family, linearize, sensors
+from jaxslam.filters import ekf_slam
+from jaxslam.protocols import Filter
+from jaxslam.run import run
+from jaxslam.scenarios import loop, stationary
+from jaxslam.simulate import simulate
+
+KEY = jax.random.key(0)
+CURES = ["ideal", "fej", "oc", "right_invariant", "robocentric", "ukf_right"]
+VICTIMS = ["ekf", "iterated", "left_invariant", "ukf", "ukf_left", "square_root"]
+
+
+def drive(world, name, seed=1, probe=None, **options):
+    """One run of a variant: its trace, and the truth."""
+    truth, log = jax.jit(partial(simulate, world))(jax.random.key(seed))
+
+    @jax.jit
+    def go(truth, log):
+        candidate = family.FILTERS[name](world, **options)
+        filter = candidate if isinstance(candidate, Filter) else candidate(truth)
+        return run(filter, log, world.pose, world.pose_cov, KEY, probe=probe)
+
+    return go(truth, log), truth
+
+
+def test_the_family_is_known_to_these_tests():
+    assert sorted(CURES + VICTIMS) == sorted(family.FILTERS)
+
+
+# --- observability: a turn of everything must stay invisible -------------------------------------
+
+
+@pytest.fixture(scope="module", params=CURES + VICTIMS)
+def watched(request):
+    """A filter of the family, 80 steps of the loop, and its watch after each."""
+    trace, _ = drive(loop(steps=80), request.param, watch=True, probe=lambda s: s.watch)
+    return request.param, trace
+
+
+def test_cures_keep_three_directions_unobservable_and_the_others_two(watched):
+    """Huang et al. 2010: the standard EKF's linearized system has rank deficit 2 instead of 3."""
+    name, trace = watched
+    watch = trace.final.watch
+    scale = np.sqrt(np.asarray(watch.scale))
+    size = np.linalg.eigvalsh(np.asarray(watch.information) / scale / scale[:, None])
+    assert np.all(size[:2] < 1e-15)  # translations
+    turn = np.einsum("tij,i,j->t", np.asarray(trace.probe.information), watch.turn, watch.turn)
+    assert np.all(np.diff(turn) >= 0)
+    if name in CURES:
+        assert size[2] < 1e-15
+        assert turn[-1] < 1e-12
+    else:
+        assert size[2] > 1e-7
+        assert turn[-1] > 1.0  # a standard deviation below 1 rad, out of nothing
+
+
+@pytest.fixture(scope="module")
+def still():
+    """Standard deviation of the heading (T,) on `stationary`, by filter."""
+    out = {}
+    for name in family.FILTERS:
+        trace, _ = drive(stationary(steps=60), name)
+        out[name] = np.sqrt(np.asarray(trace.estimate.pose_cov)[:, 2, 2])
+    return out
+
+
+@pytest.mark.parametrize("name", CURES)
+def test_a_robot_that_stands_still_learns_no_heading(still, name):
+    np.testing.assert_allclose(still[name], np.deg2rad(5.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", VICTIMS)
+def test_the_others_do_and_are_mistaken(still, name):
+    """Julier & Uhlmann 2001."""
+    assert still[name][-1] < np.deg2rad(4.9)
+
+
+# --- each linearizer does what it says ----------------------------------------------------------
+
+
+def test_first_estimates_stay_where_they_were(watched):
+    name, trace = watched
+    if name != "fej":
+        pytest.skip("another filter")
+    first = trace.final.lin.landmarks
+    alive = np.asarray(trace.estimate.alive)
+    for slot in np.flatnonzero(alive[-1]):
+        born = int(np.argmax(alive[:, slot]))
+        np.testing.assert_array_equal(first[slot], trace.estimate.points[born, slot])
+        assert np.abs(first[slot] - trace.estimate.points[-1, slot]).max() > 1e-6
+
+
+def test_linearization_points_solve_the_constrained_least_squares():
+    """Against a general solver of min |p* - p̂|² + Σ|l*_i - l̂_i|², l*_i - p* = d_i."""
+    world, rng = loop(steps=2), np.random.default_rng(0)
+    oc = linearize.observability()
+    joint = family.FILTERS["oc"](world).init(jnp.array([1.0, 2.0, 0.3]), jnp.eye(3) * 0.01)
+    alive = np.arange(20) < 3
+    landmarks = np.where(alive[:, None], rng.normal(size=(20, 2)) * 3, 0.0)
+    arms = np.where(alive[:, None], landmarks + rng.normal(size=(20, 2)) * 0.3, 0.0)
+    lin = joint.lin._replace(robot=jnp.array([0.9, 2.2]), landmarks=jnp.asarray(arms))
+    joint = joint._replace(landmarks=jnp.asarray(landmarks), alive=jnp.asarray(alive), lin=lin)
+    u = jnp.array([0.25, 0.025, 1.0])
+    moved, by_pose, _, after = jax.jit(
+        lambda joint: oc.motion(joint, world.motion, charts.euclidean(), u, jnp.eye(3))
+    )(joint)
+    # Unknown p*; l*_i = p* + d_i: stacked, each coordinate is a mean of p̂ and the l̂_i - d_i.
+    d = (arms - np.array([0.9, 2.2]))[alive]
+    rows = np.kron(np.ones((4, 1)), np.eye(2))
+    target = np.concatenate([[1.0, 2.0], (landmarks[alive] - d).ravel()])
+    p_star = np.linalg.lstsq(rows, target, rcond=None)[0]
+    step = np.asarray(moved)[:2] - p_star
+    np.testing.assert_allclose(by_pose[:2, 2], [-step[1], step[0]], atol=1e-12)
+    np.testing.assert_allclose(after.robot, np.array([0.9, 2.2]) + step, atol=1e-12)
+
+
+def test_all_variants_have_the_process_noise_of_the_standard_filter():
+    world = loop(steps=2)
+    u = jnp.array([0.26, 0.02, 1.0])
+    noises = []
+    for make in (linearize.at_estimate, linearize.first_estimate, linearize.observability):
+        filter = ekf_slam(world.motion, world.sensor, 3, linearize=make())
+        joint = filter.init(jnp.array([1.0, 2.0, 0.3]), jnp.eye(3) * 0.01)
+        noises.append(make().motion(joint, world.motion, charts.euclidean(), u, jnp.eye(3))[2])
+    np.testing.assert_array_equal(noises[0], noises[1])
+    np.testing.assert_array_equal(noises[0], noises[2])
+
+
+# --- square root --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"update": "joint"},
+        {"update": "sequential", "gate": 9.0, "births": 1},
+        {"update": "joint", "chart": charts.right_invariant()},
+        {"update": "joint", "chart": charts.left_invariant()},
+    ],
+    ids=["joint", "sequential", "right", "left"],
+)
+def test_the_square_root_filter_is_the_filter(options):
+    world = dataclasses.replace(worlds.ring(steps=25), pose_cov=np.diag([0.01, 0.02, 0.003]))
+    plain, _ = drive(world, "ekf", **options)
+    root, _ = drive(world, "ekf", square_root=True, probe=lambda s: s.cov, **options)
+    for name in ("pose", "pose_cov", "points", "point_covs"):
+        ours, theirs = getattr(root.estimate, name), getattr(plain.estimate, name)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(root.info.nis, plain.info.nis, rtol=1e-7, atol=1e-9)
+    np.testing.assert_array_equal(root.info.status, plain.info.status)
+    product = root.final.cov @ root.final.cov.T
+    np.testing.assert_allclose(product, plain.final.cov, rtol=1e-9, atol=1e-12)
+
+
+def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
+    """Sharp measurements of a vague map: P loses its definiteness to rounding, X cannot."""
+    sharp = sensors.range_bearing(np.diag([1e-4, 1e-4]) ** 2)
+    world = dataclasses.replace(worlds.ring(steps=25), sensor=sharp, pose_cov=np.eye(3) * 4.0)
+    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, log)
+    smallest = {}
+    for square_root in (False, True):
+        filter = family.variant(world, square_root=square_root)
+        trace = jax.jit(
+            lambda log, f=filter: run(
+                f, log, world.pose, world.pose_cov, KEY, probe=lambda s: s.cov
+            )
+        )(single)
+        cov = np.asarray(trace.probe, np.float64)
+        cov = cov @ cov.transpose(0, 2, 1) if square_root else cov
+        smallest[square_root] = np.linalg.eigvalsh(cov)[:, 0].min()
+    assert smallest[False] < 0
+    assert smallest[True] > 0
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+def three_parameters():
+    """A world whose landmarks are (x, y, signature)."""
+    world = worlds.ring(steps=5)
+    landmarks = np.concatenate([world.landmarks, np.ones((6, 1))], axis=1)
+    sensor = sensors.range_bearing_signature(np.eye(3) * 0.01)
+    return dataclasses.replace(world, sensor=sensor, landmarks=landmarks)
+
+
+@pytest.mark.parametrize("name", ["fej", "oc", "right_invariant", "left_invariant", "robocentric"])
+def test_variants_for_points_refuse_other_landmarks(name):
+    with pytest.raises(ValueError, match=r"range_bearing_signature"):
+        family.FILTERS[name](three_parameters())
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"linearize": linearize.first_estimate(), "chart": charts.right_invariant()}, "Euclidean"),
+        ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
+        ({"square_root": True, "joseph": True}, "square root"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(options, why):
+    with pytest.raises(ValueError, match=why):
+        worlds.ekf(worlds.ring(steps=2), **options)

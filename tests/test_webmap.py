@@ -1,0 +1,280 @@
+"""substeps is its model in a loop; webmap is the car it says, on a closed path of its own."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import motion, run
+from jaxslam.filters import ekf_slam
+from jaxslam.motion.substeps import substeps
+from jaxslam.scenarios.webmap import webmap
+from jaxslam.simulate import simulate
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+Q = np.array([[0.04, 0.003], [0.003, 0.01]])
+COUNT = 3
+# name: the model, and (n, U) controls of it
+MODELS = {
+    "ackermann": (
+        motion.ackermann(Q, wheelbase=2.0, sensor=(1.0, 0.3), encoder=0.2),
+        [[1.0, 0.3, 0.4], [2.0, -0.5, 0.3], [1.5, 0.0, 0.7]],
+    ),
+    # its covariance depends on the control, and has another size than the control's
+    "velocity": (
+        motion.velocity(motion.velocity_noise(np.full(6, 0.1))),
+        [[1.0, 0.3, 0.4], [2.0, -0.5, 0.3], [1.5, 0.0, 0.7]],
+    ),
+    # its covariance depends on the pose
+    "increment": (
+        motion.increment(lambda pose, u: jnp.diag(jnp.stack([1 + pose[0] ** 2, 0.1 + u[1] ** 2]))),
+        [[1.0, 0.3], [2.0, -0.5], [1.5, 0.0]],
+    ),
+}
+
+
+@pytest.fixture(params=MODELS)
+def case(request):
+    """The single model, the model of substeps, a pose, controls (n, U) and noises (n, W)."""
+    single, u = MODELS[request.param]
+    w = 0.1 * np.random.default_rng(0).normal(size=(COUNT, len(single.noises)))
+    return single, substeps(single, COUNT), np.array([1.0, -2.0, 3.0]), np.array(u), w
+
+
+def test_substeps_is_the_loop_of_single_steps(case):
+    single, whole, pose, u, w = case
+    expected = jnp.asarray(pose)
+    for k in range(COUNT):
+        expected = single.step(expected, u[k], w[k])
+    actual = jax.jit(whole.step)(pose, u.ravel(), w.ravel())
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-14)
+
+
+def test_noise_covariance_is_the_models_own_along_the_nominal_path(case):
+    single, whole, pose, u, w = case
+    size = w.shape[1]
+    expected = np.zeros((COUNT * size, COUNT * size))
+    at = jnp.asarray(pose)
+    for k in range(COUNT):
+        block = slice(k * size, (k + 1) * size)
+        expected[block, block] = single.noise_cov(at, u[k])
+        at = single.step(at, u[k], jnp.zeros(size))
+    assert np.all(np.diagonal(expected) > 0)
+    actual = jax.jit(whole.noise_cov)(pose, u.ravel())
+    np.testing.assert_allclose(actual, expected, rtol=1e-14, atol=0)
+
+
+def test_hand_jacobians_are_the_chain_rule(case):
+    single, whole, pose, u, w = case
+    arguments = (pose, u.ravel(), w.ravel())
+    assert whole.jacobians is not None
+    by_hand = jax.jit(whole.jacobians)(*arguments)
+    by_autodiff = jax.jit(jax.jacfwd(whole.step, argnums=(0, 1, 2)))(*arguments)
+    for hand, autodiff, n in zip(by_hand, by_autodiff, (3, u.size, w.size), strict=True):
+        assert hand.shape == (3, n)
+        np.testing.assert_allclose(hand, autodiff, rtol=0, atol=1e-13)
+
+
+def test_perturbed_controls_move_as_the_noise_does():
+    single, u = MODELS["ackermann"]
+    whole, pose, u = substeps(single, COUNT), np.array([1.0, -2.0, 3.0]), np.ravel(u)
+    w = 0.1 * np.random.default_rng(1).normal(size=2 * COUNT)
+    assert whole.perturb is not None
+    moved = whole.perturb(jnp.asarray(u), jnp.asarray(w))
+    assert np.any(moved != u)
+    np.testing.assert_array_equal(whole.step(pose, moved, 0 * w), whole.step(pose, u, w))
+
+
+def test_what_the_model_lacks_substeps_lack():
+    bare = dataclasses.replace(MODELS["ackermann"][0], perturb=None, jacobians=None)
+    whole = substeps(bare, 2)
+    assert whole.perturb is None and whole.jacobians is None
+    assert substeps(motion.velocity(np.eye(3)), 2).perturb is None
+
+
+def test_names_are_numbered_and_keep_their_units(case):
+    single, whole, _, u, w = case
+    assert len(whole.controls) == u.size and len(whole.noises) == w.size
+    assert len(set(whole.controls)) == u.size and len(set(whole.noises)) == w.size
+    for one, many in ((single.controls, whole.controls), (single.noises, whole.noises)):
+        assert [n.rpartition(" ")[2] for n in many] == [n.rpartition(" ")[2] for n in one] * COUNT
+    assert substeps(MODELS["ackermann"][0], 2).noises == (
+        *("v_e 1 [m/s]", "steering 1 [rad]"),
+        *("v_e 2 [m/s]", "steering 2 [rad]"),
+    )
+
+
+def test_float32_stays(case):
+    _, whole, pose, u, w = case
+    pose, u, w = (jnp.asarray(a, jnp.float32) for a in (pose, u.ravel(), w.ravel()))
+    out = [
+        jax.eval_shape(whole.step, pose, u, w),
+        jax.eval_shape(whole.noise_cov, pose, u),
+        *jax.eval_shape(whole.jacobians, pose, u, w),
+    ]
+    if whole.perturb is not None:
+        out.append(jax.eval_shape(whole.perturb, u, w))
+    for array in out:
+        assert array.dtype == jnp.float32
+
+
+def test_gradients_reach_the_models_parameters():
+    @jax.jit
+    def end(wheelbase):
+        model = substeps(motion.ackermann(Q, wheelbase=wheelbase), COUNT)
+        u = jnp.asarray(MODELS["ackermann"][1]).ravel()
+        return jnp.sum(model.step(jnp.zeros(3), u, jnp.zeros(2 * COUNT)))
+
+    slope = jax.grad(end)(2.0)
+    np.testing.assert_allclose(slope, (end(2.0 + 1e-6) - end(2.0 - 1e-6)) / 2e-6, rtol=1e-7)
+
+
+@pytest.mark.parametrize("count", [0, -1, 2.0, True, None])
+def test_a_bad_count_is_refused(count):
+    with pytest.raises(ValueError, match="substeps: count"):
+        substeps(MODELS["ackermann"][0], count)
+
+
+# --- webmap -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scenario(quick_compilation):
+    return webmap()
+
+
+@pytest.fixture(scope="module")
+def drawn(scenario):
+    return jax.device_get(jax.jit(functools.partial(simulate, scenario))(jax.random.key(0)))
+
+
+def fine_controls(scenario):
+    """(8T, 3): speed, steering, interval."""
+    return np.asarray(scenario.controls).reshape(-1, 3)
+
+
+def offsets(path, landmarks):
+    """(T, N, 2): ahead and to the left of each pose."""
+    dx = landmarks - path[:, None, :2]
+    c, s = np.cos(path[:, 2])[:, None], np.sin(path[:, 2])[:, None]
+    return np.stack([c * dx[..., 0] + s * dx[..., 1], -s * dx[..., 0] + c * dx[..., 1]], axis=-1)
+
+
+def test_controls_keep_the_cars_limits(scenario):
+    speed, steering, interval = fine_controls(scenario).T
+    assert len(speed) == 8 * scenario.steps
+    np.testing.assert_array_equal(speed, 3)
+    np.testing.assert_array_equal(interval, 0.025)
+    assert np.abs(steering).max() <= np.deg2rad(30)
+    rate = np.diff(steering, prepend=0) / interval
+    assert np.abs(rate).max() <= np.deg2rad(20) * (1 + 1e-9)
+    # and is limited by them: it is a car that cannot take every corner as it wants to
+    assert np.abs(rate).max() >= np.deg2rad(20) * (1 - 1e-9)
+
+
+def test_true_path_is_the_nominal_one_whatever_the_draw(scenario, drawn):
+    """In plain NumPy: arcs of curvature tan α/4 m."""
+    x, y, theta = np.asarray(scenario.pose)
+    path = []
+    for v, alpha, dt in fine_controls(scenario):
+        turn = v * np.tan(alpha) / 4 * dt
+        straight = v * dt * np.sinc(turn / (2 * np.pi))
+        x, y = x + straight * np.cos(theta + turn / 2), y + straight * np.sin(theta + turn / 2)
+        theta += turn
+        path.append((x, y, theta))
+    expected = np.array(path)[7::8]
+    truth, log = drawn
+    np.testing.assert_allclose(truth.pose[:, :2], expected[:, :2], rtol=0, atol=1e-9)
+    turned = truth.pose[:, 2] - expected[:, 2]
+    np.testing.assert_allclose(np.exp(1j * turned), 1, rtol=0, atol=1e-11)
+    assert expected[-1, 2] - np.asarray(scenario.pose)[2] == pytest.approx(4 * np.pi, abs=0.2)
+
+
+def test_odometry_and_measurements_have_the_published_noise(scenario, drawn):
+    """Within five standard errors of the standard deviation, 5/√(2n), and of the mean, 5/√n."""
+    truth, log = drawn
+    speed, steering, interval = (log.control - scenario.controls).reshape(-1, 3).T
+    np.testing.assert_array_equal(interval, 0)
+    ahead = np.take_along_axis(
+        offsets(truth.pose, np.asarray(scenario.landmarks)), log.scan.tag[..., None], axis=1
+    )
+    expected = np.stack([np.hypot(*ahead.T).T, np.arctan2(ahead[..., 1], ahead[..., 0])], axis=-1)
+    distance, bearing = (log.scan.z - expected)[log.scan.valid].T
+    for noise, sigma in (
+        (speed, 0.3),
+        (steering, np.deg2rad(3)),
+        (distance, 0.1),
+        (bearing, np.deg2rad(1)),
+    ):
+        assert abs(noise.mean()) < 5 * sigma / np.sqrt(len(noise))
+        assert noise.std() == pytest.approx(sigma, rel=5 / np.sqrt(2 * len(noise)))
+    white = speed[1:] @ speed[:-1] / len(speed) / 0.3**2  # from one substep to the next
+    assert abs(white) < 5 / np.sqrt(len(speed))
+
+
+def test_every_loop_ends_where_it_began(scenario, drawn):
+    truth, _ = drawn
+    start = np.asarray(scenario.pose)
+    once = webmap(loops=1)
+    for steps in (once.steps, scenario.steps):
+        end = truth.pose[steps - 1]
+        assert np.hypot(*(end - start)[:2]) < 2
+        assert abs(np.angle(np.exp(1j * (end - start)[2]))) < 0.2
+    assert abs(scenario.steps - 2 * once.steps) <= 2
+    np.testing.assert_array_equal(once.controls, np.asarray(scenario.controls)[: once.steps])
+    assert 250 < 0.6 * once.steps < 400
+    assert np.all(np.ptp(truth.pose[:, :2], axis=0) < 150)
+
+
+def test_scans_hold_all_that_is_near_and_ahead_and_nothing_else(scenario, drawn):
+    truth, log = drawn
+    assert not truth.missed.any()
+    ahead = offsets(truth.pose, np.asarray(scenario.landmarks))
+    expected = (np.hypot(*ahead.T).T < 30) & (ahead[..., 0] > 0)
+    seen = np.zeros_like(expected)
+    rows, places = np.nonzero(log.scan.valid)
+    seen[rows, log.scan.tag[rows, places]] = True
+    np.testing.assert_array_equal(seen, expected)
+    assert seen.sum() == log.scan.valid.sum()
+    assert log.scan.z.shape[1] == scenario.places == expected.sum(axis=1).max()
+    z = log.scan.z[log.scan.valid]
+    assert z[:, 0].max() < 30 + 0.5 and np.abs(z[:, 1]).max() < np.deg2rad(90 + 5)
+
+
+def test_every_landmark_is_seen_and_at_least_two_at_any_moment(drawn):
+    _, log = drawn
+    tags = log.scan.tag[log.scan.valid]
+    half = log.scan.valid[: len(log.scan.valid) // 2]
+    assert set(tags) == set(range(36))
+    assert log.scan.valid.sum(axis=1).min() >= 2
+    assert set(log.scan.tag[: len(half)][half]) == set(range(36))
+
+
+def test_steps_may_be_given():
+    short, long = webmap(7), webmap(700, loops=1)
+    assert (short.name, short.steps, long.steps) == ("webmap", 7, 700)
+    np.testing.assert_array_equal(short.controls, np.asarray(long.controls)[:7])
+    assert np.asarray(short.controls).dtype == np.float64
+    assert short.places <= long.places
+    for bad in (0, -1, 2.5):
+        with pytest.raises(ValueError, match="steps"):
+            webmap(bad)
+        with pytest.raises(ValueError, match="loops"):
+            webmap(loops=bad)
+
+
+def test_ekf_slam_runs_on_it():
+    scenario = webmap(20)
+    landmarks = np.asarray(scenario.landmarks)
+    ekf = ekf_slam(scenario.motion, scenario.sensor, len(landmarks), **scenario.filter_options)
+    truth, log = jax.jit(functools.partial(simulate, scenario))(jax.random.key(1))
+    go = jax.jit(lambda log: run(ekf, log, scenario.pose, scenario.pose_cov, jax.random.key(2)))
+    trace = jax.device_get(go(log))
+    for leaf in jax.tree.leaves((trace.estimate, trace.info)):
+        assert np.isfinite(leaf).all()
+    assert np.hypot(*(trace.estimate.pose - truth.pose)[-1, :2]) < 1
+    assert trace.estimate.alive[-1].sum() == len(set(log.scan.tag[log.scan.valid].tolist()))
