@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import motion, plot, report, se2, sensors, userfile, verify
+from jaxslam import motion, page, plot, report, se2, sensors, userfile, verify
 from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS
 from jaxslam.family import FILTERS
@@ -153,14 +153,26 @@ def _campaign_files(
     trace = run(filter, log, scenario.pose, scenario.pose_cov, key_filter)
     title = f"{scenario.name}, {name}, run 0 of seed {options.seed}"
     figures = {
-        "nees.png": plot.nees_figure(campaign),
-        "errors.png": plot.errors_figure(trace.estimate, truth, title=title),
-        "map.png": plot.map_figure(trace.estimate, truth=truth, title=title),
+        "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
+        "bound": ("RMSE against the Cramér-Rao bound", plot.bound_figure(campaign)),
+        "coverage": ("Coverage of the ellipsoids", plot.coverage_figure(campaign)),
+        "whiteness": ("Autocorrelation of innovations", plot.whiteness_figure(campaign)),
+        "gained": ("Information wrongly gained of a turn", plot.gained_figure(campaign)),
+        "errors": (f"Errors: {title}", plot.errors_figure(trace.estimate, truth, title=title)),
+        "map": (f"Map: {title}", plot.map_figure(trace.estimate, truth=truth, title=title)),
     }
     return {
+        "report.html": page.page(
+            campaign,
+            report.ROWS,
+            command,
+            options.seed,
+            report.versions(),
+            dict(figures.values()),
+        ),
         "consistency.json": report.as_json(campaign, command, options.seed),
         "consistency.csv": report.as_csv(campaign),
-    } | {name: figure.savefig for name, figure in figures.items()}
+    } | {f"{name}.png": figure.savefig for name, (_, figure) in figures.items()}
 
 
 def _run_dataset(options: argparse.Namespace, command: str) -> int:

@@ -1,17 +1,19 @@
-"""Figures a paper could print: maps, errors, NEES over time. The only module that draws.
+"""Figures a paper could print: maps, errors, and what a campaign shows. The only module that draws.
 
 Figures are made without pyplot, so there is no global state and no window; save one with
 `figure.savefig(path)`.
 """
 
+import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Figure  # others name the type, and import only this module
 
 from jaxslam.angles import wrap
-from jaxslam.consistency import DOF
+from jaxslam.consistency import DOF, LEVELS
 from jaxslam.monte_carlo import Campaign
 from jaxslam.types import Estimate, Truth
 
@@ -19,6 +21,12 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#00
 """A palette that colour-blind readers can tell apart (Okabe & Ito)."""
 
 _INK = "#333333"
+
+_HUES, _DASHES, _MARKS = 6, ("-", (0, (4, 1.6)), (0, (1, 1.2))), ("o", "s", "^")
+"""Filters take six of the colours in turn, then again with other dashes and markers."""
+
+_NOTHING = 1e-6
+"""[1/rad²] information on a heading of which one has learnt nothing: σ is 1000 rad."""
 
 
 def ellipse(
@@ -105,60 +113,246 @@ def errors_figure(
         axes.plot(step, scale * error[:, i], color=COLORS[1], lw=1.0, label="truth - estimate")
         axes.axhline(0.0, color=_INK, lw=0.6)
         axes.set(ylabel=name)
-    _caption(panels[0], title)
-    panels[-1].set(xlabel="step", xlim=(1, max(len(error), 2)))
+    _caption(figure, title)
+    panels[-1].set(xlabel="step", xlim=_span(len(error)))
     return figure
 
 
-def nees_figure(campaign: Campaign, *, blocks: Sequence[str] = ("pose", "heading")) -> Figure:
-    """Average NEES over the steps for every filter of a campaign, with the 95 % chi-square band."""
-    figure, panels = _figure(7.0, 2.6 * len(blocks) + 0.6, len(blocks))
+def nees_figure(campaign: Campaign, *, blocks: Sequence[str] = tuple(DOF)) -> Figure:
+    """Average NEES over the steps for every filter of a campaign, with the 95 % chi-square band.
+
+    The band is that of the filter with the most finite runs, the narrowest.
+    """
+    figure, panels = _figure(7.0, 1.9 * len(blocks) + 0.8, len(blocks))
+    step = np.arange(1, campaign.steps + 1)
+    most = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
     for axes, block in zip(panels, blocks, strict=True):
-        step = np.arange(1, campaign.steps + 1)
+        low, high = most[f"nees_{block}_low"], most[f"nees_{block}_high"]
+        axes.fill_between(
+            step, low, high, color="#999999", alpha=0.45, lw=0, label="95 % band", zorder=1
+        )
+        axes.axhline(DOF[block], color=_INK, lw=0.6, zorder=1.5)
         for i, (name, summary) in enumerate(campaign.filters.items()):
-            curves = summary.curves
-            if i == 0:
-                low, high = curves[f"nees_{block}_low"], curves[f"nees_{block}_high"]
-                axes.fill_between(
-                    step, low, high, color="#999999", alpha=0.45, lw=0, label="95 % band", zorder=1
-                )
-                axes.axhline(DOF[block], color=_INK, lw=0.6, zorder=2)
             label = f"{name} ({summary.verdict})"
-            axes.plot(step, curves[f"nees_{block}"], color=COLORS[i % 8], lw=1.0, label=label)
-        axes.set(ylabel=f"{block} NEES (dof {DOF[block]})", yscale="log")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter(_few_digits)
-    _caption(panels[0], f"{campaign.scenario}, NEES over {campaign.runs} runs")
-    panels[-1].set(xlabel="step", xlim=(1, max(campaign.steps, 2)))
+            _curve(axes, i, step, summary.curves[f"nees_{block}"], label)
+        axes.set(ylabel=f"{block} NEES (dof {DOF[block]})")
+        _logarithmic(axes)
+    _caption(figure, f"{_head(campaign)}: NEES, average over {_runs(campaign)}")
+    panels[-1].set(xlabel="step", xlim=_span(campaign.steps))
     return figure
 
 
-def _figure(width: float, height: float, panels: int) -> tuple[Figure, list[Axes]]:
+def bound_figure(campaign: Campaign) -> Figure:
+    """RMSE of position and heading over the steps for every filter, above the posterior Cramér-Rao
+    bound where the campaign has one.
+
+    Logarithmic where one filter's largest error is over ten times another's.
+    """
+    figure, panels = _figure(7.0, 4.8, 2)
+    step = np.arange(1, campaign.steps + 1)
+    quantities = (("position", "position RMSE [m]"), ("heading_deg", "heading RMSE [°]"))
+    for axes, (key, named) in zip(panels, quantities, strict=True):
+        peaks = []
+        for i, (name, summary) in enumerate(campaign.filters.items()):
+            curve = summary.curves[f"rmse_{key}"]
+            _curve(axes, i, step, curve, name)
+            peaks.append(np.max(curve, initial=0.0, where=np.isfinite(curve)))
+        for summary in campaign.filters.values():
+            bound = summary.curves.get(f"bound_{key}")
+            if bound is not None:
+                label = "Cramér-Rao bound"
+                axes.plot(step, bound, color=_INK, lw=2.0, label=label, zorder=5, **_lone(bound))
+                break
+        axes.set(ylabel=named)
+        there = [peak for peak in peaks if peak > 0]
+        if there and max(there) > 10 * min(there):
+            _logarithmic(axes)
+        else:
+            axes.axhline(0.0, lw=0)
+            axes.set_ylim(bottom=0.0)
+    _caption(figure, f"{_head(campaign)}: error against the bound, {_runs(campaign)}")
+    panels[-1].set(xlabel="step", xlim=_span(campaign.steps))
+    return figure
+
+
+def coverage_figure(campaign: Campaign) -> Figure:
+    """How often the truth lies in the ellipsoid of probability p, against p, for every filter.
+
+    On the diagonal a filter is honest; below it is optimistic, above pessimistic.
+    """
+    figure, panels = _figure(7.0, 3.3, 1, len(DOF))
+    for axes, block in zip(panels, DOF, strict=True):
+        axes.plot([0, 1], [0, 1], color=_INK, lw=0.8, label="honest", zorder=1.5)
+        for i, (name, summary) in enumerate(campaign.filters.items()):
+            _curve(axes, i, np.asarray(LEVELS), summary.coverage[block], name, mark=2.2)
+        ticks = np.linspace(0, 1, 5)
+        axes.set(xlim=(0, 1), ylim=(0, 1), xticks=ticks, yticks=ticks, box_aspect=1)
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.set_title(f"{block} (dof {DOF[block]})", fontsize="medium")
+    panels[0].set(ylabel="share of truth within")
+    panels[len(panels) // 2].set(xlabel="probability p of the ellipsoid")
+    _caption(figure, f"{_head(campaign)}: coverage, {_runs(campaign)}")
+    return figure
+
+
+def whiteness_figure(campaign: Campaign) -> Figure:
+    """Autocorrelation of whitened innovations against the lag for every filter; 0 is honest."""
+    figure, (axes,) = _figure(7.0, 3.4, 1)
+    axes.axhline(0.0, color=_INK, lw=0.8, zorder=1.5)
+    extreme = 0.1
+    for i, (name, summary) in enumerate(campaign.filters.items()):
+        values = summary.autocorrelation
+        lags = np.arange(1, len(values) + 1)
+        _curve(axes, i, lags, values, name, mark=3.5)
+        extreme = np.max(np.abs(values), initial=extreme, where=np.isfinite(values))
+        axes.set(xticks=lags)
+    axes.set(xlabel="lag [steps]", ylabel="autocorrelation", ylim=(-1.1 * extreme, 1.1 * extreme))
+    _caption(figure, f"{_head(campaign)}: whiteness of innovations, {_runs(campaign)}")
+    return figure
+
+
+def gained_figure(campaign: Campaign) -> Figure:
+    """Information wrongly gained along a turn of the whole frame over the steps; 0 is honest.
+
+    Of the filters that were watched. Below 1e-6 / rad² (σ of 1000 rad, nothing) a curve runs in a
+    strip of its own under the logarithmic axis, exact zeros and rounding alike.
+    """
+    figure, (axes,) = _figure(7.0, 3.6, 1)
+    step = np.arange(1, campaign.steps + 1)
+    key, top = "rotation_information", 1.0
+    watched = [name for name, s in campaign.filters.items() if key in s.curves]
+    strip = 1.0 + 0.15 * len(watched)
+    for i, name in enumerate(campaign.filters):
+        if name not in watched:
+            continue
+        values = campaign.filters[name].curves[key]
+        lane = strip * (watched.index(name) + 1) / (len(watched) + 1)
+        _curve(axes, i, step, np.where(values < _NOTHING, _NOTHING * 10**-lane, values), name)
+        top = np.max(values, initial=top, where=np.isfinite(values))
+    if not watched:
+        axes.text(0.5, 0.6, "no filter was watched", transform=axes.transAxes, ha="center")
+    axes.axhspan(_NOTHING * 10**-strip, _NOTHING, color="#999999", alpha=0.2, lw=0, zorder=1)
+    last = int(np.ceil(np.log10(top)))
+    powers = range(-6, last + 1, 2 if last < 8 else 4)
+    axes.set(yscale="log", ylim=(_NOTHING * 10**-strip, 3 * top))
+    axes.set_yticks(
+        [_NOTHING * 10 ** (-strip / 2), *(10.0**k for k in powers)],
+        ["nothing", *(f"$10^{{{k}}}$" for k in powers)],
+    )
+    axes.set_yticks([], minor=True)
+    axes.set(xlabel="step", xlim=_span(campaign.steps), ylabel="information [1/rad²]")
+    _caption(figure, f"{_head(campaign)}: learnt of a turn of the whole frame, {_runs(campaign)}")
+    return figure
+
+
+def png(figure: Figure, dpi: float = 180) -> bytes:
+    """The figure as a PNG file, dpi dots an inch."""
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=dpi)
+    return out.getvalue()
+
+
+def describe(figure: Figure) -> str:
+    """What the figure shows, in a sentence, for those who cannot see it."""
+    panels = [" ".join(filter(None, (a.get_title(), a.get_ylabel()))) for a in figure.axes]
+    across = next(filter(None, (a.get_xlabel() for a in figure.axes)), "")
+    legends = [*figure.legends, *filter(None, (a.get_legend() for a in figure.axes))]
+    named = [text.get_text() for legend in legends for text in legend.get_texts()]
+    said = f"{'; '.join(filter(None, panels))} against {across}"
+    return (f"{said}. Drawn: {', '.join(named)}." if named else f"{said}.").replace(r"\$", "$")
+
+
+def _figure(width: float, height: float, rows: int, columns: int = 1) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
-    grid = figure.subplots(panels, 1, sharex=True, squeeze=False)
-    for axes in grid[:, 0]:
+    grid = figure.subplots(rows, columns, sharex=True, sharey=columns > 1, squeeze=False)
+    for axes in grid.flat:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(color="#dddddd", lw=0.5)
         axes.set_axisbelow(True)
-    return figure, list(grid[:, 0])
+    return figure, list(grid.flat)
 
 
-def _caption(axes: Axes, title: str) -> None:
-    """Title on the left above the axes, legend below it, clear of the curves."""
-    axes.set_title(title, loc="left", pad=26)
-    axes.legend(
-        loc="lower left",
-        bbox_to_anchor=(-0.01, 0.99),
-        frameon=False,
-        ncols=4,
-        fontsize="small",
-        columnspacing=1.2,
+def _curve(
+    axes: Axes, i: int, x: np.ndarray, y: np.ndarray, label: str, *, mark: float = 0.0
+) -> None:
+    """The line of filter number i; marks of that size in points, and where a line needs them."""
+    dashes = _DASHES[i // _HUES % len(_DASHES)]
+    marks: dict[str, Any] = {"marker": _MARKS[i // _HUES % len(_MARKS)], "ms": mark or 3.0}
+    axes.plot(
+        x,
+        y,
+        color=COLORS[i % _HUES],
+        ls=dashes,
+        lw=1.2,
+        label=_plain(label),
+        zorder=3 + 0.01 * i,
+        **(marks if mark else _lone(y)),
     )
 
 
+def _lone(y: np.ndarray) -> dict[str, Any]:
+    """A marker for curves of a single number, which have no line."""
+    return {"marker": "o", "ms": 3.0} if np.isfinite(y).sum() == 1 else {}
+
+
+def _plain(name: str) -> str:
+    """A name as it stands: no mathematics in it, and not hidden from the legend."""
+    name = name.replace("$", r"\$")
+    return f" {name}" if name.startswith("_") else name
+
+
+def _head(campaign: Campaign) -> str:
+    return _plain(campaign.scenario)
+
+
+def _runs(campaign: Campaign) -> str:
+    return f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic ordinate with plain numbers; minor ticks have some where decades are few."""
+    axes.set_yscale("log", nonpositive="mask")
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(_few_digits if high < 100 * low else "")
+
+
+def _caption(figure: Figure, title: str) -> None:
+    """Title and legend above the panels, clear of the curves; the figure grows with its rows."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    width = 72 * figure.get_figwidth()
+    columns = 1
+    for more in range(2, min(len(labels), 6) + 1):
+        parts = np.array_split(np.array([len(label) for label in labels]), more)
+        if sum(4.4 * part.max() + 40 for part in parts) < width:
+            columns = more
+    figure.set_figheight(figure.get_figheight() + 0.17 * (-(-len(labels) // columns) - 1))
+    legend = figure.legend(
+        handles,
+        labels,
+        loc="outside upper left",
+        title=title or None,
+        alignment="left",
+        frameon=False,
+        ncols=columns,
+        fontsize=8,
+        title_fontsize=10.5,
+        columnspacing=1.4,
+        handlelength=2.4,
+    )
+    for line in legend.get_lines():
+        line.set_linewidth(1.6)
+
+
 def _few_digits(x: float, _: float) -> str:
-    """Minor ticks of a logarithmic axis: 2, 3 and 5 of each decade."""
-    return f"{x:g}" if f"{x:.0e}"[0] in "235" else ""
+    """Minor ticks of a logarithmic axis: 2 and 5 of each decade."""
+    return f"{x:g}" if f"{x:.0e}"[0] in "25" else ""
+
+
+def _span(steps: int) -> tuple[float, float]:
+    """The first to the last step, and room for a single one."""
+    return (1, steps) if steps > 1 else (0.5, 1.5)
 
 
 def _extent(*clouds: np.ndarray) -> float:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from test_family import three_parameters
 
 from jaxslam import cli
 
@@ -18,7 +19,13 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
     assert "verdict" in printed
     assert "published" not in printed  # of 2500 steps, and these are 8
     names = {path.name for path in out.iterdir()}
-    assert names == {"consistency.json", "consistency.csv", "nees.png", "errors.png", "map.png"}
+    assert names == {
+        "report.html",
+        "consistency.json",
+        "consistency.csv",
+        *(f"{n}.png" for n in ("nees", "bound", "coverage", "whiteness", "gained")),
+        *(f"{n}.png" for n in ("errors", "map")),
+    }
     found = json.loads((out / "consistency.json").read_text())
     assert (found["runs"], found["steps"], found["seed"]) == (3, 8, 4)
     assert list(found["filters"]) == ["ekf", "ideal"]
@@ -43,6 +50,16 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, capsys, change, mes
     assert cli.main([*QUICK, *change, "--out", str(out)]) == 2
     assert message in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "monte_carlo", lambda *a, **k: pytest.fail("work was begun"))
+    monkeypatch.setitem(cli.SCENARIOS, "signs", lambda steps: three_parameters())
+    asked = ["consistency", "--scenario", "signs", "--steps", "5", "--filters", "ekf,fej"]
+    assert cli.main([*asked, "--out", str(tmp_path)]) == 2
+    message = capsys.readouterr().err
+    assert "filter 'fej' cannot run scenario 'ring'" in message
+    assert "range_bearing_signature" in message
 
 
 def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, capsys, monkeypatch):

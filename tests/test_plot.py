@@ -1,11 +1,14 @@
 """Ellipses are contours of Mahalanobis distance; figures carry labels, units and equal aspect."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
 
 from jaxslam import plot, run, simulate
+from jaxslam.consistency.score import LAGS, LEVELS
 from jaxslam.monte_carlo import monte_carlo
 
 WORLD = worlds.ring(steps=15)
@@ -41,7 +44,7 @@ def test_an_ellipse_of_no_covariance_is_refused(cov):
 
 
 @pytest.fixture(scope="module")
-def drive():
+def drive(quick_compilation):
     truth, log = simulate(WORLD, worlds.key())
     return truth, run(worlds.ekf(WORLD), log, WORLD.pose, WORLD.pose_cov, worlds.key())
 
@@ -77,10 +80,188 @@ def test_errors_are_drawn_within_their_claimed_bounds(drive):
     np.testing.assert_allclose(drawn, truth.pose[:, 1] - trace.estimate.pose[:, 1])
 
 
-def test_nees_is_drawn_with_its_band():
-    campaign = monte_carlo(WORLD, {"a": worlds.ekf(WORLD)}, 4, worlds.key())
+@pytest.fixture(scope="module")
+def campaign(quick_compilation):
+    """A filter and another like it; the first as if it had been watched."""
+    found = monte_carlo(WORLD, {"a": worlds.ekf(WORLD)}, 4, worlds.key(), bound=True)
+    a = found.filters["a"]
+    watched = {"rotation_information": np.linspace(0.0, 9.0, WORLD.steps)}
+    b = dataclasses.replace(
+        a,
+        verdict="pessimistic",
+        curves={key: 1.1 * curve for key, curve in a.curves.items()},
+        coverage={block: share**2 for block, share in a.coverage.items()},
+        autocorrelation=a.autocorrelation / 2,
+    )
+    a = dataclasses.replace(a, curves=a.curves | watched)
+    return dataclasses.replace(found, filters={"a": a, "b": b})
+
+
+CAMPAIGN_FIGURES = (
+    plot.nees_figure,
+    plot.bound_figure,
+    plot.coverage_figure,
+    plot.whiteness_figure,
+    plot.gained_figure,
+)
+
+
+def many(campaign, names):
+    summaries = list(campaign.filters.values())
+    filters = {name: summaries[i % 2] for i, name in enumerate(names)}
+    return dataclasses.replace(campaign, filters=filters)
+
+
+def line(axes, label):
+    (found,) = [drawn for drawn in axes.lines if drawn.get_label() == label]
+    return found
+
+
+def named(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_nees_is_drawn_with_its_band(campaign):
     figure = plot.nees_figure(campaign)
-    assert [axes.get_yscale() for axes in figure.axes] == ["log", "log"]
-    named = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert named[0] == "95 % band"
-    assert named[1].startswith("a (")
+    assert [axes.get_yscale() for axes in figure.axes] == ["log"] * 3
+    assert [axes.get_ylabel() for axes in figure.axes] == [
+        "pose NEES (dof 3)",
+        "position NEES (dof 2)",
+        "heading NEES (dof 1)",
+    ]
+    verdicts = [summary.verdict for summary in campaign.filters.values()]
+    assert named(figure) == ["95 % band", f"a ({verdicts[0]})", f"b ({verdicts[1]})"]
+    curves, most = (campaign.filters[name].curves for name in "ba")
+    for axes, block in zip(figure.axes, ("pose", "position", "heading"), strict=True):
+        drawn = line(axes, f"b ({verdicts[1]})").get_ydata()
+        np.testing.assert_array_equal(drawn, curves[f"nees_{block}"])
+        (band,) = axes.collections
+        heights = band.get_paths()[0].vertices[:, 1]
+        assert heights.max() == np.nanmax(most[f"nees_{block}_high"])
+        assert heights.min() == np.nanmin(most[f"nees_{block}_low"])
+    (axes,) = plot.nees_figure(campaign, blocks=("heading",)).axes
+    assert axes.get_ylabel() == "heading NEES (dof 1)"
+
+
+def test_errors_are_drawn_above_the_bound(campaign):
+    figure = plot.bound_figure(campaign)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["position RMSE [m]", "heading RMSE [°]"]
+    assert named(figure) == ["a", "b", "Cramér-Rao bound"]
+    for axes, key in zip(figure.axes, ("position", "heading_deg"), strict=True):
+        bound = line(axes, "Cramér-Rao bound")
+        np.testing.assert_array_equal(
+            bound.get_ydata(), campaign.filters["a"].curves[f"bound_{key}"]
+        )
+        assert bound.get_linewidth() > line(axes, "a").get_linewidth()
+        assert axes.get_yscale() == "linear"
+        assert axes.get_ylim()[0] == 0
+    there = campaign.filters["a"]
+    key = "rmse_position"
+    far = dataclasses.replace(there, curves=there.curves | {key: 100 * there.curves[key]})
+    figure = plot.bound_figure(dataclasses.replace(campaign, filters={"a": there, "far": far}))
+    assert [axes.get_yscale() for axes in figure.axes] == ["log", "linear"]
+    bare = {name: curve for name, curve in there.curves.items() if not name.startswith("bound")}
+    alone = dataclasses.replace(campaign, filters={"a": dataclasses.replace(there, curves=bare)})
+    assert named(plot.bound_figure(alone)) == ["a"]
+
+
+def test_coverage_is_drawn_about_the_diagonal(campaign):
+    figure = plot.coverage_figure(campaign)
+    assert [axes.get_title() for axes in figure.axes] == [
+        "pose (dof 3)",
+        "position (dof 2)",
+        "heading (dof 1)",
+    ]
+    for axes, block in zip(figure.axes, ("pose", "position", "heading"), strict=True):
+        assert axes.get_box_aspect() == 1
+        np.testing.assert_array_equal(*line(axes, "honest").get_data())
+        np.testing.assert_array_equal(line(axes, "a").get_xdata(), LEVELS)
+        drawn = line(axes, "a").get_ydata()
+        np.testing.assert_array_equal(drawn, campaign.filters["a"].coverage[block])
+
+
+def test_whiteness_is_drawn_lag_by_lag_about_zero(campaign):
+    figure = plot.whiteness_figure(campaign)
+    (axes,) = figure.axes
+    drawn = line(axes, "b")
+    np.testing.assert_array_equal(drawn.get_xdata(), np.arange(1, LAGS + 1))
+    np.testing.assert_array_equal(drawn.get_ydata(), campaign.filters["b"].autocorrelation)
+    assert axes.get_ylim()[0] == -axes.get_ylim()[1]
+    assert axes.get_xlabel() == "lag [steps]"
+
+
+def test_information_gained_is_drawn_for_watched_filters_and_zeros_are_nothing(campaign):
+    there = campaign.filters["a"]
+    gained = np.array([0.0, -1e-20, 1e-30, 1e-3, np.nan, *np.linspace(1, 50, 10)])
+    filters = {
+        name: dataclasses.replace(there, curves=there.curves | {"rotation_information": values})
+        for name, values in (("learns", gained), ("honest", np.zeros(15)))
+    } | {"b": campaign.filters["b"]}
+    figure = plot.gained_figure(dataclasses.replace(campaign, filters=filters))
+    assert named(figure) == ["learns", "honest"]
+    (axes,) = figure.axes
+    drawn = line(axes, "learns").get_ydata()
+    np.testing.assert_array_equal(drawn[3:], gained[3:])
+    assert axes.get_yscale() == "log"
+    low, high = axes.get_ylim()
+    honest = line(axes, "honest").get_ydata()
+    assert np.all((drawn[:3] > low) & (drawn[:3] < 1e-6))
+    assert np.all((honest > low) & (honest < 1e-6))
+    assert not np.isclose(honest[0], drawn[0], rtol=0.2)  # each in its own lane
+    assert high > 50
+    assert "nothing" in [label.get_text() for label in axes.get_yticklabels()]
+    nobody = dataclasses.replace(campaign, filters={"b": campaign.filters["b"]})
+    (axes,) = plot.gained_figure(nobody).axes
+    assert [text.get_text() for text in axes.texts] == ["no filter was watched"]
+
+
+@pytest.mark.parametrize("draw", CAMPAIGN_FIGURES)
+def test_twelve_filters_can_be_told_apart_and_nothing_overlaps(campaign, draw):
+    figure = draw(many(campaign, [f"filter_number_{i}" for i in range(12)]))
+    plot.png(figure, 60)
+    lines = [drawn for drawn in figure.axes[0].lines if drawn.get_label().startswith("filter")]
+    looks = [(drawn.get_color(), drawn.get_linestyle()) for drawn in lines]
+    assert len(looks) == len(set(looks)) == (6 if draw is plot.gained_figure else 12)
+    page = figure.bbox
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert box.x0 >= page.x0
+    assert box.x1 <= page.x1
+    for axes in figure.axes:
+        drawn = axes.get_tightbbox()
+        assert drawn.y1 <= box.y0 + 1
+        assert drawn.y0 >= page.y0 - 1
+        assert drawn.x1 <= page.x1 + 1
+
+
+@pytest.mark.parametrize("draw", CAMPAIGN_FIGURES)
+def test_filters_without_a_number_and_single_steps_can_be_drawn(campaign, draw):
+    there = campaign.filters["a"]
+    lost = dataclasses.replace(
+        there,
+        curves={name: np.full_like(curve, np.nan) for name, curve in there.curves.items()},
+        coverage={block: np.full_like(share, np.nan) for block, share in there.coverage.items()},
+        autocorrelation=np.full(LAGS, np.nan),
+        counts=there.counts | {"runs": 0},
+    )
+    once = dataclasses.replace(there, curves={n: curve[2:3] for n, curve in there.curves.items()})
+    for steps, filters in (
+        (15, {"$lost_": lost}),
+        (15, {"_a$": lost, "b": there}),
+        (1, {"a": once}),
+    ):
+        tiny = dataclasses.replace(campaign, steps=steps, filters=filters)
+        figure = draw(tiny)
+        assert plot.png(figure, 40).startswith(b"\x89PNG")
+        said = plot.describe(figure)
+        for name in filters:
+            assert name in said
+
+
+def test_a_figure_is_described_in_words(campaign, drive):
+    said = plot.describe(plot.coverage_figure(campaign))
+    assert "share of truth within" in said
+    assert "against probability p of the ellipsoid" in said
+    assert "Drawn: honest, a, b." in said
+    truth, trace = drive
+    assert "true path" in plot.describe(plot.map_figure(trace.estimate, truth=truth))

@@ -1,0 +1,197 @@
+"""The page says what the campaign says, is well-formed HTML, loads nothing, and escapes names."""
+
+import base64
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from jaxslam import plot, report
+from jaxslam.consistency import DOF, LEVELS, Measure, Summary
+from jaxslam.monte_carlo import Campaign
+from jaxslam.page import VERDICTS, page
+
+STEPS, RUNS = 7, 30
+EVIL = "<script>alert(1)</script>&\"'"
+VOID = {"meta", "img", "br", "wbr", "hr", "link", "input"}
+
+
+def summary(verdict, measures, lost=()):
+    ones = np.ones(STEPS)
+    curves = {"rmse_position": ones, "rmse_heading_deg": ones}
+    for block, dof in DOF.items():
+        curves |= {f"nees_{block}": dof * ones}
+        curves |= {f"nees_{block}_low": 0.5 * dof * ones, f"nees_{block}_high": 1.5 * dof * ones}
+    return Summary(
+        verdict=verdict,
+        measures=measures,
+        nis_band=(0.9, 1.1),
+        inside={"pose": 0.75},
+        curves=curves,
+        coverage={block: np.asarray(LEVELS) for block in DOF},
+        autocorrelation=np.zeros(10),
+        counts={"runs": RUNS - len(lost), "not_finite": len(lost), "divergent": 0, "rejected": 0},
+        per_run={},
+        not_finite_runs=list(lost),
+    )
+
+
+def campaign(**filters):
+    return Campaign(
+        scenario=f"world {EVIL}",
+        source="A & B, https://doi.org/10.1/2",
+        published={"good": {"rmse_position": 1.25}},
+        steps=STEPS,
+        runs=RUNS,
+        dtype="float32",
+        divergence_limit=4.5,
+        filters=filters,
+        seconds=200.0,
+        compile_seconds=10.0,
+    )
+
+
+GOOD = {
+    "nees_pose": Measure(3.0412, 2.9912, 3.0912),
+    "rmse_position": Measure(1.2, 1.1, 1.3),
+    "bound_ratio_position": Measure(1.0, -np.inf, np.inf),
+    "unobservable": Measure(3.0, 3.0, 3.0),
+    "rotation_information": Measure(3e-26, 2e-26, 4e-26),
+    "log_likelihood": Measure(-12345.6, -12445.6, -12245.6),
+}
+
+
+class Reader(HTMLParser):
+    """Holds tags against each other; keeps text by element, and every attribute."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.attributes, self.words, self.rows = [], [], [], []
+        self.tags = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [(tag, *each) for each in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+            if {"td", "th"} & set(self.open):
+                self.rows[-1][-1] += data
+
+
+@pytest.fixture(scope="module")
+def text():
+    world = campaign(
+        good=summary("consistent", GOOD),
+        **{EVIL: summary("optimistic", {"nees_pose": Measure(9.0, 8.0, 10.0)}, lost=(4, 17))},
+        lost=summary("diverged", {}),
+    )
+    return page(
+        world,
+        report.ROWS,
+        f"jaxslam consistency {EVIL}",
+        1234,
+        {"jax": "9.8.7"},
+        {"NEES & its band": plot.nees_figure(world), "Coverage": plot.coverage_figure(world)},
+    )
+
+
+@pytest.fixture(scope="module")
+def read(text):
+    reader = Reader(text)
+    assert reader.open == []
+    return reader
+
+
+def row(read, label):
+    (found,) = [cells for cells in read.rows if cells[0] == label]
+    return found
+
+
+def test_nothing_is_loaded_and_nothing_runs(text, read):
+    assert text.startswith("<!DOCTYPE html>")
+    assert not {"script", "link", "iframe", "object", "base"} & set(read.tags)
+    loads = [value for _, name, value in read.attributes if name in ("src", "href", "srcset")]
+    assert len(loads) == 2
+    assert all(value.startswith("data:image/png;base64,") for value in loads)
+    assert not any(name.startswith("on") for _, name, _ in read.attributes)
+    assert "@import" not in text
+    assert "url(" not in text
+    policy = [v for _, name, v in read.attributes if name == "content" and "default-src" in v]
+    assert "default-src 'none'" in policy[0]
+
+
+def test_names_are_escaped(text, read):
+    assert "<script" not in text
+    words = "".join(read.words)
+    assert f"world {EVIL}: consistency of 3 filters" in words
+    assert f"jaxslam consistency {EVIL}" in words
+    assert f"{EVIL} was not finite in 2 of 30 runs: 4, 17." in words
+
+
+def test_filters_verdicts_and_measures_stand_in_the_table(read):
+    assert read.rows[0] == ["measure", "honest", "good", EVIL, "lost"]
+    assert row(read, "verdict")[1:] == ["consistent", "✓ consistent", "▲ optimistic", "✕ diverged"]
+    assert row(read, "pose NEES (x, y, θ)")[1:] == ["3", "3.041 ± 0.050", "9.0 ± 1.0", "–"]
+    assert row(read, "position RMSE [m]")[2] == "1.20 ± 0.10published 1.25"
+    assert row(read, "over Cramér-Rao bound")[1:3] == ["≥ 1", "1"]
+    assert row(read, "unobservable directions")[2] == "3 ± 0"
+    assert row(read, "learnt of a turn [1/rad²]")[2] == "3.0·10−26 ± 1.0·10−26"
+    assert row(read, "log-likelihood")[2] == "−12,346 ± 100"
+    assert row(read, "not finite")[2:] == ["0", "2", "0"]
+    assert row(read, "finite runs")[2:] == ["30", "28", "30"]
+    assert row(read, "steps in pose band")[2] == "75.0\N{NO-BREAK SPACE}%"
+    labels = [cells[0] for cells in read.rows]
+    assert "heading NEES" not in labels  # no filter has it
+    assert "rejected" not in labels  # nothing was
+    measured = [label.strip() for key, label, _ in report.ROWS if key in GOOD]
+    assert [label for label in labels if label in measured] == measured
+
+
+def test_every_label_of_the_table_is_shown_where_it_is_measured():
+    every = {key: Measure(1.0, 0.5, 1.5) for key, _, _ in report.ROWS}
+    reader = Reader(page(campaign(a=summary("undecided", every)), report.ROWS, "", None, {}, {}))
+    labels = [cells[0] for cells in reader.rows]
+    for _, label, _ in report.ROWS:
+        assert label.strip() in labels
+    assert "Figures" not in reader.words
+    assert "consistency of 1 filter" in "".join(reader.words)
+
+
+def test_parameters_and_conventions_are_in_words(read):
+    words = " ".join("".join(read.words).split())
+    for said in ("1234", "jax 9.8.7", "A & B, https://doi.org/10.1/2", "4.5 m", "float32"):
+        assert said in words
+    assert "3 min, 10.0 s of it compilation" in words
+    assert "not divided by its degrees of freedom" in words
+    for verdict, (_, meaning) in VERDICTS.items():
+        assert verdict in words
+        assert meaning in words
+
+
+def test_figures_are_embedded_with_captions_and_alternative_text(read):
+    words = "".join(read.words)
+    assert "Figure 1. NEES & its band" in words
+    assert "Figure 2. Coverage" in words
+    alternative = [value for _, name, value in read.attributes if name == "alt"]
+    assert "pose NEES (dof 3)" in alternative[0]
+    assert "against step" in alternative[0]
+    assert f"{EVIL} (optimistic)" in alternative[0]
+    assert "share of truth within" in alternative[1]
+    for tag, name, value in read.attributes:
+        if (tag, name) == ("img", "src"):
+            png = base64.b64decode(value.split(",")[1], validate=True)
+            assert png.startswith(b"\x89PNG\r\n")
