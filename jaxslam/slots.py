@@ -32,8 +32,18 @@ class Joint(NamedTuple):
     watch: Any = ()
     """a `Watch` of the directions that should stay unobservable, where one is kept"""
     last: Any = ()
-    """(3, D) covariance of the error (x, y, θ) of the last motion with all errors, where the chart
-    corrects that first"""
+    """the `Last` motion, where the chart keeps it apart"""
+
+
+class Last(NamedTuple):
+    """The error δ = (x, y, θ) of the last motion, in the frame it began from."""
+
+    frame: jax.Array
+    """() heading of that frame"""
+    cov: jax.Array
+    """(3, D) covariance of δ with all errors of the map, in the filter's chart"""
+    own: jax.Array
+    """(3, 3) covariance of δ"""
 
 
 class Watch(NamedTuple):
@@ -85,7 +95,7 @@ def empty(
         tag=jnp.full(capacity, -1, jnp.int32),
         lin=lin,
         watch=watch,
-        last=jnp.zeros((3, size), pose.dtype) if motion_apart else (),
+        last=Last(pose[2], jnp.zeros((3, size), pose.dtype), 0 * pose_cov) if motion_apart else (),
     )
 
 

@@ -207,6 +207,7 @@ def test_variants_for_points_refuse_other_landmarks(name):
         ({"linearize": linearize.first_estimate(), "chart": charts.right_invariant()}, "Euclidean"),
         ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
         ({"square_root": True, "joseph": True}, "square root"),
+        ({"square_root": True, "chart": charts.robocentric()}, "motion apart"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(options, why):

@@ -26,6 +26,7 @@ def main() -> int:
     part = 10 if options.quick else 1
     sections, metrics, files = [], [], {}
     section, found = circle.measure(1000 // part, options.seed)
+    print(section, flush=True)
     sections.append(section)
     metrics += found
     for module, scale in (

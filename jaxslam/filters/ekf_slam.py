@@ -284,5 +284,10 @@ def _check_parts(
         )
     if linearize.name == "unscented" and iterations > 1:
         raise ValueError("ekf_slam: the linearizer unscented does not iterate")
+    if chart.motion_apart and square_root:
+        raise ValueError(
+            f"ekf_slam: the chart {chart.name} keeps the last motion apart, which has no square "
+            "root here"
+        )
     if joseph and square_root:
         raise ValueError("ekf_slam: Joseph's form is of a covariance, not of its square root")

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg, se2, slots
-from jaxslam.filters.propagation import step_ahead
+from jaxslam import linalg, slots
+from jaxslam.filters.composition import lever_of_motion, moved_anew
+from jaxslam.filters.watching import along, informed, split
 from jaxslam.protocols import Basis, Chart, Linearizer, Sensor
-from jaxslam.slots import Joint, Watch
-
-_TINY = 1e-30
+from jaxslam.slots import Joint
 
 
 class Correction(NamedTuple):
@@ -140,15 +139,18 @@ def correct(
         cov = joint.cov - linalg.gram(v, linalg.settle(linalg.solve_lower(root, hx)))
     else:
         cov = joint.cov - linalg.gram(v, v)
-    last, step = joint.last, jnp.zeros(3, z.dtype)
-    apart = not isinstance(joint.last, tuple)
-    if apart:
-        seen_last = _along(by_pose, by_landmark, *_split(last.T, capacity), slot)
+    last = joint.last
+    if last:
+        seen_last = along(by_pose, by_landmark, *split(last.cov.T, capacity), slot)
         seen_last = jnp.where(fuse[:, None, None], seen_last, 0.0).reshape(m * size_z, 3)
         seen_last = jnp.where(keep[:, None], linalg.solve_lower(factor, seen_last), 0.0)
         step = linalg.gram(seen_last, whitened[:, None])[:, 0]
-        xi = xi - _lifted(chart, joint, step)
-        last = last - linalg.gram(seen_last, v)
+        lever = lever_of_motion(joint, chart)
+        xi = xi - lever @ step
+        last = last._replace(
+            cov=last.cov - linalg.gram(seen_last, v),
+            own=last.own - linalg.gram(seen_last, seen_last),
+        )
     poses, landmarks = over_landmarks(
         joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(capacity, size_l)
     )
@@ -157,12 +159,11 @@ def correct(
     log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
     watch = joint.watch
     if watch:
-        directions = _in_coordinates(chart, joint)
-        watch = _informed(watch, directions, *seen, slot, own_noise, fuse & positive)
-    ahead = se2.to_frame(joint.pose, joint.pose[:2] + step[:2])
+        watch = informed(joint, chart, *seen, slot, own_noise, fuse & positive)
+    turn = poses[0][2] - joint.pose[2]
     joint = joint._replace(pose=poses[0], landmarks=landmarks, cov=cov, watch=watch, last=last)
-    if apart:
-        joint = step_ahead(joint, jnp.concatenate([ahead, step[2:]]), chart, square_root)
+    if last:
+        joint = moved_anew(joint, turn, step, lever, chart)
     return joint, Correction(
         innovation=innovation,
         innovation_cov=marginal,
@@ -208,75 +209,6 @@ def augment(
     )
     born = jnp.zeros_like(joint.alive).at[slot].max(granted)
     return joint._replace(lin=linearize.born(joint, born))
-
-
-def _along(
-    by_pose: jax.Array,
-    by_landmark: jax.Array,
-    robot: jax.Array,
-    landmarks: jax.Array,
-    slot: jax.Array,
-) -> jax.Array:
-    """H times directions: of the robot (3, k) and of each landmark (N, L, k); (m, Z, k)."""
-    own = landmarks[slot]
-    terms = [by_pose[:, :, i, None] * robot[None, None, i] for i in range(3)]
-    terms += [by_landmark[:, :, i, None] * own[:, None, i] for i in range(own.shape[1])]
-    return linalg.total(terms)
-
-
-def _split(directions: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
-    """Rows (D, k) as those of the robot (3, k) and of each landmark (N, L, k)."""
-    return directions[:3], directions[3:].reshape(capacity, -1, directions.shape[1])
-
-
-def _lifted(chart: Chart, joint: Joint, step: jax.Array) -> jax.Array:
-    """The errors (D,) that a step (3,) of the robot alone is, in the chart."""
-    if chart.basis is None:
-        return jnp.concatenate([step, jnp.zeros_like(joint.landmarks).reshape(-1)])
-    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
-    robot = linalg.inverse(basis.pose[0]) @ step
-    own = -basis.cross @ robot
-    if basis.landmark is not None:
-        own = jnp.einsum("nij,nj->ni", jax.vmap(linalg.inverse)(basis.landmark), own)
-    return jnp.concatenate([robot, jnp.where(joint.alive[:, None], own, 0.0).reshape(-1)])
-
-
-def _in_coordinates(chart: Chart, joint: Joint) -> tuple[jax.Array, jax.Array]:
-    """The watched directions in coordinates: of the pose (3, 3) and of each landmark (N, L, 3)."""
-    robot, landmarks = _split(joint.watch.directions, joint.landmarks.shape[0])
-    if chart.basis is None:
-        return robot, landmarks
-    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
-    if basis.landmark is not None:
-        landmarks = jnp.einsum("nij,njk->nik", basis.landmark, landmarks)
-    return basis.pose[0] @ robot, landmarks + basis.cross @ robot
-
-
-def _informed(
-    watch: Watch,
-    directions: tuple[jax.Array, jax.Array],
-    by_pose: jax.Array,
-    by_landmark: jax.Array,
-    slot: jax.Array,
-    noise: jax.Array,
-    fused: jax.Array,
-) -> Watch:
-    """The watch with what these measurements say along its directions; all in coordinates."""
-
-    def whiten(cov: jax.Array, y: jax.Array) -> jax.Array:
-        return linalg.solve_lower(linalg.cholesky(cov)[0], y)
-
-    signed = _along(by_pose, by_landmark, *directions, slot)
-    robot, landmarks = directions
-    size = _along(jnp.abs(by_pose), jnp.abs(by_landmark), jnp.abs(robot), jnp.abs(landmarks), slot)
-    signed = jax.vmap(whiten)(noise, signed)
-    size = size / jnp.sqrt(jnp.maximum(jnp.diagonal(noise, axis1=1, axis2=2), _TINY))[:, :, None]
-    signed, size = (jnp.where(fused[:, None, None], part, 0.0) for part in (signed, size))
-    return watch._replace(
-        information=watch.information
-        + (signed[:, :, :, None] * signed[:, :, None, :]).sum(axis=(0, 1)),
-        scale=watch.scale + (size**2).sum(axis=(0, 1)),
-    )
 
 
 def _in_chart(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxslam import linalg, se2, slots
 from jaxslam.protocols import Basis, Chart, Linearizer, Motion
-from jaxslam.slots import Joint
+from jaxslam.slots import Joint, Last
 
 
 def propagate(
@@ -28,42 +28,29 @@ def propagate(
     robot = slots.robot_cov(joint, square_root)
     pose, by_pose, noise, lin = linearize.motion(joint, motion, chart, u, robot)
     if chart.basis is None:
-        moved = _Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
+        moved = Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
     else:
         over_map = jax.vmap(chart.basis, in_axes=(None, 0))
         before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
-        moved = _in_charts(by_pose, before, after, joint.alive)
+        moved = in_charts(by_pose, before, after, joint.alive)
     if square_root:
         size = joint.cov.shape[0]
         added = moved.lift(size) @ linalg.cholesky(noise)[0]
         cov = linalg.triangular_root(jnp.concatenate([moved.times(joint.cov), added], axis=1))
     else:
-        cov = _moved_cov(joint.cov, moved, noise)
+        cov = moved_cov(joint.cov, moved, noise)
     watch = joint.watch
     if watch:
         watch = watch._replace(directions=moved.times(watch.directions))
     last = joint.last
     if chart.motion_apart:
-        last = linalg.matmul(noise, moved.lift(joint.cov.shape[0]).T)
+        back = se2.adjoint(jnp.stack([0 * pose[0], 0 * pose[1], joint.pose[2]])).T
+        cov_last = linalg.matmul(back @ noise, moved.lift(joint.cov.shape[0]).T)
+        last = Last(joint.pose[2], cov_last, back @ noise @ back.T)
     return joint._replace(pose=pose, cov=cov, lin=lin, watch=watch, last=last)
 
 
-def step_ahead(joint: Joint, ahead: jax.Array, chart: Chart, square_root: bool) -> Joint:
-    """The robot a known step (3,) further in its own frame, in a chart with a basis; no noise."""
-    assert chart.basis is not None
-    pose = se2.compose(joint.pose, ahead)
-    by_pose, _ = se2.compose_jacobians(joint.pose, ahead)
-    over_map = jax.vmap(chart.basis, in_axes=(None, 0))
-    before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
-    moved = _in_charts(by_pose, before, after, joint.alive)
-    cov = moved.times(joint.cov) if square_root else _moved_cov(joint.cov, moved, None)
-    watch = joint.watch
-    if watch:
-        watch = watch._replace(directions=moved.times(watch.directions))
-    return joint._replace(pose=pose, cov=cov, watch=watch, last=moved.times(joint.last.T).T)
-
-
-class _Transition(NamedTuple):
+class Transition(NamedTuple):
     """How errors move: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise by way of dx]."""
 
     robot: jax.Array
@@ -105,7 +92,7 @@ class _Transition(NamedTuple):
         return jnp.concatenate([self.noise, rest])
 
 
-def _in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array) -> _Transition:
+def in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array) -> Transition:
     """E(x')⁻¹ F E(x) and E(x')⁻¹ by blocks, dead slots standing still."""
     undo = linalg.inverse(after.pose[0])
     robot = undo @ by_pose @ before.pose[0]
@@ -118,10 +105,10 @@ def _in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array
         landmark = jnp.where(alive[:, None, None], own @ before.landmark, still)
         cross, cross_noise = own @ cross, own @ cross_noise
     cross, cross_noise = (jnp.where(alive[:, None, None], m, 0.0) for m in (cross, cross_noise))
-    return linalg.settle(_Transition(robot, cross, landmark, undo, cross_noise))
+    return linalg.settle(Transition(robot, cross, landmark, undo, cross_noise))
 
 
-def _moved_cov(cov: jax.Array, moved: _Transition, noise: jax.Array | None) -> jax.Array:
+def moved_cov(cov: jax.Array, moved: Transition, noise: jax.Array | None) -> jax.Array:
     """A P Aᵀ + G N Gᵀ, each entry of P written once or twice."""
     if moved.cross is None:
         robot = linalg.matmul(moved.robot, cov[:3])
