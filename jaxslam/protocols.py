@@ -113,30 +113,43 @@ class Chart:
     in a world that stands still: the way of a map that is composed with the motion afterwards."""
 
 
+class Here(NamedTuple):
+    """Where a model is to be replaced: what a linearizer may look at."""
+
+    joint: Joint
+    """the filter's state, `joint.lin` being the linearizer's own memory"""
+    chart: Chart
+    pose: Array
+    """(3,) estimate of the robot"""
+    cov: Array
+    """P in the chart: of the robot (3, 3), or for `observe` of robot and landmark (3+L, 3+L)"""
+    slot: Any = None
+    """() of the landmark, for `observe`"""
+    landmark: Any = None
+    """(L,) its estimate, for `observe`"""
+
+
 @dataclass(frozen=True, eq=False)
 class Linearizer:
     """What affine function with added noise stands for a model, near a Gaussian.
 
     First-order linearizers evaluate Jacobians somewhere; statistical ones fit to the covariance.
-    Each may keep a memory of its own inside the filter's state, `joint.lin`. Derivatives are by the
-    *coordinates* of pose and landmark; covariances come in, as everywhere, in the filter's chart.
+    Each may keep a memory of its own inside the filter's state. Derivatives are by the
+    *coordinates* of pose and landmark, whatever the chart.
     """
 
     name: str
     init: Callable[[Array, Array], Any]
     """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
-    motion: Callable[[Joint, Motion, Chart, Array, Array], tuple[Array, Array, Array, Any]]
-    """(joint, motion, chart, u, P of the robot (3, 3)) -> the new pose, its derivative by the old
-    one (3, 3), the covariance that the noise adds to it (3, 3), memory."""
-    observe: Callable[
-        [Joint, Sensor, Chart, Array, Array, Array, Array], tuple[Array, Array, Array, Array]
-    ]
-    """(joint, sensor, chart, slot (), pose, l, P of robot and landmark (3+L, 3+L)) -> the expected
-    z, its derivatives by pose (Z, 3) and by l (Z, L), a covariance that belongs to the noise of
-    the measurement (Z, Z)."""
-    invert: Callable[[Joint, Sensor, Chart, Array, Array, Array], tuple[Array, Array, Array]]
-    """(joint, sensor, chart, tag (), z, P of the robot (3, 3)) -> the new l, its derivative by the
-    pose (L, 3), its covariance for a known pose (L, L)."""
+    motion: Callable[[Motion, Array, Here], tuple[Array, Array, Array, Any]]
+    """(motion, u, here) -> the new pose, its derivative by the old one (3, 3), the covariance that
+    the noise adds to it (3, 3), memory."""
+    observe: Callable[[Sensor, Here], tuple[Array, Array, Array, Array]]
+    """(sensor, here) -> the expected z, its derivatives by pose (Z, 3) and by l (Z, L), and what to
+    add to the covariance of the measurement's noise (Z, Z)."""
+    invert: Callable[[Sensor, Array, Array, Here], tuple[Array, Array, Array]]
+    """(sensor, z, tag (), here) -> the new l, its derivative by the pose (L, 3), its covariance for
+    a known pose (L, L)."""
     born: Callable[[Joint, Array], Any]
     """(joint, born (N,) bool) -> memory, after new landmarks entered the map."""
     euclidean: bool = False

@@ -11,7 +11,7 @@ import worlds
 
 from jaxslam import charts, family, linearize, sensors
 from jaxslam.filters import ekf_slam
-from jaxslam.protocols import Filter
+from jaxslam.protocols import Filter, Here
 from jaxslam.run import run
 from jaxslam.scenarios import loop, stationary
 from jaxslam.simulate import simulate
@@ -113,7 +113,9 @@ def test_linearization_points_solve_the_constrained_least_squares():
     joint = joint._replace(landmarks=jnp.asarray(landmarks), alive=jnp.asarray(alive), lin=lin)
     u = jnp.array([0.25, 0.025, 1.0])
     moved, by_pose, _, after = jax.jit(
-        lambda joint: oc.motion(joint, world.motion, charts.euclidean(), u, jnp.eye(3))
+        lambda joint: oc.motion(
+            world.motion, u, Here(joint, charts.euclidean(), joint.pose, jnp.eye(3))
+        )
     )(joint)
     # Unknown p*; l*_i = p* + d_i: stacked, each coordinate is a mean of p̂ and the l̂_i - d_i.
     d = (arms - np.array([0.9, 2.2]))[alive]
@@ -132,7 +134,8 @@ def test_all_variants_have_the_process_noise_of_the_standard_filter():
     for make in (linearize.at_estimate, linearize.first_estimate, linearize.observability):
         filter = ekf_slam(world.motion, world.sensor, 3, linearize=make())
         joint = filter.init(jnp.array([1.0, 2.0, 0.3]), jnp.eye(3) * 0.01)
-        noises.append(make().motion(joint, world.motion, charts.euclidean(), u, jnp.eye(3))[2])
+        here = Here(joint, charts.euclidean(), joint.pose, jnp.eye(3))
+        noises.append(make().motion(world.motion, u, here)[2])
     np.testing.assert_array_equal(noises[0], noises[1])
     np.testing.assert_array_equal(noises[0], noises[2])
 

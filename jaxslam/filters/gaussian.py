@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxslam import linalg, slots
 from jaxslam.filters.composition import lever_of_motion, moved_anew
 from jaxslam.filters.watching import along, informed, split
-from jaxslam.protocols import Basis, Chart, Linearizer, Sensor
+from jaxslam.protocols import Basis, Chart, Here, Linearizer, Sensor
 from jaxslam.slots import Joint
 
 
@@ -75,7 +75,7 @@ def correct(
     for iteration in range(iterations):
         expected, by_pose, by_landmark, rest = jax.vmap(
             lambda at, landmark, cov, pose=pose: linearize.observe(
-                joint, sensor, chart, at, pose, landmark, cov
+                sensor, Here(joint, chart, pose, cov, at, landmark)
             )
         )(slot, landmark, local_cov)
         noise = own_noise + rest
@@ -191,10 +191,10 @@ def augment(
     L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
     with the prior's term of (44); several in one scan are correlated through the robot.
     """
-    robot = slots.robot_cov(joint, square_root)
+    here = Here(joint, chart, joint.pose, slots.robot_cov(joint, square_root))
 
     def one(z_i: jax.Array, tag_i: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        landmark, by_pose, own = linearize.invert(joint, sensor, chart, tag_i, z_i, robot)
+        landmark, by_pose, own = linearize.invert(sensor, z_i, tag_i, here)
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)
             by_pose = by_pose @ basis.pose - basis.cross

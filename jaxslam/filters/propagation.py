@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import linalg, se2, slots
-from jaxslam.protocols import Basis, Chart, Linearizer, Motion
+from jaxslam.protocols import Basis, Chart, Here, Linearizer, Motion
 from jaxslam.slots import Joint, Last
 
 
@@ -26,7 +26,8 @@ def propagate(
     a square root X, P = X Xᵀ, A X is taken, and the noise's root beside it made part of it; O(N³).
     """
     robot = slots.robot_cov(joint, square_root)
-    pose, by_pose, noise, lin = linearize.motion(joint, motion, chart, u, robot)
+    here = Here(joint, chart, joint.pose, robot)
+    pose, by_pose, noise, lin = linearize.motion(motion, u, here)
     if chart.basis is None:
         moved = Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
     else:

@@ -3,8 +3,7 @@
 import jax
 
 from jaxslam.linearize import first_order
-from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
-from jaxslam.slots import Joint
+from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 
 Array = jax.Array
 
@@ -12,26 +11,14 @@ Array = jax.Array
 def at_estimate() -> Linearizer:
     """Every Jacobian at the newest estimate of its arguments (Solà (13), (25), (33)); no memory."""
 
-    def motion_at(
-        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
-    ) -> tuple[Array, Array, Array, tuple[()]]:
-        return (*first_order.motion_at(motion, joint.pose, u, joint.pose), ())
+    def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
+        return (*first_order.motion_at(motion, here.pose, u, here.pose), ())
 
-    def observe_at(
-        joint: Joint,
-        sensor: Sensor,
-        chart: Chart,
-        slot: Array,
-        pose: Array,
-        landmark: Array,
-        cov: Array,
-    ) -> tuple[Array, Array, Array, Array]:
-        return first_order.observe_at(sensor, pose, landmark, pose, landmark)
+    def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        return first_order.observe_at(sensor, here, here.pose, here.landmark)
 
-    def invert_at(
-        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
-    ) -> tuple[Array, Array, Array]:
-        return first_order.invert_at(sensor, joint.pose, z, joint.pose, z)
+    def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
+        return first_order.invert_at(sensor, here.pose, z, here.pose, z)
 
     return Linearizer(
         name="at_estimate",

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import turned
-from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
-from jaxslam.slots import Joint
+from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.types import Truth
 
 Array = jax.Array
@@ -25,31 +24,20 @@ def at_truth(truth: Truth) -> Linearizer:
     """
     path = jnp.concatenate([jnp.asarray(truth.start)[None], truth.pose])
 
-    def motion_at(
-        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        old, new = path[joint.lin], path[joint.lin + 1]
-        moved, by_pose, noise = first_order.motion_at(motion, joint.pose, u, old)
+    def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, Array]:
+        old, new = path[here.joint.lin], path[here.joint.lin + 1]
+        moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, old)
         ahead = motion.step(old, u, jnp.zeros(len(motion.noises), old.dtype))
-        return moved, turned(by_pose, new[:2] - ahead[:2]), noise, joint.lin + 1
+        return moved, turned(by_pose, new[:2] - ahead[:2]), noise, here.joint.lin + 1
 
-    def observe_at(
-        joint: Joint,
-        sensor: Sensor,
-        chart: Chart,
-        slot: Array,
-        pose: Array,
-        landmark: Array,
-        cov: Array,
-    ) -> tuple[Array, Array, Array, Array]:
-        true_landmark = truth.landmarks[jnp.maximum(joint.tag[slot], 0)]
-        return first_order.observe_at(sensor, pose, landmark, path[joint.lin], true_landmark)
+    def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        true_landmark = truth.landmarks[jnp.maximum(here.joint.tag[here.slot], 0)]
+        return first_order.observe_at(sensor, here, path[here.joint.lin], true_landmark)
 
-    def invert_at(
-        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
-    ) -> tuple[Array, Array, Array]:
-        true_z = sensor.observe(path[joint.lin], truth.landmarks[jnp.maximum(tag, 0)])
-        return first_order.invert_at(sensor, joint.pose, z, path[joint.lin], true_z)
+    def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
+        at_pose = path[here.joint.lin]
+        true_z = sensor.observe(at_pose, truth.landmarks[jnp.maximum(tag, 0)])
+        return first_order.invert_at(sensor, here.pose, z, at_pose, true_z)
 
     return Linearizer(
         name="at_truth",

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import turned
-from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 
 Array = jax.Array
@@ -35,30 +35,19 @@ def first_estimate() -> Linearizer:
     The process noise is that of the standard EKF. Euclidean chart and point landmarks only.
     """
 
-    def motion_at(
-        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
-    ) -> tuple[Array, Array, Array, First]:
-        moved, by_pose, noise = first_order.motion_at(motion, joint.pose, u, joint.pose)
-        by_pose = turned(by_pose, joint.pose[:2] - joint.lin.pose[:2])
-        return moved, by_pose, noise, joint.lin._replace(pose=moved)
+    def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, First]:
+        first = here.joint.lin
+        moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
+        by_pose = turned(by_pose, here.pose[:2] - first.pose[:2])
+        return moved, by_pose, noise, first._replace(pose=moved)
 
-    def observe_at(
-        joint: Joint,
-        sensor: Sensor,
-        chart: Chart,
-        slot: Array,
-        pose: Array,
-        landmark: Array,
-        cov: Array,
-    ) -> tuple[Array, Array, Array, Array]:
-        first = joint.lin
-        return first_order.observe_at(sensor, pose, landmark, first.pose, first.landmarks[slot])
+    def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        first = here.joint.lin
+        return first_order.observe_at(sensor, here, first.pose, first.landmarks[here.slot])
 
-    def invert_at(
-        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
-    ) -> tuple[Array, Array, Array]:
-        landmark, by_pose, own = first_order.invert_at(sensor, joint.pose, z, joint.pose, z)
-        return landmark, turned(by_pose, joint.pose[:2] - joint.lin.pose[:2]), own
+    def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
+        landmark, by_pose, own = first_order.invert_at(sensor, here.pose, z, here.pose, z)
+        return landmark, turned(by_pose, here.pose[:2] - here.joint.lin.pose[:2]), own
 
     def born(joint: Joint, born: Array) -> First:
         landmarks = jnp.where(born[:, None], joint.landmarks, joint.lin.landmarks)

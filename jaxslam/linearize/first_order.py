@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from jaxslam import derivatives
 from jaxslam.linalg import matmul
-from jaxslam.protocols import Motion, Sensor
+from jaxslam.protocols import Here, Motion, Sensor
 
 
 def motion_at(
@@ -19,15 +19,11 @@ def motion_at(
 
 
 def observe_at(
-    sensor: Sensor,
-    pose: jax.Array,
-    landmark: jax.Array,
-    at_pose: jax.Array,
-    at_landmark: jax.Array,
+    sensor: Sensor, here: Here, at_pose: jax.Array, at_landmark: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """h(pose, l), its Jacobians at another pose and landmark, and no added noise (Z, Z)."""
     by_pose, by_landmark = derivatives.observe_jacobians(sensor, at_pose, at_landmark)
-    expected = sensor.observe(pose, landmark)
+    expected = sensor.observe(here.pose, here.landmark)
     return expected, by_pose, by_landmark, jnp.zeros((expected.shape[0],) * 2, expected.dtype)
 
 

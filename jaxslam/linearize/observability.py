@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import turned
-from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 
 Array = jax.Array
@@ -40,34 +40,22 @@ def observability() -> Linearizer:
     process noise is that of the standard EKF. Euclidean chart and point landmarks only.
     """
 
-    def motion_at(
-        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
-    ) -> tuple[Array, Array, Array, Constraint]:
-        old = joint.lin
-        moved, by_pose, noise = first_order.motion_at(motion, joint.pose, u, joint.pose)
+    def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, Constraint]:
+        joint, old = here.joint, here.joint.lin
+        moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
         arms = joint.landmarks - joint.pose[None, :2] - old.landmarks + old.robot[None]
         arms = jnp.where(joint.alive[:, None], arms, 0.0)
         shift = arms.sum(axis=0) / (1 + joint.alive.sum())
         robot = old.robot + moved[:2] - joint.pose[:2] - shift
         return moved, turned(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
 
-    def observe_at(
-        joint: Joint,
-        sensor: Sensor,
-        chart: Chart,
-        slot: Array,
-        pose: Array,
-        landmark: Array,
-        cov: Array,
-    ) -> tuple[Array, Array, Array, Array]:
-        own = joint.lin
-        at_landmark = own.pose[:2] + own.landmarks[slot] - own.robot
-        return first_order.observe_at(sensor, pose, landmark, own.pose, at_landmark)
+    def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        own = here.joint.lin
+        at_landmark = own.pose[:2] + own.landmarks[here.slot] - own.robot
+        return first_order.observe_at(sensor, here, own.pose, at_landmark)
 
-    def invert_at(
-        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
-    ) -> tuple[Array, Array, Array]:
-        return first_order.invert_at(sensor, joint.pose, z, joint.pose, z)
+    def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
+        return first_order.invert_at(sensor, here.pose, z, here.pose, z)
 
     def born(joint: Joint, born: Array) -> Constraint:
         arms = joint.lin.robot[None] + joint.landmarks - joint.pose[None, :2]

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 
 from jaxslam import linalg
 from jaxslam.linalg import is_concrete
-from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
-from jaxslam.slots import Joint
+from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 
 Array = jax.Array
 
@@ -49,13 +48,11 @@ def unscented(alpha: float | None = None) -> Linearizer:
     def fit(f: Callable[[Array], Array], root: Array) -> Regression:
         return regress(f, root, alpha if alpha is not None else _spread(root))
 
-    def motion_at(
-        joint: Joint, motion: Motion, chart: Chart, u: Array, cov: Array
-    ) -> tuple[Array, Array, Array, tuple[()]]:
-        pose, width = joint.pose, len(motion.noises)
-        ground = jnp.zeros(joint.landmarks.shape[1], pose.dtype)
+    def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
+        pose, chart, width = here.pose, here.chart, len(motion.noises)
+        ground = jnp.zeros(here.joint.landmarks.shape[1], pose.dtype)
         moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
-        root = _root(cov)
+        root = _root(here.cov)
         root_noise = linalg.root_psd(motion.noise_cov(pose, u))
 
         def f(xi: Array) -> Array:
@@ -71,16 +68,9 @@ def unscented(alpha: float | None = None) -> Linearizer:
             noise = after @ noise @ after.T
         return moved, by_pose, noise, ()
 
-    def observe_at(
-        joint: Joint,
-        sensor: Sensor,
-        chart: Chart,
-        slot: Array,
-        pose: Array,
-        landmark: Array,
-        cov: Array,
-    ) -> tuple[Array, Array, Array, Array]:
-        root = _root(cov)
+    def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        pose, landmark, chart = here.pose, here.landmark, here.chart
+        root = _root(here.cov)
         centre = sensor.observe(pose, landmark)
 
         def h(xi: Array) -> Array:
@@ -98,14 +88,12 @@ def unscented(alpha: float | None = None) -> Linearizer:
             by_pose = (by_pose - by_landmark @ basis.cross) @ linalg.inverse(basis.pose)
         return centre + by.mean, by_pose, by_landmark, by.rest
 
-    def invert_at(
-        joint: Joint, sensor: Sensor, chart: Chart, tag: Array, z: Array, cov: Array
-    ) -> tuple[Array, Array, Array]:
-        pose, size_z = joint.pose, z.shape[0]
+    def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
+        pose, chart, size_z = here.pose, here.chart, z.shape[0]
         mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
         centre = sensor.invert(pose, z, mean)
         still = jnp.zeros_like(centre)
-        root = _root(cov)
+        root = _root(here.cov)
         own_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
 
         def g(xi: Array) -> Array:
