@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import charts, family, linearize, sensors
+from jaxslam import charts, family, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.protocols import Filter, Here
 from jaxslam.run import run
@@ -42,7 +42,7 @@ def test_the_family_is_known_to_these_tests():
 
 
 @pytest.fixture(scope="module", params=CURES + VICTIMS)
-def watched(request):
+def watched(request, quick_compilation):
     """A filter of the family, 80 steps of the loop, and its watch after each."""
     trace, _ = drive(loop(steps=80), request.param, watch=True, probe=lambda s: s.watch)
     return request.param, trace
@@ -66,7 +66,7 @@ def test_cures_keep_three_directions_unobservable_and_the_others_two(watched):
 
 
 @pytest.fixture(scope="module")
-def still():
+def still(quick_compilation):
     """Standard deviation of the heading (T,) on `stationary`, by filter."""
     out = {}
     for name in family.FILTERS:
@@ -138,6 +138,27 @@ def test_all_variants_have_the_process_noise_of_the_standard_filter():
         noises.append(make().motion(world.motion, u, here)[2])
     np.testing.assert_array_equal(noises[0], noises[1])
     np.testing.assert_array_equal(noises[0], noises[2])
+
+
+@pytest.mark.parametrize("name", ["oc", "robocentric", "ukf_right", "square_root"])
+def test_gradients_are_finite_from_a_start_that_is_known_exactly(name, quick_compilation):
+    """By both noises, through predictions, corrections and births, P0 = 0."""
+    world = worlds.ring(steps=3)
+    world = dataclasses.replace(world, landmarks=world.landmarks[:2])
+    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+
+    def cost(sigma):
+        models = {
+            "motion": motion.increment(jnp.diag(sigma[:2]) ** 2),
+            "sensor": sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
+        }
+        filter = family.FILTERS[name](dataclasses.replace(world, **models))
+        trace = run(filter, log, world.pose, world.pose_cov, KEY)
+        return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()
+
+    slope = jax.jit(jax.grad(cost))(np.array([0.01, 0.04, 0.05]))
+    assert np.isfinite(slope).all()
+    assert np.all(slope != 0)
 
 
 # --- square root --------------------------------------------------------------------------------
