@@ -197,10 +197,17 @@ def coverage_figure(campaign: Campaign) -> Figure:
 
 
 def whiteness_figure(campaign: Campaign) -> Figure:
-    """Autocorrelation of whitened innovations against the lag for every filter; 0 is honest."""
+    """Autocorrelation of whitened innovations against the lag for every filter; 0 is honest.
+
+    The band is that of white innovations, the widest of the filters.
+    """
     figure, (axes,) = _figure(7.0, 3.4, 1)
     axes.axhline(0.0, color=_INK, lw=0.8, zorder=1.5)
     extreme = 0.1
+    widest = max(campaign.filters.values(), key=lambda s: np.nan_to_num(s.autocorrelation_band[0]))
+    band = widest.autocorrelation_band
+    every = np.arange(1, len(band) + 1)
+    axes.fill_between(every, -band, band, color="#999999", alpha=0.35, lw=0, label="95 % band")
     for i, (name, summary) in enumerate(campaign.filters.items()):
         values = summary.autocorrelation
         lags = np.arange(1, len(values) + 1)

@@ -84,6 +84,7 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
             "steps_inside_band": s.inside,
             "coverage": {block: _numbers(share) for block, share in s.coverage.items()},
             "autocorrelation": _numbers(s.autocorrelation),
+            "autocorrelation_band": _numbers(s.autocorrelation_band),
             "not_finite_runs": s.not_finite_runs,
             "counts": s.counts,
         }
@@ -211,6 +212,8 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
             figures = ["" if figure is None else f"{figure:.4g}" for figure in note]
             lines.append(["  published", "", *figures])
     lines.append([f"NIS / dof, {LEVEL:.0%} band", "", *(_band(s.nis_band) for s in summaries)])
+    lags = [f"± {s.autocorrelation_band[0]:.4f}" for s in summaries]
+    lines.append([f"autocorrelation, {LEVEL:.0%} band", "", *lags])
     for block in DOF:
         shares = [f"{s.inside[block]:.1%}" if block in s.inside else "-" for s in summaries]
         lines.append([f"steps in {block} band", f"{LEVEL:.1%}", *shares])

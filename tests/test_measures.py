@@ -106,6 +106,10 @@ def test_the_autocorrelation_of_innovations_is_found_lag_by_lag(rho):
     # Five standard errors of a product of two normals, and of an AR(1) sum where correlated.
     spread = 5 * np.sqrt((1 + rho**2) / (1 - rho**2) / pairs)
     np.testing.assert_allclose(summary.autocorrelation, expected, atol=spread)
+    products = 30 * (200 - np.arange(1, consistency.LAGS + 1)) * 3 * 2
+    np.testing.assert_allclose(
+        summary.autocorrelation_band, 1.959964 / np.sqrt(products), rtol=1e-6
+    )
     measure = summary.measures["autocorrelation"]
     assert (measure.low <= 0 <= measure.high) == (rho == 0)
 

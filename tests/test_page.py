@@ -30,6 +30,7 @@ def summary(verdict, measures, lost=()):
         curves=curves,
         coverage={block: np.asarray(LEVELS) for block in DOF},
         autocorrelation=np.zeros(10),
+        autocorrelation_band=np.full(10, 0.01),
         counts={"runs": RUNS - len(lost), "not_finite": len(lost), "divergent": 0, "rejected": 0},
         per_run={},
         not_finite_runs=list(lost),

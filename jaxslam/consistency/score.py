@@ -56,7 +56,7 @@ class Score(NamedTuple):
     snapshots: tuple[Any, Any, Any]
     """pose error (K, 3), its covariance (K, 3, 3), whether that is regular (K,)."""
     sums: dict[str, Any]
-    """what is added up over runs: (T,) curves, (LEVELS,) and (LAGS, 2) counts, () drops."""
+    """what is added up over runs: (T,) curves, (LEVELS,) and (LAGS, 3) sums, () drops."""
 
 
 def snapshot_steps(steps: int) -> np.ndarray:
@@ -177,7 +177,8 @@ def _landmarks(
 
 
 def _autocorrelation(trace: Trace) -> jax.Array:
-    """(LAGS, 2): Σ w_tᵀ w_{t+l} over pairs of whitened innovations, and √(Σ|w_t|² Σ|w_{t+l}|²).
+    """(LAGS, 3): of whitened innovations Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and how
+    many products of numbers that is.
 
     Of the same landmark at t and t + l, w = L⁻¹ν with S = L Lᵀ; without landmarks, of one place.
     """
@@ -200,7 +201,8 @@ def _autocorrelation(trace: Trace) -> jax.Array:
         both = (fused[: max(steps - lag, 0)] & fused[lag:])[:, :, None]
         size = jnp.where(both, early**2, 0.0).sum() * jnp.where(both, late**2, 0.0).sum()
         size = jnp.where(size > 0, jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
-        pairs.append(jnp.stack([jnp.where(both, early * late, 0.0).sum(), size]))
+        products = both.sum().astype(white.dtype) * white.shape[2]
+        pairs.append(jnp.stack([jnp.where(both, early * late, 0.0).sum(), size, products]))
     return jnp.stack(pairs)
 
 

@@ -14,6 +14,8 @@ from jaxslam.stats import chi2_quantile, t_quantile
 LEVEL = 0.95
 """of every band and interval."""
 
+NORMAL = float(scipy.stats.norm.ppf(0.5 + LEVEL / 2))
+
 
 COUNTS = tuple(status.name.lower() for status in DROPS) + ("missed", "singular_steps")
 """The sums that are reported as counts."""
@@ -101,6 +103,9 @@ class Summary:
     """by block: share of runs' steps with the truth in the ellipsoid of each of `LEVELS`."""
     autocorrelation: np.ndarray
     """(LAGS,) of whitened innovations at lags of 1, 2, … steps; NaN without pairs."""
+    autocorrelation_band: np.ndarray
+    """(LAGS,) half-width of the 95 % band about 0 in which that of white innovations lies,
+    1.96/√(products of numbers in it) (Bar-Shalom 2001, 5.4.2)."""
     counts: dict[str, int]
     """runs (finite), not_finite, divergent, singular_steps, and dropped measurements by reason."""
     per_run: dict[str, np.ndarray]
@@ -178,6 +183,7 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
         inside=inside,
         curves=curves,
         coverage=coverage,
+        autocorrelation_band=_ratio(NORMAL, np.sqrt(sums["autocorrelation"][:, 2])),
         autocorrelation=_ratio(sums["autocorrelation"][:, 0], sums["autocorrelation"][:, 1]),
         counts=counts,
         per_run=per_run,
