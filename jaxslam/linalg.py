@@ -16,14 +16,21 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam import lapack
+
 _T = TypeVar("_T")
 
 # Up to this many rows a product AᵀB is written as outer products, which XLA fuses into one pass
 # over the result; beyond, as one matrix product.
 _OUTER_PRODUCTS = 16
 
-# Up to this size factors are unrolled into fused elementwise code, beyond it LAPACK is called.
+# Up to this size factors are unrolled into fused elementwise code; beyond it see `lapack`.
 _UNROLLED = 8
+
+
+def _tolerance(matrix: jax.Array) -> float:
+    """Of a pivot, as a share of its diagonal entry: what rounding alone leaves of zero."""
+    return matrix.shape[-1] * float(jnp.finfo(matrix.dtype).eps)
 
 
 def total(terms: Iterable[jax.Array]) -> jax.Array:
@@ -62,13 +69,12 @@ def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     A pivot not above n·eps times its diagonal entry counts as zero: its column of L is zero and the
     flag is False, so that a positive *semi*-definite A still gets a usable square root, and nothing
-    becomes NaN (beyond 8×8, where LAPACK is called, L is then zero as a whole). Only the lower
+    becomes NaN (beyond 8×8, L is then zero as a whole). Only the lower
     triangle is read. Non-finite input gives False.
     """
-    n = matrix.shape[-1]
-    tolerance = n * float(jnp.finfo(matrix.dtype).eps)
+    n, tolerance = matrix.shape[-1], _tolerance(matrix)
     if n > _UNROLLED:
-        return _cholesky_lapack(matrix, tolerance)
+        return _cholesky_beyond(matrix)
     zero = jnp.zeros((), matrix.dtype)
     rows: list[list[jax.Array]] = [[zero] * n for _ in range(n)]
     positive = jnp.asarray(True)
@@ -84,15 +90,30 @@ def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.stack([jnp.stack(row) for row in rows]), positive
 
 
-def _cholesky_lapack(matrix: jax.Array, tolerance: float) -> tuple[jax.Array, jax.Array]:
-    n = matrix.shape[-1]
-    mirrored = jnp.tril(matrix) + jnp.tril(matrix, -1).T
-    factor = jnp.linalg.cholesky(mirrored, symmetrize_input=False)
-    pivots = jnp.diagonal(factor) ** 2
-    positive = jnp.all(pivots > tolerance * jnp.abs(jnp.diagonal(matrix)))
-    # A second factor, of a matrix that is positive definite anyway, keeps gradients finite.
-    safe = jnp.where(positive, mirrored, jnp.eye(n, dtype=matrix.dtype))
-    return jnp.where(positive, jnp.linalg.cholesky(safe, symmetrize_input=False), 0.0), positive
+def _cholesky_beyond(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    factor = _factor(jnp.tril(matrix) + jnp.tril(matrix, -1).T)
+    return factor, factor[0, 0] > 0
+
+
+@jax.custom_jvp
+def _factor(matrix: jax.Array) -> jax.Array:
+    """Lower L with L Lᵀ = A of a symmetric A, zero where a pivot is."""
+    factor = jnp.tril(lapack.factor(matrix))
+    positive = jnp.all(
+        jnp.diagonal(factor) ** 2 > _tolerance(matrix) * jnp.abs(jnp.diagonal(matrix))
+    )
+    return jnp.where(positive, factor, 0.0)
+
+
+@_factor.defjvp
+def _factor_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    """dL = L Φ(L⁻¹ dA L⁻ᵀ), where Φ keeps the lower triangle and half of the diagonal."""
+    factor = _factor(*primals)
+    regular = factor[0, 0] > 0
+    safe = jnp.where(regular, factor, jnp.eye(len(factor), dtype=factor.dtype))
+    inner = lapack.solve_lower(safe, lapack.solve_lower(safe, tangents[0]).T)
+    slope = safe @ (jnp.tril(inner) - 0.5 * jnp.diag(jnp.diagonal(inner)))
+    return factor, jnp.where(regular, slope, 0.0)
 
 
 def root_psd(matrix: jax.Array) -> jax.Array:
@@ -145,7 +166,7 @@ def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
     if n > _UNROLLED:
         singular = jnp.diagonal(factor) == 0
         safe = factor + jnp.diag(singular.astype(factor.dtype))
-        out = jax.scipy.linalg.solve_triangular(safe, rhs.reshape(n, -1), lower=True)
+        out = lapack.solve_lower(safe, rhs.reshape(n, -1))
         return jnp.where(singular[:, None], 0.0, out).reshape(rhs.shape)
     rows: list[jax.Array] = []
     for i in range(n):
@@ -169,7 +190,7 @@ def inverse(matrix: jax.Array) -> jax.Array:
             [jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])], axis=1
         )
         return cofactors / jnp.dot(a[0], cofactors[:, 0])
-    return jnp.asarray(jnp.linalg.inv(a))
+    return lapack.inverse(a)
 
 
 def solve_psd(matrix: jax.Array, rhs: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -205,7 +226,7 @@ def mahalanobis_squared(
 
 def is_positive_definite(matrix: jax.Array) -> jax.Array:
     """Whether a symmetric (n, n) matrix is positive definite: its Cholesky factor is finite, ()."""
-    return jnp.all(jnp.isfinite(jnp.linalg.cholesky(matrix, symmetrize_input=False)))
+    return jnp.all(jnp.isfinite(lapack.factor(matrix)))
 
 
 def is_concrete(*values: Any) -> bool:

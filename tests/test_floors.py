@@ -14,7 +14,7 @@ import jaxslam
 PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
-    "angles se2 linalg stats",
+    "angles se2 lapack linalg stats",
     "types protocols slots noise derivatives",
     "motion sensors charts linearize association",
     "filters run simulate",

@@ -1,11 +1,14 @@
 """linalg: factors and solves against NumPy, what singular matrices give, and refusals."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 
-from jaxslam import linalg
+from jaxslam import lapack, linalg
 
 UNROLLED, LAPACK = [1, 2, 3, 4, 5, 6, 7, 8], [9, 20]
 
@@ -270,3 +273,53 @@ def test_is_concrete():
     jax.eval_shape(lambda x: seen.append(linalg.is_concrete([1.0, {"x": x}])), np.zeros(2))
     assert seen == [False]
     assert linalg.is_concrete([np.zeros(2), jnp.zeros(2), 1.0])
+
+
+def everything(a, b):
+    """Every function of linalg that has a library beneath it, of one matrix, as one vector."""
+    factor, positive = linalg.cholesky(a)
+    parts = factor, linalg.solve_lower(factor, b), linalg.solve_psd(a, b)[0], linalg.inverse(a)
+    return jnp.concatenate([part.ravel() for part in parts]), positive
+
+
+@pytest.mark.parametrize("n", [4, 9])
+def test_a_batch_gives_what_each_of_its_matrices_gives_alone(n):
+    a, b = random_covariances(n, count=2), np.random.default_rng(2).normal(size=(2, n, 3))
+
+    def weighed(a, b):
+        values, _ = everything(a, b)
+        return jnp.sum(jnp.cos(jnp.arange(values.size)) * values)
+
+    for f in (everything, jax.grad(weighed, (0, 1))):
+        alone = list(map(jax.jit(f), a, b))
+        together = jax.jit(jax.vmap(f))(a, b)
+        for i, one in enumerate(alone):
+            for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(together), strict=True):
+                scale = float(jnp.abs(x.astype(float)).max())
+                np.testing.assert_allclose(y[i], x, atol=1e-7 * scale)
+
+
+def test_slopes_of_slopes_equal_differences():
+    n = 9
+    a = random_covariances(n, count=1)[0]
+    unit = np.sqrt(np.diagonal(a))
+    a = a / unit / unit[:, None] + np.eye(n)
+    b = np.random.default_rng(3).normal(size=(n, 2))
+    f = jax.jit(lambda a, b: everything((a + a.T) / 2, b)[0])
+    check_grads(f, (a, b), order=2, rtol=1e-4, atol=1e-4)
+
+
+def test_no_batch_reaches_the_librarys_kernels_on_a_cpu():
+    # There they wait for threads that they hold themselves: see `lapack`.
+    a, b = random_covariances(20, count=4), np.ones((4, 20, 3))
+    slope = jax.grad(lambda a, b: everything(a, b)[0].sum(), (0, 1))
+    for f in (everything, slope, lapack.eigenvalues):
+        arguments = (a, b) if f is not lapack.eigenvalues else (a,)
+        program = jax.jit(jax.vmap(f)).lower(*arguments).compile().as_text()
+        calls = [
+            line for line in program.splitlines() if "lapack" in line and "custom-call(" in line
+        ]
+        batched = [line for line in calls if re.search(r"f64\[4,\d+,?\d*\]", line)]
+        assert not batched
+    alone = jax.jit(everything).lower(a[0], b[0]).compile().as_text()
+    assert "lapack_dpotrf" in alone and "lapack_dtrsm" in alone

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import linalg
+from jaxslam import lapack, linalg
 from jaxslam.angles import wrap
 from jaxslam.linalg import mahalanobis_squared
 from jaxslam.protocols import Chart, Sensor
@@ -214,6 +214,6 @@ def _null_space(information: jax.Array, watch: Any) -> tuple[jax.Array, jax.Arra
     same sum of squares with absolute values.
     """
     scale = jnp.sqrt(jnp.where(watch.scale > 0, watch.scale, 1.0))
-    size = jnp.linalg.eigvalsh(watch.information / scale[:, None] / scale[None, :])
+    size = lapack.eigenvalues(watch.information / scale[:, None] / scale[None, :])
     dimensions = (size < float(jnp.finfo(size.dtype).eps) ** 0.75).sum()
     return information @ watch.turn @ watch.turn, dimensions

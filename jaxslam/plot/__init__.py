@@ -1,0 +1,30 @@
+"""Figures a paper could print: maps, errors, and what a campaign shows. Only this package draws.
+
+Figures are made without pyplot, so there is no global state and no window; save one with
+`figure.savefig(path)`.
+"""
+
+from jaxslam.plot.campaign import (
+    bound_figure,
+    coverage_figure,
+    gained_figure,
+    nees_figure,
+    whiteness_figure,
+)
+from jaxslam.plot.single import ellipse, errors_figure, map_figure
+from jaxslam.plot.style import COLORS, Figure, describe, png
+
+__all__ = [
+    "COLORS",
+    "Figure",
+    "bound_figure",
+    "coverage_figure",
+    "describe",
+    "ellipse",
+    "errors_figure",
+    "gained_figure",
+    "map_figure",
+    "nees_figure",
+    "png",
+    "whiteness_figure",
+]

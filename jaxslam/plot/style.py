@@ -1,0 +1,120 @@
+"""What every figure shares: colours, panels, curves, captions and axes."""
+
+import io
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Figure  # others name the type, and import only this module
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
+"""A palette that colour-blind readers can tell apart (Okabe & Ito)."""
+
+INK = "#333333"
+
+_HUES, _DASHES, _MARKS = 6, ("-", (0, (4, 1.6)), (0, (1, 1.2))), ("o", "s", "^")
+"""Filters take six of the colours in turn, then again with other dashes and markers."""
+
+
+def png(figure: Figure, dpi: float = 180) -> bytes:
+    """The figure as a PNG file, dpi dots an inch."""
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=dpi)
+    return out.getvalue()
+
+
+def describe(figure: Figure) -> str:
+    """What the figure shows, in a sentence, for those who cannot see it."""
+    panels = [" ".join(filter(None, (a.get_title(), a.get_ylabel()))) for a in figure.axes]
+    across = next(filter(None, (a.get_xlabel() for a in figure.axes)), "")
+    legends = [*figure.legends, *filter(None, (a.get_legend() for a in figure.axes))]
+    named = [text.get_text() for legend in legends for text in legend.get_texts()]
+    said = f"{'; '.join(filter(None, panels))} against {across}"
+    return (f"{said}. Drawn: {', '.join(named)}." if named else f"{said}.").replace(r"\$", "$")
+
+
+def panels_of(
+    width: float, height: float, rows: int, columns: int = 1
+) -> tuple[Figure, list[Axes]]:
+    """An empty figure, width by height inches, and its panels row by row."""
+    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=True, sharey=columns > 1, squeeze=False)
+    for axes in grid.flat:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(color="#dddddd", lw=0.5)
+        axes.set_axisbelow(True)
+    return figure, list(grid.flat)
+
+
+def curve(
+    axes: Axes, i: int, x: np.ndarray, y: np.ndarray, label: str, *, mark: float = 0.0
+) -> None:
+    """The line of filter number i; marks of that size in points, and where a line needs them."""
+    dashes = _DASHES[i // _HUES % len(_DASHES)]
+    marks: dict[str, Any] = {"marker": _MARKS[i // _HUES % len(_MARKS)], "ms": mark or 3.0}
+    axes.plot(
+        x,
+        y,
+        color=COLORS[i % _HUES],
+        ls=dashes,
+        lw=1.2,
+        label=plain(label),
+        zorder=3 + 0.01 * i,
+        **(marks if mark else lone_mark(y)),
+    )
+
+
+def lone_mark(y: np.ndarray) -> dict[str, Any]:
+    """A marker for curves of a single number, which have no line."""
+    return {"marker": "o", "ms": 3.0} if np.isfinite(y).sum() == 1 else {}
+
+
+def plain(name: str) -> str:
+    """A name as it stands: no mathematics in it, and not hidden from the legend."""
+    name = name.replace("$", r"\$")
+    return f" {name}" if name.startswith("_") else name
+
+
+def logarithmic(axes: Axes) -> None:
+    """A logarithmic ordinate with plain numbers; minor ticks have some where decades are few."""
+    axes.set_yscale("log", nonpositive="mask")
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(_few_digits if high < 100 * low else "")
+
+
+def _few_digits(x: float, _: float) -> str:
+    """Minor ticks of a logarithmic axis: 2 and 5 of each decade."""
+    return f"{x:g}" if f"{x:.0e}"[0] in "25" else ""
+
+
+def caption(figure: Figure, title: str) -> None:
+    """Title and legend above the panels, clear of the curves; the figure grows with its rows."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    width = 72 * figure.get_figwidth()
+    columns = 1
+    for more in range(2, min(len(labels), 6) + 1):
+        parts = np.array_split(np.array([len(label) for label in labels]), more)
+        if sum(4.4 * part.max() + 40 for part in parts) < width:
+            columns = more
+    figure.set_figheight(figure.get_figheight() + 0.17 * (-(-len(labels) // columns) - 1))
+    legend = figure.legend(
+        handles,
+        labels,
+        loc="outside upper left",
+        title=title or None,
+        alignment="left",
+        frameon=False,
+        ncols=columns,
+        fontsize=8,
+        title_fontsize=10.5,
+        columnspacing=1.4,
+        handlelength=2.4,
+    )
+    for line in legend.get_lines():
+        line.set_linewidth(1.6)
+
+
+def span(steps: int) -> tuple[float, float]:
+    """The first to the last step, and room for a single one."""
+    return (1, steps) if steps > 1 else (0.5, 1.5)
