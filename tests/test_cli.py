@@ -53,7 +53,7 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, capsys, change, mes
 
 
 def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "monte_carlo", lambda *a, **k: pytest.fail("work was begun"))
+    monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: pytest.fail("work was begun"))
     monkeypatch.setitem(cli.SCENARIOS, "signs", lambda steps: three_parameters())
     asked = ["consistency", "--scenario", "signs", "--steps", "5", "--filters", "ekf,fej"]
     assert cli.main([*asked, "--out", str(tmp_path)]) == 2
@@ -63,7 +63,7 @@ def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, capsys
 
 
 def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "monte_carlo", lambda *a, **k: pytest.fail("work was begun"))
+    monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: pytest.fail("work was begun"))
     (tmp_path / "file").write_text("")
     assert cli.main([*QUICK, "--out", str(tmp_path / "file")]) == 2
     assert "not a folder" in capsys.readouterr().err
@@ -74,7 +74,7 @@ def test_an_interrupt_exits_with_130_and_writes_nothing(tmp_path, capsys, monkey
         progress(1, 3)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "monte_carlo", interrupted)
+    monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
     assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
     assert "nothing was written" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -78,5 +78,5 @@ def figure(campaign: Campaign) -> Figure:
     )
     axes.grid(color="#dddddd", lw=0.5)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize="small", ncols=2, loc="center right")
+    axes.legend(frameon=False, fontsize="small", ncols=4, loc="lower center")
     return picture

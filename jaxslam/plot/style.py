@@ -76,7 +76,11 @@ def plain(name: str) -> str:
 
 
 def logarithmic(axes: Axes) -> None:
-    """A logarithmic ordinate with plain numbers; minor ticks have some where decades are few."""
+    """A logarithmic ordinate with plain numbers, where the values span more than a factor of four;
+    minor ticks have numbers where decades are few."""
+    low, high = axes.get_ylim()
+    if 0 < high < 4 * low:
+        return
     axes.set_yscale("log", nonpositive="mask")
     low, high = axes.get_ylim()
     axes.yaxis.set_major_formatter("{x:g}")

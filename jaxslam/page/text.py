@@ -1,0 +1,66 @@
+"""How numbers and names are written on the page."""
+
+from html import escape
+
+import numpy as np
+
+from jaxslam.consistency import LEVEL, Measure
+
+
+def cell(measure: Measure | None) -> str:
+    """value ± half-width, to two digits of the half-width."""
+    if measure is None:
+        return "–"
+    half = (measure.high - measure.low) / 2
+    if not np.isfinite(half):
+        return number(measure.value, 4)
+    if half == 0:
+        return f"{number(measure.value, 4)} ± 0"
+    size = max(abs(measure.value), half)
+    if not 1e-3 <= size < 1e6:
+        return f"{number(measure.value, 2)} ± {number(half, 2)}"
+    digits = min(max(1 - int(np.floor(np.log10(half))), 0), 6)
+    return f"{measure.value:,.{digits}f} ± {half:,.{digits}f}".replace("-", "−")
+
+
+def number(value: float, digits: int) -> str:
+    """So many significant digits; tiny and huge ones as a power of ten."""
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits}g}".replace("-", "−")
+    mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}·10<sup>{int(power)}</sup>".replace("-", "−")
+
+
+def interval_title(measure: Measure | None) -> str:
+    """The attribute that shows a measure's interval under the pointer."""
+    if measure is None or not np.isfinite(measure.low):
+        return ""
+    return f' title="{percentage(LEVEL)} interval {measure.low:.5g} to {measure.high:.5g}"'
+
+
+def published_note(value: float | None) -> str:
+    """The published figure, where there is one."""
+    return "" if value is None else f'<span class="published">published {number(value, 4)}</span>'
+
+
+def percentage(share: float, digits: int = 0) -> str:
+    """As a percentage, with a space that does not break."""
+    return f"{100 * share:.{digits}f}\N{NO-BREAK SPACE}%"
+
+
+def counted(number: int, noun: str) -> str:
+    """1 run, 2 runs."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as seconds, minutes or hours."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def breakable(name: str) -> str:
+    """Escaped, with places where a long name may break."""
+    return escape(name).replace("_", "_<wbr>")
