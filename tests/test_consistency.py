@@ -154,6 +154,17 @@ def test_the_verdict_tells_honest_from_dishonest(claimed, verdict):
     assert abs(summary.measures["nees_pose"].value - 3 / claimed) < 0.15
 
 
+def test_an_interval_that_a_few_enormous_runs_widen_decides_nothing():
+    counts = {"runs": 100, "not_finite": 0, "divergent": 1}
+    for runs, verdict in (
+        (np.linspace(2, 4, 100), "consistent"),
+        ([3.0] * 99 + [1e9], "undecided"),
+    ):
+        nees = consistency.interval(runs)
+        assert nees.low < 3 < nees.high
+        assert consistency.judge({"nees_pose": nees}, counts) == verdict
+
+
 def test_too_few_runs_are_undecided():
     trace, truth, _ = synthetic(np.random.default_rng(6), runs=1)
     summary = consistency.summarize(summed(trace, truth))

@@ -15,6 +15,8 @@ from jaxslam.datasets import READERS
 from jaxslam.family import FILTERS
 from jaxslam.scenarios import SCENARIOS
 
+__all__ = ["main"]
+
 USAGE_ERROR = 2
 INTERRUPTED = 130
 

@@ -197,7 +197,8 @@ def judge(measures: dict[str, Measure], counts: dict[str, int]) -> str:
     Each run gives one time average, and runs are independent, so their mean has a t interval
     although NEES is correlated in time. consistent: 3 lies in the 95 % interval; optimistic: the
     interval lies above 3; pessimistic: below. diverged: over half of the runs are not finite or
-    divergent. undecided: under two runs have a NEES.
+    divergent. undecided: under two runs have a NEES, or 3 lies in an interval whose half-width
+    exceeds 3, which a few enormous runs make as wide as any.
     """
     lost = counts["not_finite"] + counts["divergent"]
     if lost > 0.5 * (counts["runs"] + counts["not_finite"]):
@@ -207,7 +208,9 @@ def judge(measures: dict[str, Measure], counts: dict[str, int]) -> str:
         return "undecided"
     if nees.low > DOF["pose"]:
         return "optimistic"
-    return "pessimistic" if nees.high < DOF["pose"] else "consistent"
+    if nees.high < DOF["pose"]:
+        return "pessimistic"
+    return "consistent" if nees.high - nees.low <= 2 * DOF["pose"] else "undecided"
 
 
 def interval(values: np.ndarray | Sequence[float]) -> Measure | None:

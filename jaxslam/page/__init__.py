@@ -21,12 +21,17 @@ from jaxslam.page.text import (
 )
 from jaxslam.plot import Figure, describe, png
 
+__all__ = ["VERDICTS", "page"]
+
 VERDICTS = {
     "consistent": ("✓", f"{DOF['pose']} lies in the interval of the mean pose NEES"),
     "optimistic": ("▲", "the interval lies above: covariances are claimed too small"),
     "pessimistic": ("▼", "the interval lies below: covariances are claimed too large"),
     "diverged": ("✕", "over half of the runs are not finite or divergent"),
-    "undecided": ("?", "fewer than two runs have a NEES"),
+    "undecided": (
+        "?",
+        "fewer than two runs have a NEES, or the interval holds 3 but is wider than ± 3",
+    ),
 }
 """Each verdict with its sign and its meaning."""
 

@@ -76,10 +76,10 @@ def plain(name: str) -> str:
 
 
 def logarithmic(axes: Axes) -> None:
-    """A logarithmic ordinate with plain numbers, where the values span more than a factor of four;
+    """A logarithmic ordinate with plain numbers, where the values span more than a decade;
     minor ticks have numbers where decades are few."""
     low, high = axes.get_ylim()
-    if 0 < high < 4 * low:
+    if 0 < high < 10 * low:
         return
     axes.set_yscale("log", nonpositive="mask")
     low, high = axes.get_ylim()
