@@ -152,6 +152,8 @@ def _measures(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
     bands = [
         _row(f"NIS / dof, {percentage(LEVEL)} band", "", _cells(map(_band, summaries.values())))
     ]
+    white = (f"± {s.autocorrelation_band[0]:.4f}" for s in summaries.values())
+    bands.append(_row(f"autocorrelation, {percentage(LEVEL)} band", "", _cells(white)))
     for block in DOF:
         shares = [
             percentage(s.inside[block], 1) if block in s.inside else "–" for s in summaries.values()

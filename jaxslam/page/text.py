@@ -17,10 +17,11 @@ def cell(measure: Measure | None) -> str:
     if half == 0:
         return f"{number(measure.value, 4)} ± 0"
     size = max(abs(measure.value), half)
-    if not 1e-3 <= size < 1e6:
-        return f"{number(measure.value, 2)} ± {number(half, 2)}"
+    power = 0 if 1e-3 <= size < 1e6 else int(np.floor(np.log10(size)))
+    value, half = measure.value / 10.0**power, half / 10.0**power
     digits = min(max(1 - int(np.floor(np.log10(half))), 0), 6)
-    return f"{measure.value:,.{digits}f} ± {half:,.{digits}f}".replace("-", "−")
+    text = f"{value:,.{digits}f} ± {half:,.{digits}f}"
+    return (f"({text})·10<sup>{power}</sup>" if power else text).replace("-", "−")
 
 
 def number(value: float, digits: int) -> str:
