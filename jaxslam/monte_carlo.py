@@ -76,8 +76,8 @@ def monte_carlo(
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
         if value is not None:
             check_count(f"monte_carlo: {name}", value)
-    if not filters:
-        raise ValueError("monte_carlo: expected at least one filter")
+    if not isinstance(filters, Mapping) or not filters:
+        raise ValueError("monte_carlo: expected filters by name, at least one")
     for name, candidate in filters.items():
         _check_fits(name, candidate, scenario)
     began = time.perf_counter()

@@ -70,7 +70,10 @@ def not_finite(campaign: Campaign) -> list[str]:
         lost = summary.not_finite_runs
         if lost:
             shown = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
-            out.append(f"{name} was not finite in {len(lost)} of {campaign.runs} runs: {shown}")
+            out.append(
+                f"{name} was not finite in {len(lost)} of {campaign.runs} runs, which its figures "
+                f"leave out: {shown}"
+            )
     return out
 
 
@@ -212,7 +215,8 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
             figures = ["" if figure is None else f"{figure:.4g}" for figure in note]
             lines.append(["  published", "", *figures])
     lines.append([f"NIS / dof, {LEVEL:.0%} band", "", *(_band(s.nis_band) for s in summaries)])
-    lags = [f"± {s.autocorrelation_band[0]:.4f}" for s in summaries]
+    first = [s.autocorrelation_band[0] for s in summaries]
+    lags = [f"± {half:.4f}" if np.isfinite(half) else "-" for half in first]
     lines.append([f"autocorrelation, {LEVEL:.0%} band", "", *lags])
     for block in DOF:
         shares = [f"{s.inside[block]:.1%}" if block in s.inside else "-" for s in summaries]

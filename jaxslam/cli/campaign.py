@@ -20,7 +20,11 @@ from jaxslam.simulate import Scenario, simulate
 def consistency(options: argparse.Namespace, command: str) -> int:
     """Run the campaign that was asked for, print its table, write its files; exit status."""
     scenario = _scenario(options.scenario, options.steps)
-    names = list(FILTERS) if options.filters == "all" else options.filters.split(",")
+    names = [name.strip() for name in options.filters.split(",")]
+    if names == ["all"]:
+        names = list(FILTERS)
+    if len(set(names)) < len(names):
+        raise ValueError(f"expected each filter once, got {options.filters!r}")
     filters = {name: _filter(name, scenario) for name in names}
     if not 0 <= options.seed < 2**32:
         raise ValueError(f"expected a seed between 0 and 2³²-1, got {options.seed}")
@@ -38,7 +42,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         )
     print(report.table(campaign))
     written = report.write_files(options.out, _campaign_files(campaign, scenario, options, command))
-    print(f"\n{campaign.seconds:.1f} s; wrote " + ", ".join(str(path) for path in written))
+    print(f"\ncampaign {campaign.seconds:.1f} s; wrote " + ", ".join(str(path) for path in written))
     return 0
 
 
@@ -56,7 +60,10 @@ def _campaign_files(
     title = f"{scenario.name}, {name}, run 0 of seed {options.seed}"
     figures = {
         "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
-        "bound": ("RMSE against the Cramér-Rao bound", plot.bound_figure(campaign)),
+        "bound": (
+            "RMSE, and the Cramér-Rao bound" if options.bound else "RMSE",
+            plot.bound_figure(campaign),
+        ),
         "coverage": ("Coverage of the ellipsoids", plot.coverage_figure(campaign)),
         "whiteness": ("Autocorrelation of innovations", plot.whiteness_figure(campaign)),
         "gained": ("Information wrongly gained of a turn", plot.gained_figure(campaign)),

@@ -155,16 +155,17 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
         ("position", "rmse_position", 1.0),
         ("heading", "rmse_heading_deg", np.rad2deg(1.0)),
     ):
-        if bound is not None and key in measures and bound[name].mean() > 0:
+        # The bound is averaged over all runs, so it is no yardstick where some were lost.
+        if bound is not None and finite.all() and key in measures and bound[name].mean() > 0:
             least = one * np.sqrt(bound[name].mean())
             measures[f"bound_ratio_{name}"] = Measure(*(x / least for x in measures[key]))
             curves[key.replace("rmse", "bound")] = one * np.sqrt(bound[name])
     total_dof = float(np.sum(sums["nis_dof"]))
     nis_band = None
     if total_dof > 0:
-        measures["nis_per_dof"] = measures["nis_per_dof"]._replace(
-            value=float(np.sum(sums["nis"])) / total_dof
-        )
+        share = float(np.sum(sums["nis"])) / total_dof
+        half = measures["nis_per_dof"].high - measures["nis_per_dof"].value
+        measures["nis_per_dof"] = Measure(share, share - half, share + half)
         tail = (1 - LEVEL) / 2
         nis_band = (
             chi2_quantile(tail, total_dof) / total_dof,
@@ -227,15 +228,17 @@ def interval(values: np.ndarray | Sequence[float]) -> Measure | None:
 
 
 def _as_reported(name: str, measure: Measure) -> dict[str, Measure]:
-    """Mean squares become root mean squares, radians degrees; an interval's ends go along."""
+    """Mean squares become their roots, radians degrees; intervals go by the slope of the root."""
     kind, _, what = name.partition("_")
     if kind != "square":
         return {name: measure}
-    low, high = max(measure.low, 0.0), measure.high
-    roots = np.sqrt([measure.value, low, high])
-    if what == "heading":
-        return {"rmse_heading_deg": Measure(*np.rad2deg(roots).tolist())}
-    return {f"rmse_{what}": Measure(*roots.tolist())}
+    unit = np.rad2deg(1.0) if what == "heading" else 1.0
+    root = unit * float(np.sqrt(measure.value))
+    half = 0.0
+    if root > 0:
+        half = unit**2 * (measure.high - measure.value) / (2 * root)
+    name = "rmse_heading_deg" if what == "heading" else f"rmse_{what}"
+    return {name: Measure(root, root - half, root + half)}
 
 
 def _ratio(total: Any, count: np.ndarray) -> np.ndarray:

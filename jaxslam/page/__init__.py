@@ -152,7 +152,8 @@ def _measures(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
     bands = [
         _row(f"NIS / dof, {percentage(LEVEL)} band", "", _cells(map(_band, summaries.values())))
     ]
-    white = (f"± {s.autocorrelation_band[0]:.4f}" for s in summaries.values())
+    first = [s.autocorrelation_band[0] for s in summaries.values()]
+    white = (f"± {half:.4f}" if half < float("inf") else "–" for half in first)
     bands.append(_row(f"autocorrelation, {percentage(LEVEL)} band", "", _cells(white)))
     for block in DOF:
         shares = [
@@ -203,7 +204,7 @@ def _lost(campaign: Campaign) -> str:
             numbers = ", ".join(map(str, lost[:_SHOWN])) + (", …" if len(lost) > _SHOWN else "")
             out.append(
                 f'<p class="note"><strong>{escape(name)}</strong> was not finite in {len(lost):,} '
-                f"of {campaign.runs:,} runs: {numbers}.</p>"
+                f"of {campaign.runs:,} runs, which its figures leave out: {numbers}.</p>"
             )
     return "\n".join(out)
 

@@ -65,7 +65,9 @@ def bound_figure(campaign: Campaign) -> Figure:
         else:
             axes.axhline(0.0, lw=0)
             axes.set_ylim(bottom=0.0)
-    caption(figure, f"{_head(campaign)}: error against the bound, {_runs(campaign)}")
+    known = any("bound_position" in summary.curves for summary in campaign.filters.values())
+    said = "error against the bound" if known else "error"
+    caption(figure, f"{_head(campaign)}: {said}, {_runs(campaign)}")
     panels[-1].set(xlabel="step", xlim=span(campaign.steps))
     return figure
 
