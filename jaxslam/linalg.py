@@ -9,7 +9,7 @@ import functools
 import operator
 from collections.abc import Iterable
 from numbers import Integral
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam import lapack
-
-_T = TypeVar("_T")
 
 # Up to this many rows a product AᵀB is written as outer products, which XLA fuses into one pass
 # over the result; beyond, as one matrix product.
@@ -36,15 +34,6 @@ def _tolerance(matrix: jax.Array) -> float:
 def total(terms: Iterable[jax.Array]) -> jax.Array:
     """The sum of at least one array; written out, it fuses into one elementwise kernel."""
     return functools.reduce(operator.add, terms)
-
-
-def settle(values: _T) -> _T:
-    """The same arrays, computed once.
-
-    XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
-    of D entries would be solved for anew at each of the D² entries of the covariance it updates.
-    """
-    return cast(_T, jax.lax.optimization_barrier(values))
 
 
 def gram(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -172,7 +161,7 @@ def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
     for i in range(n):
         rest = rhs[i] - sum((factor[i, k] * rows[k] for k in range(i)), jnp.zeros_like(rhs[i]))
         pivot = factor[i, i]
-        rows.append(jnp.where(pivot > 0, rest / jnp.where(pivot > 0, pivot, 1.0), 0.0))
+        rows.append(rest * jnp.where(pivot > 0, 1.0 / jnp.where(pivot > 0, pivot, 1.0), 0.0))
     return jnp.stack(rows)
 
 

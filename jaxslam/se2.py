@@ -148,6 +148,16 @@ def polar(point: jax.Array) -> jax.Array:
     return jnp.stack([jnp.where(away, jnp.sqrt(x * x + y * y), 0.0), jnp.arctan2(y, x)])
 
 
+def polar_in_frame(frame: jax.Array, point: jax.Array) -> jax.Array:
+    """(range, bearing) of a world point (2,) in the frame: `polar` of `to_frame`, (Solà (63)).
+
+    Without the frame's sine and cosine: (|p - t|, atan2(p - t) - θ); (0, 0) at the origin.
+    """
+    x, y, away = _away_from_origin(point - frame[:2])
+    bearing = wrap(jnp.arctan2(y, x) - frame[2])
+    return jnp.where(away, jnp.stack([jnp.sqrt(x * x + y * y), bearing]), 0.0)
+
+
 def polar_jacobians(point: jax.Array) -> tuple[jax.Array]:
     """Derivative of `polar`, (2, 2): [x/r, y/r; -y/r², x/r²] (ERRATA, Solà C.1.2); 0 at r = 0."""
     x, y, away = _away_from_origin(point)

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam.linalg import cholesky, settle, symmetrize, total, triangular_root
+from jaxslam.linalg import cholesky, symmetrize, total, triangular_root
+from jaxslam.staging import settle
 
 
 class Joint(NamedTuple):
@@ -102,7 +103,8 @@ def empty(
 def find(tag: jax.Array, alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The slot (M,) of each wanted tag (M,), 0 where none, and whether there is one (M,)."""
     match = (wanted[:, None] == tag[None, :]) & alive[None, :]
-    return jnp.argmax(match, axis=1).astype(jnp.int32), match.any(axis=1)
+    slot = jnp.where(match, jnp.arange(tag.shape[0], dtype=jnp.int32), -1).max(axis=1, initial=-1)
+    return jnp.maximum(slot, 0), slot >= 0
 
 
 def allocate(alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -135,6 +137,11 @@ def local_cov(joint: Joint, slot: jax.Array, square_root: bool = False) -> jax.A
     rows = jnp.concatenate([joint.cov[:3], gather(joint, slot)[1]])
     if square_root:
         return rows @ rows.T
+    return local_block(rows, slot, size)
+
+
+def local_block(rows: jax.Array, slot: jax.Array, size: int) -> jax.Array:
+    """The columns of the robot and of the landmark (size L) of a slot (), of rows (k, D)."""
     own = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
     return jnp.concatenate([rows[:, :3], own], axis=1)
 
@@ -163,35 +170,52 @@ def scatter(
         landmarks, by_pose, own_cov, tag: (m, L), (m, L, 3), (m, L, L), (m,).
     """
     m, size = landmarks.shape
-    here = granted[:, None]
-    rows = 3 + slot[:, None] * size + jnp.arange(size)[None, :]
-    flat = rows.reshape(-1)
-    gain = jnp.where(here[:, :, None], by_pose, 0.0).reshape(m * size, 3)
-    blocks = rows[:, :, None], rows[:, None, :]
+    capacity = joint.landmarks.shape[0]
+    if m == 0:
+        return joint
+    # By slot: the place it is filled from. Whole passes over P are cheaper than scattered writes.
+    source = granted[None, :] & (slot[None, :] == jnp.arange(capacity)[:, None])
+    born = source.any(axis=1)
+    place = jnp.argmax(source, axis=1)
+
+    def of_slots(values: jax.Array) -> jax.Array:
+        mask = born.reshape(-1, *(1,) * (values.ndim - 1))
+        return jnp.where(mask, values[place], jnp.zeros_like(values[:1]))
+
+    gain = of_slots(by_pose).reshape(capacity * size, 3)
+    own = of_slots(symmetrize(own_cov))
+    rows = 3 + jnp.arange(capacity * size)
     # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
-    cov = joint.cov.at[flat, flat].add(-jnp.repeat(granted, size).astype(gain.dtype))
+    cov = joint.cov.at[rows, rows].add(-jnp.repeat(born, size).astype(gain.dtype))
     if square_root:
-        root = jax.vmap(lambda cov: cholesky(cov)[0])(symmetrize(own_cov))
-        cov = cov.at[flat].add(total(gain[:, k, None] * joint.cov[None, k] for k in range(3)))
-        cov = cov.at[blocks].add(jnp.where(here[:, :, None], root, 0.0))
+        root = jax.vmap(lambda cov: cholesky(cov)[0])(own)
+        cov = cov.at[3:].add(total(gain[:, k, None] * joint.cov[None, k] for k in range(3)))
+        cov = _add_blocks(cov, root)
     else:
         # R is zero at the new columns. With T = R + P_RR Gᵀ/2, G T + (G T)ᵀ is the cross-covariance
         # with the map and, where rows and columns are both new, G P_RR Gᵀ; symmetric to the bit.
-        half = joint.cov[:3].at[:, flat].add(0.5 * joint.cov[:3, :3] @ gain.T)
+        half = joint.cov[:3].at[:, 3:].add(0.5 * joint.cov[:3, :3] @ gain.T)
         cross = settle(total(gain[:, k, None] * half[k, None, :] for k in range(3)))
-        cov = cov.at[flat].add(cross).at[:, flat].add(cross.T)
-        cov = cov.at[blocks].add(jnp.where(here[:, :, None], symmetrize(own_cov), 0.0))
+        cov = cov.at[3:].add(cross).at[:, 3:].add(cross.T)
+        cov = _add_blocks(cov, own)
     watch = joint.watch
     if watch:
-        grown = watch.directions.at[flat].add(gain @ watch.directions[:3])
+        grown = watch.directions.at[3:].add(gain @ watch.directions[:3])
         watch = watch._replace(directions=grown)
     return joint._replace(
-        landmarks=joint.landmarks.at[slot].add(jnp.where(here, landmarks, 0.0)),
+        landmarks=joint.landmarks + of_slots(landmarks),
         cov=cov,
-        alive=joint.alive.at[slot].max(granted),
-        tag=joint.tag.at[slot].max(jnp.where(granted, tag, -1).astype(jnp.int32)),
+        alive=joint.alive | born,
+        tag=jnp.where(born, tag[place], joint.tag).astype(jnp.int32),
         watch=watch,
     )
+
+
+def _add_blocks(cov: jax.Array, blocks: jax.Array) -> jax.Array:
+    """P with blocks (N, L, L) added on the diagonal of the landmarks."""
+    capacity, size = blocks.shape[:2]
+    rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
+    return cov.at[rows[:, :, None], rows[:, None, :]].add(blocks)
 
 
 def remove(joint: Joint, dead: jax.Array, *, square_root: bool = False) -> Joint:

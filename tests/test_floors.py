@@ -14,12 +14,12 @@ import jaxslam
 PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
-    "angles se2 lapack linalg stats",
+    "angles se2 lapack linalg staging stats",
     "types protocols slots noise derivatives",
     "motion sensors charts linearize association",
     "filters run simulate",
     "consistency monte_carlo verify linearity scenarios family",
-    "datasets plot page report userfile cli __main__",
+    "datasets plot page report store userfile cli __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
 ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it

@@ -151,18 +151,6 @@ def test_total_is_the_sum():
     np.testing.assert_array_equal(linalg.total(iter(terms)), [111, 222])
 
 
-def test_settle_is_the_identity_under_every_transformation():
-    def cubed(x):
-        once, tree = linalg.settle((x**2, {"x": x}))
-        return jnp.sum(once * tree["x"])
-
-    x = np.array([[1.0, 2.0], [3.0, -1.0]])
-    value, slope = jax.jit(jax.vmap(jax.value_and_grad(cubed)))(x)
-    np.testing.assert_allclose(value, (x**3).sum(axis=1))
-    np.testing.assert_allclose(slope, 3 * x**2)
-    np.testing.assert_allclose(jax.vmap(jax.jacfwd(cubed))(x), 3 * x**2)
-
-
 # --- Mahalanobis --------------------------------------------------------------------------------
 
 distance = jax.jit(jax.vmap(linalg.mahalanobis_squared))

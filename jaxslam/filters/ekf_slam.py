@@ -1,7 +1,7 @@
 """EKF-SLAM: the one Kalman-type SLAM filter, of which the published variants are arguments."""
 
 from functools import partial
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +9,22 @@ import jax.numpy as jnp
 from jaxslam import linalg, slots
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters import gaussian, propagation
+from jaxslam.filters import augmentation, correction, propagation
 from jaxslam.linalg import check_count, is_concrete
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.protocols import Associate, Chart, Filter, Linearizer, Motion, Prediction, Sensor
 from jaxslam.slots import Joint
+from jaxslam.staging import where_any
 from jaxslam.types import Estimate, Info, Scan, Status
+
+
+class Births(NamedTuple):
+    """What became of the measurements of a scan that are of no landmark of the map, (M,) each."""
+
+    slot: jax.Array
+    granted: jax.Array
+    deferred: jax.Array
+    repeated: jax.Array
 
 
 def ekf_slam(
@@ -77,18 +87,19 @@ def ekf_slam(
         linearize=linearize,
         square_root=square_root,
     )
-    correct = partial(
-        gaussian.correct,
-        sensor=sensor,
-        chart=chart,
-        linearize=linearize,
-        gate=gate,
-        iterations=iterations,
-        joseph=joseph,
-        square_root=square_root,
-    )
+    options: dict[str, Any] = {
+        "sensor": sensor,
+        "chart": chart,
+        "linearize": linearize,
+        "gate": gate,
+        "iterations": iterations,
+        "joseph": joseph,
+        "square_root": square_root,
+    }
+    at_once = partial(correction.correct, **options)
+    in_turn = partial(correction.correct_in_turn, **options)
     augment = partial(
-        gaussian.augment,
+        augmentation.augment,
         sensor=sensor,
         chart=chart,
         linearize=linearize,
@@ -124,30 +135,35 @@ def ekf_slam(
         else:
             slot, is_new = jnp.full_like(scan.tag, -1), jnp.zeros_like(scan.valid)
             matched = scan.valid
-        parts = (scan.z, jnp.maximum(slot, 0), matched)
-        if update == "joint" and scan.tag.shape[0] > 0:
-            joint, done = correct(joint, *parts)
-        else:
-            # One measurement a pass: the place axis becomes time, with m = 1 inside.
-            one_by_one = jax.tree.map(lambda part: part[:, None], parts)
-            joint, done = jax.lax.scan(lambda j, part: correct(j, *part), joint, one_by_one)
-            done = jax.tree.map(lambda part: part[:, 0], done)
+        # Padding may hold anything, and is multiplied by zero further down.
+        z = jnp.where(scan.valid[:, None], scan.z, 0.0)
+        parts = (z, jnp.maximum(slot, 0), matched)
+        correct = at_once if update == "joint" and len(scan.tag) > 0 else in_turn
+        joint, done = correct(joint, *parts)
 
-        repeated = is_new & _seen_before(scan.tag, is_new)
-        wanted = is_new & ~repeated
-        quota = wanted.shape[0] if births is None else births
-        deferred = wanted & (jnp.cumsum(wanted) > quota)
-        new_slot, granted = slots.allocate(joint.alive, wanted & ~deferred)
-        joint = augment(joint, scan.z, scan.tag, new_slot, granted)
+        def start(joint: Joint) -> tuple[Joint, Births]:
+            repeated = is_new & _seen_before(scan.tag, is_new)
+            wanted = is_new & ~repeated
+            quota = wanted.shape[0] if births is None else births
+            deferred = wanted & (jnp.cumsum(wanted) > quota)
+            slot, granted = slots.allocate(joint.alive, wanted & ~deferred)
+            joint = augment(joint, z, scan.tag, slot, granted)
+            return joint, Births(slot, granted, deferred, repeated)
+
+        def start_none(joint: Joint) -> tuple[Joint, Births]:
+            none = jnp.zeros_like(is_new)
+            return joint, Births(jnp.zeros_like(slot), none, none, none)
+
+        joint, born = where_any(is_new.any(), start, start_none, joint)
 
         status = jnp.select(
             [
                 matched & ~done.inside,
                 matched & ~done.positive,
                 matched,
-                repeated,
-                deferred,
-                granted,
+                born.repeated,
+                born.deferred,
+                born.granted,
                 is_new,
                 scan.valid,
             ],
@@ -169,7 +185,7 @@ def ekf_slam(
             dof=jnp.where(fused, size_z, 0),
             innovation=jnp.where(matched[:, None], done.innovation, 0.0),
             innovation_cov=jnp.where(matched[:, None, None], done.innovation_cov, 0.0),
-            slot=jnp.where(fused, slot, jnp.where(granted, new_slot, -1)),
+            slot=jnp.where(fused, slot, jnp.where(born.granted, born.slot, -1)),
             status=status,
             log_likelihood=done.log_likelihood.sum(),
         )

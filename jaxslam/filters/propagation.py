@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxslam import linalg, se2, slots
 from jaxslam.protocols import Basis, Chart, Here, Linearizer, Motion
 from jaxslam.slots import Joint, Last
+from jaxslam.staging import settle
 
 
 def propagate(
@@ -106,7 +107,7 @@ def in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array)
         landmark = jnp.where(alive[:, None, None], own @ before.landmark, still)
         cross, cross_noise = own @ cross, own @ cross_noise
     cross, cross_noise = (jnp.where(alive[:, None, None], m, 0.0) for m in (cross, cross_noise))
-    return linalg.settle(Transition(robot, cross, landmark, undo, cross_noise))
+    return settle(Transition(robot, cross, landmark, undo, cross_noise))
 
 
 def moved_cov(cov: jax.Array, moved: Transition, noise: jax.Array | None) -> jax.Array:
@@ -126,5 +127,5 @@ def moved_cov(cov: jax.Array, moved: Transition, noise: jax.Array | None) -> jax
     if noise is not None:
         added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
         left, right = [*left, added], [*right, added]
-    change = linalg.gram(*linalg.settle((jnp.concatenate(left), jnp.concatenate(right))))
+    change = linalg.gram(*settle((jnp.concatenate(left), jnp.concatenate(right))))
     return linalg.symmetrize(cov + change)

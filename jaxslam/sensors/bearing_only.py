@@ -41,7 +41,7 @@ def bearing_only(
     sensor_pose, sensor_pose_jacobian = mounting("bearing_only", mount)
 
     def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
-        return se2.polar(se2.to_frame(sensor_pose(pose), landmark))[1:]
+        return se2.polar_in_frame(sensor_pose(pose), landmark)[1:]
 
     def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
         return wrap(z - z_hat)

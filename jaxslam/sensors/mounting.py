@@ -25,7 +25,11 @@ def mounting(
     if is_concrete(mount) and not np.all(np.isfinite(np.asarray(mount))):
         raise ValueError(f"{name}: the mounting pose is not finite")
 
+    at_origin = is_concrete(mount) and not np.any(np.asarray(mount))
+
     def sensor_pose(pose: jax.Array) -> jax.Array:
+        if at_origin:
+            return pose
         return se2.compose(pose, jnp.asarray(mount, pose.dtype))
 
     def jacobian(pose: jax.Array) -> jax.Array:

@@ -26,7 +26,7 @@ def range_bearing(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     sensor_pose, sensor_pose_jacobian = mounting("range_bearing", mount)
 
     def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
-        return se2.polar(se2.to_frame(sensor_pose(pose), landmark))
+        return se2.polar_in_frame(sensor_pose(pose), landmark)
 
     def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
         return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1])])

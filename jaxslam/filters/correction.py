@@ -1,0 +1,445 @@
+"""The correction of a Kalman-type SLAM filter on a `Joint`, by a scan at once or place by place.
+
+With `filters.propagation`, they exploit that a motion touches the robot alone, and a measurement
+the robot and one landmark: no dense D×D product is formed. They take the models as records, so one
+set of equations serves every sensor, chart and linearizer. `filters.ekf_slam` binds them.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import linalg, slots
+from jaxslam.filters.composition import lever_of_motion, moved_anew
+from jaxslam.filters.watching import along, informed, split
+from jaxslam.protocols import Basis, Chart, Here, Linearizer, Sensor
+from jaxslam.slots import Joint
+from jaxslam.staging import apart, settle, where_any
+
+# Measurements that one pass over the covariance corrects by. More rows a pass cost more loads of
+# P_I, fewer more of P; 3 to 6 are alike on the CPUs tried.
+_GROUP = 4
+
+
+class Correction(NamedTuple):
+    """What `correct` did with its m measurements; the numbers are finite for all of them."""
+
+    innovation: jax.Array
+    """(m, Z) against the prior"""
+    innovation_cov: jax.Array
+    """(m, Z, Z)"""
+    nis: jax.Array
+    """(m,)"""
+    log_likelihood: jax.Array
+    """(m,)"""
+    inside: jax.Array
+    """(m,) bool: passed the gate"""
+    positive: jax.Array
+    """(m,) bool: its innovation covariance is positive definite"""
+
+
+def correct(
+    joint: Joint,
+    z: jax.Array,
+    slot: jax.Array,
+    known: jax.Array,
+    *,
+    sensor: Sensor,
+    chart: Chart,
+    linearize: Linearizer,
+    gate: float | None = None,
+    iterations: int = 1,
+    joseph: bool = False,
+    square_root: bool = False,
+) -> tuple[Joint, Correction]:
+    """Correct by m measurements at once, z (m, Z) of the landmarks in slot (m,): Solà (26)-(30).
+
+    With S = H P Hᵀ + R = L Lᵀ and V = L⁻¹ H P: x ← x ⊞ Vᵀ L⁻¹ ν and P ← P - Vᵀ V, symmetric as it
+    stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot means nothing. Places
+    not known (m,), outside the gate (ν_iᵀ S_ii⁻¹ ν_i above it, each against the prior) or with a
+    singular S do nothing.
+
+    Each further iteration linearizes at the newest estimate x_i = x ⊞ ξ_i but starts again from the
+    prior: ξ_{i+1} = K (z - h(x_i) + H ξ_i) (Bell & Cathey 1993). joseph: P ← (I-KH)P(I-KH)ᵀ + KRKᵀ.
+
+    square_root: of P = X Xᵀ, X ← X - Vᵀ (L + N)⁻¹ H X, R = N Nᵀ (Andrews 1968, "A square root
+    formulation of the Kalman covariance equations", AIAA Journal 6(6)).
+    """
+    found = _weigh(
+        joint,
+        slot,
+        _view(joint, slot, square_root),
+        z,
+        known,
+        (joint, slot),
+        sensor=sensor,
+        chart=chart,
+        linearize=linearize,
+        gate=gate,
+        iterations=iterations,
+        square_root=square_root,
+    )
+    m, size_z = z.shape
+    v, factor, noise = found.v, found.factor, found.noise
+    same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
+    each = found.fuse[:, None, None, None]
+    if joseph:
+        fused_noise = jnp.where(each, same * noise[:, :, None], 0.0)
+        cov = _joseph(joint.cov, found.hp, found.s, fused_noise, factor, v)
+    elif square_root:
+        root = jax.vmap(lambda cov: linalg.cholesky(cov)[0])(noise)
+        unit = jnp.eye(size_z, dtype=z.dtype)
+        root = same * jnp.where(found.fuse[:, None, None], root, unit)[:, :, None]
+        root = factor + root.reshape(m * size_z, m * size_z)
+        hx = found.hx.reshape(m * size_z, -1)
+        cov = joint.cov - linalg.gram(v, settle(linalg.solve_lower(root, hx)))
+    else:
+        cov = joint.cov - linalg.gram(v, v)
+    xi, last = found.xi, joint.last
+    if last:
+        seen_last = along(*found.slopes, *split(last.cov.T, joint.landmarks.shape[0]), slot)
+        seen_last = linalg.solve_lower(factor, seen_last.reshape(m * size_z, 3))
+        step = linalg.gram(seen_last, found.whitened[:, None])[:, 0]
+        lever = lever_of_motion(joint, chart)
+        xi = xi - lever @ step
+        last = last._replace(
+            cov=last.cov - linalg.gram(seen_last, v),
+            own=last.own - linalg.gram(seen_last, seen_last),
+        )
+    moved = _moved(joint, found, xi, slot, chart)._replace(cov=cov, last=last)
+    if last:
+        moved = moved_anew(moved, moved.pose[2] - joint.pose[2], step, lever, chart)
+    return moved, found.correction
+
+
+def correct_in_turn(
+    joint: Joint,
+    z: jax.Array,
+    slot: jax.Array,
+    known: jax.Array,
+    *,
+    chart: Chart,
+    joseph: bool = False,
+    square_root: bool = False,
+    **options: Any,
+) -> tuple[Joint, Correction]:
+    """Correct by m measurements one after the other, each linearized at what those before left.
+
+    The same numbers as `correct` on each alone, with P read and written once a group of them: what
+    a group sees of P are the rows P_I of the robot and of its landmarks. Each measurement corrects
+    means and these rows, P_I ← P_I - V_Iᵀ V, and leaves V; at the end P ← P - Σ Vᵀ V over the
+    group. This is the postponed update of Guivant & Nebot 2001 ("Optimization of the simultaneous
+    localization and map-building algorithm for real-time implementation", IEEE T-RA 17(3)), over
+    one scan. A group without a known measurement in any run of a batch costs nothing.
+
+    Options are those of `correct`, which is used as it is, one measurement at a time, for forms of
+    the update that need all of P.
+    """
+    whole = joseph or square_root or chart.motion_apart
+    m, size_l = z.shape[0], joint.landmarks.shape[1]
+    group = 1 if whole else max(1, min(_GROUP, m))
+    groups = -(-m // group)
+
+    def padded(part: jax.Array) -> jax.Array:
+        wide = jnp.pad(part, [(0, groups * group - m), *[(0, 0)] * (part.ndim - 1)])
+        return wide.reshape(groups, group, *part.shape[1:])
+
+    def one_of_all(joint: Joint, part: Any) -> tuple[Joint, Correction]:
+        return correct(joint, *part, chart=chart, joseph=joseph, square_root=square_root, **options)
+
+    def in_group(joint: Joint, part: Any) -> tuple[Joint, Correction]:
+        slot = part[1]
+        of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
+        at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
+        rows = joint.cov[at]
+        watch: Any = joint.watch
+        if watch:
+            watch = watch._replace(directions=watch.directions[at])
+        # The local map, and beside its P the matrix that takes P_I of before to P_I of now.
+        local = joint._replace(
+            landmarks=joint.landmarks[slot],
+            cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
+            alive=joint.alive[slot],
+            tag=joint.tag[slot],
+            watch=watch,
+        )
+
+        def one(local: Joint, place: Any) -> tuple[Joint, Any]:
+            i, part = place
+            i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], (i, part))
+            memory = joint._replace(pose=local.pose), slot
+            found = _weigh(local, i, _view(local, i), z, known, memory, chart=chart, **options)
+            v, reach = found.v[:, : len(at)], found.v[:, len(at) :]
+            moved = _moved(local, found, found.xi[: len(at)], i, chart)
+            moved = moved._replace(cov=local.cov - linalg.gram(v, found.v))
+            done = jax.tree.map(lambda leaf: leaf[0], found.correction)
+            return moved, (reach, found.whitened, done)
+
+        local, (reach, whitened, done) = jax.lax.scan(one, local, (jnp.arange(group), part))
+        v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
+        landmarks = _moved_map(joint, v, whitened, chart)
+        if watch:
+            watch = local.watch._replace(directions=joint.watch.directions)
+        cov = joint.cov - linalg.gram(v, v)
+        return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov, watch=watch), done
+
+    work = one_of_all if whole else in_group
+
+    def of_group(joint: Joint, part: Any) -> tuple[Joint, Correction]:
+        nothing = jax.tree.map(
+            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(work, joint, part)[1]
+        )
+        return where_any(part[2].any(), lambda j: work(j, part), lambda j: (j, nothing), joint)
+
+    joint, done = jax.lax.scan(of_group, joint, jax.tree.map(padded, (z, slot, known)))
+    return joint, jax.tree.map(lambda leaf: leaf.reshape(groups * group, *leaf.shape[2:])[:m], done)
+
+
+class View(NamedTuple):
+    """What m measurements see of P, or, of a square-root filter, of its root."""
+
+    robot: jax.Array
+    """(3, D) rows of the robot"""
+    own: jax.Array
+    """(m, L, D) rows of the landmarks seen"""
+    local: jax.Array
+    """(m, 3+L, 3+L) P of the robot and the landmark"""
+
+
+class Weighed(NamedTuple):
+    """What m measurements say of all errors, and what the forms of the update are made of."""
+
+    xi: jax.Array
+    """(D,) the correction in the chart"""
+    v: jax.Array
+    """(m·Z, D) V = L⁻¹ H P"""
+    whitened: jax.Array
+    """(m·Z,) L⁻¹ ν"""
+    factor: jax.Array
+    """(m·Z, m·Z) L, with rows of zeros for what is not fused"""
+    s: jax.Array
+    """(m, Z, m, Z) S"""
+    hp: jax.Array
+    """(m·Z, D) H P"""
+    hx: jax.Array
+    """(m, Z, D) H X of a square-root filter, else H P"""
+    noise: jax.Array
+    """(m, Z, Z) R with what the linearizer added"""
+    own_noise: jax.Array
+    """(m, Z, Z) R"""
+    slopes: tuple[jax.Array, jax.Array]
+    """H by the errors of pose (m, Z, 3) and landmark (m, Z, L)"""
+    seen: tuple[jax.Array, jax.Array]
+    """the same by coordinates, at the prior"""
+    fuse: jax.Array
+    """(m,) bool: known, inside the gate and regular alone"""
+    correction: Correction
+
+
+def _view(joint: Joint, slot: jax.Array, square_root: bool = False) -> View:
+    own = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
+    local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
+    return View(joint.cov[:3], settle(own), local)
+
+
+def _weigh(
+    joint: Joint,
+    slot: jax.Array,
+    view: View,
+    z: jax.Array,
+    known: jax.Array,
+    memory: tuple[Joint, jax.Array],
+    *,
+    sensor: Sensor,
+    chart: Chart,
+    linearize: Linearizer,
+    gate: float | None = None,
+    iterations: int = 1,
+    square_root: bool = False,
+) -> Weighed:
+    """Solà (26)-(29) for m measurements at once, from the view they have of P.
+
+    memory: the state that the linearizer remembers by, and the landmarks' slots (m,) there. P may
+    have further columns, which count as other errors.
+    """
+    whole, slot_in_whole = memory
+    m, size_z = z.shape
+    capacity, size_l = joint.landmarks.shape
+    width = 3 + capacity * size_l
+    prior_l = joint.landmarks[slot]
+    own_noise = jax.vmap(sensor.noise_cov)(z)
+    same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
+    over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
+    pose, landmark = joint.pose, prior_l
+    xi = jnp.zeros(view.robot.shape[1], z.dtype)
+    for iteration in range(iterations):
+        expected, by_pose, by_landmark, rest = jax.vmap(
+            lambda at, landmark, cov, pose=pose: linearize.observe(
+                sensor, Here(whole, chart, pose, cov, at, landmark)
+            )
+        )(slot_in_whole, landmark, view.local)
+        noise = own_noise + rest
+        nu = jax.vmap(sensor.residual)(z, expected)
+        if iteration == 0:
+            seen = by_pose, by_landmark
+        xi_l = xi[3:width].reshape(capacity, size_l)[slot]
+        if chart.basis is not None:
+            by_pose, by_landmark = _in_chart(
+                chart, joint.pose, prior_l, xi[:3], xi_l, by_pose, by_landmark, iteration == 0
+            )
+        if iteration > 0:
+            nu = nu + jnp.einsum("mzi,i->mz", by_pose, xi[:3])
+            nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, xi_l)
+        by_pose, by_landmark, nu = settle((by_pose, by_landmark, nu))
+        hp = linalg.total(by_pose[:, :, k, None] * view.robot[None, None, k] for k in range(3))
+        if size_l > 0:
+            hp = hp + linalg.total(
+                by_landmark[:, :, k, None] * view.own[:, None, k] for k in range(size_l)
+            )
+        hp = hx = settle(hp)
+        if square_root:
+            hp = settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
+        s = _innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
+        if iteration == 0:
+            marginal = s[jnp.arange(m), :, jnp.arange(m)]
+            distance, positive = jax.vmap(_squared_distance)(nu, marginal)
+            inside = jnp.ones(m, bool) if gate is None else ~positive | (distance <= gate)
+            fuse = known & inside & positive
+            innovation = nu
+        hp = hp.reshape(m * size_z, -1)
+        both = fuse[:, None, None, None] & fuse[None, None, :, None]
+        s = jnp.where(both, s, same * jnp.eye(size_z, dtype=z.dtype)[None, :, None])
+        s = settle(s)
+        factor = settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
+        pivots = jnp.diagonal(factor).reshape(m, size_z)
+        # Measurements that are regular one by one can still be singular together.
+        regular = (pivots > 0).all(axis=1)
+        # A row without a pivot says nothing, and costs no mask of what it would say.
+        factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
+        v, whitened = linalg.solve_lower(factor, hp), linalg.solve_lower(factor, nu.reshape(-1))
+        v, whitened = settle((v, whitened))
+        xi = linalg.gram(v, whitened[:, None])[:, 0]
+        if iteration == 0:
+            positive = positive & regular
+            first_pivots = pivots
+            nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
+        if iteration + 1 < iterations:
+            xi_l = xi[3:width].reshape(capacity, size_l)[slot]
+            poses, landmark = over_landmarks(joint.pose, prior_l, xi[:3], xi_l)
+            pose = poses[0]
+
+    log_det = 2 * jnp.log(jnp.where(first_pivots > 0, first_pivots, 1.0)).sum(axis=1)
+    log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
+    return Weighed(
+        xi=xi,
+        v=v,
+        whitened=whitened,
+        factor=factor,
+        s=s,
+        hp=hp,
+        hx=hx,
+        noise=noise,
+        own_noise=own_noise,
+        slopes=(by_pose, by_landmark),
+        seen=seen,
+        fuse=fuse,
+        correction=Correction(
+            innovation=innovation,
+            innovation_cov=marginal,
+            nis=jnp.where(fuse, nis, distance),
+            log_likelihood=jnp.where(fuse & positive, log_likelihood, 0.0),
+            inside=inside,
+            positive=positive,
+        ),
+    )
+
+
+def _moved(joint: Joint, found: Weighed, xi: jax.Array, slot: jax.Array, chart: Chart) -> Joint:
+    """The means moved by ξ (D,), and what the measurements tell a watch; P as it was."""
+    pose, landmarks = _retracted(chart, joint, xi)
+    watch = joint.watch
+    if watch:
+        fused = found.fuse & found.correction.positive
+        watch = informed(joint, chart, *found.seen, slot, found.own_noise, fused)
+    return joint._replace(pose=pose, landmarks=landmarks, watch=watch)
+
+
+def _moved_map(joint: Joint, v: jax.Array, whitened: jax.Array, chart: Chart) -> jax.Array:
+    """The landmarks (N, L) after corrections V (g·Z, D), L⁻¹ ν (g, Z), one after the other."""
+    if chart.basis is None:  # moves add up
+        xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
+        return _retracted(chart, joint, xi)[1]
+
+    def move(joint: Joint, one: tuple[jax.Array, jax.Array]) -> tuple[Joint, None]:
+        xi = linalg.gram(one[0], one[1][:, None])[:, 0]
+        pose, landmarks = _retracted(chart, joint, xi)
+        return joint._replace(pose=pose, landmarks=landmarks), None
+
+    each = v.reshape(*whitened.shape, -1)
+    return jax.lax.scan(move, joint, (each, whitened))[0].landmarks
+
+
+def _retracted(chart: Chart, joint: Joint, xi: jax.Array) -> tuple[jax.Array, jax.Array]:
+    over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
+    poses, landmarks = over_landmarks(
+        joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
+    )
+    return poses[0], jnp.where(joint.alive[:, None], landmarks, 0.0)
+
+
+def _in_chart(
+    chart: Chart,
+    pose: jax.Array,
+    landmarks: jax.Array,
+    dx: jax.Array,
+    dl: jax.Array,
+    by_pose: jax.Array,
+    by_landmark: jax.Array,
+    at_zero: bool,
+) -> tuple[jax.Array, jax.Array]:
+    """Chain Jacobians (m, Z, ·) with the derivative of retract(pose, l, ·) at (dx, dl)."""
+    if at_zero:
+        assert chart.basis is not None
+        basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
+    else:
+        by_dx, by_dl = jax.vmap(
+            jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
+        )(pose, landmarks, dx, dl)
+        basis = Basis(by_dx[0], by_dl[0], by_dl[1])
+    by_chart = by_pose @ basis.pose + by_landmark @ basis.cross
+    return by_chart, by_landmark if basis.landmark is None else by_landmark @ basis.landmark
+
+
+def _innovation_cov(
+    hp: jax.Array, by_pose: jax.Array, by_landmark: jax.Array, slot: jax.Array, capacity: int
+) -> jax.Array:
+    """H P Hᵀ (m, Z, m, Z) of HP (m, Z, D): only the robot's and the seen landmarks' columns."""
+    m, size_z, size_l = by_landmark.shape
+    own = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
+    if size_l == 0:
+        return own
+    by_slot = hp[:, :, 3 : 3 + capacity * size_l].reshape(m, size_z, capacity, size_l)
+    at_landmark = by_slot[:, :, slot]
+    return own + linalg.total(
+        at_landmark[..., k, None] * by_landmark[None, None, :, :, k] for k in range(size_l)
+    )
+
+
+def _squared_distance(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """νᵀ S⁻¹ ν () and whether S (Z, Z) is positive definite; finite where it is not."""
+    factor, positive = linalg.cholesky(cov)
+    return (linalg.solve_lower(factor, nu) ** 2).sum(), positive
+
+
+def _joseph(
+    cov: jax.Array, hp: jax.Array, s: jax.Array, noise: jax.Array, factor: jax.Array, v: jax.Array
+) -> jax.Array:
+    """(I - KH) P (I - KH)ᵀ + K R Kᵀ from H P, in O(D²): the left factor first, then the right."""
+    rows = hp.shape[0]
+    gain = linalg.solve_lower(factor[::-1, ::-1].T, v[::-1])[::-1].T
+    noise = noise.reshape(rows, rows)
+    left = cov - gain @ hp
+    left_h = hp.T - gain @ (s.reshape(rows, rows) - noise)
+    return linalg.symmetrize(left - left_h @ gain.T + gain @ noise @ gain.T)

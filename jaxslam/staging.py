@@ -1,0 +1,53 @@
+"""What XLA has to be told: what to compute once, and what to skip for a whole batch."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import jax
+from jax.experimental.xla_metadata import set_xla_metadata
+
+_T = TypeVar("_T")
+_U = TypeVar("_U")
+
+
+def apart(function: Callable[..., _T], *arguments: Any) -> _T:
+    """function(*arguments), compiled as a computation of its own.
+
+    XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
+    of D entries would be computed anew at each of the D² entries of the covariance it updates. It
+    fuses nothing across a call that may not be inlined. (An `optimization_barrier` is gone by the
+    time it fuses.)
+    """
+    with set_xla_metadata(inlineable="false"):
+        out = jax.jit(function)(*arguments)
+    return cast(_T, out)
+
+
+def settle(values: _T) -> _T:
+    """The same arrays, computed once and kept; see `apart`, which saves a copy of large ones."""
+    return apart(jax.lax.optimization_barrier, values)
+
+
+@jax.custom_batching.custom_vmap
+def anywhere(flag: jax.Array) -> jax.Array:
+    """Whether the flag () is set; under `vmap`, in any run of the batch, one answer for all.
+
+    Under `vmap` a `lax.cond` with a predicate of its own for each run becomes a `select`, and both
+    branches are computed. One predicate for the whole batch stays a branch.
+    """
+    return flag
+
+
+@anywhere.def_vmap
+def _over_batch(_: int, batched: Any, flag: jax.Array) -> tuple[jax.Array, bool]:
+    return anywhere(flag.any(axis=0)), False
+
+
+def where_any(
+    flag: jax.Array, work: Callable[[_T], _U], otherwise: Callable[[_T], _U], state: _T
+) -> _U:
+    """work(state) if the flag () is set in any run of the batch, else otherwise(state).
+
+    Of a run whose own flag is not set, both must give the same numbers.
+    """
+    return cast(_U, jax.lax.cond(anywhere(flag), work, otherwise, state))

@@ -1,0 +1,361 @@
+"""A store gives back what was saved, bit for bit, or says which file is bad; nothing half-written counts."""
+
+import contextlib
+import errno
+import itertools
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import zipfile
+
+import numpy as np
+import pytest
+
+from jaxslam import store
+
+SETTINGS = {
+    "scenario": "ring",
+    "filters": ("ekf", "σ"),
+    "seed": 3,
+    "lags": {1: 0.5},
+    "versions": {"jax": "0.10.1"},
+}
+ARRAYS = {
+    "ekf/nees": np.random.default_rng(0).normal(size=(4, 3)),
+    "file": np.float32([[1.5, np.nan], [-0.0, np.inf]]),  # an argument's name in np.savez
+    "finite": np.array([True, False]),
+    "counts": np.asfortranarray(np.arange(6, dtype=np.int64).reshape(2, 3)),
+    "nothing": np.zeros((0, 5), np.float32),
+    "single": np.array(7, np.int32),
+    "verdict σ": np.array(["fine", "pessimistic"]),
+}
+
+
+def assert_same(found, expected):
+    assert list(found) == list(expected)
+    for name, array in expected.items():
+        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
+        assert found[name].tobytes() == array.tobytes()
+
+
+@pytest.fixture
+def made(tmp_path):
+    return store.create(tmp_path / "a" / "campaign", SETTINGS)
+
+
+def fill(made, *firsts, runs=32):
+    return [made.save(first, {"x": np.arange(first, first + runs) / 3}, runs) for first in firsts]
+
+
+def spans(made):
+    return [(block.first, block.runs) for block in made.blocks()]
+
+
+def files(made):
+    return sorted(path.name for path in made.folder.iterdir())
+
+
+def test_arrays_come_back_bit_for_bit(made):
+    path = made.save(32, ARRAYS, 32)
+    assert path.name == "block-00000032-00000064.npz"
+    with zipfile.ZipFile(path) as entries:  # the time of writing is not in it
+        assert {entry.date_time for entry in entries.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+    once = path.read_bytes()
+    assert made.save(32, ARRAYS, 32).read_bytes() == once
+    made.save(0, {}, np.int64(32))
+    again = store.resume(made.folder, SETTINGS)
+    empty, full = again.blocks()
+    assert empty == (0, 32, {})
+    assert full[:2] == (32, 32)
+    assert_same(full.arrays, ARRAYS)
+    with np.load(path, allow_pickle=False) as npz:  # anyone can read it
+        np.testing.assert_array_equal(npz["ekf/nees"], ARRAYS["ekf/nees"])
+    assert again.set_aside == []
+
+
+def test_what_would_not_come_back_is_refused(made):
+    for arrays in (
+        {"x": np.array([None])},
+        {"x": np.zeros(2, [("a", float)])},
+        *({name: np.zeros(2)} for name in ("", "_block", "a.npy", "a\0b", "a\\b")),
+    ):
+        with pytest.raises(ValueError, match="block"):
+            made.save(0, arrays, 1)
+    for first, runs in ((-1, 1), (0, 0)):
+        with pytest.raises(ValueError, match="expected >= 1"):
+            made.save(first, {}, runs)
+    assert files(made) == ["manifest.json"]
+
+
+@pytest.mark.parametrize("call", ["replace", "fsync"])
+@pytest.mark.parametrize("kind", [OSError, KeyboardInterrupt])
+def test_a_failed_save_leaves_the_earlier_blocks_alone(made, monkeypatch, call, kind):
+    fill(made, 0)
+    before = files(made)
+    content = made.folder.joinpath(before[0]).read_bytes()
+
+    def fail(*_):
+        (hidden,) = set(files(made)) - set(before)
+        assert hidden.startswith(".")
+        assert str(os.getpid()) in hidden  # another process has another
+        raise kind(errno.ENOSPC, "No space left on device") if kind is OSError else kind
+
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises(kind) as caught:
+        fill(made, 0, runs=31)
+    if kind is OSError:
+        assert caught.value.errno == errno.ENOSPC
+        assert "block-00000000-00000031.npz" in str(caught.value)
+        assert "No space left" in str(caught.value) and "bytes" in str(caught.value)
+    with pytest.raises(kind):
+        made.save(0, {"x": np.ones(9)}, 32)  # over one that is there
+    assert files(made) == before
+    assert made.folder.joinpath(before[0]).read_bytes() == content
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_full_disk_names_the_file_and_the_size(made, monkeypatch):
+    monkeypatch.setattr("builtins.open", lambda _, mode, plain=open: plain("/dev/full", mode))
+    with pytest.raises(
+        OSError, match=r"cannot write 80\d,\d{3} bytes, No space .*block-00000000"
+    ) as e:
+        made.save(0, {"x": np.zeros(100_000)}, 1)
+    assert e.value.errno == errno.ENOSPC
+
+
+def test_a_block_cut_short_anywhere_is_set_aside(made):
+    (path,) = fill(made, 0)
+    whole = path.read_bytes()
+    for size in [0, 1, 4, *range(10, len(whole), 37), len(whole) - 1]:
+        path.write_bytes(whole[:size])
+        with pytest.raises(
+            ValueError, match=r"block-00000000-00000032\.npz: truncated or not an npz"
+        ):
+            made.load(path)
+    assert spans(made) == []
+    (path,) = fill(made, 0)
+    path.write_bytes(whole[:300])
+    assert spans(made) == []
+    bad = path.name + ".bad"
+    assert files(made) == [bad, f"{bad}1", "manifest.json"]
+    assert made.folder.joinpath(f"{bad}1").read_bytes() == whole[:300]
+    assert [bad in line and "truncated" in line for line in made.set_aside] == [True, True]
+
+
+def test_no_flipped_bit_changes_a_number(made):
+    """A bit that carries no content, as of a date, may flip; each one of the data must be missed."""
+    x = np.arange(20) / 3
+    path = made.save(0, {"x": x}, 20)
+    whole = path.read_bytes()
+    data = range(whole.index(x.tobytes()), whole.index(x.tobytes()) + x.nbytes)
+    for place, bit in itertools.product(range(len(whole)), (0, 6)):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << bit
+        path.write_bytes(flipped)
+        with contextlib.suppress(ValueError):
+            block = made.load(path)
+            assert place not in data
+            assert block[:2] == (0, 20)
+            assert_same(block.arrays, {"x": x})
+
+
+def test_a_damaged_header_cannot_ask_for_memory(made):
+    (path,) = fill(made, 0)
+    old, new = b"(32,), }" + b" " * 12, b"(99999999999999,), }"
+    assert len(old) == len(new) and path.read_bytes().count(old) == 1
+    path.write_bytes(path.read_bytes().replace(old, new))
+    with pytest.raises(ValueError, match=r"entry x\.npy is damaged"):
+        made.load(path)
+
+
+def test_the_checksum_sees_what_the_zip_does_not(made):
+    (path,) = fill(made, 0)
+    with np.load(path) as npz:
+        entries = dict(npz)
+    x = entries.pop("x")
+    np.savez(path, x=x, **entries)
+    assert_same(made.load(path).arrays, {"x": x})
+    forms = [np.nextafter(x, 9), x.astype(np.float32), x.reshape(2, 16), x.view(np.int64)]
+    for changed in ({}, {"y": x}, {"x": x, "y": x}, *({"x": form} for form in forms)):
+        np.savez(path, **entries, **changed)
+        with pytest.raises(ValueError, match="checksum"):
+            made.load(path)
+    for about in (b"{}", b"[]", b"{"):
+        np.savez(path, x=x, _block=np.frombuffer(about, np.uint8))
+        with pytest.raises(ValueError, match="not a block"):
+            made.load(path)
+    np.savez(path, x=x)
+    with pytest.raises(ValueError, match="not a block"):
+        made.load(path)
+
+
+def test_a_renamed_or_foreign_block_is_set_aside(made, tmp_path):
+    first, _ = fill(made, 0, 32)
+    first.rename(made.folder / "block-00000064-00000096.npz")
+    other = store.create(tmp_path / "other", SETTINGS | {"seed": 4})
+    shutil.copy(fill(other, 0)[0], made.folder)
+    shutil.copy(fill(made, 96)[0], made.folder / "block-96.npz")
+    assert spans(made) == [(32, 32), (96, 32)]
+    assert len(made.set_aside) == 3
+    nameless, foreign, renamed = made.set_aside
+    assert "block-96.npz: names no runs, holds 96 to 128" in nameless
+    assert "block-00000000-00000032.npz: made with other settings" in foreign
+    assert "block-00000064-00000096.npz: names runs 64 to 96, holds 0 to 32" in renamed
+    assert sum(name.endswith(".bad") for name in files(made)) == 3
+    assert spans(made) == [(32, 32), (96, 32)] and len(made.set_aside) == 3
+
+
+def test_no_run_counts_twice(made):
+    fill(made, 0, 32, 64)
+    fill(made, 0, runs=8)
+    fill(made, 40, runs=60)
+    (bad,) = fill(made, 16, runs=1)
+    bad.write_bytes(b"")
+    assert spans(made) == [(0, 32), (32, 32), (64, 32)]
+    assert [line.split("block-")[1][:17] for line in made.set_aside] == [
+        "00000000-00000008", "00000016-00000017", "00000040-00000100"
+    ]  # fmt: skip
+    # One that is bad itself bars nothing.
+    fill(made, 96, runs=64)[0].write_bytes(b"")
+    fill(made, 100, runs=8)
+    assert spans(made)[3:] == [(100, 8)]
+
+
+def test_blocks_are_read_one_at_a_time(made, monkeypatch):
+    fill(made, *range(0, 320, 32))
+    read = []
+    monkeypatch.setattr(
+        store.Store,
+        "load",
+        lambda self, path, load=store.Store.load: read.append(path) or load(self, path),
+    )
+    for number, _ in enumerate(made.blocks(), 1):
+        assert len(read) == number
+
+
+def test_pickle_is_never_loaded(made):
+    class Trap:
+        def __reduce__(self):
+            return pytest.fail, ("unpickled",)
+
+    path = made.folder / "block-00000000-00000032.npz"
+    np.savez(path, x=np.array([Trap()], object))
+    with pytest.raises(ValueError, match="allow_pickle"):
+        made.load(path)
+
+
+def test_a_manifest_is_whole_or_refused(made, tmp_path):
+    manifest = made.folder / "manifest.json"
+    text = manifest.read_text(encoding="utf-8")
+    for content, message in (
+        ('{\n"format": 1,\n"settings": {]}', "manifest.json, line 3: "),
+        ("[]", "manifest.json: not the manifest"),
+        ("\udcff", "manifest.json: not JSON"),
+        (text.replace('"format": 1', '"format": 2'), "manifest.json: of format 2, expected 1"),
+        (text.replace('"seed": 3', '"seed": 4'), "manifest.json: its settings were changed"),
+    ):
+        manifest.write_text(content, encoding="utf-8", errors="surrogateescape")
+        with pytest.raises(ValueError, match=message):
+            store.resume(made.folder)
+    manifest.write_text(text, encoding="utf-8")
+    assert store.resume(made.folder).settings == made.settings == json.loads(text)["settings"]
+    with pytest.raises(ValueError, match=r"nowhere.manifest\.json is not there"):
+        store.resume(tmp_path / "nowhere")
+    for unfit in (float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="JSON"):
+            store.create(tmp_path / "nowhere", {"bound": unfit})
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_campaign_is_not_begun_twice(made):
+    fill(made, 0, 64)
+    fill(made, 80, runs=32)
+    with pytest.raises(ValueError, match="holds a campaign of which 80 runs are done: resume it"):
+        store.create(made.folder, SETTINGS)
+
+
+def test_every_difference_of_settings_is_named(made):
+    for here, expected in (
+        ({"seed": 4}, ["seed: 3 there, 4 here"]),
+        ({"seed": "3"}, ['seed: 3 there, "3" here']),
+        ({"seed": 3.0}, ["seed: 3 there, 3.0 here"]),
+        ({"versions": {"jax": "0.10.2"}}, ["versions.jax: 0.10.1 there, 0.10.2 here"]),
+        (
+            {"versions": {"numpy": "2"}, "dtype": None},
+            ["versions.jax: 0.10.1 there, absent here", "versions.numpy: absent there, 2 here", "dtype: absent there, null here"],
+        ),
+        ({"filters": ["ekf"]}, ['filters: ["ekf", "σ"] there, ["ekf"] here']),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="another campaign") as caught:
+            store.resume(made.folder, SETTINGS | here)
+        assert str(caught.value).split("another campaign: ")[1].split("; ") == expected
+    with pytest.raises(ValueError, match="seed: 3 there, absent here"):
+        store.resume(made.folder, {key: value for key, value in SETTINGS.items() if key != "seed"})
+
+
+def test_missing_is_every_run_not_done():
+    rng = np.random.default_rng(1)
+    for _ in range(500):
+        runs, block = int(rng.integers(0, 60)), int(rng.integers(1, 20))
+        done = [tuple(map(int, rng.integers(0, [70, 25]))) for _ in range(rng.integers(0, 6))]
+        todo = store.missing(iter(done), runs, block)
+        assert all(0 < size <= block for _, size in todo)
+        listed = [run for first, size in todo for run in range(first, first + size)]
+        finished = {run for first, size in done for run in range(first, first + size)}
+        assert listed == [run for run in range(runs) if run not in finished]
+    assert store.missing([(32, 32)], 128, 32) == [(0, 32), (64, 32), (96, 32)]
+    assert store.missing([(8, 8)], 40, 16) == [(0, 8), (16, 16), (32, 8)]
+    with pytest.raises(ValueError, match="block = 0"):
+        store.missing([], 3, 0)
+
+
+def _save_some(folder, offset):
+    made = store.resume(folder, SETTINGS)
+    for first in range(offset, 640, 64):
+        fill(made, first)
+
+
+def _save_until_killed(folder, call):
+    made = store.resume(folder, SETTINGS)
+
+    def kill(at, *_):
+        if call == "fsync":  # in the middle of the write
+            os.ftruncate(at, os.fstat(at).st_size // 2)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    for first in itertools.count(0, 32):
+        if first == 96:
+            setattr(os, call, kill)
+        fill(made, first)
+
+
+def finish(target, *arguments):
+    """Exit codes of processes of their own, one for each tuple of arguments, all at once."""
+    spawn = multiprocessing.get_context("spawn")
+    workers = [spawn.Process(target=target, args=each) for each in arguments]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(120)
+    return [worker.exitcode for worker in workers]
+
+
+def test_two_processes_save_into_one_folder(made):
+    assert finish(_save_some, (made.folder, 0), (made.folder, 32)) == [0, 0]
+    assert spans(made) == [(first, 32) for first in range(0, 640, 32)]
+    assert made.set_aside == []
+    assert len(files(made)) == 21
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_killed_process_leaves_whole_blocks_only(made, call):
+    assert finish(_save_until_killed, (made.folder, call)) == [-signal.SIGKILL]
+    assert sum(name.endswith(".tmp") for name in files(made)) == 1, "killed in the middle"
+    resumed = store.resume(made.folder, SETTINGS)
+    assert spans(resumed) == [(0, 32), (32, 32), (64, 32)]
+    fill(resumed, 96)
+    assert spans(resumed)[3:] == [(96, 32)]
+    assert resumed.set_aside == []
