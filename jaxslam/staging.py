@@ -19,13 +19,12 @@ def apart(function: Callable[..., _T], *arguments: Any) -> _T:
     time it fuses.)
     """
     with set_xla_metadata(inlineable="false"):
-        out = jax.jit(function)(*arguments)
-    return cast(_T, out)
+        return cast(_T, jax.jit(function)(*arguments))
 
 
 def settle(values: _T) -> _T:
     """The same arrays, computed once and kept; see `apart`, which saves a copy of large ones."""
-    return apart(jax.lax.optimization_barrier, values)
+    return cast(_T, apart(jax.lax.optimization_barrier, values))
 
 
 @jax.custom_batching.custom_vmap

@@ -13,12 +13,14 @@ import operator
 import os
 import re
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from jaxslam.monte_carlo.pieces import missing
 
 FORMAT = 1
 """Of the folder, as its manifest says; another number is refused."""
@@ -102,6 +104,11 @@ class Store:
             raise ValueError(f"{path}: {names}, holds {first} to {first + runs}")
         return Block(first, runs, arrays)
 
+    def spans(self) -> list[tuple[int, int]]:
+        """(first, runs) of each block by its name alone; `blocks` looks into them."""
+        named = (_named(path) for path in self.folder.glob("block-*.npz"))
+        return sorted((first, last - first) for first, last in filter(None, named))
+
     def blocks(self) -> Iterator[Block]:
         """The good blocks in order of their runs, read one at a time; no run comes twice.
 
@@ -144,12 +151,12 @@ def create(folder: Path, settings: Mapping[str, Any]) -> Store:
     own = _plain(settings)
     path = folder / MANIFEST
     if path.exists():
-        spans = [span for block in folder.glob("block-*.npz") if (span := _named(block))]
-        end = max((last for _, last in spans), default=0)
-        gaps = missing([(first, last - first) for first, last in spans], end, max(end, 1))
+        spans = Store(folder, {}).spans()
+        end = max((first + runs for first, runs in spans), default=0)
+        done = end - sum(count for _, count in missing(spans, end, max(end, 1)))
         raise ValueError(
-            f"{folder} holds a campaign of which {end - sum(count for _, count in gaps)} runs are "
-            "done: resume it, or name another folder"
+            f"{folder} holds a campaign of which {done} runs are done: resume it, or name another "
+            "folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
     manifest = {"format": FORMAT, "digest": _digest(own), "settings": own}
@@ -182,21 +189,6 @@ def resume(folder: Path, settings: Mapping[str, Any] | None = None) -> Store:
     if settings is not None and (differences := _differences(own, _plain(settings))):
         raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
     return Store(folder, own)
-
-
-def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
-    """(first, runs) of the pieces still to do of runs 0 … runs - 1, in order, none over block runs.
-
-    done has (first, runs) of what is finished, in any order and sizes.
-    """
-    if block < 1:
-        raise ValueError(f"block = {block}, expected >= 1")
-    pieces, end = [], 0
-    for first, count in [*sorted(done), (runs, 0)]:
-        stop = min(first, runs)
-        pieces += [(start, min(block, stop - start)) for start in range(end, stop, block)]
-        end = max(end, first + count)
-    return pieces
 
 
 def _named(path: Path) -> tuple[int, int] | None:

@@ -4,10 +4,12 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from test_family import three_parameters
 
-from jaxslam import cli
+from jaxslam import cli, store
+from jaxslam.monte_carlo import Interrupted
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
@@ -20,6 +22,7 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
     assert "published" not in printed  # of 2500 steps, and these are 8
     names = {path.name for path in out.iterdir()}
     assert names == {
+        "blocks",
         "report.html",
         "consistency.json",
         "consistency.csv",
@@ -43,6 +46,24 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
         (["--block", "-1"], "block"),
         (["--seed", "-1"], "seed"),
         (["--dtype", "float16"], "invalid choice"),
+        (["--devices", "0"], "at least 1 device"),
+        (["--devices", "abacus"], "no device 'abacus' here; known: all, cpu"),
+        (["--processes", "2"], "need --coordinator"),
+        (["--coordinator", "here"], "expected --coordinator HOST:PORT"),
+        (["--coordinator", "127.0.0.1:9", "--processes", "2"], "--process-id I"),
+        (
+            [
+                "--coordinator",
+                "127.0.0.1:9",
+                "--processes",
+                "2",
+                "--process-id",
+                "1",
+                "--timeout",
+                "1",
+            ],
+            "no coordinator at 127.0.0.1:9 within 1 s",
+        ),
     ],
 )
 def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, capsys, change, message):
@@ -72,12 +93,12 @@ def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, capsys, mon
 def test_an_interrupt_exits_with_130_and_writes_nothing(tmp_path, capsys, monkeypatch):
     def interrupted(*arguments, progress, **options):
         progress(1, 3)
-        raise KeyboardInterrupt
+        raise Interrupted(None, 3)
 
     monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
     assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
     assert "nothing was written" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    assert not list(tmp_path.rglob("*.*"))
 
 
 def test_no_command_exits_with_2(capsys):
@@ -141,3 +162,64 @@ def test_a_bad_data_set_exits_with_2_and_writes_nothing(tmp_path, capsys, datase
     assert cli.main(["run", "--dataset", dataset, str(data), "--out", str(out)]) == 2
     assert message in capsys.readouterr().err
     assert not out.exists()
+
+
+def kept(out):
+    return {path.name for path in (out / "blocks").iterdir()}
+
+
+def results(out):
+    """What a campaign found, but for how long it took and what it was called."""
+    found = json.loads((out / "consistency.json").read_text())
+    return {k: v for k, v in found.items() if k not in ("seconds", "compile_seconds", "command")}
+
+
+def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys):
+    out, again = tmp_path / "out", ["consistency", "--resume", str(tmp_path / "out")]
+    asked = [*QUICK, "--filters", "ekf,fej", "--no-bound", "--block", "1", "--devices", "1"]
+    assert cli.main([*asked, "--out", str(out)]) == 0
+    whole, csv = results(out), (out / "consistency.csv").read_text()
+    assert len(kept(out)) == 4
+
+    # A finished one prints its result; a lost block is computed again, a damaged one set aside.
+    capsys.readouterr()
+    assert cli.main(again) == 0
+    assert "verdict" in capsys.readouterr().out
+    lost, damaged = sorted((out / "blocks").glob("*.npz"))[:2]
+    lost.unlink()
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    (out / "consistency.json").unlink()
+    assert cli.main(again) == 0
+    assert f"{damaged.name}" in capsys.readouterr().err
+    assert results(out) == whole
+    assert (out / "consistency.csv").read_text() == csv
+    assert f"{damaged.name}.bad" in kept(out)
+
+    assert cli.main([*again, "--seed", "3", "--filters", "ekf"]) == 2
+    message = capsys.readouterr().err
+    assert "asked.seed: 0 there, 3 here" in message
+    assert "asked.filters: ekf,fej there, ekf here" in message
+    assert cli.main(["consistency", "--resume", str(tmp_path)]) == 2
+    assert "no campaign to resume" in capsys.readouterr().err
+
+
+def test_an_unfinished_campaign_is_not_overwritten_unasked(tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+
+    def stopped(*arguments, keep, **options):
+        keep.save(0, {"x": np.zeros(2)}, 2)
+        raise Interrupted(None, 3)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", stopped)
+    monkeypatch.setattr(cli.campaign.shutil, "rmtree", lambda *a, **k: None)
+    assert cli.main([*QUICK, "--out", str(out)]) == 130
+    monkeypatch.undo()
+    assert cli.main([*QUICK, "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert "2 runs done" in message
+    assert "--resume" in message
+    assert "--overwrite" in message
+    monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        cli.main([*QUICK, "--out", str(out), "--overwrite"])
+    assert store.resume(out / "blocks").spans() == []

@@ -58,9 +58,10 @@ def summed(trace, truth, limit=1e9):
     each = _scores(*jax.tree.map(jnp.asarray, (trace, truth)), jnp.asarray(limit))
     tally = consistency.Tally()
     # In two parts, as blocks come.
-    for part in (slice(0, 2), slice(2, None)):
+    for first, part in ((2, slice(2, None)), (0, slice(0, 2))):
         scores = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[part], each)
-        tally.add(scores._replace(sums=jax.tree.map(lambda leaf: leaf.sum(axis=0), scores.sums)))
+        if len(scores.finite) > 0:
+            tally.add(first, len(scores.finite), consistency.condense(scores, first))
     return tally
 
 

@@ -137,8 +137,12 @@ def test_landmark_nees_and_own_coordinates():
 
     @jax.jit
     def own(trace, truth):
-        score = partial(consistency.score, chart=charts.right_invariant())
-        return jax.vmap(lambda a, b: score(a, b, worlds.ring().sensor, 1e9))(trace, truth)
+        def one(trace, truth):
+            sensor = worlds.ring().sensor
+            error = consistency.own_error_of(charts.right_invariant(), sensor, trace, truth)
+            return consistency.score(trace, truth, sensor, 1e9, error)
+
+        return jax.vmap(one)(trace, truth)
 
     found = own(*jax.tree.map(jnp.asarray, (trace, truth))).measures["nees_own"][0]
     local = jax.jit(jax.vmap(charts.right_invariant().local, (0, None, 0, None)))

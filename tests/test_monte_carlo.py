@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import family, filters, motion, run, simulate
-from jaxslam.monte_carlo import monte_carlo
+from jaxslam import family, filters, motion, run, simulate, store
+from jaxslam.monte_carlo import Interrupted, monte_carlo
+from jaxslam.monte_carlo import campaign as campaign_module
 
 SHORT = worlds.ring(steps=12)
 
@@ -18,32 +19,141 @@ SHORT = worlds.ring(steps=12)
 @pytest.fixture(scope="module")
 def in_one_block():
     candidates = {"ekf": worlds.ekf(SHORT), "again": worlds.ekf(SHORT)}
-    return monte_carlo(SHORT, candidates, 10, worlds.key(), block=10, workers=1)
+    return campaign_of(candidates, block=10, devices=1, workers=1)
+
+
+def campaign_of(candidates=None, *, devices=1, **options):
+    candidates = candidates or {"ekf": worlds.ekf(SHORT)}
+    here = jax.devices()[:devices]
+    return monte_carlo(SHORT, candidates, 10, worlds.key(), devices=here, bound=True, **options)
+
+
+def identical(a, b):
+    """To the last bit, run by run and in their sums."""
+    assert a.counts == b.counts
+    for part in ("per_run", "curves", "coverage"):
+        ours, theirs = getattr(a, part), getattr(b, part)
+        assert ours.keys() == theirs.keys()
+        for name in ours:
+            assert ours[name].tobytes() == theirs[name].tobytes(), name
+    assert a.measures == b.measures
 
 
 def same(a, b, rtol=1e-9):
     assert a.counts == b.counts
-    assert a.measures.keys() == b.measures.keys()
-    for name in a.measures:
+    for name in a.measures.keys() & b.measures.keys():  # a bound is taken in some
         np.testing.assert_allclose(a.measures[name], b.measures[name], rtol=rtol)
-    for name in a.curves:
+    for name in a.curves.keys() & b.curves.keys():
         np.testing.assert_allclose(a.curves[name], b.curves[name], rtol=rtol)
 
 
-@pytest.mark.parametrize(("block", "workers"), [(4, 1), (3, 2)])
-def test_blocks_and_workers_do_not_change_the_result(in_one_block, block, workers):
+@pytest.mark.parametrize(
+    ("block", "devices", "workers"), [(4, 1, 1), (3, 1, 2), (1, 4, 1), (2, 2, 3)]
+)
+def test_blocks_devices_and_workers_do_not_change_a_bit(in_one_block, block, devices, workers):
     heard = []
-    campaign = monte_carlo(
-        SHORT,
-        {"ekf": worlds.ekf(SHORT)},
-        10,
-        worlds.key(),
+    campaign = campaign_of(
         block=block,
+        devices=devices,
         workers=workers,
         progress=lambda done, total: heard.append((done, total)),
     )
-    same(campaign.filters["ekf"], in_one_block.filters["ekf"])
-    assert [done for done, _ in heard] == [*range(block, 10, block), 10]
+    identical(campaign.filters["ekf"], in_one_block.filters["ekf"])
+    assert [total for _, total in heard] == [10] * -(-10 // (block * devices))
+    assert sorted(done for done, _ in heard)[-1] == 10
+
+
+class Spy:
+    """A keep that writes down what is saved, and may fail."""
+
+    def __init__(self, store, fails=()):
+        self.store, self.saved, self.fails = store, [], list(fails)
+
+    def save(self, first, arrays, runs):
+        if self.fails and self.fails.pop(0):
+            raise OSError(28, "no space left")
+        self.saved.append((first, runs))
+        return self.store.save(first, arrays, runs)
+
+    def blocks(self):
+        return self.store.blocks()
+
+
+def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_one_block):
+    kept = store.create(tmp_path, {"seed": 0})
+    first = Spy(kept)
+
+    def stop(done, total):
+        if done >= 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted, match="of 10 runs done") as stopped:
+        campaign_of(block=2, workers=1, keep=first, progress=stop)
+    so_far = stopped.value.campaign
+    assert so_far.runs == sum(runs for _, runs in first.saved) < 10
+    assert so_far.filters["ekf"].counts["runs"] == so_far.runs
+
+    second = Spy(store.resume(tmp_path), fails=[False, True])
+    with pytest.raises(OSError, match="no space"):
+        campaign_of(block=1, workers=1, keep=second)
+
+    third = Spy(store.resume(tmp_path))
+    campaign = campaign_of(block=3, devices=2, keep=third)
+    identical(campaign.filters["ekf"], in_one_block.filters["ekf"])
+    pieces = sorted(first.saved + second.saved + third.saved)
+    assert [run for at, runs in pieces for run in range(at, at + runs)] == list(range(10))
+
+    finished = Spy(store.resume(tmp_path))
+    began = campaign_of(keep=finished)
+    assert finished.saved == []
+    assert began.compile_seconds == 0
+    assert began.divergence_limit == in_one_block.divergence_limit
+    identical(began.filters["ekf"], in_one_block.filters["ekf"])
+
+
+def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(campaign_module, "compile_programs", interrupted)
+    with pytest.raises(Interrupted, match="0 of 10") as stopped:
+        campaign_of()
+    assert stopped.value.campaign is None
+
+
+def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_one_block):
+    tried = []
+    compile_programs = campaign_module.compile_programs
+
+    def little_memory(scenario, filters, key, block, devices, bound, pool):
+        tried.append(block)
+        if block > 2:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
+        return compile_programs(scenario, filters, key, block, devices, bound, pool)
+
+    monkeypatch.setattr(campaign_module, "compile_programs", little_memory)
+    with pytest.warns(UserWarning, match="going on with block=") as warned:
+        campaign = campaign_of(block=9)
+    assert (tried, len(warned)) == ([9, 4, 2], 2)
+    identical(campaign.filters["ekf"], in_one_block.filters["ekf"])
+
+
+def test_out_of_memory_for_one_run_says_so(monkeypatch):
+    def no_memory(*arguments):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    monkeypatch.setattr(campaign_module, "compile_programs", no_memory)
+    with pytest.raises(MemoryError, match="block=1"):
+        campaign_of(block=1)
+
+
+def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
+    def broken(*arguments):
+        raise jax.errors.JaxRuntimeError("INTERNAL: something else")
+
+    monkeypatch.setattr(campaign_module, "compile_programs", broken)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
+        campaign_of(block=4)
 
 
 def test_every_filter_gets_the_same_draws(in_one_block):
@@ -174,6 +284,7 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"runs": 2.5}, "runs"),
         ({"block": 0}, "block"),
         ({"workers": 0}, "workers"),
+        ({"devices": []}, "device"),
         ({"filters": {}}, "at least one"),
         ({"filters": {"x": 3}}, "neither"),
         (

@@ -295,22 +295,6 @@ def test_every_difference_of_settings_is_named(made):
         store.resume(made.folder, {key: value for key, value in SETTINGS.items() if key != "seed"})
 
 
-def test_missing_is_every_run_not_done():
-    rng = np.random.default_rng(1)
-    for _ in range(500):
-        runs, block = int(rng.integers(0, 60)), int(rng.integers(1, 20))
-        done = [tuple(map(int, rng.integers(0, [70, 25]))) for _ in range(rng.integers(0, 6))]
-        todo = store.missing(iter(done), runs, block)
-        assert all(0 < size <= block for _, size in todo)
-        listed = [run for first, size in todo for run in range(first, first + size)]
-        finished = {run for first, size in done for run in range(first, first + size)}
-        assert listed == [run for run in range(runs) if run not in finished]
-    assert store.missing([(32, 32)], 128, 32) == [(0, 32), (64, 32), (96, 32)]
-    assert store.missing([(8, 8)], 40, 16) == [(0, 8), (16, 16), (32, 8)]
-    with pytest.raises(ValueError, match="block = 0"):
-        store.missing([], 3, 0)
-
-
 def _save_some(folder, offset):
     made = store.resume(folder, SETTINGS)
     for first in range(offset, 640, 64):

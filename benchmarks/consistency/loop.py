@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
-from jaxslam.consistency import score
+from jaxslam.consistency import own_error_of, score
 from jaxslam.family import FILTERS
 from jaxslam.plot import COLORS
 from jaxslam.protocols import Filter, Motion, Sensor
@@ -134,7 +134,8 @@ def campaign(names, maps: int, runs: int, steps: int, seed: int, noise=1.0, bloc
             key_filter,
             probe=lambda joint: joint.watch.information,
         )
-        scores = score(trace, truth, here.sensor, jnp.asarray(jnp.inf), filter.chart)
+        own = own_error_of(filter.chart, here.sensor, trace, truth)
+        scores = score(trace, truth, here.sensor, jnp.asarray(jnp.inf), own)
         kept = {
             m: jnp.where(scores.measures[m][1], scores.measures[m][0], jnp.nan) for m in MEASURES
         }

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import jax
 
-from jaxslam.cli.campaign import consistency
+from jaxslam.cli import devices
+from jaxslam.cli.asking import INTERRUPTED
+from jaxslam.cli.campaign import DEFAULTS, consistency
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
 from jaxslam.datasets import READERS
@@ -18,7 +20,6 @@ from jaxslam.scenarios import SCENARIOS
 __all__ = ["main"]
 
 USAGE_ERROR = 2
-INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,8 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
     except SystemExit as stop:
         return int(stop.code or 0)
-    jax.config.update("jax_enable_x64", options.dtype == "float64")
     try:
+        if hasattr(options, "devices"):
+            devices.prepare(options)
+        else:
+            jax.config.update("jax_enable_x64", options.dtype == "float64")
         return int(options.command(options, shlex.join(["jaxslam", *arguments])))
     except (ValueError, OSError) as error:
         print(f"jaxslam: {error}", file=sys.stderr)
@@ -48,21 +52,63 @@ def _parser() -> argparse.ArgumentParser:
         help="is a filter honest? a Monte-Carlo campaign",
         description="Run filters over the same simulated worlds and compare their errors with the "
         "covariances they claim. Prints a table and writes JSON, CSV and figures.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    judge.add_argument("--scenario", default="circle", help=f"one of: {', '.join(SCENARIOS)}")
-    judge.add_argument(
-        "--filters", default="ekf", help=f'"all", or some of: {",".join(FILTERS)}; comma-separated'
+    asked = judge.add_argument_group(
+        "what", "kept in the folder of results; --resume reads it there"
     )
-    judge.add_argument("--runs", type=int, default=100, help="simulated trajectories")
-    judge.add_argument("--steps", type=int, help="steps of each; default: the scenario's own")
-    judge.add_argument("--block", type=int, default=32, help="runs computed together; sets memory")
-    judge.add_argument("--seed", type=int, default=0, help="of every draw")
-    judge.add_argument(
+    for name, about in {
+        "scenario": f"one of: {', '.join(SCENARIOS)}",
+        "filters": f'"all", or some of: {",".join(FILTERS)}; comma-separated',
+        "runs": "simulated trajectories",
+        "steps": "steps of each; default the scenario's own",
+        "seed": "of every draw",
+    }.items():
+        default = DEFAULTS[name]
+        kind = str if isinstance(default, str) else int
+        about += "" if default is None else f" (default: {default})"
+        asked.add_argument(f"--{name}", type=kind, default=argparse.SUPPRESS, help=about)
+    asked.add_argument(
         "--bound",
         action=argparse.BooleanOptionalAction,
-        default=True,
-        help="also the posterior Cramér-Rao bound",
+        default=argparse.SUPPRESS,
+        help="also the posterior Cramér-Rao bound (default: yes)",
+    )
+    asked.add_argument(
+        "--dtype",
+        default=argparse.SUPPRESS,
+        choices=["float32", "float64"],
+        help="(default: float64)",
+    )
+    judge.add_argument(
+        "--out", type=Path, default=Path("out"), help="folder for results (default: out)"
+    )
+    judge.add_argument(
+        "--resume", type=Path, metavar="DIR", help="go on with the campaign in a folder of results"
+    )
+    judge.add_argument(
+        "--overwrite", action="store_true", help="give up an unfinished campaign in the folder"
+    )
+    judge.add_argument(
+        "--block", type=int, help="runs computed together on a device; sets memory (default: 32)"
+    )
+    judge.add_argument(
+        "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'
+    )
+    judge.add_argument(
+        "--cache", type=Path, metavar="DIR", help="keep compiled programs there for the next time"
+    )
+    others = judge.add_argument_group(
+        "several processes", "the same command on each, but for the id"
+    )
+    others.add_argument(
+        "--coordinator",
+        metavar="HOST:PORT",
+        help='where process 0 listens; "auto" for SLURM, Kubernetes, Open MPI',
+    )
+    others.add_argument("--processes", type=int, metavar="P", help="how many there are")
+    others.add_argument("--process-id", type=int, metavar="I", help="which one this is, from 0")
+    others.add_argument(
+        "--timeout", type=int, default=60, help="seconds to wait for the others (default: 60)"
     )
     judge.set_defaults(command=consistency)
 
@@ -96,7 +142,6 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
     check.set_defaults(command=verify_models, dtype="float64")
 
-    for command in (judge, drive):
-        command.add_argument("--dtype", default="float64", choices=["float32", "float64"])
-        command.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
+    drive.add_argument("--dtype", default="float64", choices=["float32", "float64"])
+    drive.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
     return parser

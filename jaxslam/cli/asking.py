@@ -7,6 +7,9 @@ from typing import TypeVar
 
 _T = TypeVar("_T")
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+
 
 def pick(kind: str, name: str, known: Mapping[str, _T]) -> _T:
     """What has that name, or ValueError with the names that are known."""

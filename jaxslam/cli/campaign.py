@@ -1,67 +1,139 @@
 """`jaxslam consistency`: a campaign, its table and its files."""
 
 import argparse
+import shutil
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 
-from jaxslam import page, plot, report
-from jaxslam.cli.asking import Progress, pick
+from jaxslam import page, plot, report, store
+from jaxslam.cli import devices
+from jaxslam.cli.asking import INTERRUPTED, Progress, pick
 from jaxslam.family import FILTERS
-from jaxslam.monte_carlo import Campaign, monte_carlo
+from jaxslam.linalg import check_count
+from jaxslam.monte_carlo import Campaign, Interrupted, missing, monte_carlo
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.run import run
 from jaxslam.scenarios import SCENARIOS
 from jaxslam.simulate import Scenario, simulate
 
+BLOCKS = "blocks"
+"""The folder of a campaign's finished blocks, beside its results."""
+
+DEFAULTS: dict[str, Any] = {
+    "scenario": "circle",
+    "filters": "ekf",
+    "runs": 100,
+    "steps": None,
+    "seed": 0,
+    "bound": True,
+    "dtype": "float64",
+}
+"""What a campaign is asked for by, unless said or resumed otherwise."""
+
 
 def consistency(options: argparse.Namespace, command: str) -> int:
     """Run the campaign that was asked for, print its table, write its files; exit status."""
-    scenario = _scenario(options.scenario, options.steps)
-    names = [name.strip() for name in options.filters.split(",")]
+    asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
+    if options.resume is not None:
+        asked = store.resume(options.resume / BLOCKS).settings["asked"] | asked
+    asked = DEFAULTS | asked
+    out = options.resume or options.out
+    jax.config.update("jax_enable_x64", asked["dtype"] == "float64")
+    devices.join(options)
+    scenario = _scenario(asked["scenario"], asked["steps"])
+    names = [name.strip() for name in asked["filters"].split(",")]
     if names == ["all"]:
         names = list(FILTERS)
     if len(set(names)) < len(names):
-        raise ValueError(f"expected each filter once, got {options.filters!r}")
+        raise ValueError(f"expected each filter once, got {asked['filters']!r}")
     filters = {name: _filter(name, scenario) for name in names}
-    if not 0 <= options.seed < 2**32:
-        raise ValueError(f"expected a seed between 0 and 2³²-1, got {options.seed}")
-    report.check_writable(options.out)
-    key = jax.random.key(options.seed)
-    with Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress:
-        campaign = monte_carlo(
-            scenario,
-            filters,
-            options.runs,
-            key,
-            block=options.block,
-            bound=options.bound,
-            progress=progress,
-        )
+    if not 0 <= asked["seed"] < 2**32:
+        raise ValueError(f"expected a seed between 0 and 2³²-1, got {asked['seed']}")
+    check_count("runs", asked["runs"])
+    if options.block is not None:
+        check_count("block", options.block)
+    report.check_writable(out)
+    here = devices.chosen(options.devices)
+    keep = _keep(options, out, {"asked": asked, "versions": report.versions()})
+    try:
+        with Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress:
+            campaign = monte_carlo(
+                scenario,
+                filters,
+                asked["runs"],
+                jax.random.key(asked["seed"]),
+                block=options.block,
+                devices=here,
+                bound=asked["bound"],
+                keep=keep,
+                progress=progress,
+            )
+    except Interrupted as stop:
+        if stop.campaign is None:
+            shutil.rmtree(keep.folder, ignore_errors=True)
+            raise
+        print(report.table(stop.campaign))
+        print(f"\njaxslam: interrupted, {stop}; --resume {out} goes on", file=sys.stderr)
+        return INTERRUPTED
+    for sentence in keep.set_aside:
+        print(f"jaxslam: {sentence}", file=sys.stderr)
+    if jax.process_index() > 0:
+        return 0
     print(report.table(campaign))
-    written = report.write_files(options.out, _campaign_files(campaign, scenario, options, command))
+    files = _campaign_files(campaign, scenario, asked["seed"], asked["bound"], command)
+    written = report.write_files(out, files)
     print(f"\ncampaign {campaign.seconds:.1f} s; wrote " + ", ".join(str(path) for path in written))
     return 0
 
 
+def _keep(options: argparse.Namespace, out: Path, settings: dict[str, Any]) -> store.Store:
+    """Where this campaign's blocks are kept: a new folder, or that of the campaign resumed."""
+    folder = out / BLOCKS
+    if options.resume is None and jax.process_index() == 0:
+        done = _done(folder)
+        if done and not options.overwrite:
+            raise ValueError(
+                f"{out} holds an unfinished campaign, with {done} runs done: --resume {out} goes "
+                "on with it, --overwrite gives it up"
+            )
+        shutil.rmtree(folder, ignore_errors=True)
+        store.create(folder, settings)
+    devices.wait_for_all("campaign folder")
+    return store.resume(folder, settings)
+
+
+def _done(folder: Path) -> int:
+    """How many runs an unfinished campaign in a folder has; 0 where there is none."""
+    try:
+        kept = store.resume(folder)
+    except ValueError:
+        return 0
+    runs = kept.settings["asked"]["runs"]
+    left = sum(count for _, count in missing(kept.spans(), runs, runs))
+    return int(runs - left) if left else 0
+
+
 def _campaign_files(
-    campaign: Campaign, scenario: Scenario, options: argparse.Namespace, command: str
+    campaign: Campaign, scenario: Scenario, seed: int, bound: bool, command: str
 ) -> dict[str, str | Callable[[Path], object]]:
     """The campaign, and pictures of its first run under its first filter."""
     name = next(iter(campaign.filters))
-    key_world, key_filter = jax.random.split(jax.random.fold_in(jax.random.key(options.seed), 0))
+    key_world, key_filter = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0))
     truth, log = jax.jit(partial(simulate, scenario))(key_world)
     candidate = FILTERS[name](scenario)
     filter = candidate if isinstance(candidate, Filter) else candidate(truth)
     assert isinstance(filter, Filter)
     trace = run(filter, log, scenario.pose, scenario.pose_cov, key_filter)
-    title = f"{scenario.name}, {name}, run 0 of seed {options.seed}"
+    title = f"{scenario.name}, {name}, run 0 of seed {seed}"
     figures = {
         "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
         "bound": (
-            "RMSE, and the Cramér-Rao bound" if options.bound else "RMSE",
+            "RMSE, and the Cramér-Rao bound" if bound else "RMSE",
             plot.bound_figure(campaign),
         ),
         "coverage": ("Coverage of the ellipsoids", plot.coverage_figure(campaign)),
@@ -75,11 +147,11 @@ def _campaign_files(
             campaign,
             report.ROWS,
             command,
-            options.seed,
+            seed,
             report.versions(),
             dict(figures.values()),
         ),
-        "consistency.json": report.as_json(campaign, command, options.seed),
+        "consistency.json": report.as_json(campaign, command, seed),
         "consistency.csv": report.as_csv(campaign),
     } | {f"{name}.png": figure.savefig for name, (_, figure) in figures.items()}
 

@@ -3,8 +3,9 @@
 from jaxslam.consistency.alignment import align_map
 from jaxslam.consistency.bound import posterior_bound
 from jaxslam.consistency.credibility import credibility
-from jaxslam.consistency.score import DOF, LAGS, LANDMARK_DOF, LEVELS, Score, score
-from jaxslam.consistency.summary import LEVEL, Measure, Summary, Tally, interval, judge, summarize
+from jaxslam.consistency.score import DOF, LAGS, LANDMARK_DOF, LEVELS, Score, own_error_of, score
+from jaxslam.consistency.summary import LEVEL, Measure, Summary, interval, judge, summarize
+from jaxslam.consistency.tally import Tally, condense
 
 __all__ = [
     "DOF",
@@ -17,9 +18,11 @@ __all__ = [
     "Summary",
     "Tally",
     "align_map",
+    "condense",
     "credibility",
     "interval",
     "judge",
+    "own_error_of",
     "posterior_bound",
     "score",
     "summarize",

@@ -65,9 +65,17 @@ def snapshot_steps(steps: int) -> np.ndarray:
 
 
 def score(
-    trace: Trace, truth: Truth, sensor: Sensor, limit: jax.Array, chart: Chart | None = None
+    trace: Trace,
+    truth: Truth,
+    sensor: Sensor,
+    limit: jax.Array,
+    own_error: jax.Array | None = None,
 ) -> Score:
-    """Score one run. limit () [m]: a final position error above is divergence."""
+    """Score one run.
+
+    limit () [m]: a final position error above is divergence. own_error (T, 3): the pose errors in
+    the filter's own coordinates (see `own_error_of`), by default those in (x, y, θ).
+    """
     error = truth.pose - trace.estimate.pose
     error = jnp.concatenate([error[:, :2], wrap(error[:, 2:])], axis=1)
     cov = trace.estimate.pose_cov
@@ -85,7 +93,7 @@ def score(
         sums[f"coverage_runs_{block}"] = (regular.sum() > 0).astype(nees.dtype)
         at_95 = covered[:, LEVELS.index(0.95)].sum()
         measures[f"coverage_95_{block}"] = at_95.astype(nees.dtype), regular.sum()
-    own = error if chart is None else _own_error(chart, sensor, trace, truth)
+    own = error if own_error is None else own_error
     nees, regular = jax.vmap(mahalanobis_squared)(own, cov, scale)
     measures["nees_own"] = nees.sum(), regular.sum()
 
@@ -109,9 +117,7 @@ def score(
 
     sums |= {s.name.lower(): (trace.info.status == s).sum() for s in DROPS}
     sums |= {"missed": truth.missed.sum(), "singular_steps": (sums["regular_pose"] == 0).sum()}
-    finite = jnp.asarray(True)
-    for leaf in jax.tree.leaves((trace.estimate, trace.info, sums, measures)):
-        finite = finite & jnp.all(jnp.isfinite(leaf))
+    finite = _all_finite((trace.estimate, trace.info, sums, measures))
     far = jnp.sqrt(sums["square_position"][-1]) > limit
 
     def kept(value: jax.Array) -> jax.Array:
@@ -132,6 +138,16 @@ def score(
     )
 
 
+def _all_finite(tree: Any) -> jax.Array:
+    """Whether every number is; arrays of one shape together, which compiles faster."""
+    by_shape: dict[Any, list[jax.Array]] = {}
+    for leaf in map(jnp.asarray, jax.tree.leaves(tree)):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            by_shape.setdefault((leaf.shape, leaf.dtype), []).append(leaf)
+    each = [jnp.isfinite(jnp.stack(leaves)).all() for leaves in by_shape.values()]
+    return jnp.stack(each).all()
+
+
 def _scale(cov: jax.Array) -> jax.Array:
     """Units (T, 3) in which a pose covariance is judged: x and y, both metres, have one."""
     variance = jnp.maximum(jnp.diagonal(cov, axis1=1, axis2=2), 0.0)
@@ -145,7 +161,7 @@ def _covered(nees: jax.Array, regular: jax.Array, dof: int) -> jax.Array:
     return (nees[:, None] <= radii[None, :]) & regular[:, None]
 
 
-def _own_error(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> jax.Array:
+def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> jax.Array:
     """The pose error in the filter's coordinates, brought to (x, y, θ) by its basis, (T, 3).
 
     ξᵀ P_ξ⁻¹ ξ = (E ξ)ᵀ P⁻¹ (E ξ) with P = E P_ξ Eᵀ as the filter reports it.
@@ -193,17 +209,24 @@ def _autocorrelation(trace: Trace) -> jax.Array:
     white = jnp.where(fused[:, :, None], white, 0.0)
     if count > 0:
         mine = (info.slot[:, :, None] == jnp.arange(count)[None, None]) & fused[:, :, None]
-        white = jnp.einsum("tmn,tmz->tnz", mine.astype(white.dtype), white)
+        # Not a product with zeros and ones, whose last bit would go by how many runs are batched.
+        place = jnp.argmax(mine, axis=1)
+        white = jnp.take_along_axis(white, place[:, :, None], axis=1)
+        white = jnp.where(mine.any(axis=1)[:, :, None], white, 0.0)
         fused = mine.any(axis=1)
-    steps, pairs = white.shape[0], []
-    for lag in range(1, LAGS + 1):
-        early, late = white[: max(steps - lag, 0)], white[lag:]
-        both = (fused[: max(steps - lag, 0)] & fused[lag:])[:, :, None]
-        size = jnp.where(both, early**2, 0.0).sum() * jnp.where(both, late**2, 0.0).sum()
+    # By landmark: (w_t, |w_t|², whether there is one), zeros beyond the end.
+    there = fused.astype(white.dtype)
+    energy = (white**2).sum(axis=2)
+    later = [jnp.pad(x, [(0, LAGS)] + [(0, 0)] * (x.ndim - 1)) for x in (white, energy, there)]
+
+    def pairs(lag: jax.Array) -> jax.Array:
+        w, e, f = (jax.lax.dynamic_slice_in_dim(x, lag, len(white)) for x in later)
+        size = (energy * f).sum() * (e * there).sum()
         size = jnp.where(size > 0, jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
-        products = both.sum().astype(white.dtype) * white.shape[2]
-        pairs.append(jnp.stack([jnp.where(both, early * late, 0.0).sum(), size, products]))
-    return jnp.stack(pairs)
+        return jnp.stack([(white * w).sum(), size, (f * there).sum() * white.shape[2]])
+
+    out: jax.Array = jax.lax.map(pairs, jnp.arange(1, LAGS + 1))
+    return out
 
 
 def _null_space(information: jax.Array, watch: Any) -> tuple[jax.Array, jax.Array]:

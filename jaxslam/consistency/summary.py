@@ -8,7 +8,8 @@ import numpy as np
 import scipy.stats
 
 from jaxslam.consistency.credibility import credibility
-from jaxslam.consistency.score import DOF, DROPS, Score
+from jaxslam.consistency.score import DOF, DROPS
+from jaxslam.consistency.tally import Tally
 from jaxslam.stats import chi2_quantile, t_quantile
 
 LEVEL = 0.95
@@ -19,50 +20,6 @@ NORMAL = float(scipy.stats.norm.ppf(0.5 + LEVEL / 2))
 
 COUNTS = tuple(status.name.lower() for status in DROPS) + ("missed", "singular_steps")
 """The sums that are reported as counts."""
-
-
-class Tally:
-    """The scores of a campaign so far: sums, and what is kept of each run, in order.
-
-    Sums are taken in float64 on the host. Snapshots are kept of the first `shots` runs.
-    """
-
-    def __init__(self, shots: int = 2048) -> None:
-        self.sums: dict[str, np.ndarray] = {}
-        self._kept: list[Score] = []
-        self._snapshots: list[Any] = []
-        self._room = shots
-
-    def add(self, scores: Score) -> None:
-        """Scores of further runs: per-run leaves with a leading axis, sums already added up."""
-        for name, value in scores.sums.items():
-            self.sums[name] = self.sums.get(name, 0.0) + np.asarray(value, np.float64)
-        runs = len(scores.finite)
-        if self._room > 0:
-            finite = np.asarray(scores.finite)[: self._room]
-            shots = [np.asarray(leaf)[: self._room][finite] for leaf in scores.snapshots]
-            self._snapshots.append(shots)
-            self._room -= runs
-        self._kept.append(scores._replace(sums={}, snapshots=((), (), ())))
-
-    def flags(self, name: str) -> np.ndarray:
-        """(runs,) finite or divergent, by run."""
-        return np.concatenate([np.asarray(getattr(s, name)) for s in self._kept])
-
-    def measures(self) -> dict[str, np.ndarray]:
-        """(runs,) each run's average, NaN where it has none."""
-        out = {}
-        for name in self._kept[0].measures:
-            values, defined = (
-                np.concatenate([np.asarray(s.measures[name][i]) for s in self._kept])
-                for i in (0, 1)
-            )
-            out[name] = np.where(defined, values.astype(np.float64), np.nan)
-        return out
-
-    def snapshots(self) -> list[np.ndarray]:
-        """Errors (R, K, 3), covariances (R, K, 3, 3), regular (R, K), of the first finite runs."""
-        return [np.concatenate(parts) for parts in zip(*self._snapshots, strict=True)]
 
 
 class Measure(NamedTuple):
@@ -188,7 +145,7 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
         autocorrelation=_ratio(sums["autocorrelation"][:, 0], sums["autocorrelation"][:, 1]),
         counts=counts,
         per_run=per_run,
-        not_finite_runs=np.flatnonzero(~finite).tolist(),
+        not_finite_runs=tally.numbers()[~finite].tolist(),
     )
 
 

@@ -1,0 +1,102 @@
+"""Which devices compute, and which other processes: what must be said before JAX is first used."""
+
+import argparse
+import contextlib
+import os
+import socket
+import time
+
+import jax
+from jax.experimental import multihost_utils
+
+
+def prepare(options: argparse.Namespace) -> None:
+    """Before JAX looks at its devices: as many CPU devices as asked for, by default as cores."""
+    asked = options.devices
+    count = cores() if asked in ("all", "cpu") else int(asked) if asked.isdecimal() else None
+    if count is not None and count < 1:
+        raise ValueError(f"expected at least 1 device, got {asked}")
+    if count is not None:
+        with contextlib.suppress(RuntimeError):  # JAX has been used before, as in a notebook
+            jax.config.update("jax_num_cpu_devices", count)
+    if options.cache is not None:
+        jax.config.update("jax_compilation_cache_dir", str(options.cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def cores() -> int:
+    """CPU cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+
+
+def join(options: argparse.Namespace) -> None:
+    """Join the other processes of the campaign, where there are any.
+
+    Raises ValueError on numbers that do not fit, and where the coordinator cannot be reached within
+    options.timeout seconds.
+    """
+    address, count, mine = options.coordinator, options.processes, options.process_id
+    if address is None:
+        if count is not None or mine is not None:
+            raise ValueError("--processes and --process-id need --coordinator HOST:PORT")
+        return
+    if address == "auto":  # as JAX finds them in the variables of SLURM, Kubernetes, Open MPI
+        jax.distributed.initialize(initialization_timeout=options.timeout)
+        return
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal():
+        raise ValueError(f"expected --coordinator HOST:PORT, got {address!r}")
+    if count is None or mine is None or count < 1 or not 0 <= mine < count:
+        raise ValueError(
+            f"expected --processes P >= 1 and --process-id I in 0 to P-1, got {count} and {mine}"
+        )
+    if mine > 0:
+        _await(host, int(port), options.timeout)
+    try:
+        jax.distributed.initialize(address, count, mine, initialization_timeout=options.timeout)
+    except jax.errors.JaxRuntimeError as error:
+        raise ValueError(
+            f"not all of the {count} processes met at {address} within {options.timeout} s "
+            f"({str(error).splitlines()[0]})"
+        ) from error
+
+
+def chosen(asked: str) -> list[jax.Device]:
+    """This process's devices by what was asked for: all, their number, or a platform's name."""
+    if asked == "all":
+        return list(jax.local_devices())
+    if asked.isdecimal():
+        there = jax.local_devices()
+        if int(asked) > len(there):
+            raise ValueError(f"{asked} devices asked for; there are {len(there)}")
+        return list(there[: int(asked)])
+    try:
+        return list(jax.local_devices(backend=asked))
+    except RuntimeError as error:
+        known = sorted({device.platform for device in jax.local_devices()} | {"cpu"})
+        raise ValueError(
+            f"no device {asked!r} here; known: all, {', '.join(known)}, or a number"
+        ) from error
+
+
+def wait_for_all(what: str) -> None:
+    """Until every process of the campaign is here."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(what)
+
+
+def _await(host: str, port: int, timeout: int) -> None:
+    """Until a coordinator listens; the library would abort the program instead of saying so."""
+    end = time.monotonic() + timeout
+    while True:
+        try:
+            with socket.create_connection((host, port), timeout=min(5, timeout)):
+                return
+        except OSError as error:
+            if time.monotonic() >= end:
+                raise ValueError(
+                    f"no coordinator at {host}:{port} within {timeout} s ({error})"
+                ) from error
+            time.sleep(0.2)

@@ -1,0 +1,181 @@
+"""The scores of a campaign so far, however its runs came in: blocks in any order and of any size.
+
+Sums over runs are taken in pairs of float64 (106 bits), so that what they are rounded to does not
+depend on how the runs were divided; Knuth's two-sum, and the sums of Dekker 1971 ("A floating-point
+technique for extending the available precision", Numerische Mathematik 18).
+"""
+
+import io
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.consistency.score import Score
+
+SHOTS = 2048
+"""Snapshots are kept of runs with numbers below this."""
+
+
+class Sum(NamedTuple):
+    """high + low, where low is what rounding high left over."""
+
+    high: np.ndarray
+    low: np.ndarray
+
+
+def plus(a: Sum, b: Sum) -> Sum:
+    """a + b, to about 2⁻¹⁰⁴ of |a| + |b|."""
+    high, rest = _two_sum(a.high, b.high)
+    low, last = _two_sum(a.low, b.low)
+    high, rest = _renormalized(high, rest + low)
+    return Sum(*_renormalized(high, rest + last))
+
+
+def total(rows: np.ndarray) -> Sum:
+    """The sum over the leading axis, which may be empty."""
+    rows = np.asarray(rows, np.float64)
+    if len(rows) == 0:
+        return Sum(np.zeros(rows.shape[1:]), np.zeros(rows.shape[1:]))
+    parts = Sum(rows, np.zeros_like(rows))
+    while len(parts.high) > 1:
+        even = len(parts.high) // 2 * 2
+        halves = plus(Sum(*(part[:even:2] for part in parts)), Sum(*(p[1:even:2] for p in parts)))
+        rest = (part[even:] for part in parts)
+        parts = Sum(*(np.concatenate(pair) for pair in zip(halves, rest, strict=True)))
+    return Sum(parts.high[0], parts.low[0])
+
+
+def condense(scores: Score, first: int) -> dict[str, np.ndarray]:
+    """What a tally keeps of runs first, first + 1, … (leading axis), as named arrays."""
+    runs = len(scores.finite)
+    out = {"finite": np.asarray(scores.finite), "divergent": np.asarray(scores.divergent)}
+    for name, (value, defined) in scores.measures.items():
+        out[f"measure/{name}"], out[f"defined/{name}"] = np.asarray(value), np.asarray(defined)
+    kept = max(min(runs, SHOTS - first), 0)
+    for i, leaf in enumerate(scores.snapshots):
+        out[f"snapshot/{i}"] = np.asarray(leaf)[:kept]
+    return out | condensed_sums(scores.sums)
+
+
+def condensed_sums(per_run: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The sums over the runs of named arrays, as `Tally.add` takes them."""
+    out = {}
+    for name, rows in per_run.items():
+        out[f"high/{name}"], out[f"low/{name}"] = total(np.asarray(rows))
+    return out
+
+
+class Tally:
+    """Blocks of condensed scores, added in any order."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, Sum] = {}
+        self._blocks: dict[int, dict[str, np.ndarray]] = {}
+        self._runs: dict[int, int] = {}
+
+    def add(self, first: int, runs: int, block: dict[str, np.ndarray]) -> None:
+        """What `condense` made of runs first … first + runs - 1."""
+        kept = {}
+        for name, value in block.items():
+            kind, _, what = name.partition("/")
+            if kind == "high":
+                new = Sum(value, block[f"low/{what}"])
+                self._sums[what] = plus(self._sums[what], new) if what in self._sums else new
+            elif kind != "low":
+                kept[name] = value
+        self._blocks[first], self._runs[first] = kept, runs
+
+    def merge(self, other: "Tally") -> None:
+        """The blocks of another tally, of other runs."""
+        for name, value in other._sums.items():
+            self._sums[name] = plus(self._sums[name], value) if name in self._sums else value
+        self._blocks |= other._blocks
+        self._runs |= other._runs
+
+    def packed(self) -> bytes:
+        """All of it as the bytes of an npz, for another process to `unpack`."""
+        arrays = {}
+        for name, (high, low) in self._sums.items():
+            arrays[f"high/{name}"], arrays[f"low/{name}"] = high, low
+        for first, block in self._blocks.items():
+            arrays[f"runs/{first}"] = np.asarray(self._runs[first])
+            arrays |= {f"{first}/{name}": value for name, value in block.items()}
+        out = io.BytesIO()
+        np.savez(out, allow_pickle=False, **arrays)
+        return out.getvalue()
+
+    @classmethod
+    def unpack(cls, content: bytes) -> "Tally":
+        """The inverse of `packed`."""
+        tally = cls()
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            for label in arrays.files:
+                kind, _, name = label.partition("/")
+                if kind == "high":
+                    tally._sums[name] = Sum(arrays[label], arrays[f"low/{name}"])
+                elif kind == "runs":
+                    tally._runs[int(name)] = int(arrays[label])
+                elif kind != "low":
+                    tally._blocks.setdefault(int(kind), {})[name] = arrays[label]
+        return tally
+
+    @property
+    def sums(self) -> dict[str, np.ndarray]:
+        """The sums over all runs, rounded to float64."""
+        return {name: value.high + value.low for name, value in self._sums.items()}
+
+    def pieces(self) -> list[tuple[int, int]]:
+        """(first, runs) of each block, in order."""
+        return sorted(self._runs.items())
+
+    def numbers(self) -> np.ndarray:
+        """(runs,) the numbers of the runs, in order."""
+        return _joined(np.arange(first, first + runs) for first, runs in self.pieces())
+
+    def flags(self, name: str) -> np.ndarray:
+        """(runs,) finite or divergent, by run."""
+        return self._all(name)
+
+    def first(self, name: str) -> np.ndarray:
+        """A named array of the first block."""
+        return self._blocks[min(self._blocks)][name]
+
+    def measures(self) -> dict[str, np.ndarray]:
+        """(runs,) each run's average, NaN where it has none."""
+        some = next(iter(self._blocks.values()))
+        names = [name.removeprefix("measure/") for name in some if name.startswith("measure/")]
+        return {
+            name: np.where(
+                self._all(f"defined/{name}"),
+                self._all(f"measure/{name}").astype(np.float64),
+                np.nan,
+            )
+            for name in names
+        }
+
+    def snapshots(self) -> list[np.ndarray]:
+        """Errors (R, K, 3), covariances (R, K, 3, 3), regular (R, K), of the first finite runs."""
+        parts = [self._all(f"snapshot/{i}") for i in range(3)]
+        finite = self.flags("finite")[self.numbers() < SHOTS]
+        return [part[finite] for part in parts]
+
+    def _all(self, name: str) -> np.ndarray:
+        return _joined(self._blocks[first][name] for first in sorted(self._blocks))
+
+
+def _joined(parts: Iterable[np.ndarray]) -> np.ndarray:
+    return np.concatenate(list(parts))
+
+
+def _two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """a + b rounded, and exactly what rounding left over."""
+    high = a + b
+    of_b = high - a
+    return high, (a - (high - of_b)) + (b - of_b)
+
+
+def _renormalized(high: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same for |high| >= |low|."""
+    out = high + low
+    return out, low - (out - high)

@@ -1,0 +1,270 @@
+"""The campaign: blocks of runs over devices and processes, kept as they finish, then summed up.
+
+A run is a number: its key, hence its world and its filters' results, are the same to the bit in
+whatever block, on whatever device and in whatever process it runs. Only condensed scores leave the
+devices, so memory is that of the blocks in flight however many runs there are.
+"""
+
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from jaxslam.consistency import Summary, Tally, summarize
+from jaxslam.linalg import check_count
+from jaxslam.monte_carlo.pieces import missing
+from jaxslam.monte_carlo.programs import BOUND, check_fits, compile_programs
+from jaxslam.monte_carlo.together import gathered, share
+from jaxslam.protocols import Candidate
+from jaxslam.simulate import Scenario
+
+BLOCK = 32
+"""Runs vmapped together on one device, by default."""
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """The result: the scenario, what was run, and a `Summary` for each filter by name."""
+
+    scenario: str
+    source: str
+    published: dict[str, dict[str, float]]
+    steps: int
+    runs: int
+    dtype: str
+    divergence_limit: float
+    """[m] a run is divergent when its final position error exceeds it: 5 σ of the ideal spread,
+    σ² = tr P of the position at the end of an EKF with Jacobians at the truth, in run 0."""
+    filters: dict[str, Summary]
+    seconds: float
+    """wall time, compilation included."""
+    compile_seconds: float
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C, once the blocks at work are finished; `campaign` is of the runs done, if any."""
+
+    def __init__(self, campaign: Campaign | None, runs: int) -> None:
+        super().__init__(f"{campaign.runs if campaign else 0} of {runs} runs done")
+        self.campaign = campaign
+
+
+class Keep(Protocol):
+    """Where finished blocks are kept: `store.Store`, for one."""
+
+    def save(self, first: int, arrays: Mapping[str, np.ndarray], runs: int) -> Any:
+        """Keep runs first … first + runs - 1."""
+
+    def blocks(self) -> Iterable[Any]:
+        """(first, runs, arrays) of each block kept."""
+
+
+def monte_carlo(
+    scenario: Scenario,
+    filters: Mapping[str, Candidate],
+    runs: int,
+    key: jax.Array,
+    *,
+    block: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+    workers: int | None = None,
+    bound: bool = False,
+    keep: Keep | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Campaign:
+    """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
+
+    Where `jax.distributed` has been initialized, the processes divide the blocks among themselves,
+    and each returns the whole campaign.
+
+    Args:
+        scenario: what to draw; see `scenarios`.
+        filters: by name. A function instead of a filter is called with each run's `Truth`.
+        runs: how many worlds; run i has key fold_in(key, i).
+        key: a PRNG key.
+        block: runs vmapped together on a device, which sets memory; default 32. Where memory does
+            not suffice, half of it is tried, with a warning.
+        devices: of this process; default all of `jax.local_devices()`.
+        workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
+            accelerator).
+        bound: also take the posterior Cramér-Rao bound of every run, at the price of one more EKF.
+        keep: blocks are saved there as they finish, and those found there are not run again.
+        progress: called with (runs done, runs) of this process after each block.
+    Returns:
+        Campaign.
+    Raises:
+        ValueError: on runs, block or workers below 1, no devices, no filters, or a filter that does
+            not fit the scenario; before anything is traced.
+        MemoryError: if one run a device is too much.
+        Interrupted: on Ctrl-C, with the campaign so far.
+    """
+    for name, value in (("runs", runs), ("block", block), ("workers", workers)):
+        if value is not None:
+            check_count(f"monte_carlo: {name}", value)
+    if not isinstance(filters, Mapping) or not filters:
+        raise ValueError("monte_carlo: expected filters by name, at least one")
+    for name, candidate in filters.items():
+        check_fits(name, candidate, scenario)
+    devices = jax.local_devices() if devices is None else list(devices)
+    if not devices:
+        raise ValueError("monte_carlo: expected at least one device")
+    began = time.perf_counter()
+    runs = int(runs)
+    if workers is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        workers = -(-(cores or 1) // len(devices)) if devices[0].platform == "cpu" else 1
+    names = (*filters, BOUND)
+    tallies, own = ({name: Tally() for name in names} for _ in range(2))
+    for first, count, arrays in keep.blocks() if keep is not None else ():
+        _add(tallies, first, count, _by_filter(arrays, names))
+    size = min(int(block or BLOCK), -(-runs // len(devices)))
+    kept = tallies[names[0]].pieces()
+    todo = share(missing(kept, runs, size * len(devices)))
+    work = _Work(scenario, filters, key, devices, bound, workers, keep, progress)
+    interrupted = False
+    while True:
+        try:
+            work.go(own, todo, size)
+            break
+        except KeyboardInterrupt:
+            interrupted = True
+            break
+        except (jax.errors.JaxRuntimeError, MemoryError) as error:
+            if not (isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)):
+                raise
+            if size == 1:
+                raise MemoryError(
+                    "monte_carlo: out of memory with one run a device (block=1); fewer steps, "
+                    "landmarks or filters at a time may fit"
+                ) from error
+            warnings.warn(
+                f"monte_carlo: out of memory with block={size}; going on with block={size // 2}",
+                stacklevel=2,
+            )
+            size //= 2
+    for name, tally in own.items() if interrupted else gathered(own).items():
+        tallies[name].merge(tally)
+    done = sum(count for _, count in tallies[names[0]].pieces())
+    campaign = None
+    if done:
+        limit = tallies[BOUND].first("limit")
+        sums = tallies[BOUND].sums
+        least = {name: total / done for name, total in sums.items()} or None
+        campaign = Campaign(
+            scenario=scenario.name,
+            source=scenario.source,
+            published=scenario.published,
+            steps=scenario.steps,
+            runs=done,
+            dtype=str(limit.dtype),
+            divergence_limit=float(limit),
+            filters={name: summarize(tallies[name], least) for name in filters},
+            seconds=time.perf_counter() - began,
+            compile_seconds=work.compile_seconds,
+        )
+    if interrupted or campaign is None:
+        raise Interrupted(campaign, runs)
+    return campaign
+
+
+@dataclass
+class _Work:
+    """What computes the missing blocks of a campaign."""
+
+    scenario: Scenario
+    filters: Mapping[str, Candidate]
+    key: jax.Array
+    devices: Sequence[jax.Device]
+    bound: bool
+    workers: int
+    keep: Keep | None
+    progress: Callable[[int, int], None] | None
+    compile_seconds: float = 0.0
+
+    def go(self, own: dict[str, Tally], todo: Sequence[tuple[int, int]], size: int) -> None:
+        """Add those of the pieces that are not yet in the tallies, in blocks of size a device."""
+        if not todo:
+            return
+        with ThreadPoolExecutor(self.workers) as pool:
+            began = time.perf_counter()
+            programs = compile_programs(
+                self.scenario, self.filters, self.key, size, self.devices, self.bound, pool
+            )
+            self.compile_seconds += time.perf_counter() - began
+            before = own[next(iter(own))].pieces()
+            queue = (
+                (first + at, count)
+                for first, runs in todo
+                for at, count in missing(_within(before, first, runs), runs, programs.wide)
+            )
+            done = sum(count for _, count in before)
+            total = sum(count for _, count in todo)
+            flight: dict[Future[Any], tuple[int, int]] = {}
+            stop: BaseException | None = None
+            while True:
+                try:
+                    while stop is None and len(flight) <= self.workers:
+                        piece = next(queue, None)
+                        if piece is None:
+                            break
+                        flight[pool.submit(programs.block, *piece)] = piece
+                    if not flight:
+                        break
+                    for future in wait(flight, return_when=FIRST_COMPLETED).done:
+                        first, count = flight.pop(future)
+                        if future.cancelled():
+                            continue
+                        found = future.result()
+                        if self.keep is not None:
+                            self.keep.save(first, _flat(found, own), count)
+                        _add(own, first, count, found)
+                        done += count
+                        if self.progress is not None:
+                            self.progress(done, total)
+                except BaseException as error:
+                    if stop is not None:
+                        raise
+                    stop = error  # what is at work is finished, and kept
+                    for future in flight:
+                        future.cancel()
+            if stop is not None:
+                raise stop
+
+
+def _within(pieces: Iterable[tuple[int, int]], first: int, runs: int) -> list[tuple[int, int]]:
+    """The pieces within runs first … first + runs - 1, counted from there."""
+    return [(at - first, count) for at, count in pieces if first <= at < first + runs]
+
+
+def _add(
+    tallies: dict[str, Tally], first: int, runs: int, found: dict[str, dict[str, np.ndarray]]
+) -> None:
+    for name, arrays in found.items():
+        tallies[name].add(first, runs, arrays)
+
+
+def _flat(found: dict[str, dict[str, np.ndarray]], names: Iterable[str]) -> dict[str, np.ndarray]:
+    """One mapping of arrays for all filters, which go by their position."""
+    return {
+        f"{i}/{key}": array
+        for i, name in enumerate(names)
+        for key, array in found.get(name, {}).items()
+    }
+
+
+def _by_filter(
+    arrays: Mapping[str, np.ndarray], names: Iterable[str]
+) -> dict[str, dict[str, np.ndarray]]:
+    """The inverse of `_flat`."""
+    out: dict[str, dict[str, np.ndarray]] = {}
+    order = list(names)
+    for label, array in arrays.items():
+        i, _, key = label.partition("/")
+        out.setdefault(order[int(i)], {})[key] = array
+    return out

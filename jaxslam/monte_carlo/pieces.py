@@ -1,0 +1,21 @@
+"""Which runs are still to do, and who does them."""
+
+from collections.abc import Iterable
+
+
+def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
+    """(first, runs) of the pieces of runs 0 … runs-1 that are not done, none above block, in order.
+
+    done: (first, runs) of what is, in any order; may overlap and reach beyond.
+    """
+    if block < 1:
+        raise ValueError(f"block = {block}, expected >= 1")
+    gaps, at = [], 0
+    for first, count in [*sorted(done), (runs, 0)]:
+        gaps.append((at, min(first, runs)))
+        at = max(at, first + count)
+    return [
+        (first, min(block, end - first))
+        for begin, end in gaps
+        for first in range(begin, end, block)
+    ]

@@ -1,0 +1,207 @@
+"""The programs of a campaign: a block of runs, drawn, filtered and scored on every device.
+
+Each takes the campaign's key and the numbers of its runs, so one compilation serves every block and
+seed. Runs are divided over the devices with `shard_map`: no device ever waits for another.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.consistency import Score, condense, own_error_of, posterior_bound, score
+from jaxslam.consistency.tally import condensed_sums
+from jaxslam.protocols import Candidate, Chart, Estimator, Filter
+from jaxslam.run import run
+from jaxslam.simulate import Scenario, simulate
+from jaxslam.types import Estimate, Info, Log, Trace, Truth
+
+BOUND = "bound"
+"""The name under which a block keeps the sums of the posterior bound, and the divergence limit."""
+
+
+@dataclass(frozen=True)
+class Programs:
+    """Compiled for blocks of `wide` runs; run i has key fold_in(key, i)."""
+
+    key: jax.Array
+    wide: int
+    draw: Callable[..., Any]
+    drives: dict[str, Callable[..., Any]]
+    scores: dict[str, Callable[..., Any]]
+    least: Callable[..., Any]
+    bound: bool
+    limit: jax.Array
+    """() [m] the divergence limit, from run 0"""
+
+    def block(self, first: int, runs: int) -> dict[str, dict[str, np.ndarray]]:
+        """Condensed scores of runs first … first + runs - 1 (at most `wide`), by filter."""
+        which = first + jnp.arange(self.wide)
+        world = self.draw(self.key, which)
+        out = {}
+        for name, drive in self.drives.items():
+            scores = self.scores[name](self.limit, world[0], drive(self.key, which, world))
+            kept = jax.tree.map(lambda leaf: leaf[:runs], jax.device_get(scores))
+            out[name] = condense(kept, first)
+        out[BOUND] = {"limit": np.asarray(self.limit)}
+        if self.bound:
+            least = jax.device_get(self.least(self.key, which, world))
+            out[BOUND] |= condensed_sums({name: rows[:runs] for name, rows in least.items()})
+        return out
+
+
+class Driven(NamedTuple):
+    """What a filter made of a log, as far as it is scored."""
+
+    estimate: Estimate
+    info: Info
+    own_error: jax.Array
+    watch: Any
+    probe: Any
+
+
+class _Final(NamedTuple):
+    watch: Any
+
+
+def compile_programs(
+    scenario: Scenario,
+    filters: Mapping[str, Candidate],
+    key: jax.Array,
+    block: int,
+    devices: Sequence[jax.Device],
+    bound: bool,
+    pool: ThreadPoolExecutor,
+) -> Programs:
+    """Compile for blocks of `block` runs a device, all programs at once.
+
+    Filters whose results have the same shapes share the program that scores them.
+    """
+    mesh = Mesh(np.asarray(devices), ("runs",))
+    wide = block * len(devices)
+
+    def draw(key: jax.Array, which: jax.Array) -> tuple[Truth, Log]:
+        return jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
+
+    def drive(
+        candidate: Candidate, key: jax.Array, which: jax.Array, world: tuple[Truth, Log]
+    ) -> Driven:
+        def one(i: jax.Array, truth: Truth, log: Log) -> Driven:
+            method, chart = _estimator(candidate, truth, scenario)
+            trace = method(log, _keys(key, i)[1])
+            own = own_error_of(chart, scenario.sensor, trace, truth)
+            watch = getattr(trace.final, "watch", ())
+            return Driven(trace.estimate, trace.info, own, watch, trace.probe)
+
+        driven: Driven = jax.vmap(one)(which, *world)
+        return driven
+
+    def judge(limit: jax.Array, truth: Truth, driven: Driven) -> Score:
+        def one(truth: Truth, driven: Driven) -> Score:
+            trace = Trace(driven.estimate, driven.info, _Final(driven.watch), driven.probe)
+            return score(trace, truth, scenario.sensor, limit, driven.own_error)
+
+        scores: Score = jax.vmap(one)(truth, driven)
+        return scores
+
+    def least(key: jax.Array, which: jax.Array, world: tuple[Truth, Log]) -> dict[str, jax.Array]:
+        def one(i: jax.Array, truth: Truth, log: Log) -> jax.Array:
+            return posterior_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov
+
+        cov = jax.vmap(one)(which, *world)
+        position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)
+        return {"position": position, "heading": cov[:, :, 2, 2]}
+
+    def lowered(function: Callable[..., Any], by_runs: str, *arguments: Any) -> jax.stages.Lowered:
+        """by_runs: for each argument, "r" if it has an axis of runs."""
+        specs = tuple(PartitionSpec("runs") if each == "r" else PartitionSpec() for each in by_runs)
+        spread = jax.shard_map(
+            function, mesh=mesh, in_specs=specs, out_specs=PartitionSpec("runs"), check_vma=False
+        )
+        return jax.jit(spread).lower(*arguments)
+
+    which = jnp.arange(wide)
+    # Tracing holds Python's lock, compiling does not: each is compiled while the next is traced.
+    # Random numbers compile twice as fast unoptimized, and are a few per cent of the work.
+    fast: dict[str, Any] = {"xla_backend_optimization_level": 0}
+    draws = pool.submit(lowered(draw, "-r", key, which).compile, compiler_options=fast)
+    world = jax.eval_shape(draw, key, which)
+    dtype = world[0].pose.dtype
+    drives: dict[str, Future[Any]] = {}
+    scores: dict[Any, Future[Any]] = {}
+    kinds = {}
+    for name, candidate in filters.items():
+        low = lowered(partial(drive, candidate), "-rr", key, which, world)
+        drives[name] = pool.submit(low.compile)
+        driven = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), low.out_info)
+        leaves, structure = jax.tree.flatten(driven)
+        kinds[name] = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        if kinds[name] not in scores:
+            limit = jax.ShapeDtypeStruct((), dtype)
+            scores[kinds[name]] = pool.submit(
+                lowered(judge, "-rr", limit, world[0], driven).compile
+            )
+    bounds = pool.submit(lowered(least, "-rr", key, which, world).compile)
+    first = bounds.result()(key, which, draws.result()(key, which))
+    variance = float(first["position"][0, -1])
+    return Programs(
+        key=key,
+        wide=wide,
+        draw=draws.result(),
+        drives={name: program.result() for name, program in drives.items()},
+        scores={name: scores[kind].result() for name, kind in kinds.items()},
+        least=bounds.result(),
+        bound=bound,
+        limit=jnp.asarray(_divergence_limit(scenario, variance**0.5, dtype), dtype),
+    )
+
+
+def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
+    """Raise ValueError unless a candidate takes what the scenario's log has."""
+    if not isinstance(candidate, Filter):
+        if not callable(candidate):
+            raise ValueError(f"monte_carlo: {name} is neither a filter nor a function of the truth")
+        return
+    for what, has, needs in (
+        ("control", candidate.control_size, len(scenario.motion.controls)),
+        ("measurement", candidate.measurement_size, len(scenario.sensor.measurements)),
+    ):
+        if has != needs:
+            raise ValueError(
+                f"monte_carlo: filter {name} takes a {what} of size {has}, "
+                f"the scenario {scenario.name} gives {needs}"
+            )
+
+
+def _keys(key: jax.Array, i: jax.Array) -> jax.Array:
+    """The keys of run i: of its world, and of its filter."""
+    return jax.random.split(jax.random.fold_in(key, i))
+
+
+def _estimator(candidate: Candidate, truth: Truth, scenario: Scenario) -> tuple[Estimator, Chart]:
+    """What runs, and the chart of its errors."""
+    method = candidate if isinstance(candidate, Filter) else candidate(truth)
+    if not isinstance(method, Filter):
+        return method, euclidean()
+
+    def learnt(state: Any) -> Any:
+        watch = getattr(state, "watch", ())
+        return watch.information if watch else ()
+
+    def drive(log: Log, key: jax.Array) -> Any:
+        return run(method, log, scenario.pose, scenario.pose_cov, key, probe=learnt)
+
+    return drive, method.chart
+
+
+def _divergence_limit(scenario: Scenario, spread: float, dtype: Any) -> float:
+    """5 σ of the ideal spread, or, in a world without noise, what rounding can do."""
+    reach = 1.0 + float(np.max(np.abs(np.asarray(scenario.landmarks)), initial=0.0))
+    return max(5 * spread, 1000 * float(jnp.finfo(dtype).eps) * reach)

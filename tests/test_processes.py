@@ -1,0 +1,103 @@
+"""Campaigns over real processes on this machine: the same bits, and nothing lost with one of them."""
+
+import itertools
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+RUNS = 24
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("compiled")
+
+
+def command(out, cache, *more, runs=RUNS):
+    asked = ["--scenario", "circle", "--steps", "60", "--no-bound", "--runs", str(runs)]
+    shape = ["--devices", "1", "--block", "2", "--cache", str(cache), "--out", str(out)]
+    return [sys.executable, "-m", "jaxslam", "consistency", *asked, *shape, *more]
+
+
+def together(out, cache, count, *more, **options):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    where = ["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--timeout", "60"]
+    return [
+        subprocess.Popen(
+            command(out, cache, *where, "--process-id", str(i), *more, **options),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for i in range(count)
+    ]
+
+
+def results(out):
+    found = json.loads((out / "consistency.json").read_text())
+    for name in ("seconds", "compile_seconds", "command"):
+        del found[name]
+    return found, (out / "consistency.csv").read_text()
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory, cache):
+    out = tmp_path_factory.mktemp("alone")
+    subprocess.run(command(out, cache), check=True, capture_output=True)
+    return results(out)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_processes_together_are_one_alone(tmp_path, cache, alone, count):
+    processes = together(tmp_path, cache, count)
+    said = [process.communicate(timeout=300)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0] * count, said
+    assert ["verdict" in text for text in said] == [i == 0 for i in range(count)]
+    assert results(tmp_path) == alone
+
+
+def test_a_killed_process_loses_no_finished_run(tmp_path, cache):
+    many = 4000  # so many that they are not done before one is killed
+    processes = together(tmp_path, cache, 2, runs=many)
+    blocks = tmp_path / "blocks"
+    deadline = time.monotonic() + 200
+    while len(list(blocks.glob("*.npz"))) < 6 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(processes[1].pid, signal.SIGKILL)
+    processes[0].kill()  # it would wait for the other until its heartbeat is missed
+    for process in processes:
+        process.communicate(timeout=60)
+    done = {path.name: path.read_bytes() for path in blocks.glob("block-*.npz")}
+    assert len(done) >= 6
+
+    stale = sorted(done)[-1]
+    again = command(tmp_path, cache, runs=many)
+    again = [
+        *again[: again.index("--out")],
+        "--resume",
+        str(tmp_path),
+        *again[again.index("--out") + 2 :],
+    ]
+    resumed = subprocess.Popen(again, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    count = len(done)
+    while len(list(blocks.glob("*.npz"))) < count + 4 and time.monotonic() < deadline + 200:
+        time.sleep(0.05)
+    resumed.send_signal(signal.SIGINT)
+    said = resumed.communicate(timeout=120)[0]
+    assert resumed.returncode == 130, said
+    assert f"of {many} runs done" in said
+    assert "--resume" in said
+    now = {path.name: path.read_bytes() for path in blocks.glob("block-*.npz")}
+    assert len(now) > count
+    assert all(now[name] == content for name, content in done.items())  # none was run again
+    spans = sorted(tuple(map(int, name[6:-4].split("-"))) for name in now)
+    assert all(end <= first for (_, end), (first, _) in itertools.pairwise(spans))
+    assert stale in now

@@ -1,0 +1,114 @@
+"""Sums that do not depend on how runs are divided, and the pieces they are divided into."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from jaxslam.consistency import Score, Tally, condense
+from jaxslam.consistency.tally import Sum, plus, total
+from jaxslam.monte_carlo import missing
+
+
+def test_a_total_is_exact_where_a_plain_sum_is_not():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(77, 5)) * 10.0 ** rng.integers(-12, 12, size=(77, 5))
+    high, low = total(rows)
+    exact = [sum(map(Fraction, rows[:, i].tolist())) for i in range(5)]
+    assert any(
+        Fraction(plain) != e for plain, e in zip(rows.sum(axis=0).tolist(), exact, strict=True)
+    )
+    for i in range(5):
+        assert abs(Fraction(high[i]) + Fraction(low[i]) - exact[i]) < 1e-18 * abs(exact[i])
+        assert high[i] == float(exact[i])
+
+
+@pytest.mark.parametrize("rows", [np.zeros((0, 3)), np.ones((1, 3))])
+def test_a_total_of_none_or_one(rows):
+    np.testing.assert_array_equal(total(rows).high, rows.sum(axis=0))
+
+
+def test_cancellation_leaves_the_small_term():
+    part = Sum(np.array([1e16]), np.array([0.0]))
+    for value in (1.0, -1e16):
+        part = plus(part, Sum(np.array([value]), np.array([0.0])))
+    np.testing.assert_array_equal(part.high + part.low, [1.0])
+
+
+def scores(runs, rng):
+    def measure():
+        return rng.normal(size=runs), rng.random(runs) > 0.2
+
+    return Score(
+        finite=rng.random(runs) > 0.1,
+        divergent=rng.random(runs) > 0.9,
+        measures={"nees_pose": measure(), "square_position": measure()},
+        snapshots=(
+            rng.normal(size=(runs, 2, 3)),
+            rng.normal(size=(runs, 2, 3, 3)),
+            rng.random((runs, 2)) > 0.5,
+        ),
+        sums={"nees_pose": rng.normal(size=(runs, 4)) * 1e3, "missed": rng.integers(0, 5, runs)},
+    )
+
+
+def tallied(each, cuts, order):
+    runs = len(each.finite)
+    edges = [0, *cuts, runs]
+    tally = Tally()
+    for i in order:
+        first, end = edges[i], edges[i + 1]
+        part = Score(*(_cut(field, first, end) for field in each))
+        tally.add(first, end - first, condense(part, first))
+    return tally
+
+
+def _cut(field, first, end):
+    if isinstance(field, dict):
+        return {name: _cut(value, first, end) for name, value in field.items()}
+    if isinstance(field, tuple):
+        return tuple(_cut(value, first, end) for value in field)
+    return field[first:end]
+
+
+@pytest.mark.parametrize(("cuts", "order"), [([], [0]), ([7], [1, 0]), ([1, 2, 30], [3, 0, 2, 1])])
+def test_blocks_of_any_size_in_any_order_give_the_same_bits(cuts, order):
+    each = scores(41, np.random.default_rng(1))
+    one, other = tallied(each, [], [0]), tallied(each, cuts, order)
+    other = Tally.unpack(other.packed())
+    assert other.pieces() == sorted(other.pieces())
+    np.testing.assert_array_equal(other.numbers(), np.arange(41))
+    for name, value in one.sums.items():
+        assert value.tobytes() == other.sums[name].tobytes()
+        np.testing.assert_allclose(value, each.sums[name].sum(axis=0), rtol=1e-12)
+    for name, value in one.measures().items():
+        np.testing.assert_array_equal(value, other.measures()[name])
+        np.testing.assert_array_equal(np.isnan(value), ~each.measures[name][1])
+    for a, b, leaf in zip(one.snapshots(), other.snapshots(), each.snapshots, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, leaf[each.finite])
+
+
+def test_merged_tallies_are_one():
+    each = scores(20, np.random.default_rng(2))
+    whole, parts = tallied(each, [12], [0, 1]), tallied(each, [12], [1])
+    parts.merge(tallied(each, [12], [0]))
+    np.testing.assert_array_equal(parts.flags("divergent"), each.divergent)
+    for name, value in whole.sums.items():
+        assert value.tobytes() == parts.sums[name].tobytes()
+
+
+def test_missing_is_every_run_not_done():
+    rng = np.random.default_rng(1)
+    for _ in range(500):
+        runs, block = int(rng.integers(0, 60)), int(rng.integers(1, 20))
+        done = [tuple(map(int, rng.integers(0, [70, 25]))) for _ in range(rng.integers(0, 6))]
+        todo = missing(iter(done), runs, block)
+        assert all(0 < size <= block for _, size in todo)
+        listed = [run for first, size in todo for run in range(first, first + size)]
+        finished = {run for first, size in done for run in range(first, first + size)}
+        assert listed == [run for run in range(runs) if run not in finished]
+    assert missing([(32, 32)], 128, 32) == [(0, 32), (64, 32), (96, 32)]
+    assert missing([(8, 8)], 40, 16) == [(0, 8), (16, 16), (32, 8)]
+    with pytest.raises(ValueError, match="block = 0"):
+        missing([], 3, 0)
