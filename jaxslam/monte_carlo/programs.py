@@ -129,9 +129,7 @@ def compile_programs(
 
     which = jnp.arange(wide)
     # Tracing holds Python's lock, compiling does not: each is compiled while the next is traced.
-    # Random numbers compile twice as fast unoptimized, and are a few per cent of the work.
-    fast: dict[str, Any] = {"xla_backend_optimization_level": 0}
-    draws = pool.submit(lowered(draw, "-r", key, which).compile, compiler_options=fast)
+    draws = pool.submit(lowered(draw, "-r", key, which).compile)
     world = jax.eval_shape(draw, key, which)
     dtype = world[0].pose.dtype
     drives: dict[str, Future[Any]] = {}
