@@ -12,9 +12,11 @@ import time
 
 import jax
 
-from benchmarks import gradient, real_data, speed, victoria_park
+from benchmarks import gradient, real_data, victoria_park
 from benchmarks.consistency import circle
 from benchmarks.gate import Metric, report
+from benchmarks.speed.__main__ import gated
+from benchmarks.speed.__main__ import measure as measure_speed
 
 
 def command_seconds() -> list[Metric]:
@@ -35,7 +37,7 @@ def main() -> int:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     metrics = command_seconds()
-    metrics += speed.measure()
+    metrics += gated(measure_speed(options.quick))
     metrics += gradient.measure()
     metrics += circle.measure(200 if options.quick else 1000)[1]
     metrics += victoria_park.measure()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import family, filters, motion, run, simulate, store
+from jaxslam import family, filters, motion, run, sensors, simulate, store
 from jaxslam.monte_carlo import Interrupted, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
 
@@ -213,6 +213,35 @@ def test_blocks_share_one_trace():
         monte_carlo(SHORT, {"ekf": ekf}, runs, worlds.key(), block=2)
         counts.append(len(traces))
     assert counts[0] == counts[1] > 0
+
+
+def test_other_noise_map_seed_and_runs_compile_nothing_anew(monkeypatch):
+    compiled = []
+    compile_once = jax.stages.Lowered.compile
+
+    def counted(self, *arguments, **options):
+        compiled.append(1)
+        return compile_once(self, *arguments, **options)
+
+    monkeypatch.setattr(jax.stages.Lowered, "compile", counted)
+
+    def found(size, seed, runs):
+        world = dataclasses.replace(
+            worlds.ring(steps=5),
+            motion=motion.increment(np.diag([size, 2 * size]) ** 2),
+            sensor=sensors.range_bearing(np.diag([3 * size, size]) ** 2),
+            landmarks=np.asarray(SHORT.landmarks) * (1 + size),
+        )
+        ekf = filters.ekf_slam(world.motion, world.sensor, 6)
+        campaign = monte_carlo(world, {"ekf": ekf}, runs, worlds.key(seed), block=1, workers=1)
+        return campaign.filters["ekf"].measures["rmse_position"].value
+
+    small = found(0.01, 0, 4)
+    assert len(compiled) > 0
+    compiled.clear()
+    large = found(0.1, 1, 6)
+    assert compiled == []
+    assert large > 3 * small  # the other noise was used
 
 
 def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_one_block):

@@ -1,9 +1,12 @@
 """The programs of a campaign: a block of runs, drawn, filtered and scored on every device.
 
-Each takes the campaign's key and the numbers of its runs, so one compilation serves every block and
-seed. Runs are divided over the devices with `shard_map`: no device ever waits for another.
+Each takes the campaign's key, the numbers of its runs, and every array that models, filters and map
+were made of: one compilation serves all blocks, seeds, noises and map values. Runs are divided over
+the devices with `shard_map`: no device ever waits for another.
 """
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -119,34 +122,42 @@ def compile_programs(
         position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)
         return {"position": position, "heading": cov[:, :, 2, 2]}
 
-    def lowered(function: Callable[..., Any], by_runs: str, *arguments: Any) -> jax.stages.Lowered:
-        """by_runs: for each argument, "r" if it has an axis of runs."""
+    def program(
+        function: Callable[..., Any], by_runs: str, *arguments: Any
+    ) -> tuple[Future[Any], Any]:
+        """Compiling; and the shapes of its results. by_runs: "r" for an argument by runs."""
+        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+
+        def pure(constants: list[Any], *arguments: Any) -> Any:
+            leaves = jax.core.eval_jaxpr(traced.jaxpr, constants, *jax.tree.leaves(arguments))
+            return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
         specs = tuple(PartitionSpec("runs") if each == "r" else PartitionSpec() for each in by_runs)
         spread = jax.shard_map(
-            function, mesh=mesh, in_specs=specs, out_specs=PartitionSpec("runs"), check_vma=False
+            pure,
+            mesh=mesh,
+            in_specs=(PartitionSpec(), *specs),
+            out_specs=PartitionSpec("runs"),
+            check_vma=False,
         )
-        return jax.jit(spread).lower(*arguments)
+        lowered = jax.jit(spread).lower(traced.consts, *arguments)
+        # Tracing holds Python's lock, compiling does not: the next is traced meanwhile.
+        return pool.submit(_compiled, lowered, tuple(devices), traced.consts), shapes
 
     which = jnp.arange(wide)
-    # Tracing holds Python's lock, compiling does not: each is compiled while the next is traced.
-    draws = pool.submit(lowered(draw, "-r", key, which).compile)
-    world = jax.eval_shape(draw, key, which)
+    draws, world = program(draw, "-r", key, which)
     dtype = world[0].pose.dtype
     drives: dict[str, Future[Any]] = {}
     scores: dict[Any, Future[Any]] = {}
     kinds = {}
     for name, candidate in filters.items():
-        low = lowered(partial(drive, candidate), "-rr", key, which, world)
-        drives[name] = pool.submit(low.compile)
-        driven = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), low.out_info)
+        drives[name], driven = program(partial(drive, candidate), "-rr", key, which, world)
         leaves, structure = jax.tree.flatten(driven)
         kinds[name] = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         if kinds[name] not in scores:
             limit = jax.ShapeDtypeStruct((), dtype)
-            scores[kinds[name]] = pool.submit(
-                lowered(judge, "-rr", limit, world[0], driven).compile
-            )
-    bounds = pool.submit(lowered(least, "-rr", key, which, world).compile)
+            scores[kinds[name]] = program(judge, "-rr", limit, world[0], driven)[0]
+    bounds, _ = program(least, "-rr", key, which, world)
     first = bounds.result()(key, which, draws.result()(key, which))
     variance = float(first["position"][0, -1])
     return Programs(
@@ -159,6 +170,23 @@ def compile_programs(
         bound=bound,
         limit=jnp.asarray(_divergence_limit(scenario, variance**0.5, dtype), dtype),
     )
+
+
+_KEPT: OrderedDict[Any, Any] = OrderedDict()
+_ROOM = 64
+
+
+def _compiled(
+    lowered: jax.stages.Lowered, devices: tuple[jax.Device, ...], constants: list[Any]
+) -> Callable[..., Any]:
+    """The program with its constants, compiled unless the same has been, whatever its constants."""
+    text = hashlib.sha256(lowered.as_text().encode()).digest()
+    kept = _KEPT.get((text, devices))
+    if kept is None:
+        kept = _KEPT[text, devices] = lowered.compile()
+        while len(_KEPT) > _ROOM:
+            _KEPT.popitem(last=False)
+    return partial(kept, constants)
 
 
 def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:

@@ -1,0 +1,1 @@
+"""Speed beside a hand-written limit: see `__main__`."""
