@@ -126,7 +126,10 @@ def compile_programs(
         function: Callable[..., Any], by_runs: str, *arguments: Any
     ) -> tuple[Future[Any], Any]:
         """Compiling; and the shapes of its results. by_runs: "r" for an argument by runs."""
-        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+        own = [
+            _resized(x, block) if r == "r" else x for r, x in zip(by_runs, arguments, strict=True)
+        ]
+        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*own)
 
         def pure(constants: list[Any], *arguments: Any) -> Any:
             leaves = jax.core.eval_jaxpr(traced.jaxpr, constants, *jax.tree.leaves(arguments))
@@ -142,7 +145,8 @@ def compile_programs(
         )
         lowered = jax.jit(spread).lower(traced.consts, *arguments)
         # Tracing holds Python's lock, compiling does not: the next is traced meanwhile.
-        return pool.submit(_compiled, lowered, tuple(devices), traced.consts), shapes
+        program = pool.submit(_compiled, lowered, tuple(devices), traced.consts)
+        return program, _resized(shapes, wide)
 
     which = jnp.arange(wide)
     draws, world = program(draw, "-r", key, which)
@@ -169,6 +173,13 @@ def compile_programs(
         least=bounds.result(),
         bound=bound,
         limit=jnp.asarray(_divergence_limit(scenario, variance**0.5, dtype), dtype),
+    )
+
+
+def _resized(tree: Any, runs: int) -> Any:
+    """The shapes of arrays by runs, with so many of them."""
+    return jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((runs, *leaf.shape[1:]), leaf.dtype), tree
     )
 
 
