@@ -223,3 +223,15 @@ def test_an_unfinished_campaign_is_not_overwritten_unasked(tmp_path, capsys, mon
     with pytest.raises(ZeroDivisionError):
         cli.main([*QUICK, "--out", str(out), "--overwrite"])
     assert store.resume(out / "blocks").spans() == []
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path, capsys):
+    mine = tmp_path / "blocks" / "mine.txt"
+    mine.parent.mkdir()
+    mine.write_text("precious")
+    assert cli.main([*QUICK, "--out", str(tmp_path)]) == 2
+    assert "no campaign's" in capsys.readouterr().err
+    assert mine.read_text() == "precious"
+    (mine.parent / "manifest.json").write_text("{")
+    assert cli.main([*QUICK, "--out", str(tmp_path), "--overwrite"]) == 2
+    assert mine.exists()

@@ -75,7 +75,8 @@ def consistency(options: argparse.Namespace, command: str) -> int:
             )
     except Interrupted as stop:
         if stop.campaign is None:
-            shutil.rmtree(keep.folder, ignore_errors=True)
+            if not keep.spans():  # other processes may have some
+                shutil.rmtree(keep.folder, ignore_errors=True)
             raise
         print(report.table(stop.campaign))
         print(f"\njaxslam: interrupted, {stop}; --resume {out} goes on", file=sys.stderr)
@@ -101,7 +102,10 @@ def _keep(options: argparse.Namespace, out: Path, settings: dict[str, Any]) -> s
                 f"{out} holds an unfinished campaign, with {done} runs done: --resume {out} goes "
                 "on with it, --overwrite gives it up"
             )
-        shutil.rmtree(folder, ignore_errors=True)
+        if (folder / store.MANIFEST).exists():
+            shutil.rmtree(folder)
+        elif folder.exists() and any(folder.iterdir()):
+            raise ValueError(f"{folder} holds files that are no campaign's; choose another --out")
         store.create(folder, settings)
     devices.wait_for_all("campaign folder")
     return store.resume(folder, settings)
@@ -109,10 +113,9 @@ def _keep(options: argparse.Namespace, out: Path, settings: dict[str, Any]) -> s
 
 def _done(folder: Path) -> int:
     """How many runs an unfinished campaign in a folder has; 0 where there is none."""
-    try:
-        kept = store.resume(folder)
-    except ValueError:
+    if not (folder / store.MANIFEST).exists():
         return 0
+    kept = store.resume(folder)
     runs = kept.settings["asked"]["runs"]
     left = sum(count for _, count in missing(kept.spans(), runs, runs))
     return int(runs - left) if left else 0
