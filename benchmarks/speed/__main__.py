@@ -28,6 +28,8 @@ GATES = {
     "float64, NumPy / ours, a run": (True, 10, 0.5),
     "float64, largest difference from NumPy": (False, 1e-9, None),
     "float64, exponent in landmarks, 36 to 1000, 20 visible": (False, 2.1, 0.15),
+    "float64, compressed, exponent in landmarks, 36 to 1000, 20 visible": (False, 1.3, 0.5),
+    "float64, ordinary / compressed, a step, 1000 landmarks": (True, 5, 0.5),
     "float64, exponent in steps, 10 to 40": (False, 1.2, 0.15),
     "float64, exponent in visible landmarks, 4 to 32 of 300": (False, 1.2, 0.25),
     "float64, 100 places for 20 measurements / 20 places": (False, 1.1, 0.15),

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from benchmarks.speed import roofline
+from benchmarks.speed.area import compressed
 from benchmarks.speed.dense import dense_ekf
 from jaxslam.family import FILTERS
 from jaxslam.filters.ekf_slam import ekf_slam
@@ -135,12 +136,17 @@ def scaling():
     by_visible = [seconds(300, n) for n in seen]
     by_steps = [seconds(100, VISIBLE, steps=n) for n in (10, 20, 40)]
     wide = seconds(100, VISIBLE, places=100)
+    scan = jax.tree.map(lambda leaf: leaf[:40, :VISIBLE], log.scan)
+    local, ordinary = compressed(scenario, log._replace(control=log.control[:40], scan=scan), SIZES)
     return {
         "exponent in landmarks, 36 to 1000, 20 visible": exponent(SIZES, by_landmarks),
         "exponent in landmarks, 300 to 1000": exponent(SIZES[-2:], by_landmarks[-2:]),
         "exponent in visible landmarks, 4 to 32 of 300": exponent(seen, by_visible),
         "exponent in steps, 10 to 40": exponent((10, 20, 40), by_steps),
         "100 places for 20 measurements / 20 places": wide / by_steps[-1],
+        "compressed, exponent in landmarks, 36 to 1000, 20 visible": exponent(SIZES, local),
+        "compressed, exponent in landmarks, 300 to 1000": exponent(SIZES[-2:], local[-2:]),
+        "ordinary / compressed, a step, 1000 landmarks": ordinary / local[-1],
         "ms a step, 1000 landmarks": 1e3 * by_landmarks[-1] / 40,
     }
 
