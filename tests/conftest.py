@@ -1,8 +1,19 @@
 """Strictness of the whole suite (never of the package), and the oracles that many tests share."""
 
-import jax
+import os
+
+import jaxlib
 import numpy as np
 import pytest
+
+# A suite compiles much and runs little, and XLA's older emitters of CPU code compile in half the
+# time. Benchmarks run what users run. An unknown flag would abort, so only where it was tried.
+if tuple(map(int, jaxlib.__version__.split(".")[:2])) < (0, 11):
+    os.environ.setdefault(
+        "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+    )
+
+import jax
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 4)

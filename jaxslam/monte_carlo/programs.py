@@ -123,9 +123,13 @@ def compile_programs(
         return {"position": position, "heading": cov[:, :, 2, 2]}
 
     def program(
-        function: Callable[..., Any], by_runs: str, *arguments: Any
+        function: Callable[..., Any], by_runs: str, *arguments: Any, straight: bool = False
     ) -> tuple[Future[Any], Any]:
-        """Compiling; and the shapes of its results. by_runs: "r" for an argument by runs."""
+        """Compiling; and the shapes of its results.
+
+        by_runs: "r" for an argument by runs. straight: its time goes into long passes over arrays,
+        not into a loop of small ones.
+        """
         own = [
             _resized(x, block) if r == "r" else x for r, x in zip(by_runs, arguments, strict=True)
         ]
@@ -145,11 +149,12 @@ def compile_programs(
         )
         lowered = jax.jit(spread).lower(traced.consts, *arguments)
         # Tracing holds Python's lock, compiling does not: the next is traced meanwhile.
-        program = pool.submit(_compiled, lowered, tuple(devices), traced.consts)
+        options = _QUICK if straight and devices[0].platform == "cpu" else {}
+        program = pool.submit(_compiled, lowered, tuple(devices), traced.consts, options)
         return program, _resized(shapes, wide)
 
     which = jnp.arange(wide)
-    draws, world = program(draw, "-r", key, which)
+    draws, world = program(draw, "-r", key, which, straight=True)
     dtype = world[0].pose.dtype
     drives: dict[str, Future[Any]] = {}
     scores: dict[Any, Future[Any]] = {}
@@ -160,7 +165,8 @@ def compile_programs(
         kinds[name] = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         if kinds[name] not in scores:
             limit = jax.ShapeDtypeStruct((), dtype)
-            scores[kinds[name]] = program(judge, "-rr", limit, world[0], driven)[0]
+            shapes = limit, world[0], driven
+            scores[kinds[name]] = program(judge, "-rr", *shapes, straight=True)[0]
     bounds, _ = program(least, "-rr", key, which, world)
     first = bounds.result()(key, which, draws.result()(key, which))
     variance = float(first["position"][0, -1])
@@ -186,15 +192,28 @@ def _resized(tree: Any, runs: int) -> Any:
 _KEPT: OrderedDict[Any, Any] = OrderedDict()
 _ROOM = 64
 
+# XLA's older emitters of CPU code: straight passes compile in under half the time and run as fast,
+# but the small kernels in a filter's loop run half as fast.
+_QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+
 
 def _compiled(
-    lowered: jax.stages.Lowered, devices: tuple[jax.Device, ...], constants: list[Any]
+    lowered: jax.stages.Lowered,
+    devices: tuple[jax.Device, ...],
+    constants: list[Any],
+    options: dict[str, Any],
 ) -> Callable[..., Any]:
     """The program with its constants, compiled unless the same has been, whatever its constants."""
     text = hashlib.sha256(lowered.as_text().encode()).digest()
     kept = _KEPT.get((text, devices))
     if kept is None:
-        kept = _KEPT[text, devices] = lowered.compile()
+        try:
+            kept = lowered.compile(options)
+        except jax.errors.JaxRuntimeError as error:
+            if "No such compile option" not in str(error):
+                raise
+            kept = lowered.compile()
+        _KEPT[text, devices] = kept
         while len(_KEPT) > _ROOM:
             _KEPT.popitem(last=False)
     return partial(kept, constants)
