@@ -156,17 +156,52 @@ class Linearizer:
     """whether it is meant for the Euclidean chart and landmarks that are points (x, y) alone."""
 
 
-class Prediction(NamedTuple):
-    """What association may look at: the map before the scan's corrections."""
+class Pairs(NamedTuple):
+    """How each of M measurements compares with each of N slots, every pair for itself."""
+
+    innovation: Array
+    """(M, N, Z) ν_ij = z_i ⊖ ẑ_j."""
+    cov: Array
+    """(M, N, Z, Z) S_ij = H_j P H_jᵀ + R_i."""
+    distance: Array
+    """(M, N) ν_ijᵀ S_ij⁻¹ ν_ij."""
+    log_det: Array
+    """(M, N) log |S_ij|."""
+    possible: Array
+    """(M, N) bool: measurement and landmark are there, and S_ij is positive definite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What association may look at: the map before the scan's corrections.
+
+    The functions compute what they return when they are called, within the trace.
+    """
 
     tag: Array
     """(N,) tags of the slots, -1 where dead."""
     alive: Array
     """(N,) bool."""
+    pairs: Callable[[Scan], Pairs]
+    """(scan) -> every measurement against every slot."""
+    cross: Callable[[], Array]
+    """() -> (N, Z, N, Z): H_i P H_jᵀ, what the errors of two expected measurements share."""
 
 
-Associate = Callable[[Prediction, Scan], tuple[Array, Array]]
-"""(prediction, scan) -> slot (M,) int, -1 where none; is_new (M,) bool: start a landmark."""
+class Association(NamedTuple):
+    """Which landmark each measurement of a scan is of."""
+
+    slot: Array
+    """(M,) int, -1 where none; no slot twice."""
+    is_new: Array
+    """(M,) bool: start a landmark. A valid measurement that is neither is left alone, and
+    counted."""
+    exhausted: Array | bool = False
+    """() bool: a search ended at its budget, with the best it had found."""
+
+
+Associate = Callable[[Prediction, Scan], Association]
+"""Association methods. They are not differentiated: what they return are integers."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 from jaxslam.angles import wrap
 from jaxslam.linalg import check_covariance, is_concrete, root_psd
 from jaxslam.protocols import Motion, Sensor
+from jaxslam.spurious import Spurious, spoil
 from jaxslam.types import Log, Scan, Truth
 
 
@@ -47,6 +49,9 @@ class Scenario:
     places: int | None = None
     """M measurement places a scan; default N. The lowest tags first get a place, and the landmarks
     in view beyond M are counted in `Truth.missed`."""
+    spurious: Spurious | None = None
+    """clutter, misses, outliers and wrong labels; where given, if only as `Spurious()`, the truth
+    says which landmark each measurement is of, and associations are scored."""
     filter_options: dict[str, Any] = field(default_factory=dict)
     """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
     published: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -82,7 +87,10 @@ def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
     dtype = jnp.result_type(float)
     controls = jnp.asarray(scenario.controls, dtype)
     landmarks = jnp.asarray(scenario.landmarks, dtype)
-    key_motion, key_scan, key_start = jax.random.split(key, 3)
+    if scenario.spurious is None:
+        key_motion, key_scan, key_start = jax.random.split(key, 3)
+    else:
+        key_motion, key_scan, key_start, key_spoil = jax.random.split(key, 4)
     start = jnp.asarray(scenario.pose, dtype)
     start = start + _draw(jnp.asarray(scenario.pose_cov, dtype), _normals(key_start, start))
     start = start.at[2].set(wrap(start[2]))
@@ -109,8 +117,12 @@ def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
         tag=jnp.where(valid, tag, -1).astype(jnp.int32),
         valid=valid,
     )
-    missed = seen.sum(axis=1) - valid.sum(axis=1)
-    return Truth(poses, landmarks, missed, start), Log(logged, scan)
+    truth = Truth(poses, landmarks, seen.sum(axis=1) - valid.sum(axis=1), start)
+    if scenario.spurious is not None:
+        wrong = partial(spoil, scenario.spurious, scenario.sensor)
+        scan, origin = jax.vmap(wrong)(poses, scan, jax.random.split(key_spoil, scenario.steps))
+        truth = truth._replace(origin=origin)
+    return truth, Log(logged, scan)
 
 
 def _drive(

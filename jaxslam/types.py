@@ -34,6 +34,9 @@ class Status(IntEnum):
     """Its new tag occurs earlier in the same scan; dropped."""
     SINGULAR = 7
     """Its innovation covariance is not positive definite; dropped."""
+    UNMATCHED = 8
+    """Association found it neither of a landmark nor new (between two gates, ambiguous, or of
+    unknown identity where identities are asked for); dropped."""
 
 
 class Scan(NamedTuple):
@@ -67,6 +70,9 @@ class Truth(NamedTuple):
     """(T,) int: landmarks in view for which the scan had no place."""
     start: jax.Array
     """(3,) true pose before the first control."""
+    origin: Any = ()
+    """(T, M) int: the tag of the landmark each measurement is truly of, -1 of none; in a world with
+    `spurious` data alone."""
 
 
 class Estimate(NamedTuple):
@@ -104,6 +110,8 @@ class Info(NamedTuple):
     """(M,) int, see `Status`."""
     log_likelihood: jax.Array
     """() Σ log N(innovation; 0, S) over fused places."""
+    exhausted: Any = ()
+    """() bool: the search for the best association ended at its budget; or nothing."""
 
     @property
     def overflow(self) -> jax.Array:

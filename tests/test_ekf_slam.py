@@ -118,11 +118,11 @@ def test_a_new_tag_twice_in_a_scan_is_born_once():
     assert_unchanged(once, twice)
 
 
-def test_an_unknown_identity_is_rejected():
+def test_an_unknown_identity_is_unmatched():
     joint = with_landmarks(1)
     after, info = updater()(joint, scan_of((-1, 2.0, 0.3)))
     assert_unchanged(joint, after)
-    assert int(info.status[0]) == Status.REJECTED
+    assert int(info.status[0]) == Status.UNMATCHED
 
 
 @pytest.mark.parametrize("update", ["sequential", "joint"])

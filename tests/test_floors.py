@@ -14,10 +14,10 @@ import jaxslam
 PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
-    "angles se2 lapack linalg staging stats",
+    "angles se2 lapack linalg assignment staging stats",
     "types protocols slots noise derivatives",
     "motion sensors charts linearize association",
-    "filters run simulate",
+    "filters run simulate spurious",
     "consistency monte_carlo verify linearity scenarios family",
     "datasets plot page report store userfile cli __main__",
 ]

@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import worlds
 from jaxslam import family, filters, motion, run, sensors, simulate, store
 from jaxslam.monte_carlo import Interrupted, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
+from jaxslam.monte_carlo.programs import fitting_block
 
 SHORT = worlds.ring(steps=12)
 
@@ -45,6 +47,20 @@ def same(a, b, rtol=1e-9):
         np.testing.assert_allclose(a.measures[name], b.measures[name], rtol=rtol)
     for name in a.curves.keys() & b.curves.keys():
         np.testing.assert_allclose(a.curves[name], b.curves[name], rtol=rtol)
+
+
+def test_blocks_follow_the_memory_of_an_accelerator():
+    def fits(platform, memory):
+        stats = None if memory is None else {"bytes_limit": memory}
+        device = SimpleNamespace(platform=platform, memory_stats=lambda: stats)
+        return fitting_block(SHORT, {"ekf": worlds.ekf(SHORT)}, device)
+
+    assert fits("cpu", None) == 32
+    assert fits("gpu", None) == 1024
+    assert fits("gpu", 10**6) == 32
+    assert 32 < fits("gpu", 10**8) < 4096
+    assert fits("gpu", 2 * 10**8) == 2 * fits("gpu", 10**8)
+    assert fits("gpu", 10**11) == 4096
 
 
 @pytest.mark.parametrize(

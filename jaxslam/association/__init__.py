@@ -1,5 +1,9 @@
 """Data association: which landmark a measurement is of."""
 
+from jaxslam.association.global_nearest import global_nearest
+from jaxslam.association.joint import joint
 from jaxslam.association.known import known
+from jaxslam.association.maximum_likelihood import maximum_likelihood
+from jaxslam.association.nearest import nearest
 
-__all__ = ["known"]
+__all__ = ["global_nearest", "joint", "known", "maximum_likelihood", "nearest"]

@@ -89,7 +89,9 @@ def _parser() -> argparse.ArgumentParser:
         "--overwrite", action="store_true", help="give up an unfinished campaign in the folder"
     )
     judge.add_argument(
-        "--block", type=int, help="runs computed together on a device; sets memory (default: 32)"
+        "--block",
+        type=int,
+        help="runs computed together on a device; sets memory (default: 32 on a CPU)",
     )
     judge.add_argument(
         "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxslam import lapack, linalg
 from jaxslam.angles import wrap
+from jaxslam.consistency.associations import associations, identities
 from jaxslam.linalg import mahalanobis_squared
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.stats import chi2_quantile
@@ -31,6 +32,7 @@ DROPS = (
     Status.DEFERRED,
     Status.REPEATED,
     Status.SINGULAR,
+    Status.UNMATCHED,
 )
 """What can keep a measurement from the map; each is counted."""
 
@@ -105,7 +107,11 @@ def score(
     measures["square_position"] = sums["square_position"].sum(), steps
     measures["square_heading"] = sums["square_heading"].sum(), steps
     measures["nis_per_dof"] = sums["nis"].sum(), sums["nis_dof"].sum()
-    measures |= _landmarks(trace, truth, sensor)
+    held = jnp.where(trace.estimate.alive, trace.estimate.tag, -1)
+    if not isinstance(truth.origin, tuple):
+        held = identities(trace, truth.origin)
+        measures |= associations(trace, truth.origin, held)
+    measures |= _landmarks(trace, truth, sensor, held)
     measures["log_likelihood"] = trace.info.log_likelihood.sum(), jnp.asarray(1)
     sums["autocorrelation"] = _autocorrelation(trace)
     measures["autocorrelation"] = sums["autocorrelation"][0, 0], sums["autocorrelation"][0, 1]
@@ -176,13 +182,16 @@ def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> ja
 
 
 def _landmarks(
-    trace: Trace, truth: Truth, sensor: Sensor
+    trace: Trace, truth: Truth, sensor: Sensor, held: jax.Array
 ) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """NEES of each landmark of the map at each step; |p̂ - p|² of the final map, unaligned."""
+    """NEES of each landmark of the map at each step; |p̂ - p|² of the final map, unaligned.
+
+    held: (T, N) which true landmark each slot holds, -1 for none.
+    """
     estimate = trace.estimate
-    named = estimate.alive & (estimate.tag >= 0)
+    named = held >= 0
     true_points = jax.vmap(sensor.position)(truth.landmarks)
-    off = true_points[jnp.maximum(estimate.tag, 0)] - estimate.points
+    off = true_points[jnp.maximum(held, 0)] - estimate.points
     nees, regular = jax.vmap(jax.vmap(mahalanobis_squared))(off, estimate.point_covs)
     counts = named & regular
     square = jnp.where(named[-1], (off[-1] ** 2).sum(axis=-1), 0.0)

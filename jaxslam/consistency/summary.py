@@ -47,7 +47,8 @@ class Summary:
     map, unaligned); bound_ratio_position and _heading: those over the posterior Cramér-Rao bound
     (at least 1). unobservable (3) and rotation_information [1/rad²] (0): the dimension of the
     filter's unobservable subspace, and what it has learnt of a turn of the whole frame.
-    log_likelihood (mean a run).
+    log_likelihood (mean a run). In a world with spurious data: precision and recall of
+    associations, and false_landmarks; see `associations`.
     """
     nis_band: tuple[float, float] | None
     """95 % band of nis_per_dof from the summed degrees of freedom; None without a measurement."""

@@ -5,11 +5,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
-from jaxslam.association.known import known
+from jaxslam import linalg, slots
 from jaxslam.filters.ekf_slam import ekf_slam
 from jaxslam.linalg import check_count
-from jaxslam.protocols import Filter, Motion, Prediction, Sensor
+from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.staging import where_any
 from jaxslam.types import Estimate, Info, Scan
@@ -79,7 +78,6 @@ def compressed_ekf_slam(
             "of every landmark; it needs the chart euclidean"
         )
     local = ekf_slam(motion, sensor, own + _more(own, size), **options)
-    associate = known()
     most = options.get("births")
 
     def init(pose: jax.Array, pose_cov: jax.Array) -> Compressed:
@@ -100,9 +98,10 @@ def compressed_ekf_slam(
                 f"compressed_ekf_slam: a scan has {len(scan.tag)} places, the area {area}"
             )
         joint = state.whole
-        slot, is_new = associate(Prediction(joint.tag, joint.alive), scan)
-        seen = jnp.zeros(capacity, bool).at[jnp.maximum(slot, 0)].max(slot >= 0)
-        new = jnp.minimum(is_new.sum(), scan.tag.shape[0] if most is None else most)
+        tagged = scan.valid & (scan.tag >= 0)
+        slot, found = slots.find(joint.tag, joint.alive, scan.tag)
+        seen = jnp.zeros(capacity, bool).at[slot].max(tagged & found)
+        new = jnp.minimum((tagged & ~found).sum(), scan.tag.shape[0] if most is None else most)
         room, room_anywhere = (~state.area.alive).sum(), (~joint.alive).sum()
         outside = seen & ~jnp.zeros(capacity, bool).at[state.slot].set(True)
         leave = outside.any() | ((new > room) & (room_anywhere > room))

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 
 from jaxslam import linalg, slots
 from jaxslam.filters.composition import lever_of_motion, moved_anew
+from jaxslam.filters.expectation import in_chart, innovation_cov
 from jaxslam.filters.watching import along, informed, split
-from jaxslam.protocols import Basis, Chart, Here, Linearizer, Sensor
+from jaxslam.protocols import Chart, Here, Linearizer, Sensor
 from jaxslam.slots import Joint
 from jaxslam.staging import apart, settle, where_any
 
@@ -286,9 +287,8 @@ def _weigh(
             seen = by_pose, by_landmark
         xi_l = xi[3:width].reshape(capacity, size_l)[slot]
         if chart.basis is not None:
-            by_pose, by_landmark = _in_chart(
-                chart, joint.pose, prior_l, xi[:3], xi_l, by_pose, by_landmark, iteration == 0
-            )
+            moved = None if iteration == 0 else (xi[:3], xi_l)
+            by_pose, by_landmark = in_chart(chart, joint.pose, prior_l, by_pose, by_landmark, moved)
         if iteration > 0:
             nu = nu + jnp.einsum("mzi,i->mz", by_pose, xi[:3])
             nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, xi_l)
@@ -301,7 +301,7 @@ def _weigh(
         hp = hx = settle(hp)
         if square_root:
             hp = settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
-        s = _innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
+        s = innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
         if iteration == 0:
             marginal = s[jnp.arange(m), :, jnp.arange(m)]
             distance, positive = jax.vmap(_squared_distance)(nu, marginal)
@@ -387,44 +387,6 @@ def _retracted(chart: Chart, joint: Joint, xi: jax.Array) -> tuple[jax.Array, ja
         joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
     )
     return poses[0], jnp.where(joint.alive[:, None], landmarks, 0.0)
-
-
-def _in_chart(
-    chart: Chart,
-    pose: jax.Array,
-    landmarks: jax.Array,
-    dx: jax.Array,
-    dl: jax.Array,
-    by_pose: jax.Array,
-    by_landmark: jax.Array,
-    at_zero: bool,
-) -> tuple[jax.Array, jax.Array]:
-    """Chain Jacobians (m, Z, ·) with the derivative of retract(pose, l, ·) at (dx, dl)."""
-    if at_zero:
-        assert chart.basis is not None
-        basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
-    else:
-        by_dx, by_dl = jax.vmap(
-            jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
-        )(pose, landmarks, dx, dl)
-        basis = Basis(by_dx[0], by_dl[0], by_dl[1])
-    by_chart = by_pose @ basis.pose + by_landmark @ basis.cross
-    return by_chart, by_landmark if basis.landmark is None else by_landmark @ basis.landmark
-
-
-def _innovation_cov(
-    hp: jax.Array, by_pose: jax.Array, by_landmark: jax.Array, slot: jax.Array, capacity: int
-) -> jax.Array:
-    """H P Hᵀ (m, Z, m, Z) of HP (m, Z, D): only the robot's and the seen landmarks' columns."""
-    m, size_z, size_l = by_landmark.shape
-    own = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
-    if size_l == 0:
-        return own
-    by_slot = hp[:, :, 3 : 3 + capacity * size_l].reshape(m, size_z, capacity, size_l)
-    at_landmark = by_slot[:, :, slot]
-    return own + linalg.total(
-        at_landmark[..., k, None] * by_landmark[None, None, :, :, k] for k in range(size_l)
-    )
 
 
 def _squared_distance(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:

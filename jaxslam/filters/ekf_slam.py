@@ -10,9 +10,10 @@ from jaxslam import linalg, slots
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import augmentation, correction, propagation
+from jaxslam.filters.expectation import prediction_of
 from jaxslam.linalg import check_count, is_concrete
 from jaxslam.linearize.at_estimate import at_estimate
-from jaxslam.protocols import Associate, Chart, Filter, Linearizer, Motion, Prediction, Sensor
+from jaxslam.protocols import Associate, Association, Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.staging import where_any
 from jaxslam.types import Estimate, Info, Scan, Status
@@ -96,6 +97,13 @@ def ekf_slam(
         "joseph": joseph,
         "square_root": square_root,
     }
+    predict_scan = partial(
+        prediction_of,
+        sensor=sensor,
+        chart=chart,
+        linearize=linearize,
+        square_root=square_root,
+    )
     at_once = partial(correction.correct, **options)
     in_turn = partial(correction.correct_in_turn, **options)
     augment = partial(
@@ -128,15 +136,16 @@ def ekf_slam(
         return propagate(joint, u)
 
     def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
+        # Padding may hold anything, and is multiplied by zero further down.
+        z = jnp.where(scan.valid[:, None], scan.z, 0.0)
         if size_l > 0:
-            slot, is_new = associate(Prediction(joint.tag, joint.alive), scan)
+            found = Association(*associate(predict_scan(joint), scan._replace(z=z)))
+            slot, is_new, exhausted = found.slot, found.is_new, jnp.asarray(found.exhausted)
             matched = scan.valid & (slot >= 0) & ~is_new
             is_new = scan.valid & is_new
         else:
             slot, is_new = jnp.full_like(scan.tag, -1), jnp.zeros_like(scan.valid)
-            matched = scan.valid
-        # Padding may hold anything, and is multiplied by zero further down.
-        z = jnp.where(scan.valid[:, None], scan.z, 0.0)
+            matched, exhausted = scan.valid, jnp.asarray(False)
         parts = (z, jnp.maximum(slot, 0), matched)
         correct = at_once if update == "joint" and len(scan.tag) > 0 else in_turn
         joint, done = correct(joint, *parts)
@@ -175,7 +184,7 @@ def ekf_slam(
                 Status.DEFERRED,
                 Status.BORN,
                 Status.OVERFLOW,
-                Status.REJECTED,
+                Status.UNMATCHED,
             ],
             Status.EMPTY,
         ).astype(jnp.int32)
@@ -188,6 +197,7 @@ def ekf_slam(
             slot=jnp.where(fused, slot, jnp.where(born.granted, born.slot, -1)),
             status=status,
             log_likelihood=done.log_likelihood.sum(),
+            exhausted=exhausted,
         )
         return joint, info
 

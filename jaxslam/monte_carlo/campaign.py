@@ -19,13 +19,10 @@ import numpy as np
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.linalg import check_count
 from jaxslam.monte_carlo.pieces import missing
-from jaxslam.monte_carlo.programs import BOUND, check_fits, compile_programs
+from jaxslam.monte_carlo.programs import BOUND, check_fits, compile_programs, fitting_block
 from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
 from jaxslam.simulate import Scenario
-
-BLOCK = 32
-"""Runs vmapped together on one device, by default."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +85,9 @@ def monte_carlo(
         filters: by name. A function instead of a filter is called with each run's `Truth`.
         runs: how many worlds; run i has key fold_in(key, i).
         key: a PRNG key.
-        block: runs vmapped together on a device, which sets memory; default 32. Where memory does
-            not suffice, half of it is tried, with a warning.
+        block: runs vmapped together on a device, which sets memory; default 32 on a CPU, and
+            by its memory on an accelerator. Where memory does not suffice, half of it is tried,
+            with a warning.
         devices: of this process; default all of `jax.local_devices()`.
         workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
             accelerator).
@@ -123,7 +121,8 @@ def monte_carlo(
     tallies, own = ({name: Tally() for name in names} for _ in range(2))
     for first, count, arrays in keep.blocks() if keep is not None else ():
         _add(tallies, first, count, _by_filter(arrays, names))
-    size = min(int(block or BLOCK), -(-runs // len(devices)))
+    block = block or fitting_block(scenario, filters, devices[0])
+    size = min(int(block), -(-runs // len(devices)))
     kept = tallies[names[0]].pieces()
     todo = share(missing(kept, runs, size * len(devices)))
     work = _Work(scenario, filters, key, devices, bound, workers, keep, progress)

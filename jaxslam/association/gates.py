@@ -1,0 +1,42 @@
+"""Two gates: what is near enough to be a landmark's, and what is far enough to be a new one's."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.linalg import is_concrete
+from jaxslam.protocols import Pairs
+from jaxslam.types import Scan
+
+
+def check_gates(name: str, gate: float, new_gate: float | None) -> float:
+    """The gate for new landmarks, by default that for associations.
+
+    Raises:
+        ValueError: on a gate below 0, or a new_gate below it.
+    """
+    if is_concrete(gate) and not gate >= 0:
+        raise ValueError(f"{name}: expected a gate of at least 0, got {gate}")
+    if new_gate is None:
+        return gate
+    if is_concrete((gate, new_gate)) and not new_gate >= gate:
+        raise ValueError(f"{name}: expected new_gate >= gate = {gate}, got {new_gate}")
+    return new_gate
+
+
+def far_from_all(pairs: Pairs, scan: Scan, new_gate: float) -> jax.Array:
+    """Whether a measurement lies beyond the gate of every landmark there is, (M,)."""
+    near = pairs.possible & (pairs.distance <= new_gate)
+    return scan.valid & ~near.any(axis=1)
+
+
+def mutual(score: jax.Array, allowed: jax.Array) -> jax.Array:
+    """The slot (M,) that is best for a measurement and for which it is the best, else -1.
+
+    score, allowed: (M, N); the lowest score is the best.
+    """
+    if 0 in score.shape:
+        return jnp.full(score.shape[0], -1, jnp.int32)
+    score = jnp.where(allowed, score, jnp.inf)
+    slot = jnp.argmin(score, axis=1).astype(jnp.int32)
+    best = jnp.argmin(score, axis=0)[slot] == jnp.arange(score.shape[0])
+    return jnp.where(allowed.any(axis=1) & best, slot, -1)

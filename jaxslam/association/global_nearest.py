@@ -1,0 +1,37 @@
+"""All measurements of a scan at once to different landmarks, at the least sum of distances."""
+
+import jax.numpy as jnp
+
+from jaxslam.assignment import assign
+from jaxslam.association.gates import check_gates, far_from_all
+from jaxslam.protocols import Associate, Association, Prediction
+from jaxslam.types import Scan
+
+
+def global_nearest(gate: float, new_gate: float | None = None) -> Associate:
+    """Global nearest neighbour: the assignment that minimizes Σ d² over the pairs it makes, a
+    measurement left without a landmark costing as much as the gate.
+
+    Of compatible pairs (d² <= gate) alone; with an infinite gate, of the largest number of
+    possible pairs. Solved exactly (`assignment.assign`). Blackman & Popoli, "Design and analysis
+    of modern tracking systems", 1999, section 6.4. The gates are as those of `nearest`.
+
+    Raises:
+        ValueError: on a negative gate, or a new_gate below it.
+    """
+    beyond = check_gates("global_nearest", gate, new_gate)
+
+    def associate(prediction: Prediction, scan: Scan) -> Association:
+        pairs = prediction.pairs(scan)
+        m, n = pairs.distance.shape
+        compatible = pairs.possible & (pairs.distance <= gate)
+        within = jnp.where(compatible, pairs.distance, 0.0)
+        alone = jnp.minimum(gate, 1 + within.sum())
+        cost = jnp.where(compatible, pairs.distance, 2 * alone + 1)
+        # A column of its own for each measurement that stays alone.
+        cost = jnp.concatenate([cost, jnp.broadcast_to(alone, (m, m))], axis=1)
+        column = assign(cost)
+        slot = jnp.where(column < n, column, -1)
+        return Association(slot, far_from_all(pairs, scan, beyond) & (slot < 0))
+
+    return associate

@@ -1,0 +1,216 @@
+"""Joint compatibility branch and bound, with fixed memory and a budget."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam import linalg
+from jaxslam.association.gates import check_gates, far_from_all
+from jaxslam.linalg import check_count
+from jaxslam.protocols import Associate, Association, Pairs, Prediction
+from jaxslam.stats import chi2_quantile
+from jaxslam.types import Scan
+
+Array = jax.Array
+
+
+def joint(
+    probability: float = 0.99,
+    new_gate: float | None = None,
+    *,
+    budget: int = 2000,
+    candidates: int = 8,
+) -> Associate:
+    """JCBB: the largest set of pairs that are compatible *together*; of several, the nearest.
+
+    Of a hypothesis H = {(i, j)} with m pairs, D² = ν_Hᵀ S_H⁻¹ ν_H with all cross-covariances, and
+    it is compatible if every pair is (d² <= χ²(Z, p)) and D² <= χ²(m·Z, p). Neira & Tardós, "Data
+    association in stochastic mapping using the joint compatibility test", IEEE T-RA 17(6), 2001.
+
+    Depth first over the measurements, the nearest landmark first, none last. S_H = L Lᵀ grows by
+    one block row a pair, and D² with it, so a branch ends where it cannot have more pairs than
+    the best, or as many at a lower D², or where D² exceeds even χ² of all pairs it could still
+    make. (The original ends it where the pairs so far are not compatible, and then depends on
+    their order.) Without a measurement's landmark at most `new_gate` away it is new; by default
+    that is χ²(Z, p).
+
+    Args:
+        probability: p of both tests, 0 to 1.
+        budget: nodes of the search. Where they do not suffice, the best so far is returned, and
+            `Association.exhausted` is set.
+        candidates: compatible landmarks a measurement is tried with, the nearest; where there are
+            more, `exhausted` is set.
+    Raises:
+        ValueError: on a probability outside 0 to 1, a new_gate below the gate of single pairs, or
+            a budget or candidates below 1.
+    """
+    if not 0 <= probability <= 1:
+        raise ValueError(f"joint: expected a probability from 0 to 1, got {probability}")
+    check_count("joint: budget", budget)
+    check_count("joint: candidates", candidates)
+
+    def associate(prediction: Prediction, scan: Scan) -> Association:
+        pairs: Pairs = jax.lax.stop_gradient(prediction.pairs(scan))
+        m, _, size_z = pairs.innovation.shape
+        if m == 0:
+            return Association(jnp.full(0, -1, jnp.int32), scan.valid, jnp.asarray(False))
+        quantiles = _quantiles(probability, m, size_z)
+        beyond = check_gates("joint", float(quantiles[1]), new_gate)
+        levels = jnp.asarray(quantiles, pairs.distance.dtype)
+        problem = _problem(pairs, jax.lax.stop_gradient(prediction.cross()), levels, candidates)
+        found = _search(problem, budget)
+        exhausted = (found.level >= 0) | problem.cut
+        slot = found.best
+        return Association(slot, far_from_all(pairs, scan, beyond) & (slot < 0), exhausted)
+
+    return associate
+
+
+def _quantiles(probability: float, m: int, size_z: int) -> np.ndarray:
+    """χ²(k·Z, p) for k = 0 … m."""
+    if probability in (0, 1):
+        return np.append(0.0, np.full(m, np.inf if probability else 0.0))
+    return np.append(0.0, [chi2_quantile(probability, k * size_z) for k in range(1, m + 1)])
+
+
+class _Problem(NamedTuple):
+    slot: Array
+    """(M, K) candidates, the nearest first"""
+    fits: Array
+    """(M, K) bool"""
+    innovation: Array
+    """(M, K, Z)"""
+    cov: Array
+    """(M, K, Z, Z)"""
+    cross: Array
+    """(N, Z, N, Z)"""
+    levels: Array
+    """(M + 1,) what D² of k pairs may be"""
+    left: Array
+    """(M + 1,) how many measurements from the i-th on have candidates"""
+    cut: Array
+    """() bool: there were more candidates than K"""
+
+
+def _problem(pairs: Pairs, cross: Array, levels: Array, candidates: int) -> _Problem:
+    m, n = pairs.distance.shape
+    compatible = pairs.possible & (pairs.distance <= levels[1])
+    order = jnp.argsort(jnp.where(compatible, pairs.distance, jnp.inf), axis=1)
+    slot = order[:, : min(candidates, n)].astype(jnp.int32)
+    at = jnp.arange(m)[:, None], slot
+    some = compatible.any(axis=1)
+    left = jnp.append(jnp.cumsum(some[::-1])[::-1], 0)
+    return _Problem(
+        slot=slot,
+        fits=compatible[at],
+        innovation=pairs.innovation[at],
+        cov=pairs.cov[at],
+        cross=cross,
+        levels=levels,
+        left=left,
+        cut=(compatible.sum(axis=1) > slot.shape[1]).any(),
+    )
+
+
+class _Search(NamedTuple):
+    level: Array
+    """() the measurement to decide on; -1 when all is searched"""
+    option: Array
+    """(M,) which of its candidates comes next; K is none"""
+    chosen: Array
+    """(M,) slot of each measurement decided on, -1 for none"""
+    pairs: Array
+    """(M + 1,) how many there are among the first k"""
+    distance: Array
+    """(M + 1,) D² of the first k"""
+    inverse: Array
+    """(M·Z, M·Z) L⁻¹, rows of zeros where there is no pair"""
+    whitened: Array
+    """(M·Z,) L⁻¹ ν"""
+    best: Array
+    best_count: Array
+    best_distance: Array
+    nodes: Array
+
+
+def _search(problem: _Problem, budget: int) -> _Search:
+    m, k, size_z = problem.innovation.shape
+    dtype = problem.innovation.dtype
+    zero = jnp.zeros((), jnp.int32)
+    start = _Search(
+        level=zero,
+        option=jnp.zeros(m, jnp.int32),
+        chosen=jnp.full(m, -1, jnp.int32),
+        pairs=jnp.zeros(m + 1, jnp.int32),
+        distance=jnp.zeros(m + 1, dtype),
+        inverse=jnp.zeros((m * size_z, m * size_z), dtype),
+        whitened=jnp.zeros(m * size_z, dtype),
+        best=jnp.full(m, -1, jnp.int32),
+        best_count=zero - 1,
+        best_distance=jnp.full((), jnp.inf, dtype),
+        nodes=zero,
+    )
+
+    def visit(at: _Search) -> _Search:
+        i, option = at.level, at.option[at.level]
+        which = jnp.minimum(option, k - 1)
+        slot = jnp.where(option < k, problem.slot[i, which], -1)
+        rows, white, more, regular = _block_row(problem, at, which)
+        taken = (jnp.arange(m) < i) & (at.chosen == slot)
+        fits = (option == k) | (problem.fits[i, which] & regular & ~taken.any())
+        pair = (option < k).astype(jnp.int32)
+        count, distance = at.pairs[i] + pair, at.distance[i] + pair * more
+        most = count + problem.left[i + 1]
+        better = (most > at.best_count) | ((most == at.best_count) & (distance < at.best_distance))
+        go = (option <= k) & fits & better & (distance <= problem.levels[most])
+        leaf = go & (i == m - 1)
+        deeper = go & ~leaf
+        chosen = at.chosen.at[i].set(slot)
+        start_row = i * size_z
+        keep = (deeper & (option < k)).astype(dtype)
+        inverse = jax.lax.dynamic_update_slice(at.inverse, keep * rows, (start_row, 0 * start_row))
+        whitened = jax.lax.dynamic_update_slice(at.whitened, keep * white, (start_row,))
+        following = jnp.minimum(i + 1, m - 1)
+        options = at.option.at[i].add(1)
+        options = options.at[following].set(jnp.where(deeper, 0, options[following]))
+        level = jnp.where(deeper, i + 1, jnp.where(option >= k, i - 1, i))
+        return _Search(
+            level=level,
+            option=options,
+            chosen=chosen,
+            pairs=at.pairs.at[i + 1].set(count),
+            distance=at.distance.at[i + 1].set(distance),
+            inverse=inverse,
+            whitened=whitened,
+            best=jnp.where(leaf, chosen, at.best),
+            best_count=jnp.where(leaf, count, at.best_count),
+            best_distance=jnp.where(leaf, distance, at.best_distance),
+            nodes=at.nodes + 1,
+        )
+
+    return jax.lax.while_loop(lambda at: (at.level >= 0) & (at.nodes < budget), visit, start)
+
+
+def _block_row(problem: _Problem, at: _Search, which: Array) -> tuple[Array, Array, Array, Array]:
+    """What the next pair adds to L⁻¹ (Z, M·Z) and L⁻¹ ν (Z,), to D² (), and whether it is regular.
+
+    With W = L⁻¹ C, C the covariance of the pairs before with it, and B = S - WᵀW = l lᵀ: the new
+    rows of L⁻¹ are l⁻¹ [-Wᵀ L⁻¹, I], and those of L⁻¹ ν are l⁻¹ (ν - Wᵀ L⁻¹ ν).
+    """
+    m, _, size_z = problem.innovation.shape
+    i = at.level
+    slot = problem.slot[i, which]
+    before = (jnp.arange(m) < i) & (at.chosen >= 0)
+    shared = problem.cross[jnp.maximum(at.chosen, 0), :, slot]
+    shared = jnp.where(before[:, None, None], shared, 0.0).reshape(m * size_z, size_z)
+    there = jnp.repeat(before, size_z)
+    inverse = jnp.where(there[:, None], at.inverse, 0.0)
+    whitened = jnp.where(there, at.whitened, 0.0)
+    w = inverse @ shared
+    factor, regular = linalg.cholesky(problem.cov[i, which] - w.T @ w)
+    own = jnp.arange(m * size_z)[None, :] == i * size_z + jnp.arange(size_z)[:, None]
+    rows = linalg.solve_lower(factor, own.astype(w.dtype) - w.T @ inverse)
+    white = linalg.solve_lower(factor, problem.innovation[i, which] - w.T @ whitened)
+    return rows, white, (white**2).sum(), regular

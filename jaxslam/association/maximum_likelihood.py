@@ -1,0 +1,26 @@
+"""Each measurement to the landmark that makes it most likely, every pair judged alone."""
+
+from jaxslam.association.gates import check_gates, far_from_all, mutual
+from jaxslam.protocols import Associate, Association, Prediction
+from jaxslam.types import Scan
+
+
+def maximum_likelihood(gate: float, new_gate: float | None = None) -> Associate:
+    """As `nearest`, by the least d² + log |S|, which is -2 log N(ν; 0, S) but for a constant.
+
+    The determinant counts: a landmark of large covariance is near to everything in d², and makes
+    nothing likely (Notes, EKF-SLAM with unknown correspondences; Tacher). The gates are of
+    d², as those of `nearest`.
+
+    Raises:
+        ValueError: on a negative gate, or a new_gate below it.
+    """
+    beyond = check_gates("maximum_likelihood", gate, new_gate)
+
+    def associate(prediction: Prediction, scan: Scan) -> Association:
+        pairs = prediction.pairs(scan)
+        compatible = pairs.possible & (pairs.distance <= gate)
+        slot = mutual(pairs.distance + pairs.log_det, compatible)
+        return Association(slot, far_from_all(pairs, scan, beyond) & (slot < 0))
+
+    return associate

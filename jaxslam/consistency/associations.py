@@ -1,0 +1,52 @@
+"""How often a filter takes a measurement for one of the landmark it is of."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.types import Status, Trace
+
+
+def identities(trace: Trace, origin: jax.Array) -> jax.Array:
+    """What each slot truly holds after each step, (T, N): the origin of the measurement its
+    landmark was born of, -1 for nothing. Tags may be wrong, and are not looked at.
+
+    origin: (T, M), `Truth.origin`.
+    """
+    count = trace.estimate.alive.shape[1]
+
+    def step(held: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        status, slot, origin = row
+        at = jnp.where(status == Status.BORN, slot, count)
+        held = held.at[at].set(origin, mode="drop")
+        return held, held
+
+    nothing = jnp.full(count, -1, origin.dtype)
+    held = jax.lax.scan(step, nothing, (trace.info.status, trace.info.slot, origin))[1]
+    return jnp.where(trace.estimate.alive, held, -1)
+
+
+def associations(
+    trace: Trace, origin: jax.Array, held: jax.Array
+) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """Sums and their weights, of one run; held (T, N): its `identities`.
+
+    precision: corrections by a measurement of the very landmark, over all corrections. recall:
+    the same over the measurements of landmarks that were in the map before the step.
+    false_landmarks: those of the final map that are nothing's, or were there before.
+    """
+    info = trace.info
+    fused = info.status == Status.FUSED
+    mine = jnp.take_along_axis(held, jnp.maximum(info.slot, 0), axis=1)
+    right = (fused & (origin >= 0) & (mine == origin)).sum()
+    before = jnp.pad(held[:-1], [(1, 0), (0, 0)], constant_values=-1)
+    known = (origin >= 0) & (origin[:, :, None] == before[:, None, :]).any(axis=2)
+    last, alive = held[-1], trace.estimate.alive[-1]
+    same = (last[:, None] == last[None, :]) & alive[None, :]
+    again = (same & jnp.tril(jnp.ones(same.shape, bool), -1)).any(axis=1)
+    false = alive & (again | (last < 0))
+    dtype = trace.estimate.pose.dtype
+    return {
+        "precision": (right.astype(dtype), fused.sum()),
+        "recall": (right.astype(dtype), known.sum()),
+        "false_landmarks": (false.sum().astype(dtype), jnp.asarray(1)),
+    }

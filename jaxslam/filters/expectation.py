@@ -1,0 +1,102 @@
+"""What a filter on a `Joint` expects to measure of every landmark: what association looks at."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import linalg, slots
+from jaxslam.protocols import Basis, Chart, Here, Linearizer, Pairs, Prediction, Sensor
+from jaxslam.slots import Joint
+from jaxslam.types import Scan
+
+
+def prediction_of(
+    joint: Joint,
+    *,
+    sensor: Sensor,
+    chart: Chart,
+    linearize: Linearizer,
+    square_root: bool = False,
+) -> Prediction:
+    """The map as an association may see it; what it does not ask for is not computed."""
+
+    def slopes() -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """ẑ (N, Z), H by errors of pose (N, Z, 3) and landmark (N, Z, L), H P Hᵀ of each alone."""
+        every = jnp.arange(joint.landmarks.shape[0])
+        local = jax.vmap(lambda slot: slots.local_cov(joint, slot, square_root))(every)
+        expected, by_pose, by_landmark, rest = jax.vmap(
+            lambda slot, landmark, cov: linearize.observe(
+                sensor, Here(joint, chart, joint.pose, cov, slot, landmark)
+            )
+        )(every, joint.landmarks, local)
+        if chart.basis is not None:
+            by_pose, by_landmark = in_chart(
+                chart, joint.pose, joint.landmarks, by_pose, by_landmark
+            )
+        h = jnp.concatenate([by_pose, by_landmark], axis=2)
+        hp = linalg.total(h[:, :, k, None] * local[:, None, k] for k in range(h.shape[2]))
+        own = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in range(h.shape[2]))
+        return expected, by_pose, by_landmark, own + rest
+
+    def pairs(scan: Scan) -> Pairs:
+        expected, _, _, own = slopes()
+        noise = jax.vmap(sensor.noise_cov)(scan.z)
+        over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
+        innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
+        cov = own[None] + noise[:, None]
+
+        def weigh(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            factor, positive = linalg.cholesky(cov)
+            pivots = jnp.diagonal(factor)
+            log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
+            return (linalg.solve_lower(factor, nu) ** 2).sum(), log_det, positive
+
+        distance, log_det, positive = jax.vmap(jax.vmap(weigh))(innovation, cov)
+        possible = scan.valid[:, None] & joint.alive[None, :] & positive
+        return Pairs(innovation, cov, distance, log_det, possible)
+
+    def cross() -> jax.Array:
+        _, by_pose, by_landmark, _ = slopes()
+        capacity, size = joint.landmarks.shape
+        cov = joint.cov @ joint.cov.T if square_root else joint.cov
+        rows = cov[3:].reshape(capacity, size, -1)
+        hp = linalg.total(by_pose[:, :, k, None] * cov[None, None, k] for k in range(3))
+        hp = hp + linalg.total(by_landmark[:, :, k, None] * rows[:, None, k] for k in range(size))
+        return innovation_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
+
+    return Prediction(joint.tag, joint.alive, pairs, cross)
+
+
+def in_chart(
+    chart: Chart,
+    pose: jax.Array,
+    landmarks: jax.Array,
+    by_pose: jax.Array,
+    by_landmark: jax.Array,
+    moved: tuple[jax.Array, jax.Array] | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """Chain Jacobians (m, Z, ·) with the derivative of retract(pose, l, ·), at zero or moved."""
+    assert chart.basis is not None
+    if moved is None:
+        basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
+    else:
+        by_dx, by_dl = jax.vmap(
+            jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
+        )(pose, landmarks, *moved)
+        basis = Basis(by_dx[0], by_dl[0], by_dl[1])
+    by_chart = by_pose @ basis.pose + by_landmark @ basis.cross
+    return by_chart, by_landmark if basis.landmark is None else by_landmark @ basis.landmark
+
+
+def innovation_cov(
+    hp: jax.Array, by_pose: jax.Array, by_landmark: jax.Array, slot: jax.Array, capacity: int
+) -> jax.Array:
+    """H P Hᵀ (m, Z, m, Z) of HP (m, Z, D): only the robot's and the seen landmarks' columns."""
+    m, size_z, size_l = by_landmark.shape
+    own = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
+    if size_l == 0:
+        return own
+    by_slot = hp[:, :, 3 : 3 + capacity * size_l].reshape(m, size_z, capacity, size_l)
+    at_landmark = by_slot[:, :, slot]
+    return own + linalg.total(
+        at_landmark[..., k, None] * by_landmark[None, None, :, :, k] for k in range(size_l)
+    )
