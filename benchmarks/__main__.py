@@ -1,7 +1,8 @@
 """All benchmarks, one gate: `python -m benchmarks [--quick]`, or `make bench`.
 
 A table of every metric with the range it must lie in; the exit status is 1 if one is missed. Each
-part is also a program of its own: consistency, victoria_park, real_data, speed, gradient.
+part is also a program of its own: consistency, victoria_park, real_data, speed, gradient,
+association, bearing.
 """
 
 import argparse
@@ -12,7 +13,8 @@ import time
 
 import jax
 
-from benchmarks import gradient, real_data, victoria_park
+from benchmarks import bearing, gradient, real_data, victoria_park
+from benchmarks.association.__main__ import measure as measure_association
 from benchmarks.consistency import circle
 from benchmarks.gate import Metric, report
 from benchmarks.speed.__main__ import gated
@@ -42,6 +44,8 @@ def main() -> int:
     metrics += circle.measure(200 if options.quick else 1000)[1]
     metrics += victoria_park.measure()
     metrics += real_data.measure()
+    metrics += measure_association(options.quick)
+    metrics += bearing.measure(20 if options.quick else 100)
     print()
     return report(metrics)
 

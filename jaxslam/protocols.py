@@ -205,6 +205,21 @@ Associate = Callable[[Prediction, Scan], Association]
 
 
 @dataclass(frozen=True, eq=False)
+class Life:
+    """Which landmarks stay in the map: the guide's map manager, asked after every scan."""
+
+    name: str
+    init: Callable[[Array, Array], Any]
+    """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
+    after: Callable[[Joint, Info, Callable[[], Estimate]], tuple[Any, Array]]
+    """(joint, info, estimate) -> memory, slots to remove (N,) bool; after a scan, with what became
+    of it. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
+    make_room: Callable[[Joint, Array], Array] | None = None
+    """(joint, needed () int) -> slots (N,) bool to remove before new landmarks enter a map that
+    lacks so many places; None where a full map refuses."""
+
+
+@dataclass(frozen=True, eq=False)
 class Filter:
     """A recursive estimator: what `run` drives and the harness judges."""
 

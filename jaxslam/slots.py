@@ -34,6 +34,8 @@ class Joint(NamedTuple):
     """a `Watch` of the directions that should stay unobservable, where one is kept"""
     last: Any = ()
     """the `Last` motion, where the chart keeps it apart"""
+    life: Any = ()
+    """the memory of the filter's `Life`, where it has one"""
 
 
 class Last(NamedTuple):

@@ -112,6 +112,8 @@ class Info(NamedTuple):
     """() Σ log N(innovation; 0, S) over fused places."""
     exhausted: Any = ()
     """() bool: the search for the best association ended at its budget; or nothing."""
+    removed: Any = ()
+    """(N,) bool: slots whose landmark was removed, where the filter has a `Life`."""
 
     @property
     def overflow(self) -> jax.Array:

@@ -14,9 +14,9 @@ import jaxslam
 PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
-    "angles se2 lapack linalg assignment staging stats",
+    "angles se2 frames lapack linalg assignment staging stats",
     "types protocols slots noise derivatives",
-    "motion sensors charts linearize association",
+    "motion sensors charts linearize association life",
     "filters run simulate spurious",
     "consistency monte_carlo verify linearity scenarios family",
     "datasets plot page report store userfile cli __main__",

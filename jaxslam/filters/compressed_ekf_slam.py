@@ -57,15 +57,15 @@ def compressed_ekf_slam(
     Args:
         area: landmarks K that are worked on; at least the places of a scan.
         options: those of `ekf_slam` in the Euclidean chart, whose landmarks stand still, with a
-            linearizer that remembers nothing (at_estimate, unscented), but for associate, watch and
-            square_root.
+            linearizer that remembers nothing (at_estimate, unscented), but for associate, watch,
+            square_root and life.
     Raises:
         ValueError: as `ekf_slam`; on an area below 1, an option that is not for this filter; and,
             when a scan has more places than the area, from `update`.
     """
     check_count("compressed_ekf_slam: capacity", capacity)
     check_count("compressed_ekf_slam: area", area)
-    for name in ("associate", "watch", "square_root"):
+    for name in ("associate", "watch", "square_root", "life"):
         if options.get(name):
             raise ValueError(f"compressed_ekf_slam: does not take {name}")
     whole = ekf_slam(motion, sensor, capacity, **options)

@@ -13,7 +13,16 @@ from jaxslam.filters import augmentation, correction, propagation
 from jaxslam.filters.expectation import prediction_of
 from jaxslam.linalg import check_count, is_concrete
 from jaxslam.linearize.at_estimate import at_estimate
-from jaxslam.protocols import Associate, Association, Chart, Filter, Linearizer, Motion, Sensor
+from jaxslam.protocols import (
+    Associate,
+    Association,
+    Chart,
+    Filter,
+    Life,
+    Linearizer,
+    Motion,
+    Sensor,
+)
 from jaxslam.slots import Joint
 from jaxslam.staging import where_any
 from jaxslam.types import Estimate, Info, Scan, Status
@@ -26,6 +35,8 @@ class Births(NamedTuple):
     granted: jax.Array
     deferred: jax.Array
     repeated: jax.Array
+    given_up: jax.Array
+    """(N,) slots that were emptied to make room"""
 
 
 def ekf_slam(
@@ -43,6 +54,7 @@ def ekf_slam(
     births: int | None = None,
     square_root: bool = False,
     watch: bool = False,
+    life: Life | None = None,
 ) -> Filter:
     """Extended Kalman filter SLAM in a map of fixed capacity (Solà 2).
 
@@ -69,6 +81,7 @@ def ekf_slam(
             one. Default no limit.
         square_root: hold a root X of P = X Xᵀ instead of P, in which float32 goes as far as float64
             does in P; the same filter, dearer (the prediction is O(N³)).
+        life: which landmarks stay in the map (`jaxslam.life`); default all.
         watch: keep a `slots.Watch` in the state, which campaigns report.
     Raises:
         ValueError: on a capacity, iterations or births below 1, a gate not above 0, an unknown
@@ -121,7 +134,7 @@ def ekf_slam(
             undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
             pose_cov, turn = undo @ pose_cov @ undo.T, undo @ turn
         lin = linearize.init(pose, ground)
-        return slots.empty(
+        joint = slots.empty(
             pose,
             pose_cov,
             capacity,
@@ -131,6 +144,11 @@ def ekf_slam(
             turn=turn if watch else None,
             motion_apart=chart.motion_apart,
         )
+        return joint if life is None else joint._replace(life=life.init(pose, joint.landmarks))
+
+    def without(joint: Joint, dead: jax.Array) -> Joint:
+        kept = partial(slots.remove, square_root=square_root)
+        return where_any(dead.any(), lambda joint: kept(joint, dead), lambda joint: joint, joint)
 
     def predict(joint: Joint, u: jax.Array, key: jax.Array) -> Joint:
         return propagate(joint, u)
@@ -155,13 +173,19 @@ def ekf_slam(
             wanted = is_new & ~repeated
             quota = wanted.shape[0] if births is None else births
             deferred = wanted & (jnp.cumsum(wanted) > quota)
-            slot, granted = slots.allocate(joint.alive, wanted & ~deferred)
+            wanted = wanted & ~deferred
+            given_up = jnp.zeros_like(joint.alive)
+            if life is not None and life.make_room is not None:
+                needed = wanted.sum() - (~joint.alive).sum()
+                given_up = life.make_room(joint, needed)
+                joint = without(joint, given_up)
+            slot, granted = slots.allocate(joint.alive, wanted)
             joint = augment(joint, z, scan.tag, slot, granted)
-            return joint, Births(slot, granted, deferred, repeated)
+            return joint, Births(slot, granted, deferred, repeated, given_up)
 
         def start_none(joint: Joint) -> tuple[Joint, Births]:
-            none = jnp.zeros_like(is_new)
-            return joint, Births(jnp.zeros_like(slot), none, none, none)
+            none, given_up = jnp.zeros_like(is_new), jnp.zeros_like(joint.alive)
+            return joint, Births(jnp.zeros_like(slot), none, none, none, given_up)
 
         joint, born = where_any(is_new.any(), start, start_none, joint)
 
@@ -199,6 +223,10 @@ def ekf_slam(
             log_likelihood=done.log_likelihood.sum(),
             exhausted=exhausted,
         )
+        if life is not None:
+            memory, dead = life.after(joint, info, lambda: estimate(joint))
+            joint = without(joint._replace(life=memory), dead)
+            info = info._replace(removed=dead | born.given_up)
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:

@@ -1,0 +1,81 @@
+"""`python -m benchmarks.association [--quick] [--out FOLDER]`: association methods compared.
+
+One scan as the heading becomes uncertain; whole runs against clutter and odometry noise; the cost
+beside a correction; Victoria Park without its identities. About 15 minutes; --quick leaves the
+whole runs out.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+
+from benchmarks.association import clutter, cost, heading, park
+from benchmarks.gate import Metric, report
+
+
+def table(title, rows, columns):
+    """rows: {name: {column: value}}."""
+    print(f"\n{title}\n{'':24}" + "".join(f"{column:>18}" for column in columns))
+    for name, values in rows.items():
+        cells = (f"{values[c]:18.4g}" if c in values else f"{'-':>18}" for c in columns)
+        print(f"{name:24}" + "".join(cells))
+
+
+def measure(quick=False, out=None):
+    metrics = []
+
+    def save(figure, name):
+        if out:
+            out.mkdir(parents=True, exist_ok=True)
+            figure.savefig(out / name, dpi=160)
+
+    seconds = cost.measure()
+    print("\n20 measurements, 200 landmarks, one core's share of 16 runs together:")
+    for name, value in seconds.items():
+        print(f"{name:24}{1e6 * value:10.0f} µs{value / seconds['correction']:8.2f} × correction")
+        if name not in ("correction", "joint"):
+            ratio = value / seconds["correction"]
+            metrics.append(Metric(f"association, {name} / correction", ratio, high=2.0))
+
+    found = heading.measure()
+    save(heading.draw(found), "heading.png")
+    rows = {
+        f"σ = {sigma:g}°": {name: right[i] for name, (right, _, _) in found.items()}
+        for i, sigma in enumerate(heading.SIGMAS)
+    }
+    table("share associated rightly", rows, tuple(found))
+    budget = found["joint"][2].max()
+    print(f"joint: at most {budget:.1%} of the searches at one σ ended at their budget")
+
+    figures, maps = park.measure(park.METHOD)
+    save(park.draw(maps), "victoria_park.png")
+    print("\nVictoria Park, identities ignored, against identities given:")
+    for name, value in figures.items():
+        print(f"{name:24}{value:10.4g}")
+    metrics.append(Metric("Victoria Park, wrong associations [%]", figures["wrong [%]"], high=5.0))
+    metrics.append(Metric("Victoria Park, map from known [m]", figures["map RMSE [m]"], high=1.0))
+
+    if not quick:
+        settings = {(c, 1.0) for c in clutter.CLUTTER} | {(1.0, n) for n in clutter.NOISE}
+        runs = {at: clutter.measure(*at) for at in sorted(settings)}
+        for (density, noise), rows in runs.items():
+            title = f"clutter {density:g} a scan, odometry {noise:g} ×, {clutter.RUNS} runs"
+            table(title, rows, (*clutter.ROWS, "divergent"))
+        save(clutter.draw(runs), "clutter.png")
+    return metrics
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.association")
+    parser.add_argument("--quick", action="store_true", help="without the whole runs")
+    parser.add_argument("--out", type=Path, help="write figures to this folder")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    metrics = measure(options.quick, options.out)
+    print()
+    return report(metrics)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

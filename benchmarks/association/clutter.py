@@ -1,0 +1,89 @@
+"""Whole runs: precision, recall, NEES and divergence against clutter and odometry noise."""
+
+import dataclasses
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxslam import association, motion, plot
+from jaxslam.filters import ekf_slam
+from jaxslam.life import existence
+from jaxslam.monte_carlo import monte_carlo
+from jaxslam.scenarios import cloister
+from jaxslam.spurious import Spurious
+from jaxslam.stats import chi2_quantile
+
+RUNS = 32
+REACH = 4.0
+CAPACITY = 60
+CLUTTER = (0.0, 0.5, 1.0, 2.0)
+NOISE = (1.0, 2.0, 3.0)
+"""times the scenario's σ of the odometry"""
+GATE, NEW = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
+METHODS = {
+    "nearest": association.nearest(GATE, NEW),
+    "maximum_likelihood": association.maximum_likelihood(GATE, NEW),
+    "global_nearest": association.global_nearest(GATE, NEW),
+    "joint": association.joint(0.99, NEW, budget=500),
+}
+ROWS = ("precision", "recall", "false_landmarks", "nees_pose", "rmse_position")
+
+
+def near(reach):
+    return lambda pose, point: ((pose[:2] - point) ** 2).sum() < reach**2
+
+
+def world(clutter, noise):
+    plain = cloister()
+    sigma = noise * np.diag([0.01, 0.02])
+    return dataclasses.replace(
+        plain,
+        motion=motion.increment(sigma**2),
+        visible=near(REACH),
+        places=12,
+        spurious=Spurious(clutter=clutter, missed=0.05, reach=REACH),
+    )
+
+
+def measure(clutter, noise):
+    """{method: {measure: value}} with the share of divergent runs; `known` believes the tags."""
+    scenario = world(clutter, noise)
+    parts = scenario.motion, scenario.sensor, CAPACITY
+    life = existence(near(0.8 * REACH), patience=20)
+    filters = {"known": ekf_slam(*parts)}
+    for name, method in METHODS.items():
+        filters[name] = ekf_slam(*parts, associate=method, life=life)
+    campaign = monte_carlo(scenario, filters, RUNS, jax.random.key(0))
+    out = {}
+    for name, summary in campaign.filters.items():
+        out[name] = {row: summary.measures[row].value for row in ROWS if row in summary.measures}
+        lost = summary.counts["divergent"] + summary.counts["not_finite"]
+        out[name]["divergent"] = lost / RUNS
+    return out
+
+
+def draw(found):
+    """found: {(clutter, noise): what measure returned}."""
+    figure = Figure(figsize=(9.6, 5.2), layout="constrained")
+    panels = figure.subplots(2, 3)
+    series = (
+        ("clutter [false measurements a scan]", [(c, 1.0) for c in CLUTTER], CLUTTER),
+        ("σ of the odometry [times 1 cm, 1.1°]", [(1.0, n) for n in NOISE], NOISE),
+    )
+    rows = (
+        ("precision", "precision"),
+        ("recall", "recall"),
+        ("nees_pose", "pose NEES (honest: 3)"),
+    )
+    for line, (label, at, x) in zip(panels, series, strict=True):
+        for axes, (row, title) in zip(line, rows, strict=True):
+            for name, color in zip(("known", *METHODS), plot.COLORS, strict=False):
+                values = [found[key][name].get(row, np.nan) for key in at]
+                axes.plot(x, values, ".-", color=color, lw=1.2, ms=5, label=name)
+            axes.set(xlabel=label, ylabel=title)
+            axes.grid(alpha=0.25)
+            if row == "nees_pose":
+                axes.axhline(3, color="0.5", lw=0.8, ls="--")
+    panels[0, 0].legend(frameon=False, fontsize="x-small")
+    return figure

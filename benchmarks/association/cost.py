@@ -1,0 +1,68 @@
+"""What association costs beside the correction it serves: 20 measurements, a map of 200."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.speed.timing import together
+from jaxslam import association
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.filters import correction
+from jaxslam.filters.expectation import prediction_of
+from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.scenarios import cloister
+from jaxslam.slots import Joint
+from jaxslam.types import Scan
+
+COUNT, SEEN, RUNS = 200, 20, 16
+GATE = 9.21
+METHODS = {
+    "nearest": association.nearest(GATE),
+    "maximum_likelihood": association.maximum_likelihood(GATE),
+    "global_nearest": association.global_nearest(GATE),
+    "joint": association.joint(0.99),
+}
+
+
+def problem(sensor, seed):
+    """A robot in a map of 200 correlated landmarks, and a scan of the 20 nearest."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-30, 30, size=(COUNT, 2))
+    points = points[np.argsort((points**2).sum(axis=1))]
+    root = 0.02 * rng.normal(size=(3 + 2 * COUNT, 5))
+    cov = root @ root.T + 0.01 * np.eye(3 + 2 * COUNT)
+    cov[:3, :3] *= 0.1
+    cov[:3, 3:] *= 0.1**0.5
+    cov[3:, :3] *= 0.1**0.5
+    pose = jnp.zeros(3)
+    z = jax.vmap(sensor.observe, (None, 0))(pose, jnp.asarray(points[:SEEN]))
+    z = z + rng.normal(size=z.shape) * np.array([0.1, 0.017])
+    joint = Joint(
+        pose, jnp.asarray(points), jnp.asarray(cov), jnp.ones(COUNT, bool), jnp.arange(COUNT), ()
+    )
+    return joint, Scan(z, jnp.arange(SEEN), jnp.ones(SEEN, bool))
+
+
+def measure():
+    """Seconds of one scan: the correction, and each method."""
+    sensor = dataclasses.replace(cloister().sensor)
+    joint, scan = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *(problem(sensor, seed) for seed in range(RUNS))
+    )
+    models = {"sensor": sensor, "chart": euclidean(), "linearize": at_estimate()}
+
+    def correct(joint, scan):
+        return correction.correct_in_turn(joint, scan.z, scan.tag, scan.valid, **models)[0]
+
+    def find(method):
+        return lambda joint, scan: tuple(method(prediction_of(joint, **models), scan))
+
+    programs = {"correction": correct} | {name: find(method) for name, method in METHODS.items()}
+    actions = {}
+    for name, program in programs.items():
+        compiled = jax.jit(jax.vmap(program)).lower(joint, scan).compile()
+        actions[name] = lambda compiled=compiled: jax.block_until_ready(compiled(joint, scan))
+    seconds = together(actions)
+    return {name: value / RUNS for name, value in seconds.items()}

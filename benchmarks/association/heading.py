@@ -1,0 +1,93 @@
+"""One scan, one decision: what each method makes of it as the heading becomes uncertain.
+
+A mapped cluster of landmarks, a robot in the middle whose heading has a standard deviation of 0 to
+45°, one scan of eight of them. An error of the heading moves all expected measurements together:
+each alone may then be nearest to a wrong landmark, while all of them still fit together.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxslam import association, plot
+from jaxslam.angles import wrap
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.filters.expectation import prediction_of
+from jaxslam.linalg import root_psd
+from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.sensors import range_bearing
+from jaxslam.slots import Joint
+from jaxslam.stats import chi2_quantile
+from jaxslam.types import Scan
+
+COUNT, SEEN, DRAWS = 14, 8, 500
+SIGMAS = np.array([0.5, 2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45])
+SENSOR = range_bearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2)
+GATE = chi2_quantile(0.99, 2)
+METHODS = {
+    "nearest": association.nearest(GATE),
+    "maximum_likelihood": association.maximum_likelihood(GATE),
+    "global_nearest": association.global_nearest(GATE),
+    "joint": association.joint(0.99, budget=20_000, candidates=COUNT),
+}
+
+
+def decide(method, sigma, key):
+    """Shares of a scan's measurements associated rightly and wrongly; whether it was exhausted."""
+    keys = jax.random.split(key, 4)
+    angle = jax.random.uniform(keys[3], (COUNT,), minval=-jnp.pi, maxval=jnp.pi)
+    radius = jax.random.uniform(keys[0], (COUNT,), minval=2.0, maxval=8.0)
+    points = radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    spread = jnp.concatenate([jnp.array([0.1, 0.1]), sigma[None], jnp.full(2 * COUNT, 0.05)])
+    joint = Joint(
+        pose=jnp.zeros(3),
+        landmarks=points,
+        cov=jnp.diag(spread**2),
+        alive=jnp.ones(COUNT, bool),
+        tag=jnp.full(COUNT, -1),
+        lin=(),
+    )
+    error = spread * jax.random.normal(keys[1], spread.shape)
+    pose = jnp.append(error[:2], wrap(error[2]))
+    true = (points + error[3:].reshape(COUNT, 2))[:SEEN]
+    exact = jax.vmap(SENSOR.observe, (None, 0))(pose, true)
+    normals = jax.random.normal(keys[2], exact.shape)
+    noise = jax.vmap(lambda z, n: root_psd(SENSOR.noise_cov(z)) @ n)(exact, normals)
+    z = jax.vmap(SENSOR.residual)(exact + noise, jnp.zeros_like(exact))
+    scan = Scan(z, jnp.full(SEEN, -1), jnp.ones(SEEN, bool))
+    models = {"sensor": SENSOR, "chart": euclidean(), "linearize": at_estimate()}
+    found = method(prediction_of(joint, **models), scan)
+    right = found.slot == jnp.arange(SEEN)
+    return right.mean(), (~right & (found.slot >= 0)).mean(), jnp.asarray(found.exhausted)
+
+
+def measure():
+    """By method: (right, wrong, exhausted), (S,) each over SIGMAS."""
+    keys = jax.random.split(jax.random.key(0), DRAWS)
+    out = {}
+    for name, method in METHODS.items():
+        over = jax.jit(jax.vmap(partial(decide, method), (None, 0)))
+        each = [over(jnp.deg2rad(sigma), keys) for sigma in SIGMAS]
+        out[name] = tuple(np.array([float(e[i].mean()) for e in each]) for i in range(3))
+    return out
+
+
+def draw(found):
+    figure = Figure(figsize=(8.4, 3.4), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True)
+    for (name, (right, wrong, _)), color in zip(found.items(), plot.COLORS, strict=False):
+        for axes, share in zip(panels, (right, wrong), strict=True):
+            axes.plot(SIGMAS, 100 * share, ".-", color=color, lw=1.2, ms=5, label=name)
+    for axes, what in zip(panels, ("rightly", "wrongly"), strict=True):
+        axes.set(
+            xlabel="standard deviation of the heading [°]",
+            ylabel=f"measurements associated {what} [%]",
+            ylim=(0, None),
+        )
+        axes.grid(alpha=0.25)
+    panels[0].set(ylim=(0, 103))
+    panels[0].legend(frameon=False, fontsize="small")
+    return figure

@@ -1,0 +1,96 @@
+"""Two landmarks of a map that are one: found by a joint chi-square test, merged by a constraint."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import linalg, slots
+from jaxslam.protocols import Chart
+from jaxslam.slots import Joint
+
+Array = jax.Array
+
+
+def closest_pair(
+    joint: Joint, chart: Chart, reach: float, allowed: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Slots i < j of the two landmarks that are most likely one, and their squared distance.
+
+    d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), in which the correlation of the two counts:
+    of landmarks that are each known badly, but well against one another, d² is large. i = j = 0 and
+    d² infinite where no pair is within reach [m] of another and allowed (N, N).
+    """
+    capacity, size = joint.landmarks.shape
+    delta = joint.landmarks[:, None] - joint.landmarks[None, :]
+    by_robot, by_landmark = _derivatives(joint, chart)
+    robot = joint.cov[:3, :3]
+    cross = joint.cov[:3, 3:].reshape(3, capacity, size)
+    blocks = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)
+    # Of coordinates: l_i = A_i dx + B_i dl_i, so cov(l_i, l_j) has four terms.
+    with_robot = jnp.einsum("nij,jmk,mlk->nmil", by_robot, cross, by_landmark)
+    apart = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)
+    cov = apart + with_robot + with_robot.transpose(1, 0, 3, 2)
+    cov = cov + jnp.einsum("nij,jk,mlk->nmil", by_robot, robot, by_robot)
+    own = cov[jnp.arange(capacity), jnp.arange(capacity)]
+    spread = own[:, None] + own[None, :] - cov - cov.transpose(1, 0, 2, 3)
+
+    def distance(delta: Array, cov: Array) -> Array:
+        factor, positive = linalg.cholesky(cov)
+        return jnp.where(positive, (linalg.solve_lower(factor, delta) ** 2).sum(), jnp.inf)
+
+    pairs = joint.alive[:, None] & joint.alive[None, :]
+    pairs = pairs & (jnp.arange(capacity)[:, None] < jnp.arange(capacity)[None, :])
+    pairs = pairs & ((delta**2).sum(axis=2) <= reach**2)
+    if allowed is not None:
+        pairs = pairs & allowed
+    each = jnp.where(pairs, jax.vmap(jax.vmap(distance))(delta, spread), jnp.inf)
+    best = jnp.argmin(each)
+    return best // capacity, best % capacity, each.reshape(-1)[best]
+
+
+def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False) -> Joint:
+    """The map given that the landmarks of slots i and j are one, which slot i keeps.
+
+    The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with
+    S = cov(δ) = L Lᵀ and V = L⁻¹ cov(δ, ·), x ← x ⊞ -Vᵀ L⁻¹ δ and P ← P - Vᵀ V, for points exact.
+    Slot j, now the same, is removed. Nothing happens where i = j or S is singular.
+    """
+    size = joint.landmarks.shape[1]
+    by_robot, by_landmark = (part[jnp.stack([i, j])] for part in _derivatives(joint, chart))
+    rows = joint.cov @ joint.cov.T if square_root else joint.cov
+    own = [jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size) for slot in (i, j)]
+    with_all = (by_robot[0] - by_robot[1]) @ rows[:3]
+    with_all = with_all + by_landmark[0] @ own[0] - by_landmark[1] @ own[1]
+    mine = [jax.lax.dynamic_slice_in_dim(with_all, 3 + s * size, size, axis=1) for s in (i, j)]
+    s = with_all[:, :3] @ (by_robot[0] - by_robot[1]).T
+    s = s + mine[0] @ by_landmark[0].T - mine[1] @ by_landmark[1].T
+    factor, positive = linalg.cholesky(linalg.symmetrize(s))
+    ok = positive & (i != j)
+    factor = jnp.where(ok, factor, 0.0)
+    v = linalg.solve_lower(factor, with_all)
+    white = linalg.solve_lower(factor, joint.landmarks[j] - joint.landmarks[i])
+    xi = linalg.gram(v, white[:, None])[:, 0]
+    over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
+    poses, landmarks = over_landmarks(
+        joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
+    )
+    cov = rows - linalg.gram(v, v)
+    if square_root:
+        cov = linalg.root_psd(cov)
+    merged = joint._replace(
+        pose=poses[0],
+        landmarks=jnp.where(joint.alive[:, None], landmarks, 0.0),
+        cov=jnp.where(ok, cov, joint.cov),
+    )
+    return slots.remove(
+        merged, ok & (jnp.arange(joint.alive.shape[0]) == j), square_root=square_root
+    )
+
+
+def _derivatives(joint: Joint, chart: Chart) -> tuple[Array, Array]:
+    """Of each landmark's coordinates by errors of the pose (N, L, 3) and its own (N, L, L)."""
+    capacity, size = joint.landmarks.shape
+    still = jnp.broadcast_to(jnp.eye(size, dtype=joint.cov.dtype), (capacity, size, size))
+    if chart.basis is None:
+        return jnp.zeros((capacity, size, 3), joint.cov.dtype), still
+    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
+    return basis.cross, still if basis.landmark is None else basis.landmark

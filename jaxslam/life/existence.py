@@ -1,0 +1,126 @@
+"""Landmarks prove that they exist by being seen where they should be."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.linalg import check_count
+from jaxslam.protocols import Life
+from jaxslam.slots import Joint
+from jaxslam.types import Estimate, Info, Status
+
+Array = jax.Array
+
+# A landmark seen for long can still be given up, after as many misses as this takes.
+_MOST = 10.0
+
+
+class Existence(NamedTuple):
+    """What is known of each slot's landmark; zero where dead."""
+
+    log_odds: Array
+    """(N,) that it exists"""
+    confirmed: Array
+    """(N,) bool: it was once believed to; before that it is provisional"""
+    seen: Array
+    """(N,) int: scans that measured it"""
+    missed: Array
+    """(N,) int: scans that should have, and did not"""
+    since: Array
+    """(N,) int: scans since it was last measured"""
+
+
+def existence(
+    visible: Callable[[Array, Array], Array],
+    *,
+    detected: float = 0.9,
+    false: float = 0.1,
+    confirm: float = 0.95,
+    remove: float = 0.05,
+    patience: int | None = None,
+    spread: float | None = None,
+    replace: bool = False,
+) -> Life:
+    """Log-odds of existence, as of a cell of an occupancy map (Thrun, Burgard, Fox, "Probabilistic
+    Robotics", 2005, sections 9.2 and 13.9, where landmarks are given up by negative evidence).
+
+    A landmark begins at even odds. Each scan that measures it adds log(detected/false), each that
+    should have and does not adds log((1 - detected)/(1 - false)). Where the probability comes to
+    `confirm` it is confirmed for good, where it falls to `remove` it is removed from the map.
+    Provisional landmarks are corrected as all others are.
+
+    Args:
+        visible: (pose, l) -> () bool: whether a scan from there should measure the landmark.
+            Better too strict than too generous: near the edge of its view a sensor misses much.
+        detected: probability that it then does, P(seen | there).
+        false: probability that something else is taken for it, P(seen | not there).
+        confirm, remove: probabilities.
+        patience: a provisional landmark not measured for so many scans is removed.
+        spread: [m] a landmark with a larger standard deviation, √(tr P/2), is removed.
+        replace: in a full map, new landmarks take the place of those least likely to exist among
+            the provisional ones; otherwise the map refuses (`Status.OVERFLOW`).
+    Raises:
+        ValueError: unless 0 < false < detected < 1 and 0 < remove < 1/2 < confirm < 1; on a
+            patience below 1 or a spread not above 0.
+    """
+    if not 0 < false < detected < 1:
+        raise ValueError(f"existence: expected 0 < false < detected < 1, got {false}, {detected}")
+    if not 0 < remove < 0.5 < confirm < 1:
+        raise ValueError(
+            f"existence: expected 0 < remove < 1/2 < confirm < 1, got {remove}, {confirm}"
+        )
+    if patience is not None:
+        check_count("existence: patience", patience)
+    if spread is not None and not spread > 0:
+        raise ValueError(f"existence: expected a spread above 0, got {spread}")
+    gain, loss = math.log(detected / false), math.log((1 - detected) / (1 - false))
+    high, low = math.log(confirm / (1 - confirm)), math.log(remove / (1 - remove))
+
+    def init(pose: Array, landmarks: Array) -> Existence:
+        capacity = landmarks.shape[0]
+        none = jnp.zeros(capacity, jnp.int32)
+        return Existence(
+            jnp.zeros(capacity, pose.dtype), jnp.zeros(capacity, bool), none, none, none
+        )
+
+    def after(
+        joint: Joint, info: Info, estimate: Callable[[], Estimate]
+    ) -> tuple[Existence, Array]:
+        born = _slots_of(joint, info, Status.BORN)
+        hit = born | _slots_of(joint, info, Status.FUSED)
+        known: Existence = joint.life
+        old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), known)
+        should = joint.alive & ~hit & jax.vmap(visible, (None, 0))(joint.pose, joint.landmarks)
+        change = jnp.where(hit & ~born, gain, 0.0) + jnp.where(should, loss, 0.0)
+        odds = jnp.clip(old.log_odds + change.astype(old.log_odds.dtype), -_MOST, _MOST)
+        confirmed = joint.alive & (old.confirmed | (odds >= high))
+        since = jnp.where(hit | ~joint.alive, 0, old.since + 1)
+        dead = odds <= low
+        if patience is not None:
+            dead = dead | (~confirmed & (since >= patience))
+        if spread is not None:
+            variance = jnp.trace(estimate().point_covs, axis1=1, axis2=2) / 2
+            dead = dead | (variance > spread**2)
+        memory = Existence(
+            odds, confirmed, old.seen + hit, old.missed + should, since.astype(jnp.int32)
+        )
+        return memory, dead & joint.alive
+
+    def make_room(joint: Joint, needed: Array) -> Array:
+        provisional = joint.alive & ~joint.life.confirmed
+        odds = jnp.where(provisional, joint.life.log_odds, jnp.inf)
+        rank = jnp.argsort(jnp.argsort(odds))
+        given_up: Array = provisional & (rank < needed)
+        return given_up
+
+    return Life("existence", init, after, make_room if replace else None)
+
+
+def _slots_of(joint: Joint, info: Info, status: Status) -> Array:
+    """Whether a measurement with that status concerned each slot, (N,)."""
+    capacity = joint.alive.shape[0]
+    slot = jnp.where(info.status == status, info.slot, capacity)
+    return jnp.zeros(capacity, bool).at[slot].set(True, mode="drop")

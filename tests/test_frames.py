@@ -1,0 +1,119 @@
+"""Uncertain frames: resistors in series and in parallel, Monte Carlo, and textbook distances."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxslam import frames, se2
+from jaxslam.frames import Frame
+
+compound, merge, reverse = map(jax.jit, (frames.compound, frames.merge, frames.reverse))
+bhattacharyya = jax.jit(frames.bhattacharyya)
+numbers = st.floats(0.01, 100.0)
+
+
+def some(seed, size=0.1):
+    rng = np.random.default_rng(seed)
+    root = size * rng.normal(size=(3, 3))
+    return Frame(jnp.asarray(rng.normal(size=3)), jnp.asarray(root @ root.T + 1e-4 * np.eye(3)))
+
+
+def resistor(variance):
+    return Frame(jnp.zeros(3), variance * jnp.eye(3))
+
+
+@settings(max_examples=50, deadline=None)
+@given(numbers, numbers)
+def test_series_and_parallel(r1, r2):
+    """Frames at the origin: variances of x and y of pure translations add, conductances add."""
+    flat = jnp.diag(jnp.array([1.0, 1.0, 0.0]))
+    a, b = (Frame(jnp.zeros(3), r * flat) for r in (r1, r2))
+    np.testing.assert_allclose(compound(a, b).cov, (r1 + r2) * flat, rtol=1e-12)
+    merged, regular = merge(resistor(r1), resistor(r2))
+    assert regular
+    np.testing.assert_allclose(jnp.diagonal(merged.cov), r1 * r2 / (r1 + r2), rtol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6))
+def test_compounding_is_associative_and_merging_commutes(seed):
+    a, b, c = (some(seed + i) for i in range(3))
+    left, right = compound(compound(a, b), c), compound(a, compound(b, c))
+    np.testing.assert_allclose(left.cov, right.cov, atol=1e-12)
+    np.testing.assert_allclose(se2.boxminus(left.pose, right.pose), 0, atol=1e-12)
+    near = Frame(a.pose + 0.1, b.cov)
+    one, other = merge(a, near)[0], merge(near, a)[0]
+    np.testing.assert_allclose(one.cov, other.cov, atol=1e-10)
+    np.testing.assert_allclose(one.pose, other.pose, atol=1e-10)
+    np.testing.assert_allclose(
+        jnp.linalg.inv(one.cov), jnp.linalg.inv(a.cov) + jnp.linalg.inv(b.cov), rtol=1e-5
+    )
+    again = reverse(reverse(a))
+    np.testing.assert_allclose(again.cov, a.cov, atol=1e-12)
+
+
+def test_cross_terms_are_those_of_monte_carlo():
+    rng = np.random.default_rng(0)
+    root = 0.02 * rng.normal(size=(6, 6))
+    both = root @ root.T
+    a = Frame(jnp.array([1.0, 2.0, 0.7]), jnp.asarray(both[:3, :3]))
+    b = Frame(jnp.array([0.5, -1.0, -2.0]), jnp.asarray(both[3:, 3:]))
+    draws = jnp.asarray(rng.normal(size=(200_000, 6)) @ root.T)
+    mean = se2.compose(a.pose, b.pose)
+    poses = jax.vmap(lambda e: se2.compose(a.pose + e[:3], b.pose + e[3:]) - mean)(draws)
+    found = np.cov(np.asarray(poses).T)
+    with_cross = frames.compound(a, b, jnp.asarray(both[:3, 3:])).cov
+    scale = np.abs(found).max()
+    np.testing.assert_allclose(with_cross, found, atol=0.02 * scale)
+    assert np.abs(frames.compound(a, b).cov - found).max() > 0.1 * scale
+
+
+def test_merging_across_the_seam_of_the_heading():
+    a = Frame(jnp.array([0.0, 0.0, np.pi - 0.1]), jnp.eye(3))
+    b = Frame(jnp.array([0.0, 0.0, -np.pi + 0.1]), jnp.eye(3))
+    assert abs(abs(float(merge(a, b)[0].pose[2])) - np.pi) < 1e-12
+    np.testing.assert_allclose(frames.mahalanobis_squared(a, b)[0], 0.2**2 / 2)
+
+
+def test_distances():
+    a, b = some(1), some(2)
+    near, regular = frames.mahalanobis_squared(a, b)
+    delta = np.asarray(a.pose - b.pose)
+    np.testing.assert_allclose(near, delta @ np.linalg.solve(a.cov + b.cov, delta))
+    assert regular
+    middle = np.asarray(a.cov + b.cov) / 2
+    det = np.linalg.det
+    textbook = delta @ np.linalg.solve(middle, delta) / 8
+    textbook += 0.5 * np.log(det(middle) / np.sqrt(det(a.cov) * det(b.cov)))
+    np.testing.assert_allclose(bhattacharyya(a, b)[0], textbook)
+    np.testing.assert_allclose(bhattacharyya(a, a)[0], 0, atol=1e-12)
+    assert bhattacharyya(a, Frame(a.pose, 100 * a.cov))[0] > 1
+
+
+def test_certain_frames():
+    exact = Frame(jnp.array([1.0, 2.0, 0.3]), jnp.zeros((3, 3)))
+    vague = some(3)
+    merged, regular = merge(vague, exact)
+    assert regular
+    np.testing.assert_allclose(merged.pose, exact.pose, atol=1e-12)
+    same, regular = merge(exact, exact)
+    assert not regular
+    np.testing.assert_array_equal(same.pose, exact.pose)
+    distance, regular = frames.bhattacharyya(exact, exact)
+    assert not regular
+    assert distance == 0
+    slopes = jax.grad(lambda cov: merge(Frame(exact.pose, cov), exact)[0].pose.sum())(exact.cov)
+    assert np.isfinite(slopes).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_batches_and_dtypes(dtype):
+    a = jax.tree.map(lambda *x: jnp.stack(x).astype(dtype), some(1), some(2))
+    b = jax.tree.map(lambda *x: jnp.stack(x).astype(dtype), some(3), some(4))
+    both = jax.vmap(frames.compound)(a, b)
+    assert both.cov.dtype == dtype
+    first = jax.tree.map(lambda x: x[0], (a, b))
+    np.testing.assert_allclose(both.cov[0], frames.compound(*first).cov, rtol=1e-4)

@@ -1,0 +1,200 @@
+"""The life of a landmark: evidence for and against it, and what a filter does when it ends."""
+
+import math
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import association, life, motion, run, sensors, slots
+from jaxslam.filters import ekf_slam
+from jaxslam.life.existence import Existence
+from jaxslam.slots import Joint
+from jaxslam.types import Log, Scan, Status
+
+MOTION = motion.increment(np.diag([0.02, 0.01]) ** 2)
+SENSOR = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2)
+POINTS = np.array([[2.0, 1.0], [3.0, -1.0], [1.0, 2.0], [-2.0, 0.5]])
+KEY = jax.random.key(0)
+
+
+def always(pose, landmark):
+    return jnp.asarray(True)
+
+
+def log_of(seen):
+    """A robot that stands still and sees, without noise, the landmarks (T, M) tags; -1 for none."""
+    seen = np.asarray(seen)
+    z = np.array(jax.vmap(SENSOR.observe, (None, 0))(jnp.zeros(3), jnp.asarray(POINTS)))
+    scan = Scan(z[np.maximum(seen, 0)] * (seen >= 0)[..., None], seen.astype(np.int32), seen >= 0)
+    return Log(np.zeros((len(seen), 2)), scan)
+
+
+@cache
+def driver(capacity=3, steps=12, places=2, **options):
+    manager = life.existence(always, **options)
+    filter = ekf_slam(MOTION, SENSOR, capacity, life=manager)
+
+    @jax.jit
+    def go(log):
+        return run(filter, log, np.zeros(3), np.eye(3) * 1e-4, KEY, probe=lambda joint: joint.life)
+
+    return go
+
+
+def test_a_landmark_that_is_not_seen_again_is_removed_when_its_odds_say_so():
+    seen = np.full((12, 2), -1)
+    seen[:, 0], seen[0, 1] = 0, 1
+    trace = driver()(log_of(seen))
+    loss = math.log(0.1 / 0.9)
+    misses = math.ceil(math.log(0.05 / 0.95) / loss)  # from even odds to a probability of 0.05
+    removed = np.asarray(trace.info.removed)
+    assert list(np.argwhere(removed)[0]) == [misses, 1]
+    assert removed.sum() == 1
+    assert list(trace.estimate.tag[-1]) == [0, -1, -1]
+    kept = jax.tree.map(lambda x: x[:, 0], trace.probe)
+    gain = math.log(0.9 / 0.1)
+    np.testing.assert_allclose(kept.log_odds[:4], gain * np.arange(4))
+    np.testing.assert_array_equal(kept.confirmed, kept.log_odds >= math.log(0.95 / 0.05))
+    assert int(kept.seen[-1]) == 12
+    assert not np.asarray(kept.missed).any()
+    gone = jax.tree.map(lambda x: x[-1, 1:], trace.probe)
+    assert not any(np.asarray(leaf).any() for leaf in gone)
+
+
+def test_what_is_left_is_the_marginal():
+    seen = np.full((12, 2), -1)
+    seen[:, 0], seen[0, 1] = 0, 1
+    with_life = driver()(log_of(seen)).final
+    plain = ekf_slam(MOTION, SENSOR, 3)
+    without = run(plain, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY).final
+    marginal = slots.remove(without, jnp.array([False, True, False]))
+    np.testing.assert_allclose(with_life.cov, marginal.cov, atol=1e-14)
+    np.testing.assert_allclose(with_life.landmarks, marginal.landmarks, atol=1e-14)
+
+
+def test_a_removed_landmark_can_come_back_and_begins_anew():
+    seen = np.full((12, 2), -1)
+    seen[:, 0], seen[0, 1], seen[8:, 1] = 0, 1, 1
+    trace = driver()(log_of(seen))
+    assert trace.info.status[8, 1] == Status.BORN
+    assert int(trace.probe.seen[-1, 1]) == 4
+    assert bool(trace.estimate.alive[-1, 1])
+
+
+def test_patience_is_for_the_provisional_alone():
+    seen = np.full((12, 2), -1)
+    seen[:3, 0], seen[0, 1] = 0, 1
+    manager = life.existence(lambda pose, landmark: jnp.asarray(False), patience=5)
+    filter = ekf_slam(MOTION, SENSOR, 3, life=manager)
+    trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
+    assert list(np.argwhere(trace.info.removed)[0]) == [5, 1]
+    assert list(trace.estimate.alive[-1]) == [True, False, False]
+
+
+def test_a_landmark_known_too_badly_is_removed():
+    filter = ekf_slam(MOTION, SENSOR, 3, life=life.existence(always, spread=0.5))
+    seen = np.array([[0, 1]])
+    exact = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
+    assert not exact.info.removed.any()
+    lost = run(filter, log_of(seen), np.zeros(3), np.eye(3), KEY)
+    np.testing.assert_array_equal(lost.info.removed[0], [True, True, False])
+    np.testing.assert_array_equal(lost.final.cov[3:, 3:], np.eye(6))
+
+
+@pytest.mark.parametrize("replace", [False, True])
+def test_a_full_map_refuses_or_gives_up_the_least_likely(replace):
+    # 0 is confirmed, 1 provisional and missed once, 2 comes into a map of two.
+    seen = np.array([[0, 1], [0, -1], [0, 2]])
+    never = life.existence(always, remove=0.01, replace=replace)
+    filter = ekf_slam(MOTION, SENSOR, 2, life=never)
+    trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
+    if replace:
+        assert trace.info.status[2, 1] == Status.BORN
+        np.testing.assert_array_equal(trace.info.removed[2], [False, True])
+        assert list(trace.estimate.tag[-1]) == [0, 2]
+        assert int(trace.final.life.seen[1]) == 1
+    else:
+        assert trace.info.status[2, 1] == Status.OVERFLOW
+        assert list(trace.estimate.tag[-1]) == [0, 1]
+
+
+def test_a_full_map_of_confirmed_landmarks_refuses_in_any_case():
+    seen = np.array([[0], [0], [0], [1]])
+    filter = ekf_slam(MOTION, SENSOR, 1, life=life.existence(always, replace=True))
+    trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
+    assert trace.info.status[3, 0] == Status.OVERFLOW
+    assert not trace.info.removed.any()
+
+
+def test_gradients_pass_through_births_and_deaths():
+    seen = np.full((8, 2), -1)
+    seen[:, 0], seen[0, 1], seen[5, 1] = 0, 1, 2
+    log = log_of(seen)
+
+    def loss(sigma):
+        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
+        method = association.nearest(9.0, 25.0)
+        filter = ekf_slam(MOTION, sensor, 3, life=life.existence(always), associate=method)
+        trace = run(filter, log, np.zeros(3), np.eye(3) * 1e-4, KEY)
+        likely = trace.info.log_likelihood.sum()
+        return likely + (trace.estimate.points[-1] ** 2).sum(), trace.info.removed
+
+    both = jax.jit(jax.value_and_grad(loss, has_aux=True))
+    (_, removed), slope = both(0.05)
+    assert removed.any()
+    rise = both(0.05 + 1e-6)[0][0] - both(0.05 - 1e-6)[0][0]
+    np.testing.assert_allclose(slope, rise / 2e-6, rtol=1e-5)
+
+
+def test_batches_and_float32():
+    seen = np.full((2, 12, 2), -1)
+    seen[:, :, 0], seen[0, 0, 1], seen[1, 3:, 1] = 0, 1, 2
+    logs = jax.tree.map(lambda *x: np.stack(x), log_of(seen[0]), log_of(seen[1]))
+    batch = jax.vmap(driver())(logs)
+    for i in range(2):
+        alone = driver()(jax.tree.map(lambda x, i=i: x[i], logs))
+        np.testing.assert_array_equal(batch.info.removed[i], alone.info.removed)
+        np.testing.assert_array_equal(batch.estimate.tag[i], alone.estimate.tag)
+    small = jax.tree.map(
+        lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, log_of(seen[0])
+    )
+    trace = driver()(small)
+    assert trace.probe.log_odds.dtype == np.float32
+    np.testing.assert_array_equal(trace.info.removed, batch.info.removed[0])
+
+
+def test_nothing_ever_seen():
+    trace = driver()(log_of(np.full((12, 2), -1)))
+    assert not trace.info.removed.any()
+    assert not trace.estimate.alive.any()
+
+
+def test_making_room_takes_the_least_likely_provisional_ones():
+    manager = life.existence(always, replace=True)
+    alive = jnp.array([True, True, True, False])
+    memory = Existence(
+        jnp.array([-1.0, -2.0, 3.0, 0.0]), jnp.array([False, False, True, False]), 0, 0, 0
+    )
+    joint = Joint(0, 0, 0, alive, 0, 0, life=memory)
+    for needed, slots_given_up in ((-1, []), (0, []), (1, [1]), (2, [0, 1]), (4, [0, 1])):
+        given_up = manager.make_room(joint, jnp.asarray(needed))
+        assert list(np.flatnonzero(given_up)) == slots_given_up
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"detected": 1.0}, "detected"),
+        ({"detected": 0.1, "false": 0.2}, "detected"),
+        ({"confirm": 0.4}, "confirm"),
+        ({"remove": 0.0}, "remove"),
+        ({"patience": 0}, "patience"),
+        ({"spread": 0.0}, "spread"),
+    ],
+)
+def test_refusals(options, message):
+    with pytest.raises(ValueError, match=message):
+        life.existence(always, **options)

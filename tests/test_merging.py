@@ -1,0 +1,117 @@
+"""Merging two landmarks that are one: the joint test, the constraint, and what it equals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import charts, motion, sensors, slots
+from jaxslam.filters import ekf_slam
+from jaxslam.filters.merging import closest_pair, merge
+from jaxslam.slots import Joint
+from jaxslam.types import Scan
+
+EUCLIDEAN = charts.euclidean()
+MOTION = motion.pose_increment(np.diag([0.1, 0.1, 0.05]) ** 2)
+SENSOR = sensors.relative_position(0.1**2 * np.eye(2))
+KEY = jax.random.key(0)
+
+
+def some_joint(seed=0, count=4):
+    rng = np.random.default_rng(seed)
+    root = 0.3 * rng.normal(size=(3 + 2 * count, 3 + 2 * count))
+    alive = np.arange(count) != 1
+    dead = np.concatenate([np.zeros(3, bool), np.repeat(~alive, 2)])
+    cov = np.where(dead[:, None] | dead[None, :], np.eye(len(dead)), root @ root.T)
+    landmarks = np.where(alive[:, None], rng.normal(size=(count, 2)), 0.0)
+    parts = np.array([0.3, -0.2, 0.5]), landmarks, cov, alive, np.where(alive, np.arange(count), -1)
+    return Joint(*map(jnp.asarray, parts), ())
+
+
+def test_the_constraint_is_a_conditional_gaussian():
+    joint = some_joint()
+    merged = jax.jit(lambda joint: merge(joint, EUCLIDEAN, jnp.asarray(0), jnp.asarray(3)))(joint)
+    p = np.asarray(joint.cov)
+    h = np.zeros((2, len(p)))
+    h[:, 3:5], h[:, 9:11] = np.eye(2), -np.eye(2)
+    gain = p @ h.T @ np.linalg.inv(h @ p @ h.T)
+    x = np.concatenate([joint.pose, np.asarray(joint.landmarks).ravel()])
+    x, p = x - gain @ h @ x, p - gain @ h @ p
+    np.testing.assert_allclose(merged.pose, x[:3], atol=1e-12)
+    np.testing.assert_allclose(np.asarray(merged.landmarks)[[0, 2]], x[3:].reshape(4, 2)[[0, 2]])
+    np.testing.assert_allclose(x[3:5], x[9:11], atol=1e-12)
+    keep = [0, 1, 2, 3, 4, 7, 8]
+    np.testing.assert_allclose(merged.cov[np.ix_(keep, keep)], p[np.ix_(keep, keep)], atol=1e-12)
+    assert list(merged.alive) == [True, False, True, False]
+    np.testing.assert_array_equal(merged.cov[9:11], np.eye(2, 11, 9))
+
+
+@pytest.mark.parametrize("chart", ["euclidean", "right_invariant", "left_invariant"])
+def test_the_pair_is_found_by_its_own_covariance(chart):
+    """d² of every pair by dense algebra in coordinates."""
+    chart = charts.REGISTRY[chart]()
+    joint = some_joint(3)
+    i, j, distance = jax.jit(lambda joint: closest_pair(joint, chart, 10.0))(joint)
+    size = joint.cov.shape[0]
+
+    def coordinates(xi):
+        over = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
+        return over(joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(-1, 2))[1]
+
+    slope = np.asarray(jax.jacfwd(coordinates)(jnp.zeros(size)))
+    best = (np.inf, 0, 0)
+    for a in range(4):
+        for b in range(a + 1, 4):
+            if joint.alive[a] and joint.alive[b]:
+                h = slope[a] - slope[b]
+                delta = np.asarray(joint.landmarks[a] - joint.landmarks[b])
+                best = min(best, (delta @ np.linalg.solve(h @ joint.cov @ h.T, delta), a, b))
+    assert (int(i), int(j)) == best[1:]
+    np.testing.assert_allclose(distance, best[0])
+
+
+def test_no_pair_within_reach():
+    joint = some_joint()
+    assert np.isinf(closest_pair(joint, EUCLIDEAN, 1e-6)[2])
+    nobody = jnp.zeros((4, 4), bool)
+    i, j, distance = closest_pair(joint, EUCLIDEAN, 10.0, nobody)
+    assert (int(i), int(j)) == (0, 0)
+    assert np.isinf(distance)
+    same = merge(joint, EUCLIDEAN, i, j)
+    for left, right in zip(jax.tree.leaves(same), jax.tree.leaves(joint), strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+@pytest.mark.parametrize("chart", ["euclidean", "right_invariant"])
+def test_two_sightings_merged_are_one_landmark_seen_twice(chart):
+    """With a linear sensor and no turn, starting anew and merging is the same as matching."""
+    chart = charts.REGISTRY[chart]()
+    filter = ekf_slam(MOTION, SENSOR, 3, chart=chart)
+    update, predict = jax.jit(filter.update), jax.jit(filter.predict)
+
+    def scan(tag, z):
+        return Scan(jnp.array([z]), jnp.array([tag]), jnp.array([True]))
+
+    # The heading is known: the model is linear, and order does not matter.
+    start = filter.init(jnp.zeros(3), jnp.diag(jnp.array([0.2, 0.3, 0.0]) ** 2))
+    still = ekf_slam(motion.pose_increment(np.diag([0.1, 0.1, 0.0]) ** 2), SENSOR, 3, chart=chart)
+    predict = jax.jit(still.predict)
+    joint = update(start, scan(0, [2.0, 1.0]), KEY)[0]
+    joint = predict(joint, jnp.array([0.5, 0.0, 0.0]), KEY)
+    matched = update(joint, scan(0, [1.4, 1.1]), KEY)[0]
+    twice = update(joint, scan(5, [1.4, 1.1]), KEY)[0]
+    i, j, distance = closest_pair(twice, chart, 1.0)
+    assert distance < 9
+    merged = merge(twice, chart, i, j)
+    np.testing.assert_allclose(merged.pose, matched.pose, atol=1e-12)
+    np.testing.assert_allclose(merged.landmarks, matched.landmarks, atol=1e-12)
+    np.testing.assert_allclose(merged.cov, matched.cov, atol=1e-12)
+
+
+def test_a_square_root_is_merged_too():
+    joint = some_joint()
+    root = joint._replace(cov=jnp.linalg.cholesky(joint.cov))
+    whole = merge(joint, EUCLIDEAN, jnp.asarray(0), jnp.asarray(2))
+    merged = merge(root, EUCLIDEAN, jnp.asarray(0), jnp.asarray(2), square_root=True)
+    np.testing.assert_allclose(merged.cov @ merged.cov.T, whole.cov, atol=1e-12)
+    assert slots.find(merged.tag, merged.alive, jnp.array([0]))[1].all()
