@@ -3,9 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg, slots
+from jaxslam import linalg
 from jaxslam.protocols import Basis, Chart, Here, Linearizer, Pairs, Prediction, Sensor
 from jaxslam.slots import Joint
+from jaxslam.staging import settle
 from jaxslam.types import Scan
 
 
@@ -19,10 +20,15 @@ def prediction_of(
 ) -> Prediction:
     """The map as an association may see it; what it does not ask for is not computed."""
 
+    capacity, size = joint.landmarks.shape
+
     def slopes() -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """ẑ (N, Z), H by errors of pose (N, Z, 3) and landmark (N, Z, L), H P Hᵀ of each alone."""
-        every = jnp.arange(joint.landmarks.shape[0])
-        local = jax.vmap(lambda slot: slots.local_cov(joint, slot, square_root))(every)
+        every = jnp.arange(capacity)
+        robot, cross, own = settle(_blocks(joint, square_root))
+        top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
+        bottom = jnp.concatenate([cross.transpose(0, 2, 1), own], axis=2)
+        local = jnp.concatenate([top, bottom], axis=1)
         expected, by_pose, by_landmark, rest = jax.vmap(
             lambda slot, landmark, cov: linearize.observe(
                 sensor, Here(joint, chart, joint.pose, cov, slot, landmark)
@@ -32,10 +38,11 @@ def prediction_of(
             by_pose, by_landmark = in_chart(
                 chart, joint.pose, joint.landmarks, by_pose, by_landmark
             )
+        expected, by_pose, by_landmark, rest = settle((expected, by_pose, by_landmark, rest))
         h = jnp.concatenate([by_pose, by_landmark], axis=2)
-        hp = linalg.total(h[:, :, k, None] * local[:, None, k] for k in range(h.shape[2]))
-        own = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in range(h.shape[2]))
-        return expected, by_pose, by_landmark, own + rest
+        hp = settle(linalg.total(h[:, :, k, None] * local[:, None, k] for k in range(3 + size)))
+        alone = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in range(3 + size))
+        return expected, by_pose, by_landmark, settle(alone + rest)
 
     def pairs(scan: Scan) -> Pairs:
         expected, _, _, own = slopes()
@@ -56,7 +63,6 @@ def prediction_of(
 
     def cross() -> jax.Array:
         _, by_pose, by_landmark, _ = slopes()
-        capacity, size = joint.landmarks.shape
         cov = joint.cov @ joint.cov.T if square_root else joint.cov
         rows = cov[3:].reshape(capacity, size, -1)
         hp = linalg.total(by_pose[:, :, k, None] * cov[None, None, k] for k in range(3))
@@ -64,6 +70,19 @@ def prediction_of(
         return innovation_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
 
     return Prediction(joint.tag, joint.alive, pairs, cross)
+
+
+def _blocks(joint: Joint, square_root: bool) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """P of the robot (3, 3), of it with each landmark (N, 3, L), and of each landmark (N, L, L)."""
+    capacity, size = joint.landmarks.shape
+    if square_root:
+        robot, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size, -1)
+        cross = jnp.einsum("ik,nlk->nil", robot, rows)
+        return robot @ robot.T, cross, jnp.einsum("nlk,nmk->nlm", rows, rows)
+    every = jnp.arange(capacity)
+    own = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[every, :, every]
+    cross = joint.cov[:3, 3:].reshape(3, capacity, size).transpose(1, 0, 2)
+    return joint.cov[:3, :3], cross, own
 
 
 def in_chart(
