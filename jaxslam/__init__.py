@@ -5,12 +5,17 @@ one harness over thousands of simulated worlds (`monte_carlo`). Importing the pa
 nothing; for float64 set `jax_enable_x64` yourself, as the command line does.
 """
 
+import importlib
+from typing import Any
+
 from jaxslam import (
     association,
     charts,
     consistency,
     family,
     filters,
+    frames,
+    life,
     linearity,
     linearize,
     motion,
@@ -18,6 +23,7 @@ from jaxslam import (
     se2,
     sensors,
     slots,
+    spurious,
     stats,
 )
 from jaxslam.linearity import linearity_index
@@ -33,6 +39,8 @@ __all__ = [
     "consistency",
     "family",
     "filters",
+    "frames",
+    "life",
     "linearity",
     "linearity_index",
     "linearize",
@@ -44,6 +52,16 @@ __all__ = [
     "sensors",
     "simulate",
     "slots",
+    "spurious",
     "stats",
     "verify_jacobians",
 ]
+
+_ON_DEMAND = ("datasets", "page", "plot", "report", "store")
+
+
+def __getattr__(name: str) -> Any:
+    """What reads files or draws is imported when it is first asked for."""
+    if name in _ON_DEMAND:
+        return importlib.import_module(f"jaxslam.{name}")
+    raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")

@@ -78,6 +78,11 @@ def test_merging_across_the_seam_of_the_heading():
     np.testing.assert_allclose(frames.mahalanobis_squared(a, b)[0], 0.2**2 / 2)
 
 
+def test_a_cross_covariance_of_another_shape_is_refused():
+    with pytest.raises(ValueError, match=r"cross of shape \(3, 3\)"):
+        frames.compound(some(1), some(2), jnp.ones(3))
+
+
 def test_distances():
     a, b = some(1), some(2)
     near, regular = frames.mahalanobis_squared(a, b)

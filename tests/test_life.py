@@ -184,6 +184,13 @@ def test_making_room_takes_the_least_likely_provisional_ones():
         assert list(np.flatnonzero(given_up)) == slots_given_up
 
 
+def test_what_is_no_manager_is_refused():
+    with pytest.raises(ValueError, match="function"):
+        life.existence(None)
+    with pytest.raises(ValueError, match="Life"):
+        ekf_slam(MOTION, SENSOR, 3, life=life.existence)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

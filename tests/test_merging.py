@@ -70,6 +70,12 @@ def test_the_pair_is_found_by_its_own_covariance(chart):
     np.testing.assert_allclose(distance, best[0])
 
 
+def test_refusals():
+    for reach, allowed, message in ((-1.0, None, "reach"), (1.0, jnp.asarray(True), "allowed")):
+        with pytest.raises(ValueError, match=message):
+            closest_pair(some_joint(), EUCLIDEAN, reach, allowed)
+
+
 def test_no_pair_within_reach():
     joint = some_joint()
     assert np.isinf(closest_pair(joint, EUCLIDEAN, 1e-6)[2])

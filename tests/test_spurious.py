@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import association, monte_carlo, sensors
+from jaxslam import association, life, monte_carlo, sensors
 from jaxslam.consistency.associations import associations, identities
 from jaxslam.filters import ekf_slam
 from jaxslam.simulate import simulate
@@ -88,6 +88,7 @@ def test_nothing_wrong_leaves_the_scan_alone():
         ({"clutter": 1.0}, "reach"),
         ({"outliers": 0.1}, "reach"),
         ({"reach": np.nan}, "reach"),
+        ({"clutter": 1.0, "reach": np.inf}, "reach"),
     ],
 )
 def test_refusals(options, message):
@@ -132,6 +133,16 @@ def test_where_landmarks_are_far_apart_every_method_finds_them_without_tags(meth
     assert summary.measures["recall"].value > 0.99
     assert summary.measures["false_landmarks"].value == 0
     assert summary.measures["rmse_landmarks"].value < 0.2
+
+
+def test_filters_with_and_without_a_life_share_a_campaign():
+    """Their results differ in what no score reads: the programs that score them must not mix."""
+    world = dataclasses.replace(worlds.ring(steps=4), spurious=Spurious(missed=0.1))
+    parts = world.motion, world.sensor, 6
+    manager = life.existence(lambda pose, landmark: jnp.asarray(True))
+    both = {"without": ekf_slam(*parts), "with": ekf_slam(*parts, life=manager)}
+    campaign = monte_carlo(world, both, 2, jax.random.key(0))
+    assert [s.counts["runs"] for s in campaign.filters.values()] == [2, 2]
 
 
 def test_wrong_labels_ruin_a_filter_that_believes_them_and_no_other():

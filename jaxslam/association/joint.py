@@ -43,8 +43,8 @@ def joint(
         candidates: compatible landmarks a measurement is tried with, the nearest; where there are
             more, `exhausted` is set.
     Raises:
-        ValueError: on a probability outside 0 to 1, a new_gate below the gate of single pairs, or
-            a budget or candidates below 1.
+        ValueError: on a probability outside 0 to 1, or a budget or candidates below 1; from the
+            filter's update, on a new_gate below the gate of single pairs.
     """
     if not 0 <= probability <= 1:
         raise ValueError(f"joint: expected a probability from 0 to 1, got {probability}")

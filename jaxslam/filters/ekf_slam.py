@@ -86,12 +86,17 @@ def ekf_slam(
     Raises:
         ValueError: on a capacity, iterations or births below 1, a gate not above 0, an unknown
             update, a chart or linearizer that does not fit the sensor's landmarks or one another,
-            Joseph's form of a square root, or several iterations of a statistical linearizer.
+            a life that is none, Joseph's form of a square root, or several iterations of a
+            statistical linearizer.
     """
     chart = chart or euclidean()
     linearize = linearize or at_estimate()
     associate = associate or known_association()
     _check(sensor, chart, capacity, update, gate, iterations, births)
+    if life is not None and not isinstance(life, Life):
+        raise ValueError(
+            f"ekf_slam: expected life to be a Life, as of life.existence, got {life!r}"
+        )
     _check_parts(sensor, chart, linearize, iterations, joseph, square_root)
     size_l, size_z = len(sensor.landmark), len(sensor.measurements)
     propagate = partial(

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import linalg, slots
+from jaxslam.linalg import is_concrete
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
 
@@ -18,8 +19,17 @@ def closest_pair(
     d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), in which the correlation of the two counts:
     of landmarks that are each known badly, but well against one another, d² is large. i = j = 0 and
     d² infinite where no pair is within reach [m] of another and allowed (N, N).
+
+    Raises ValueError on a reach not above 0, or allowed of another shape.
     """
     capacity, size = joint.landmarks.shape
+    if is_concrete(reach) and not reach > 0:
+        raise ValueError(f"closest_pair: expected a reach above 0, got {reach}")
+    if allowed is not None and jnp.shape(allowed) != (capacity, capacity):
+        raise ValueError(
+            f"closest_pair: expected allowed of shape {(capacity, capacity)}, "
+            f"got {jnp.shape(allowed)}"
+        )
     delta = joint.landmarks[:, None] - joint.landmarks[None, :]
     by_robot, by_landmark = _derivatives(joint, chart)
     robot = joint.cov[:3, :3]
@@ -52,7 +62,8 @@ def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool =
 
     The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with
     S = cov(δ) = L Lᵀ and V = L⁻¹ cov(δ, ·), x ← x ⊞ -Vᵀ L⁻¹ δ and P ← P - Vᵀ V, for points exact.
-    Slot j, now the same, is removed. Nothing happens where i = j or S is singular.
+    Slot j, now the same, is removed. Nothing happens where i = j or S is singular. square_root: the
+    state holds a root of P, as that of a filter with square_root=True does.
     """
     size = joint.landmarks.shape[1]
     by_robot, by_landmark = (part[jnp.stack([i, j])] for part in _derivatives(joint, chart))

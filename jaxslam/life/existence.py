@@ -63,9 +63,11 @@ def existence(
         replace: in a full map, new landmarks take the place of those least likely to exist among
             the provisional ones; otherwise the map refuses (`Status.OVERFLOW`).
     Raises:
-        ValueError: unless 0 < false < detected < 1 and 0 < remove < 1/2 < confirm < 1; on a
-            patience below 1 or a spread not above 0.
+        ValueError: on a visible that is no function; unless 0 < false < detected < 1 and
+            0 < remove < 1/2 < confirm < 1; on a patience below 1 or a spread not above 0.
     """
+    if not callable(visible):
+        raise ValueError(f"existence: expected visible to be a function, got {visible!r}")
     if not 0 < false < detected < 1:
         raise ValueError(f"existence: expected 0 < false < detected < 1, got {false}, {detected}")
     if not 0 < remove < 0.5 < confirm < 1:

@@ -205,7 +205,9 @@ def _compiled(
 ) -> Callable[..., Any]:
     """The program with its constants, compiled unless the same has been, whatever its constants."""
     text = hashlib.sha256(lowered.as_text().encode()).digest()
-    kept = _KEPT.get((text, devices))
+    # Arguments that nothing reads are not in the text.
+    which = (text, devices, lowered.in_tree, str(lowered.in_avals))
+    kept = _KEPT.get(which)
     if kept is None:
         try:
             kept = lowered.compile(options)
@@ -213,7 +215,7 @@ def _compiled(
             if "No such compile option" not in str(error):
                 raise
             kept = lowered.compile()
-        _KEPT[text, devices] = kept
+        _KEPT[which] = kept
         while len(_KEPT) > _ROOM:
             _KEPT.popitem(last=False)
     return partial(kept, constants)
