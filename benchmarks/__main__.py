@@ -2,7 +2,8 @@
 
 A table of every metric with the range it must lie in; the exit status is 1 if one is missed. Each
 part is also a program of its own: consistency, victoria_park, real_data, speed, gradient,
-association, bearing.
+association, baselines, bearing, delayed, plaza, team, smoothing, fastslam, plain_particles,
+scaling, comparison, monte_carlo_localization, seif.
 """
 
 import argparse
@@ -13,7 +14,23 @@ import time
 
 import jax
 
-from benchmarks import bearing, gradient, real_data, victoria_park
+from benchmarks import (
+    baselines,
+    bearing,
+    comparison,
+    delayed,
+    fastslam,
+    gradient,
+    monte_carlo_localization,
+    plain_particles,
+    plaza,
+    real_data,
+    scaling,
+    seif,
+    smoothing,
+    team,
+    victoria_park,
+)
 from benchmarks.association.__main__ import measure as measure_association
 from benchmarks.consistency import circle
 from benchmarks.gate import Metric, report
@@ -45,7 +62,18 @@ def main() -> int:
     metrics += victoria_park.measure()
     metrics += real_data.measure()
     metrics += measure_association(options.quick)
+    metrics += baselines.measure(100 if options.quick else 1000)
     metrics += bearing.measure(20 if options.quick else 100)
+    metrics += team.measure()
+    metrics += delayed.measure(20 if options.quick else 100)
+    metrics += plaza.measure()
+    metrics += smoothing.measure(10 if options.quick else 100)
+    metrics += fastslam.measure(4 if options.quick else 20, (10, 100))
+    metrics += plain_particles.measure(8 if options.quick else 20)
+    metrics += scaling.measure()
+    metrics += seif.measure(4 if options.quick else 10)
+    metrics += comparison.measure(8 if options.quick else 40)
+    metrics += monte_carlo_localization.measure(4 if options.quick else 12)
     print()
     return report(metrics)
 

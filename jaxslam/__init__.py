@@ -19,12 +19,15 @@ from jaxslam import (
     linearity,
     linearize,
     motion,
+    resampling,
     scenarios,
     se2,
     sensors,
     slots,
+    smoothing,
     spurious,
     stats,
+    team,
 )
 from jaxslam.linearity import linearity_index
 from jaxslam.monte_carlo import monte_carlo
@@ -46,14 +49,17 @@ __all__ = [
     "linearize",
     "monte_carlo",
     "motion",
+    "resampling",
     "run",
     "scenarios",
     "se2",
     "sensors",
     "simulate",
     "slots",
+    "smoothing",
     "spurious",
     "stats",
+    "team",
     "verify_jacobians",
 ]
 

@@ -1,18 +1,26 @@
-"""The family: every variant of the one EKF-SLAM by name, set up for a scenario.
+"""The family: every variant of the one EKF-SLAM by name, set up for a scenario, and what to hold
+beside it.
 
 A variant is a chart, a linearizer or an option, given in one line; `monte_carlo` and the command
 line run them side by side.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from jaxslam.charts.left_invariant import left_invariant
 from jaxslam.charts.right_invariant import right_invariant
 from jaxslam.charts.robocentric import robocentric
+from jaxslam.filters.dead_reckoning import dead_reckoning
+from jaxslam.filters.eif_slam import eif_slam
 from jaxslam.filters.ekf_slam import ekf_slam
+from jaxslam.filters.eseif import eseif
+from jaxslam.filters.fastslam import fastslam
+from jaxslam.filters.localization import localization
+from jaxslam.filters.particle_localization import particle_localization
+from jaxslam.filters.seif import seif
 from jaxslam.linearize.at_truth import at_truth
 from jaxslam.linearize.first_estimate import first_estimate
 from jaxslam.linearize.observability import observability
@@ -35,6 +43,71 @@ def ideal(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
     return lambda truth: variant(scenario, linearize=at_truth(truth), **options)
 
 
+def without_measurements(scenario: Scenario, **options: Any) -> Filter:
+    """Dead reckoning in a scenario; options of `ekf_slam` say nothing of it."""
+    return dead_reckoning(scenario.motion, scenario.sensor)
+
+
+def in_a_known_map(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
+    """Localization in the true map; of the options of `ekf_slam`, those that concern it."""
+    asked = scenario.filter_options | options
+    mine = {name: asked[name] for name in ("update", "gate", "iterations") if name in asked}
+    return lambda truth: localization(scenario.motion, scenario.sensor, truth.landmarks, **mine)
+
+
+def by_particles(
+    scenario: Scenario, proposal: Literal["motion", "measurement"], **options: Any
+) -> Filter:
+    """FastSLAM of 50 particles; of the options of `ekf_slam`, those that it has too."""
+    asked = scenario.filter_options | options
+    mine = {name: asked[name] for name in ("gate", "associate", "births", "life") if name in asked}
+    capacity = int(np.shape(scenario.landmarks)[0])
+    return fastslam(
+        scenario.motion, scenario.sensor, capacity, SLAM_PARTICLES, proposal=proposal, **mine
+    )
+
+
+def by_particles_in_a_known_map(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
+    """Monte-Carlo localization in the true map, of 300 particles; options as above."""
+    asked = scenario.filter_options | options
+    mine = {name: asked[name] for name in ("gate", "associate") if name in asked}
+    count = LOCALIZATION_PARTICLES
+    return lambda truth: particle_localization(
+        scenario.motion,
+        scenario.sensor,
+        truth.landmarks,
+        count,
+        least=count,
+        threshold=0.5,
+        **mine,
+    )
+
+
+SLAM_PARTICLES = 50
+"""of FastSLAM in the family: few, so that a campaign of all does not wait for it."""
+
+LOCALIZATION_PARTICLES = 300
+"""of Monte-Carlo localization in the family, in every step"""
+
+
+def in_canonical_form(
+    scenario: Scenario, make: Callable[..., Filter], sparse: bool = True, **options: Any
+) -> Filter:
+    """An information filter in a scenario; of the options of `ekf_slam`, the gate.
+
+    A sparse one has half the map active or 20 landmarks, twice the places of a scan if those are
+    more, all links, and reports the covariance of its whole Ω: the campaign is to judge what it
+    believes, and what sparseness costs, not blankets.
+    """
+    count = int(np.shape(scenario.landmarks)[0])
+    asked = scenario.filter_options | options
+    mine: dict[str, Any] = {name: asked[name] for name in ("gate",) if name in asked}
+    if sparse:
+        active = max(min(20, count // 2), 2 * (scenario.places or count))
+        mine |= {"active": min(active, count), "links": max(1, count - 1), "whole": True}
+    return make(scenario.motion, scenario.sensor, count, **mine)
+
+
 FILTERS: dict[str, Callable[..., Candidate]] = {
     "ekf": variant,
     "ideal": ideal,
@@ -55,3 +128,26 @@ FILTERS: dict[str, Callable[..., Candidate]] = {
 }
 """By name; each takes a scenario, and further options of `ekf_slam`, and returns what `monte_carlo`
 runs on it."""
+
+BASELINES: dict[str, Callable[..., Candidate]] = {
+    "dead_reckoning": without_measurements,
+    "localization": in_a_known_map,
+}
+"""What no SLAM filter should be worse, or can be better, than; as FILTERS."""
+
+PARTICLES: dict[str, Callable[..., Candidate]] = {
+    "fastslam1": lambda world, **more: by_particles(world, "motion", **more),
+    "fastslam2": lambda world, **more: by_particles(world, "measurement", **more),
+    "particle_localization": by_particles_in_a_known_map,
+}
+"""What draws instead of linearizing; as FILTERS."""
+
+CANONICAL: dict[str, Callable[..., Candidate]] = {
+    "eif_slam": lambda world, **more: in_canonical_form(world, eif_slam, sparse=False, **more),
+    "seif": lambda world, **more: in_canonical_form(world, seif, **more),
+    "eseif": lambda world, **more: in_canonical_form(world, eseif, **more),
+}
+"""The information filters, exact and sparse; as FILTERS."""
+
+ALL = FILTERS | CANONICAL | PARTICLES | BASELINES
+"""Every one of them: what the command line knows, and runs for `--filters all`."""

@@ -49,6 +49,15 @@ class Free(NamedTuple):
     """(K, K)"""
 
 
+class Reduced(NamedTuple):
+    """When a landmark's L parameters may become the point (x, y) where it stands, for good."""
+
+    sensor: Any
+    """a Sensor with the same z, whose landmarks are points"""
+    ready: Callable[[Array, Array, Array], Array]
+    """(pose, l, cov (L, L)) -> () bool"""
+
+
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """What the robot sees of one landmark; with L = 0, an absolute sensor, of itself in the map.
@@ -81,6 +90,8 @@ class Sensor:
     """(pose, l) -> by pose (Z, 3), by l (Z, L); hand-derived, to verify against."""
     invert_jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
     """(pose, z, s) -> by pose (L, 3), by z (L, Z), by s (L, K); hand-derived."""
+    reduced: Reduced | None = None
+    """the points that landmarks may turn into; None where they never do"""
 
 
 class Basis(NamedTuple):
@@ -204,6 +215,15 @@ Associate = Callable[[Prediction, Scan], Association]
 """Association methods. They are not differentiated: what they return are integers."""
 
 
+Resample = Callable[[Array, Array], Array]
+"""(log-weights (P,) of any scale, key) -> the ancestor (P,) int of each of the P particles that go
+on; the expected number of copies of j is P w_j. Not differentiated."""
+
+Differentiable = Callable[[Array, Array], tuple[Array, Array]]
+"""As `Resample`, with the log-weight (P,) of each as well, Σ exp = 1, through which gradients reach
+the weights before. Its sum must be left alone: its gradient may be part of the method."""
+
+
 @dataclass(frozen=True, eq=False)
 class Life:
     """Which landmarks stay in the map: the guide's map manager, asked after every scan."""
@@ -235,6 +255,8 @@ class Filter:
     estimate: Callable[[Any], Estimate]
     """(S) -> moments in map coordinates."""
     chart: Chart
+    places: tuple[int, ...] = ()
+    """how many places of a scan each sensor has, in order; () where all are of one sensor."""
 
 
 Estimator = Callable[[Log, Array], Trace]

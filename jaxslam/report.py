@@ -111,6 +111,7 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
         "divergence_limit_m": campaign.divergence_limit,
         "seconds": round(campaign.seconds, 3),
         "compile_seconds": round(campaign.compile_seconds, 3),
+        "step_seconds": campaign.step_seconds,
         "versions": versions(),
     }
     return json_text(head | {"filters": filters})
@@ -224,11 +225,16 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
     for block in DOF:
         shares = [f"{s.inside[block]:.1%}" if block in s.inside else "-" for s in summaries]
         lines.append([f"steps in {block} band", f"{LEVEL:.1%}", *shares])
+    took = [campaign.step_seconds.get(name) for name in names]
+    if any(took):
+        cells = ["-" if one is None else f"{1e6 * one:.3g}" for one in took]
+        lines.append(["time of a step [µs]", "", *cells])
     always = ("runs", "not_finite", "divergent")
-    for key in summaries[0].counts:
-        counts = [s.counts[key] for s in summaries]
+    for key in dict.fromkeys(key for s in summaries for key in s.counts):
+        counts = [s.counts.get(key) for s in summaries]
         if key in always or any(counts):
-            lines.append([key.replace("_", " "), "", *(f"{count:,}" for count in counts)])
+            shown = ("-" if count is None else f"{count:,}" for count in counts)
+            lines.append([key.replace("_", " "), "", *shown])
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     text = [
         "  ".join(

@@ -45,7 +45,12 @@ def run(
         ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN in controls
             or valid measurements, tags repeated within a scan, or a bad pose_cov.
     """
-    check_log(log, control_size=filter.control_size, measurement_size=filter.measurement_size)
+    check_log(
+        log,
+        control_size=filter.control_size,
+        measurement_size=filter.measurement_size,
+        parts=filter.places,
+    )
     if np.shape(pose) != (3,):
         raise ValueError(f"run: expected a pose of shape (3,), got {np.shape(pose)}")
     if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):

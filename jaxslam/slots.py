@@ -36,6 +36,11 @@ class Joint(NamedTuple):
     """the `Last` motion, where the chart keeps it apart"""
     life: Any = ()
     """the memory of the filter's `Life`, where it has one"""
+    reduced: Any = ()
+    """(N,) bool: the slot holds a point (x, y), and padding in the rest of its L coordinates; of
+    a sensor whose landmarks may become points"""
+    apart: Any = ()
+    """(N, N) bool: landmarks that a scan measured both, of a filter that merges others"""
 
 
 class Last(NamedTuple):
@@ -244,4 +249,6 @@ def remove(joint: Joint, dead: jax.Array, *, square_root: bool = False) -> Joint
         alive=joint.alive & ~dead,
         tag=jnp.where(dead, -1, joint.tag),
         watch=watch,
+        reduced=jax.tree.map(lambda was: was & ~dead, joint.reduced),
+        apart=jax.tree.map(lambda was: was & ~dead[:, None] & ~dead[None, :], joint.apart),
     )

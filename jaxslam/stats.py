@@ -53,3 +53,10 @@ def chi2_band(dof: float, runs: int, level: float = 0.95) -> tuple[float, float]
 def t_quantile(p: float, dof: int) -> float:
     """Student's t quantile, for the interval of a mean whose variance the runs estimate."""
     return float(scipy.stats.t.ppf(p, dof))
+
+
+def normal_quantile(p: float) -> float:
+    """The x with P(N(0, 1) <= x) = p. Raises ValueError unless 0 < p < 1."""
+    if not 0 < p < 1:
+        raise ValueError(f"expected a probability between 0 and 1, got {p}")
+    return float(scipy.stats.norm.ppf(p))

@@ -29,14 +29,18 @@ class Status(IntEnum):
     OVERFLOW = 4
     """A new landmark, but the map is full; dropped."""
     DEFERRED = 5
-    """A new landmark beyond the scan's quota of births; dropped for now."""
+    """A new landmark beyond the scan's quota of births, or any landmark that `eseif` has no
+    place for until it can relocate; dropped for now."""
     REPEATED = 6
     """Its new tag occurs earlier in the same scan; dropped."""
     SINGULAR = 7
     """Its innovation covariance is not positive definite; dropped."""
     UNMATCHED = 8
     """Association found it neither of a landmark nor new (between two gates, ambiguous, or of
-    unknown identity where identities are asked for); dropped."""
+    unknown identity where identities are asked for), or a robot it concerns has no place in the map
+    yet; dropped."""
+    SIGHTED = 9
+    """Of no landmark yet; kept as a sighting (`filters.delayed_slam`)."""
 
 
 class Scan(NamedTuple):
@@ -114,6 +118,27 @@ class Info(NamedTuple):
     """() bool: the search for the best association ended at its budget; or nothing."""
     removed: Any = ()
     """(N,) bool: slots whose landmark was removed, where the filter has a `Life`."""
+    reduced: Any = ()
+    """(N,) bool: slots whose landmark became a point, where the sensor's may."""
+    merged: Any = ()
+    """(2,) int: the slot of two landmarks merged into one and the slot given up, or -1, -1; where
+    the filter merges duplicates."""
+    ess: Any = ()
+    """() effective number of particles before resampling, of a filter that has particles."""
+    resampled: Any = ()
+    """() bool: the particles were resampled."""
+    underflow: Any = ()
+    """() bool: no particle had a weight left, and all were given the same."""
+    invalid: Any = ()
+    """() int: particles that a motion or a scan left with a pose that is not finite; they keep the
+    pose before, and weigh nothing."""
+    active: Any = ()
+    """() int: particles in use, of a filter that chooses their number."""
+    injected: Any = ()
+    """() int: particles drawn anew from the whole box before this step's motion, to find a robot
+    that is lost."""
+    capped: Any = ()
+    """() bool: the wanted number of particles was above the capacity."""
 
     @property
     def overflow(self) -> jax.Array:
@@ -138,11 +163,14 @@ class Trace(NamedTuple):
     """what the caller's probe saw after each update, leading T; () without one."""
 
 
-def check_log(log: Log, *, control_size: int, measurement_size: int) -> None:
+def check_log(
+    log: Log, *, control_size: int, measurement_size: int, parts: tuple[int, ...] = ()
+) -> None:
     """Raise ValueError, naming the row, unless a log is well formed.
 
     Shapes and kinds are always checked, values (finite controls, finite valid measurements, tags
-    >= -1 and not repeated within a scan) only where they are concrete.
+    >= -1 and not repeated within a scan) only where they are concrete. parts: how many places of a
+    scan each sensor has, where there are several; a tag may then occur once with each.
     """
     control, (z, tag, valid) = log.control, log.scan
     steps = np.shape(control)[0] if np.ndim(control) == 2 else -1
@@ -151,6 +179,8 @@ def check_log(log: Log, *, control_size: int, measurement_size: int) -> None:
     _expect("log.scan.z", z, (steps, places, measurement_size), np.floating)
     _expect("log.scan.tag", tag, (steps, places), np.integer)
     _expect("log.scan.valid", valid, (steps, places), np.bool_)
+    if parts and places != sum(parts):
+        raise ValueError(f"log.scan: expected {sum(parts)} places, for sensors of {parts}")
     if not is_concrete(log):
         return
     there, tags = np.asarray(valid), np.asarray(tag)
@@ -158,8 +188,10 @@ def check_log(log: Log, *, control_size: int, measurement_size: int) -> None:
     finite = np.isfinite(np.asarray(z)).all(axis=2)
     _refuse((there & ~finite).any(axis=1), "a valid measurement is not finite")
     _refuse((there & (tags < -1)).any(axis=1), "a tag is below -1")
-    ordered = np.sort(np.where(there & (tags >= 0), tags, -1 - np.arange(places)), axis=1)
-    _refuse((ordered[:, 1:] == ordered[:, :-1]).any(axis=1), "a tag repeats within the scan")
+    named = np.where(there & (tags >= 0), tags, -1 - np.arange(places))
+    for part in np.split(named, np.cumsum(parts)[:-1].astype(int), axis=1) if parts else (named,):
+        ordered = np.sort(part, axis=1)
+        _refuse((ordered[:, 1:] == ordered[:, :-1]).any(axis=1), "a tag repeats within the scan")
 
 
 def _expect(name: str, value: Any, shape: tuple[int, ...], kind: type) -> None:

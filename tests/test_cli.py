@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_family import three_parameters
 
-from jaxslam import cli, store
+from jaxslam import cli, family, store
 from jaxslam.monte_carlo import Interrupted
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
@@ -26,7 +26,7 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
         "report.html",
         "consistency.json",
         "consistency.csv",
-        *(f"{n}.png" for n in ("nees", "bound", "coverage", "whiteness", "gained")),
+        *(f"{n}.png" for n in ("nees", "bound", "cost", "coverage", "whiteness", "gained")),
         *(f"{n}.png" for n in ("errors", "map")),
     }
     found = json.loads((out / "consistency.json").read_text())
@@ -71,6 +71,19 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, capsys, change, mes
     assert cli.main([*QUICK, *change, "--out", str(out)]) == 2
     assert message in capsys.readouterr().err
     assert not out.exists()
+
+
+@pytest.mark.parametrize("asked", ["all", "fastslam1,fastslam2,particle_localization"])
+def test_particles_are_named_as_any_filter_and_all_spans_them(tmp_path, monkeypatch, asked):
+    seen = []
+
+    def begun(scenario, filters, *arguments, **options):
+        seen.extend(filters)
+        raise Interrupted(None, 3)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", begun)
+    assert cli.main([*QUICK, "--filters", asked, "--out", str(tmp_path / "out")]) == 130
+    assert seen == (list(family.ALL) if asked == "all" else list(family.PARTICLES))
 
 
 def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, capsys, monkeypatch):
@@ -171,7 +184,11 @@ def kept(out):
 def results(out):
     """What a campaign found, but for how long it took and what it was called."""
     found = json.loads((out / "consistency.json").read_text())
-    return {k: v for k, v in found.items() if k not in ("seconds", "compile_seconds", "command")}
+    return {
+        k: v
+        for k, v in found.items()
+        if k not in ("seconds", "compile_seconds", "step_seconds", "command")
+    }
 
 
 def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys):

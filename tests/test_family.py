@@ -1,7 +1,7 @@
 """The family: what each variant must keep invisible, what it must equal, what it refuses."""
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jaxslam import charts, family, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.protocols import Filter, Here
 from jaxslam.run import run
-from jaxslam.scenarios import loop, stationary
+from jaxslam.scenarios import SCENARIOS, loop, stationary
 from jaxslam.simulate import simulate
 
 KEY = jax.random.key(0)
@@ -21,9 +21,19 @@ CURES = ["ideal", "fej", "oc", "right_invariant", "robocentric", "ukf_right"]
 VICTIMS = ["ekf", "iterated", "left_invariant", "ukf", "ukf_left", "square_root"]
 
 
-def drive(world, name, seed=1, probe=None, **options):
-    """One run of a variant: its trace, and the truth."""
-    truth, log = jax.jit(partial(simulate, world))(jax.random.key(seed))
+def draw(world):
+    """A scenario with a truth and a log of it."""
+    return world, *jax.jit(partial(simulate, world))(jax.random.key(1))
+
+
+@cache
+def drawn(make, steps):
+    return draw(make(steps=steps))
+
+
+def drive(drawn, name, probe=None, **options):
+    """One run of a variant: its trace."""
+    world, truth, log = drawn
 
     @jax.jit
     def go(truth, log):
@@ -31,11 +41,29 @@ def drive(world, name, seed=1, probe=None, **options):
         filter = candidate if isinstance(candidate, Filter) else candidate(truth)
         return run(filter, log, world.pose, world.pose_cov, KEY, probe=probe)
 
-    return go(truth, log), truth
+    return go(truth, log)
 
 
 def test_the_family_is_known_to_these_tests():
     assert sorted(CURES + VICTIMS) == sorted(family.FILTERS)
+
+
+@pytest.mark.parametrize("scenario", ["circle", "loop_bearing", "stationary"])
+def test_what_draws_instead_of_linearizing_fits_scenarios(scenario):
+    """Built and traced, not run: what comes out has the shapes that the harness judges."""
+    world = SCENARIOS[scenario](3)
+    truth, log = jax.eval_shape(partial(simulate, world), jax.random.key(0))
+
+    def go(name, truth, log):
+        candidate = family.PARTICLES[name](world, watch=True)
+        filter = candidate if isinstance(candidate, Filter) else candidate(truth)
+        return run(filter, log, world.pose, world.pose_cov, KEY)
+
+    for name in family.PARTICLES:
+        trace = jax.eval_shape(partial(go, name), truth, log)
+        assert trace.estimate.pose.shape == (3, 3)
+        assert trace.info.invalid.shape == (3,)
+        assert trace.estimate.tag.shape == (3, len(world.landmarks))
 
 
 # --- observability: a turn of everything must stay invisible -------------------------------------
@@ -44,7 +72,7 @@ def test_the_family_is_known_to_these_tests():
 @pytest.fixture(scope="module", params=CURES + VICTIMS)
 def watched(request, quick_compilation):
     """A filter of the family, 80 steps of the loop, and its watch after each."""
-    trace, _ = drive(loop(steps=80), request.param, watch=True, probe=lambda s: s.watch)
+    trace = drive(drawn(loop, 80), request.param, watch=True, probe=lambda s: s.watch)
     return request.param, trace
 
 
@@ -70,7 +98,7 @@ def still(quick_compilation):
     """Standard deviation of the heading (T,) on `stationary`, by filter."""
     out = {}
     for name in family.FILTERS:
-        trace, _ = drive(stationary(steps=60), name)
+        trace = drive(drawn(stationary, 60), name)
         out[name] = np.sqrt(np.asarray(trace.estimate.pose_cov)[:, 2, 2])
     return out
 
@@ -152,7 +180,7 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly(name, quick_com
             "motion": motion.increment(jnp.diag(sigma[:2]) ** 2),
             "sensor": sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
         }
-        filter = family.FILTERS[name](dataclasses.replace(world, **models))
+        filter = family.FILTERS[name](dataclasses.replace(world, **models), update="joint")
         trace = run(filter, log, world.pose, world.pose_cov, KEY)
         return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()
 
@@ -176,8 +204,9 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly(name, quick_com
 )
 def test_the_square_root_filter_is_the_filter(options):
     world = dataclasses.replace(worlds.ring(steps=25), pose_cov=np.diag([0.01, 0.02, 0.003]))
-    plain, _ = drive(world, "ekf", **options)
-    root, _ = drive(world, "ekf", square_root=True, probe=lambda s: s.cov, **options)
+    here = draw(world)
+    plain = drive(here, "ekf", **options)
+    root = drive(here, "ekf", square_root=True, probe=lambda s: s.cov, **options)
     for name in ("pose", "pose_cov", "points", "point_covs"):
         ours, theirs = getattr(root.estimate, name), getattr(plain.estimate, name)
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-11)
@@ -206,6 +235,23 @@ def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
         smallest[square_root] = np.linalg.eigvalsh(cov)[:, 0].min()
     assert smallest[False] < 0
     assert smallest[True] > 0
+
+
+# --- canonical form -----------------------------------------------------------------------------
+
+
+def test_information_filters_stand_beside_the_family(quick_compilation):
+    """All active, they are the EKF by other numbers; what they do not know of is left out."""
+    world = worlds.ring(steps=12)
+    world = dataclasses.replace(world, pose_cov=np.diag([0.01, 0.02, 0.003]))
+    plain = drive(draw(world), "ekf", update="joint")
+    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    for name in ("eif_slam", "seif", "eseif"):
+        filter = family.CANONICAL[name](world, update="joint", watch=True)
+        assert filter.name == name
+        trace = jax.jit(lambda log, f=filter: run(f, log, world.pose, world.pose_cov, KEY))(log)
+        np.testing.assert_allclose(trace.estimate.pose, plain.estimate.pose, atol=1e-8)
+        np.testing.assert_allclose(trace.estimate.pose_cov, plain.estimate.pose_cov, atol=1e-8)
 
 
 # --- refusals -----------------------------------------------------------------------------------

@@ -16,9 +16,9 @@ PACKAGE = Path(jaxslam.__file__).parent
 FLOORS = [
     "angles se2 frames lapack linalg assignment staging stats",
     "types protocols slots noise derivatives",
-    "motion sensors charts linearize association life",
-    "filters run simulate spurious",
-    "consistency monte_carlo verify linearity scenarios family",
+    "motion sensors charts linearize association resampling life",
+    "filters smoothing run simulate spurious team",
+    "consistency monte_carlo verify linearity scenarios family calibration",
     "datasets plot page report store userfile cli __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}

@@ -33,9 +33,8 @@ def log_of(seen):
 
 
 @cache
-def driver(capacity=3, steps=12, places=2, **options):
-    manager = life.existence(always, **options)
-    filter = ekf_slam(MOTION, SENSOR, capacity, life=manager)
+def driver(**options):
+    filter = ekf_slam(MOTION, SENSOR, 3, life=life.existence(always), **options)
 
     @jax.jit
     def go(log):
@@ -164,6 +163,17 @@ def test_batches_and_float32():
     trace = driver()(small)
     assert trace.probe.log_odds.dtype == np.float32
     np.testing.assert_array_equal(trace.info.removed, batch.info.removed[0])
+
+
+def test_a_root_does_not_change_because_another_run_loses_a_landmark():
+    seen = np.full((2, 12, 2), -1)
+    seen[:, :, 0], seen[0, 0, 1] = 0, 1
+    one, other = log_of(seen[0]), log_of(seen[1])
+    go = driver(square_root=True)
+    beside = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), one, other))
+    twice = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), other, other))
+    assert beside.info.removed[0].any()
+    np.testing.assert_array_equal(beside.final.cov[1], twice.final.cov[1])
 
 
 def test_nothing_ever_seen():

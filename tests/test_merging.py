@@ -1,15 +1,17 @@
 """Merging two landmarks that are one: the joint test, the constraint, and what it equals."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import charts, motion, sensors, slots
+from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.filters import ekf_slam
-from jaxslam.filters.merging import closest_pair, merge
+from jaxslam.filters.merging import closest_pair, duplicates, merge
 from jaxslam.slots import Joint
-from jaxslam.types import Scan
+from jaxslam.types import Log, Scan
 
 EUCLIDEAN = charts.euclidean()
 MOTION = motion.pose_increment(np.diag([0.1, 0.1, 0.05]) ** 2)
@@ -121,3 +123,106 @@ def test_a_square_root_is_merged_too():
     merged = merge(root, EUCLIDEAN, jnp.asarray(0), jnp.asarray(2), square_root=True)
     np.testing.assert_allclose(merged.cov @ merged.cov.T, whole.cov, atol=1e-12)
     assert slots.find(merged.tag, merged.alive, jnp.array([0]))[1].all()
+
+
+def seen_twice(together=False, steps=8, dtype=np.float64):
+    """A robot that stands, and measures one landmark by tag 0, then by tag 2; and another, tag 1."""
+    rng = np.random.default_rng(5)
+    points = np.array([[2.0, 1.0], [3.0, -1.0], [2.0, 1.0]])
+    tag = np.tile(np.array([0, 1, 2], np.int32), (steps, 1))
+    valid = np.ones((steps, 3), bool)
+    if not together:
+        valid[:4, 2], valid[4:, 0] = False, False
+    z = points[None] + 0.1 * rng.normal(size=(steps, 3, 2))
+    scan = Scan(z.astype(dtype), np.where(valid, tag, -1), valid)
+    return Log(np.zeros((steps, 3), dtype), scan)
+
+
+@cache
+def merging_driver(chart="euclidean", dtype=np.float64, **options):
+    filter = ekf_slam(MOTION, SENSOR, 4, chart=charts.REGISTRY[chart](), **options)
+    start = jnp.zeros(3, dtype), jnp.zeros((3, 3), dtype), KEY
+    return filter, jax.jit(lambda log: run(filter, log, *start))
+
+
+RULE = duplicates(0.5)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"chart": "right_invariant"}, {"square_root": True}, {"update": "joint"}]
+)
+def test_a_filter_merges_what_it_holds_twice(options):
+    log = seen_twice()
+    _, go = merging_driver(merge=RULE, **options)
+    trace = go(log)
+    merged = np.asarray(trace.info.merged)
+    at = int(np.argmax(merged[:, 0] >= 0))
+    assert at >= 4 and list(merged[at]) == [0, 2]
+    assert (merged[:at] == -1).all()
+    assert not trace.estimate.alive[at, 2]
+    # The same as the filter without, and a merge by hand.
+    plain, go_plain = merging_driver(**options)
+    before = go_plain(jax.tree.map(lambda leaf: leaf[: at + 1], log)).final
+    chart = charts.REGISTRY[options.get("chart", "euclidean")]()
+    square_root = options.get("square_root", False)
+    by_hand = merge(before, chart, jnp.asarray(0), jnp.asarray(2), square_root=square_root)
+    expected = plain.estimate(by_hand)
+    for name in ("pose", "pose_cov", "points", "point_covs"):
+        actual = getattr(trace.estimate, name)[at]
+        np.testing.assert_allclose(actual, getattr(expected, name), atol=1e-10)
+
+
+def test_what_one_scan_measures_twice_is_two():
+    _, go = merging_driver(merge=RULE)
+    trace = go(seen_twice(together=True))
+    assert (trace.info.merged == -1).all()
+    assert trace.estimate.alive[-1, :3].all()
+    apart = np.asarray(trace.final.apart)
+    np.testing.assert_array_equal(apart[:3, :3], True)
+    assert not apart[3].any()
+
+
+def test_what_was_measured_beside_either_is_apart_from_the_merged():
+    _, go = merging_driver(merge=RULE)
+    trace = go(seen_twice())
+    at = int(np.argmax(np.asarray(trace.info.merged)[:, 0] >= 0))
+    final = go(jax.tree.map(lambda leaf: leaf[: at + 1], seen_twice())).final
+    apart = np.asarray(final.apart)
+    assert apart[0, 1] and apart[1, 0]
+    assert not apart[2].any() and not apart[:, 2].any()
+
+
+def test_far_landmarks_and_none_are_left_alone():
+    log = seen_twice()
+    far = log._replace(scan=log.scan._replace(z=log.scan.z + np.array([[0, 0], [0, 0], [0, 1.0]])))
+    _, go = merging_driver(merge=RULE)
+    assert (go(far).info.merged == -1).all()
+    nothing = Scan(*(np.zeros_like(part) for part in log.scan))._replace(tag=log.scan.tag * 0 - 1)
+    trace = go(log._replace(scan=nothing))
+    assert (trace.info.merged == -1).all()
+    assert np.isfinite(trace.final.cov).all()
+
+
+def test_merging_in_float32_and_its_gradient():
+    log = seen_twice(dtype=np.float32)
+    _, go = merging_driver(merge=RULE, dtype=np.float32)
+    trace = go(log)
+    assert trace.final.cov.dtype == np.float32 and (np.asarray(trace.info.merged)[:, 0] >= 0).any()
+    z = jnp.asarray(log.scan.z)
+
+    def points(z):
+        return go(log._replace(scan=log.scan._replace(z=z))).estimate.points
+
+    assert np.isfinite(jax.jvp(points, (z,), (jnp.ones_like(z),))[1]).all()
+
+
+def test_refusals_of_duplicates():
+    for bad in ({"reach": 0.0}, {"reach": 1.0, "probability": 1.0}):
+        with pytest.raises(ValueError, match="duplicates: expected"):
+            duplicates(**bad)
+    with pytest.raises(ValueError, match="to be a Duplicates"):
+        ekf_slam(MOTION, SENSOR, 3, merge=0.5)
+    rays = sensors.bearing_inverse_depth(np.eye(1))
+    for sensor in (rays, sensors.compass(np.eye(1))):
+        with pytest.raises(ValueError, match="cannot be merged"):
+            ekf_slam(MOTION, sensor, 3, merge=RULE)

@@ -49,6 +49,7 @@ def campaign(**filters):
         filters=filters,
         seconds=200.0,
         compile_seconds=10.0,
+        step_seconds={},
     )
 
 

@@ -95,12 +95,16 @@ def campaign(quick_compilation):
         autocorrelation=a.autocorrelation / 2,
     )
     a = dataclasses.replace(a, curves=a.curves | watched)
-    return dataclasses.replace(found, filters={"a": a, "b": b})
+    (one,) = found.step_seconds.values()
+    return dataclasses.replace(
+        found, filters={"a": a, "b": b}, step_seconds={"a": one, "b": 20 * one}
+    )
 
 
 CAMPAIGN_FIGURES = (
     plot.nees_figure,
     plot.bound_figure,
+    plot.cost_figure,
     plot.coverage_figure,
     plot.whiteness_figure,
     plot.gained_figure,
@@ -110,7 +114,9 @@ CAMPAIGN_FIGURES = (
 def many(campaign, names):
     summaries = list(campaign.filters.values())
     filters = {name: summaries[i % 2] for i, name in enumerate(names)}
-    return dataclasses.replace(campaign, filters=filters)
+    times = list(campaign.step_seconds.values())
+    step_seconds = {name: times[i % 2] for i, name in enumerate(names)}
+    return dataclasses.replace(campaign, filters=filters, step_seconds=step_seconds)
 
 
 def line(axes, label):
@@ -204,6 +210,20 @@ def test_whiteness_is_drawn_lag_by_lag_about_zero(campaign):
     np.testing.assert_array_equal(drawn.get_ydata(), campaign.filters["b"].autocorrelation)
     assert axes.get_ylim()[0] == -axes.get_ylim()[1]
     assert axes.get_xlabel() == "lag [steps]"
+
+
+def test_cost_is_drawn_against_error_and_nees(campaign):
+    top, bottom = plot.cost_figure(campaign).axes
+    for name, summary in campaign.filters.items():
+        for axes, key in ((top, "rmse_position"), (bottom, "nees_pose")):
+            (x,), (y,) = line(axes, name).get_data()
+            assert x == pytest.approx(1e6 * campaign.step_seconds[name])
+            assert y == pytest.approx(summary.measures[key].value)
+    assert bottom.get_xlabel() == "time of a step [µs]"
+    # A campaign that only read its blocks has timed nothing.
+    untimed = plot.cost_figure(dataclasses.replace(campaign, step_seconds={}))
+    assert "no filter was timed" in [text.get_text() for text in untimed.axes[0].texts]
+    untimed.canvas.draw()
 
 
 def test_information_gained_is_drawn_for_watched_filters_and_zeros_are_nothing(campaign):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from test_family import drive
+from test_family import draw, drive
 
 from jaxslam import charts, linearize
 from jaxslam.linearize.unscented import by_variables, regress
@@ -63,10 +63,10 @@ def test_of_an_affine_function_nothing_is_left_over():
 @pytest.mark.parametrize("chart", list(charts.REGISTRY))
 def test_with_points_close_together_it_is_the_ekf_of_the_same_chart(chart):
     """Slopes are then derivatives; what stays is the mean's second order, which is of size P."""
-    world = worlds.ring(steps=20)
+    drawn = draw(worlds.ring(steps=20))
     options = {"chart": charts.REGISTRY[chart](), "update": "joint"}
-    first, _ = drive(world, "ekf", **options)
-    fitted, _ = drive(world, "ekf", linearize=linearize.unscented(1e-3), **options)
+    first = drive(drawn, "ekf", **options)
+    fitted = drive(drawn, "ekf", linearize=linearize.unscented(1e-3), **options)
     np.testing.assert_allclose(fitted.estimate.pose, first.estimate.pose, atol=2e-3)
     np.testing.assert_allclose(
         fitted.estimate.pose_cov, first.estimate.pose_cov, rtol=0.02, atol=1e-7

@@ -1,9 +1,10 @@
 """Data association: which landmark a measurement is of."""
 
+from jaxslam.association.certain import certain
 from jaxslam.association.global_nearest import global_nearest
 from jaxslam.association.joint import joint
 from jaxslam.association.known import known
 from jaxslam.association.maximum_likelihood import maximum_likelihood
 from jaxslam.association.nearest import nearest
 
-__all__ = ["global_nearest", "joint", "known", "maximum_likelihood", "nearest"]
+__all__ = ["certain", "global_nearest", "joint", "known", "maximum_likelihood", "nearest"]

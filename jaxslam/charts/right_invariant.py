@@ -8,37 +8,55 @@ from jaxslam.angles import wrap
 from jaxslam.protocols import Basis, Chart
 
 
-def right_invariant() -> Chart:
+def right_invariant(rays: bool = False) -> Chart:
     """(R, t, l) ← exp(ξ)·(R, t, l), the group SE_{1+N}(2) acting from the left of the estimate.
 
     With dx = (ρ, φ): θ ← θ + φ, t ← R(φ)t + V(φ)ρ, l ← R(φ)l + V(φ)dl, V as in `se2.exp`. A turn φ
     of the whole map about the origin leaves ρ and dl at zero, so the unobservable directions do not
     depend on the estimate, and the filter cannot gain information along them (Barrau & Bonnabel
-    2015, arXiv:1510.06263; Zhang et al. 2017). For point landmarks l = (x, y) only.
+    2015, arXiv:1510.06263; Zhang et al. 2017). For point landmarks l = (x, y), or with
+
+    rays: for l = (x0, y0, α, ρ), as of `sensors.bearing_inverse_depth`: its place goes as a point
+    does, its direction turns with the map, α ← α + φ + dα, and ρ ← ρ + dρ.
+
+    Raises ValueError where `retract` gets a landmark of another size.
     """
+    name = "right_invariant, rays" if rays else "right_invariant"
+    size = 4 if rays else 2
 
     def retract(
         pose: jax.Array, landmark: jax.Array, dx: jax.Array, dl: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        if landmark.shape != (size,):
+            raise ValueError(f"{name}: expected a landmark ({size},), got {landmark.shape}")
         moved = se2.exp(dx)
-        shift = se2.exp(jnp.concatenate([dl, dx[2:]]))
-        return se2.compose(moved, pose), se2.from_frame(shift, landmark)
+        shift = se2.exp(jnp.concatenate([dl[:2], dx[2:]]))
+        point = se2.from_frame(shift, landmark[:2])
+        if rays:
+            turned = wrap(landmark[2:3] + dx[2:] + dl[2:3])
+            point = jnp.concatenate([point, turned, landmark[3:] + dl[3:]])
+        return se2.compose(moved, pose), point
 
     def local(
         pose0: jax.Array, landmark0: jax.Array, pose: jax.Array, landmark: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         turn = wrap(pose[2:] - pose0[2:])
         moved = se2.log(se2.compose(pose, se2.inverse(pose0)))
-        offset = landmark - se2.rotation(turn[0]) @ landmark0
-        return moved, se2.log(jnp.concatenate([offset, turn]))[:2]
+        offset = landmark[:2] - se2.rotation(turn[0]) @ landmark0[:2]
+        error = se2.log(jnp.concatenate([offset, turn]))[:2]
+        if rays:
+            turned = wrap(landmark[2:3] - landmark0[2:3] - turn)
+            error = jnp.concatenate([error, turned, landmark[3:] - landmark0[3:]])
+        return moved, error
 
     def basis(pose: jax.Array, landmark: jax.Array) -> Basis:
         eye = jnp.eye(3, dtype=pose.dtype)
-        cross = jnp.zeros((2, 3), pose.dtype)
+        cross = jnp.zeros((size, 3), pose.dtype)
+        cross = cross.at[0, 2].set(-landmark[1]).at[1, 2].set(landmark[0])
         return Basis(
             pose=eye.at[0, 2].set(-pose[1]).at[1, 2].set(pose[0]),
-            cross=cross.at[0, 2].set(-landmark[1]).at[1, 2].set(landmark[0]),
+            cross=cross.at[2, 2].set(1.0) if rays else cross,
             landmark=None,
         )
 
-    return Chart(name="right_invariant", retract=retract, local=local, basis=basis)
+    return Chart(name=name, retract=retract, local=local, basis=basis)

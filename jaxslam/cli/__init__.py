@@ -14,7 +14,7 @@ from jaxslam.cli.campaign import DEFAULTS, consistency
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
 from jaxslam.datasets import READERS
-from jaxslam.family import FILTERS
+from jaxslam.family import ALL
 from jaxslam.scenarios import SCENARIOS
 
 __all__ = ["main"]
@@ -58,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     for name, about in {
         "scenario": f"one of: {', '.join(SCENARIOS)}",
-        "filters": f'"all", or some of: {",".join(FILTERS)}; comma-separated',
+        "filters": f'"all", or some of: {",".join(ALL)}; comma-separated',
         "runs": "simulated trajectories",
         "steps": "steps of each; default the scenario's own",
         "seed": "of every draw",

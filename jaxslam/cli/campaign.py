@@ -13,7 +13,7 @@ import jax
 from jaxslam import page, plot, report, store
 from jaxslam.cli import devices
 from jaxslam.cli.asking import INTERRUPTED, Progress, pick
-from jaxslam.family import FILTERS
+from jaxslam.family import ALL
 from jaxslam.linalg import check_count
 from jaxslam.monte_carlo import Campaign, Interrupted, missing, monte_carlo
 from jaxslam.protocols import Candidate, Filter
@@ -48,7 +48,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     scenario = _scenario(asked["scenario"], asked["steps"])
     names = [name.strip() for name in asked["filters"].split(",")]
     if names == ["all"]:
-        names = list(FILTERS)
+        names = list(ALL)
     if len(set(names)) < len(names):
         raise ValueError(f"expected each filter once, got {asked['filters']!r}")
     filters = {name: _filter(name, scenario) for name in names}
@@ -128,7 +128,7 @@ def _campaign_files(
     name = next(iter(campaign.filters))
     key_world, key_filter = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0))
     truth, log = jax.jit(partial(simulate, scenario))(key_world)
-    candidate = FILTERS[name](scenario)
+    candidate = ALL[name](scenario)
     filter = candidate if isinstance(candidate, Filter) else candidate(truth)
     assert isinstance(filter, Filter)
     trace = run(filter, log, scenario.pose, scenario.pose_cov, key_filter)
@@ -139,6 +139,7 @@ def _campaign_files(
             "RMSE, and the Cramér-Rao bound" if bound else "RMSE",
             plot.bound_figure(campaign),
         ),
+        "cost": ("Error and NEES against the time of a step", plot.cost_figure(campaign)),
         "coverage": ("Coverage of the ellipsoids", plot.coverage_figure(campaign)),
         "whiteness": ("Autocorrelation of innovations", plot.whiteness_figure(campaign)),
         "gained": ("Information wrongly gained of a turn", plot.gained_figure(campaign)),
@@ -166,7 +167,7 @@ def _scenario(name: str, steps: int | None) -> Scenario:
 
 def _filter(name: str, scenario: Scenario) -> Candidate:
     """A filter of the family for a scenario, or ValueError by name if it cannot run there."""
-    make = pick("filter", name, FILTERS)
+    make = pick("filter", name, ALL)
     try:
         return make(scenario, watch=True)
     except ValueError as error:

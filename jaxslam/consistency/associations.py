@@ -36,9 +36,10 @@ def associations(
     """
     info = trace.info
     fused = info.status == Status.FUSED
-    mine = jnp.take_along_axis(held, jnp.maximum(info.slot, 0), axis=1)
-    right = (fused & (origin >= 0) & (mine == origin)).sum()
+    # A slot may be corrected and then given to a new landmark within one scan.
     before = jnp.pad(held[:-1], [(1, 0), (0, 0)], constant_values=-1)
+    mine = jnp.take_along_axis(before, jnp.maximum(info.slot, 0), axis=1)
+    right = (fused & (origin >= 0) & (mine == origin)).sum()
     known = (origin >= 0) & (origin[:, :, None] == before[:, None, :]).any(axis=2)
     last, alive = held[-1], trace.estimate.alive[-1]
     same = (last[:, None] == last[None, :]) & alive[None, :]

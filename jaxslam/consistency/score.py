@@ -36,6 +36,12 @@ DROPS = (
 )
 """What can keep a measurement from the map; each is counted."""
 
+EVENTS = (
+    *("removed", "merged", "reduced", "exhausted", "resampled", "underflow"),
+    *("invalid", "injected", "capped"),
+)
+"""Fields of `Info` that not every filter has; each is counted where it is there."""
+
 LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
 """Probabilities of the coverage curves."""
 
@@ -122,6 +128,7 @@ def score(
         measures["unobservable"] = dimensions.astype(error.dtype), jnp.asarray(1)
 
     sums |= {s.name.lower(): (trace.info.status == s).sum() for s in DROPS}
+    sums |= _events(trace)
     sums |= {"missed": truth.missed.sum(), "singular_steps": (sums["regular_pose"] == 0).sum()}
     finite = _all_finite((trace.estimate, trace.info, sums, measures))
     far = jnp.sqrt(sums["square_position"][-1]) > limit
@@ -142,6 +149,15 @@ def score(
         snapshots=jax.tree.map(kept, shots),
         sums=jax.tree.map(kept, sums),
     )
+
+
+def _events(trace: Trace) -> dict[str, jax.Array]:
+    """How often each of `EVENTS` happened."""
+    there = {name: getattr(trace.info, name) for name in EVENTS}
+    there = {name: value for name, value in there.items() if not isinstance(value, tuple)}
+    if "merged" in there:
+        there["merged"] = there["merged"][:, 0] >= 0
+    return {name: value.sum() for name, value in there.items()}
 
 
 def _all_finite(tree: Any) -> jax.Array:

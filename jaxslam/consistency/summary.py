@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 
 from jaxslam.consistency.credibility import credibility
-from jaxslam.consistency.score import DOF, DROPS
+from jaxslam.consistency.score import DOF, DROPS, EVENTS
 from jaxslam.consistency.tally import Tally
 from jaxslam.stats import chi2_quantile, t_quantile
 
@@ -18,7 +18,7 @@ LEVEL = 0.95
 NORMAL = float(scipy.stats.norm.ppf(0.5 + LEVEL / 2))
 
 
-COUNTS = tuple(status.name.lower() for status in DROPS) + ("missed", "singular_steps")
+COUNTS = tuple(status.name.lower() for status in DROPS) + ("missed", "singular_steps") + EVENTS
 """The sums that are reported as counts."""
 
 
@@ -65,7 +65,8 @@ class Summary:
     """(LAGS,) half-width of the 95 % band about 0 in which that of white innovations lies,
     1.96/√(products of numbers in it) (Bar-Shalom 2001, 5.4.2)."""
     counts: dict[str, int]
-    """runs (finite), not_finite, divergent, singular_steps, and dropped measurements by reason."""
+    """runs (finite), not_finite, divergent, singular_steps, dropped measurements by reason, and,
+    of filters that have them, landmarks removed, merged and reduced, and searches exhausted."""
     per_run: dict[str, np.ndarray]
     """(runs,) each run's own average of each measure, NaN where it has none: squares, radians."""
     not_finite_runs: list[int]

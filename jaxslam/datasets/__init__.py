@@ -10,7 +10,8 @@ from pathlib import Path
 
 from jaxslam.datasets.bonn import bonn
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.mrclam import mrclam
+from jaxslam.datasets.mrclam import mrclam, mrclam_team
+from jaxslam.datasets.plaza import plaza
 from jaxslam.datasets.victoria_park import victoria_park
 
 Reader = Callable[[str | Path, int | None], Dataset]
@@ -33,7 +34,8 @@ def _of_several_robots(
 READERS: dict[str, Reader] = {
     "bonn": partial(_of_one_robot, bonn),
     "mrclam": partial(_of_several_robots, mrclam),
+    "plaza": partial(_of_one_robot, plaza),
     "victoria_park": partial(_of_one_robot, victoria_park),
 }
 
-__all__ = ["READERS", "Dataset", "bonn", "mrclam", "victoria_park"]
+__all__ = ["READERS", "Dataset", "bonn", "mrclam", "mrclam_team", "plaza", "victoria_park"]

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxslam.protocols import Motion, Sensor
+from jaxslam.sensors.suite import Suite
+from jaxslam.team import Robot
 from jaxslam.types import Log, Scan, check_log
 
 
@@ -39,27 +41,39 @@ class Dataset:
     """keyword arguments of `filters.ekf_slam` that belong to the data (update, gate)."""
     landmarks: NDArray[np.float64] | None = None
     """(N, 2) surveyed positions [m] in tag order, in a frame of their own; None where unknown."""
+    true_path: NDArray[np.float64] | None = None
+    """(T, 3) surveyed pose at each row [m, m, rad], in the frame of `landmarks`; None where
+    unknown."""
     dropped: dict[str, int] = field(default_factory=dict)
     """measurements that are in the file and not in the log, counted by reason."""
     corrections: tuple[str, ...] = ()
     """what the reader changed of what the files say, in words."""
     source: str = ""
     """whom to credit."""
+    robots: tuple[Robot, ...] = ()
+    """of a log of several robots: for `filters.team_slam(data.robots, data.capacity)`. Tags N,
+    N+1, … are theirs; `motion` and `sensor` are of the first alone, on the same log."""
 
     def __post_init__(self) -> None:
         check_log(
             self.log,
             control_size=len(self.motion.controls),
             measurement_size=len(self.sensor.measurements),
+            parts=self.sensor.places if isinstance(self.sensor, Suite) else (),
         )
         if np.shape(self.time) != (self.steps,):
             raise ValueError(f"{self.name}: expected {self.steps} times, got {np.shape(self.time)}")
-        if np.max(self.log.scan.tag, initial=-1) >= self.capacity:
+        if np.max(self.log.scan.tag, initial=-1) >= self.capacity + len(self.robots):
             raise ValueError(f"{self.name}: a tag is not below the capacity {self.capacity}")
         if self.landmarks is not None and np.shape(self.landmarks) != (self.capacity, 2):
             raise ValueError(
                 f"{self.name}: expected landmarks of shape ({self.capacity}, 2), "
                 f"got {np.shape(self.landmarks)}"
+            )
+        if self.true_path is not None and np.shape(self.true_path) != (self.steps, 3):
+            raise ValueError(
+                f"{self.name}: expected a true path of shape ({self.steps}, 3), "
+                f"got {np.shape(self.true_path)}"
             )
 
     @property

@@ -68,10 +68,17 @@ def compressed_ekf_slam(
     for name in ("associate", "watch", "square_root", "life"):
         if options.get(name):
             raise ValueError(f"compressed_ekf_slam: does not take {name}")
+    if sensor.reduced is not None:
+        raise ValueError(
+            f"compressed_ekf_slam: the landmarks of {sensor.name} become points, which is not "
+            "for this filter"
+        )
     whole = ekf_slam(motion, sensor, capacity, **options)
     size, own = len(sensor.landmark), min(area, capacity)
     if size == 0:
         raise ValueError(f"compressed_ekf_slam: the sensor {sensor.name} has no landmarks")
+    if whole.places:
+        raise ValueError("compressed_ekf_slam: expected one sensor, not a suite")
     if whole.chart.basis is not None:
         raise ValueError(
             f"compressed_ekf_slam: in the chart {whole.chart.name} a motion changes what is known "

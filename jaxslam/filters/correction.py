@@ -5,40 +5,22 @@ the robot and one landmark: no dense D×D product is formed. They take the model
 set of equations serves every sensor, chart and linearizer. `filters.ekf_slam` binds them.
 """
 
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg, slots
+from jaxslam import linalg
 from jaxslam.filters.composition import lever_of_motion, moved_anew
-from jaxslam.filters.expectation import in_chart, innovation_cov
 from jaxslam.filters.watching import along, informed, split
-from jaxslam.protocols import Chart, Here, Linearizer, Sensor
+from jaxslam.filters.weighing import Correction, Weighed, view_of, weigh
+from jaxslam.protocols import Chart, Linearizer, Sensor
 from jaxslam.slots import Joint
 from jaxslam.staging import apart, settle, where_any
 
 # Measurements that one pass over the covariance corrects by. More rows a pass cost more loads of
 # P_I, fewer more of P; 3 to 6 are alike on the CPUs tried.
 _GROUP = 4
-
-
-class Correction(NamedTuple):
-    """What `correct` did with its m measurements; the numbers are finite for all of them."""
-
-    innovation: jax.Array
-    """(m, Z) against the prior"""
-    innovation_cov: jax.Array
-    """(m, Z, Z)"""
-    nis: jax.Array
-    """(m,)"""
-    log_likelihood: jax.Array
-    """(m,)"""
-    inside: jax.Array
-    """(m,) bool: passed the gate"""
-    positive: jax.Array
-    """(m,) bool: its innovation covariance is positive definite"""
 
 
 def correct(
@@ -68,10 +50,10 @@ def correct(
     square_root: of P = X Xᵀ, X ← X - Vᵀ (L + N)⁻¹ H X, R = N Nᵀ (Andrews 1968, "A square root
     formulation of the Kalman covariance equations", AIAA Journal 6(6)).
     """
-    found = _weigh(
+    found = weigh(
         joint,
         slot,
-        _view(joint, slot, square_root),
+        view_of(joint, slot, square_root),
         z,
         known,
         (joint, slot),
@@ -171,7 +153,7 @@ def correct_in_turn(
             i, part = place
             i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], (i, part))
             memory = joint._replace(pose=local.pose), slot
-            found = _weigh(local, i, _view(local, i), z, known, memory, chart=chart, **options)
+            found = weigh(local, i, view_of(local, i), z, known, memory, chart=chart, **options)
             v, reach = found.v[:, : len(at)], found.v[:, len(at) :]
             moved = _moved(local, found, found.xi[: len(at)], i, chart)
             moved = moved._replace(cov=local.cov - linalg.gram(v, found.v))
@@ -198,167 +180,9 @@ def correct_in_turn(
     return joint, jax.tree.map(lambda leaf: leaf.reshape(groups * group, *leaf.shape[2:])[:m], done)
 
 
-class View(NamedTuple):
-    """What m measurements see of P, or, of a square-root filter, of its root."""
-
-    robot: jax.Array
-    """(3, D) rows of the robot"""
-    own: jax.Array
-    """(m, L, D) rows of the landmarks seen"""
-    local: jax.Array
-    """(m, 3+L, 3+L) P of the robot and the landmark"""
-
-
-class Weighed(NamedTuple):
-    """What m measurements say of all errors, and what the forms of the update are made of."""
-
-    xi: jax.Array
-    """(D,) the correction in the chart"""
-    v: jax.Array
-    """(m·Z, D) V = L⁻¹ H P"""
-    whitened: jax.Array
-    """(m·Z,) L⁻¹ ν"""
-    factor: jax.Array
-    """(m·Z, m·Z) L, with rows of zeros for what is not fused"""
-    s: jax.Array
-    """(m, Z, m, Z) S"""
-    hp: jax.Array
-    """(m·Z, D) H P"""
-    hx: jax.Array
-    """(m, Z, D) H X of a square-root filter, else H P"""
-    noise: jax.Array
-    """(m, Z, Z) R with what the linearizer added"""
-    own_noise: jax.Array
-    """(m, Z, Z) R"""
-    slopes: tuple[jax.Array, jax.Array]
-    """H by the errors of pose (m, Z, 3) and landmark (m, Z, L)"""
-    seen: tuple[jax.Array, jax.Array]
-    """the same by coordinates, at the prior"""
-    fuse: jax.Array
-    """(m,) bool: known, inside the gate and regular alone"""
-    correction: Correction
-
-
-def _view(joint: Joint, slot: jax.Array, square_root: bool = False) -> View:
-    own = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
-    local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
-    return View(joint.cov[:3], settle(own), local)
-
-
-def _weigh(
-    joint: Joint,
-    slot: jax.Array,
-    view: View,
-    z: jax.Array,
-    known: jax.Array,
-    memory: tuple[Joint, jax.Array],
-    *,
-    sensor: Sensor,
-    chart: Chart,
-    linearize: Linearizer,
-    gate: float | None = None,
-    iterations: int = 1,
-    square_root: bool = False,
-) -> Weighed:
-    """Solà (26)-(29) for m measurements at once, from the view they have of P.
-
-    memory: the state that the linearizer remembers by, and the landmarks' slots (m,) there. P may
-    have further columns, which count as other errors.
-    """
-    whole, slot_in_whole = memory
-    m, size_z = z.shape
-    capacity, size_l = joint.landmarks.shape
-    width = 3 + capacity * size_l
-    prior_l = joint.landmarks[slot]
-    own_noise = jax.vmap(sensor.noise_cov)(z)
-    same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
-    over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
-    pose, landmark = joint.pose, prior_l
-    xi = jnp.zeros(view.robot.shape[1], z.dtype)
-    for iteration in range(iterations):
-        expected, by_pose, by_landmark, rest = jax.vmap(
-            lambda at, landmark, cov, pose=pose: linearize.observe(
-                sensor, Here(whole, chart, pose, cov, at, landmark)
-            )
-        )(slot_in_whole, landmark, view.local)
-        noise = own_noise + rest
-        nu = jax.vmap(sensor.residual)(z, expected)
-        if iteration == 0:
-            seen = by_pose, by_landmark
-        xi_l = xi[3:width].reshape(capacity, size_l)[slot]
-        if chart.basis is not None:
-            moved = None if iteration == 0 else (xi[:3], xi_l)
-            by_pose, by_landmark = in_chart(chart, joint.pose, prior_l, by_pose, by_landmark, moved)
-        if iteration > 0:
-            nu = nu + jnp.einsum("mzi,i->mz", by_pose, xi[:3])
-            nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, xi_l)
-        by_pose, by_landmark, nu = settle((by_pose, by_landmark, nu))
-        hp = linalg.total(by_pose[:, :, k, None] * view.robot[None, None, k] for k in range(3))
-        if size_l > 0:
-            hp = hp + linalg.total(
-                by_landmark[:, :, k, None] * view.own[:, None, k] for k in range(size_l)
-            )
-        hp = hx = settle(hp)
-        if square_root:
-            hp = settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
-        s = innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
-        if iteration == 0:
-            marginal = s[jnp.arange(m), :, jnp.arange(m)]
-            distance, positive = jax.vmap(_squared_distance)(nu, marginal)
-            inside = jnp.ones(m, bool) if gate is None else ~positive | (distance <= gate)
-            fuse = known & inside & positive
-            innovation = nu
-        hp = hp.reshape(m * size_z, -1)
-        both = fuse[:, None, None, None] & fuse[None, None, :, None]
-        s = jnp.where(both, s, same * jnp.eye(size_z, dtype=z.dtype)[None, :, None])
-        s = settle(s)
-        factor = settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
-        pivots = jnp.diagonal(factor).reshape(m, size_z)
-        # Measurements that are regular one by one can still be singular together.
-        regular = (pivots > 0).all(axis=1)
-        # A row without a pivot says nothing, and costs no mask of what it would say.
-        factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
-        v, whitened = linalg.solve_lower(factor, hp), linalg.solve_lower(factor, nu.reshape(-1))
-        v, whitened = settle((v, whitened))
-        xi = linalg.gram(v, whitened[:, None])[:, 0]
-        if iteration == 0:
-            positive = positive & regular
-            first_pivots = pivots
-            nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
-        if iteration + 1 < iterations:
-            xi_l = xi[3:width].reshape(capacity, size_l)[slot]
-            poses, landmark = over_landmarks(joint.pose, prior_l, xi[:3], xi_l)
-            pose = poses[0]
-
-    log_det = 2 * jnp.log(jnp.where(first_pivots > 0, first_pivots, 1.0)).sum(axis=1)
-    log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
-    return Weighed(
-        xi=xi,
-        v=v,
-        whitened=whitened,
-        factor=factor,
-        s=s,
-        hp=hp,
-        hx=hx,
-        noise=noise,
-        own_noise=own_noise,
-        slopes=(by_pose, by_landmark),
-        seen=seen,
-        fuse=fuse,
-        correction=Correction(
-            innovation=innovation,
-            innovation_cov=marginal,
-            nis=jnp.where(fuse, nis, distance),
-            log_likelihood=jnp.where(fuse & positive, log_likelihood, 0.0),
-            inside=inside,
-            positive=positive,
-        ),
-    )
-
-
 def _moved(joint: Joint, found: Weighed, xi: jax.Array, slot: jax.Array, chart: Chart) -> Joint:
     """The means moved by ξ (D,), and what the measurements tell a watch; P as it was."""
-    pose, landmarks = _retracted(chart, joint, xi)
+    pose, landmarks = retracted(chart, joint, xi)
     watch = joint.watch
     if watch:
         fused = found.fuse & found.correction.positive
@@ -370,29 +194,24 @@ def _moved_map(joint: Joint, v: jax.Array, whitened: jax.Array, chart: Chart) ->
     """The landmarks (N, L) after corrections V (g·Z, D), L⁻¹ ν (g, Z), one after the other."""
     if chart.basis is None:  # moves add up
         xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
-        return _retracted(chart, joint, xi)[1]
+        return retracted(chart, joint, xi)[1]
 
     def move(joint: Joint, one: tuple[jax.Array, jax.Array]) -> tuple[Joint, None]:
         xi = linalg.gram(one[0], one[1][:, None])[:, 0]
-        pose, landmarks = _retracted(chart, joint, xi)
+        pose, landmarks = retracted(chart, joint, xi)
         return joint._replace(pose=pose, landmarks=landmarks), None
 
     each = v.reshape(*whitened.shape, -1)
     return jax.lax.scan(move, joint, (each, whitened))[0].landmarks
 
 
-def _retracted(chart: Chart, joint: Joint, xi: jax.Array) -> tuple[jax.Array, jax.Array]:
+def retracted(chart: Chart, joint: Joint, xi: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Pose (3,) and landmarks (N, L) moved by errors ξ (D,)."""
     over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
     poses, landmarks = over_landmarks(
         joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
     )
     return poses[0], jnp.where(joint.alive[:, None], landmarks, 0.0)
-
-
-def _squared_distance(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """νᵀ S⁻¹ ν () and whether S (Z, Z) is positive definite; finite where it is not."""
-    factor, positive = linalg.cholesky(cov)
-    return (linalg.solve_lower(factor, nu) ** 2).sum(), positive
 
 
 def _joseph(

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import linalg
+from jaxslam.filters.reduction import at_slot
 from jaxslam.protocols import Basis, Chart, Here, Linearizer, Pairs, Prediction, Sensor
 from jaxslam.slots import Joint
 from jaxslam.staging import settle
@@ -31,7 +32,7 @@ def prediction_of(
         local = jnp.concatenate([top, bottom], axis=1)
         expected, by_pose, by_landmark, rest = jax.vmap(
             lambda slot, landmark, cov: linearize.observe(
-                sensor, Here(joint, chart, joint.pose, cov, slot, landmark)
+                at_slot(sensor, joint, slot), Here(joint, chart, joint.pose, cov, slot, landmark)
             )
         )(every, joint.landmarks, local)
         if chart.basis is not None:
@@ -64,9 +65,10 @@ def prediction_of(
     def cross() -> jax.Array:
         _, by_pose, by_landmark, _ = slopes()
         cov = joint.cov @ joint.cov.T if square_root else joint.cov
-        rows = cov[3:].reshape(capacity, size, -1)
+        rows = cov[3:].reshape(capacity, size, cov.shape[1])
         hp = linalg.total(by_pose[:, :, k, None] * cov[None, None, k] for k in range(3))
-        hp = hp + linalg.total(by_landmark[:, :, k, None] * rows[:, None, k] for k in range(size))
+        for k in range(size):
+            hp = hp + by_landmark[:, :, k, None] * rows[:, None, k]
         return innovation_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
 
     return Prediction(joint.tag, joint.alive, pairs, cross)

@@ -1,14 +1,73 @@
 """Two landmarks of a map that are one: found by a joint chi-square test, merged by a constraint."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from jaxslam import linalg, slots
+from jaxslam.filters.correction import retracted
 from jaxslam.linalg import is_concrete
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
+from jaxslam.stats import chi2_quantile
+from jaxslam.types import Info, Status
 
 Array = jax.Array
+
+
+class Duplicates(NamedTuple):
+    """Which two landmarks `ekf_slam(merge=…)` takes for one; see `duplicates`."""
+
+    reach: float
+    probability: float
+
+
+def duplicates(reach: float, probability: float = 0.95) -> Duplicates:
+    """After each scan, merge the pair of landmarks that is most likely one, if it may be one.
+
+    It may where the two are within reach, the joint test passes at this probability, and no scan
+    has measured both: a landmark gives one measurement a scan.
+
+    Args:
+        reach: [m] true landmarks do not stand as near to one another. A test alone cannot tell two
+            landmarks from one where their difference is known worse than that.
+        probability: of merging two that are one, by the test.
+    Raises:
+        ValueError: on a reach not above 0 or a probability outside 0 to 1.
+    """
+    if not reach > 0:
+        raise ValueError(f"duplicates: expected a reach above 0, got {reach}")
+    if not 0 < probability < 1:
+        raise ValueError(f"duplicates: expected 0 < probability < 1, got {probability}")
+    return Duplicates(reach, probability)
+
+
+def told_apart(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Array:
+    """(N, N) bool: which landmarks one sensor measured together, in this scan or one before.
+
+    places: how many of a scan each sensor has; () where all are of one.
+    """
+    capacity = joint.alive.shape[0]
+    both: Array = joint.apart
+    at = 0
+    for count in places or info.status.shape[-1:]:
+        both = both | _together(info.status[at : at + count], info.slot[at : at + count], capacity)
+        at += count
+    return both
+
+
+def _together(status: Array, slot: Array, capacity: int) -> Array:
+    """(N, N) bool: both slots were corrected or born."""
+    seen = (status == Status.FUSED) | (status == Status.BORN)
+    here = jnp.zeros(capacity, bool).at[jnp.where(seen, slot, capacity)].set(True, mode="drop")
+    return here[:, None] & here[None, :]
+
+
+def find_duplicate(joint: Joint, chart: Chart, rule: Duplicates) -> tuple[Array, Array, Array]:
+    """Slots i < j of two landmarks that are taken for one, and whether there are such."""
+    i, j, distance = closest_pair(joint, chart, rule.reach, allowed=~joint.apart)
+    return i, j, distance <= chi2_quantile(rule.probability, joint.landmarks.shape[1])
 
 
 def closest_pair(
@@ -80,17 +139,19 @@ def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool =
     v = linalg.solve_lower(factor, with_all)
     white = linalg.solve_lower(factor, joint.landmarks[j] - joint.landmarks[i])
     xi = linalg.gram(v, white[:, None])[:, 0]
-    over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
-    poses, landmarks = over_landmarks(
-        joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
-    )
+    pose, landmarks = retracted(chart, joint, xi)
     cov = rows - linalg.gram(v, v)
     if square_root:
         cov = linalg.root_psd(cov)
+    apart = joint.apart
+    if not isinstance(apart, tuple):  # what was measured together with either
+        either = ok & (apart[i] | apart[j])
+        apart = apart.at[i].set(apart[i] | either).at[:, i].set(apart[i] | either)
     merged = joint._replace(
-        pose=poses[0],
-        landmarks=jnp.where(joint.alive[:, None], landmarks, 0.0),
+        pose=pose,
+        landmarks=landmarks,
         cov=jnp.where(ok, cov, joint.cov),
+        apart=apart,
     )
     return slots.remove(
         merged, ok & (jnp.arange(joint.alive.shape[0]) == j), square_root=square_root

@@ -10,7 +10,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import jax
@@ -42,6 +42,9 @@ class Campaign:
     seconds: float
     """wall time, compilation included."""
     compile_seconds: float
+    step_seconds: dict[str, float]
+    """Wall time of a step of one run on one device, by filter: the median over the blocks that this
+    process computed, several of which are at work at once; without filters of which it was none."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -166,6 +169,9 @@ def monte_carlo(
             filters={name: summarize(tallies[name], least) for name in filters},
             seconds=time.perf_counter() - began,
             compile_seconds=work.compile_seconds,
+            step_seconds={
+                name: seconds / max(scenario.steps, 1) for name, seconds in work.run_seconds.items()
+            },
         )
     if interrupted or campaign is None:
         raise Interrupted(campaign, runs)
@@ -185,6 +191,7 @@ class _Work:
     keep: Keep | None
     progress: Callable[[int, int], None] | None
     compile_seconds: float = 0.0
+    run_seconds: dict[str, float] = field(default_factory=dict)
 
     def go(self, own: dict[str, Tally], todo: Sequence[tuple[int, int]], size: int) -> None:
         """Add those of the pieces that are not yet in the tallies, in blocks of size a device."""
@@ -232,6 +239,7 @@ class _Work:
                     stop = error  # what is at work is finished, and kept
                     for future in flight:
                         future.cancel()
+            self.run_seconds = programs.run_seconds()
             if stop is not None:
                 raise stop
 

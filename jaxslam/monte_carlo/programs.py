@@ -6,6 +6,7 @@ the devices with `shard_map`: no device ever waits for another.
 """
 
 import hashlib
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -43,14 +44,20 @@ class Programs:
     bound: bool
     limit: jax.Array
     """() [m] the divergence limit, from run 0"""
+    devices: int
+    spent: dict[str, list[float]]
+    """wall seconds of each block so far, by filter"""
 
     def block(self, first: int, runs: int) -> dict[str, dict[str, np.ndarray]]:
         """Condensed scores of runs first … first + runs - 1 (at most `wide`), by filter."""
         which = first + jnp.arange(self.wide)
-        world = self.draw(self.key, which)
+        world = jax.block_until_ready(self.draw(self.key, which))
         out = {}
         for name, drive in self.drives.items():
-            scores = self.scores[name](self.limit, world[0], drive(self.key, which, world))
+            began = time.perf_counter()
+            driven = jax.block_until_ready(drive(self.key, which, world))
+            self.spent[name].append(time.perf_counter() - began)
+            scores = self.scores[name](self.limit, world[0], driven)
             kept = jax.tree.map(lambda leaf: leaf[:runs], jax.device_get(scores))
             out[name] = condense(kept, first)
         out[BOUND] = {"limit": np.asarray(self.limit)}
@@ -58,6 +65,11 @@ class Programs:
             least = jax.device_get(self.least(self.key, which, world))
             out[BOUND] |= condensed_sums({name: rows[:runs] for name, rows in least.items()})
         return out
+
+    def run_seconds(self) -> dict[str, float]:
+        """What one run took on one device, by filter: the median over blocks so far."""
+        each = self.devices / self.wide
+        return {name: each * float(np.median(all_)) for name, all_ in self.spent.items() if all_}
 
 
 class Driven(NamedTuple):
@@ -179,6 +191,8 @@ def compile_programs(
         least=bounds.result(),
         bound=bound,
         limit=jnp.asarray(_divergence_limit(scenario, variance**0.5, dtype), dtype),
+        devices=len(devices),
+        spent={name: [] for name in filters},
     )
 
 

@@ -161,7 +161,7 @@ def _measures(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
         ]
         bands.append(_row(f"steps in {block} band", percentage(LEVEL, 1), _cells(shares)))
     counts = []
-    for key in next(iter(summaries.values())).counts:
+    for key in dict.fromkeys(key for s in summaries.values() for key in s.counts):
         found = [s.counts.get(key, 0) for s in summaries.values()]
         if key in _ALWAYS or any(found):
             label = "finite runs" if key == "runs" else key.replace("_", " ")

@@ -6,6 +6,7 @@ Figures are made without pyplot, so there is no global state and no window; save
 
 from jaxslam.plot.campaign import (
     bound_figure,
+    cost_figure,
     coverage_figure,
     gained_figure,
     nees_figure,
@@ -18,6 +19,7 @@ __all__ = [
     "COLORS",
     "Figure",
     "bound_figure",
+    "cost_figure",
     "coverage_figure",
     "describe",
     "ellipse",

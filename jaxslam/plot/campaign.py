@@ -7,7 +7,17 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, LEVELS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.plot.style import INK, caption, curve, logarithmic, lone_mark, panels_of, plain, span
+from jaxslam.plot.style import (
+    INK,
+    caption,
+    curve,
+    few_digits,
+    logarithmic,
+    lone_mark,
+    panels_of,
+    plain,
+    span,
+)
 
 _NOTHING = 1e-6
 """[1/rad²] information on a heading of which one has learnt nothing: σ is 1000 rad."""
@@ -69,6 +79,38 @@ def bound_figure(campaign: Campaign) -> Figure:
     said = "error against the bound" if known else "error"
     caption(figure, f"{_head(campaign)}: {said}, {_runs(campaign)}")
     panels[-1].set(xlabel="step", xlim=span(campaign.steps))
+    return figure
+
+
+def cost_figure(campaign: Campaign) -> Figure:
+    """Position error and pose NEES of every filter against what a step of it takes.
+
+    Filters that were not timed have a name and no mark.
+    """
+    figure, panels = panels_of(7.0, 4.6, 2)
+    times = [1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters]
+    quantities = (
+        ("rmse_position", "position RMSE [m]"),
+        ("nees_pose", f"pose NEES (dof {DOF['pose']})"),
+    )
+    for axes, (key, named) in zip(panels, quantities, strict=True):
+        for i, (name, summary) in enumerate(campaign.filters.items()):
+            y = summary.measures[key].value if key in summary.measures else np.nan
+            curve(axes, i, np.array(times[i : i + 1]), np.array([y]), name, mark=6.0)
+        axes.set(ylabel=named)
+        if np.isfinite(times).any():
+            logarithmic(axes)
+    panels[-1].axhline(DOF["pose"], color=INK, lw=0.8, zorder=1.5)
+    panels[-1].set(xlabel="time of a step [µs]")
+    if np.isfinite(times).any():
+        panels[-1].set(xscale="log")
+        panels[-1].xaxis.set_major_formatter("{x:g}")
+        near = np.nanmax(times) < 100 * np.nanmin(times)
+        panels[-1].xaxis.set_minor_formatter(few_digits if near else "")
+    else:
+        said = "no filter was timed"
+        panels[0].text(0.5, 0.5, said, transform=panels[0].transAxes, ha="center")
+    caption(figure, f"{_head(campaign)}: what a step costs, and what it gives, {_runs(campaign)}")
     return figure
 
 

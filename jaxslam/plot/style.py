@@ -12,7 +12,9 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#00
 
 INK = "#333333"
 
-_HUES, _DASHES, _MARKS = 6, ("-", (0, (4, 1.6)), (0, (1, 1.2))), ("o", "s", "^")
+_HUES = 6
+_DASHES = ("-", (0, (4, 1.6)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
+_MARKS = ("o", "s", "^", "D")
 """Filters take six of the colours in turn, then again with other dashes and markers."""
 
 
@@ -84,10 +86,10 @@ def logarithmic(axes: Axes) -> None:
     axes.set_yscale("log", nonpositive="mask")
     low, high = axes.get_ylim()
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(_few_digits if high < 100 * low else "")
+    axes.yaxis.set_minor_formatter(few_digits if high < 100 * low else "")
 
 
-def _few_digits(x: float, _: float) -> str:
+def few_digits(x: float, _: float) -> str:
     """Minor ticks of a logarithmic axis: 2 and 5 of each decade."""
     return f"{x:g}" if f"{x:.0e}"[0] in "25" else ""
 

@@ -11,6 +11,7 @@ from jaxslam.sensors.range_bearing import range_bearing
 from jaxslam.sensors.range_bearing_signature import range_bearing_signature
 from jaxslam.sensors.range_only import range_only
 from jaxslam.sensors.relative_position import relative_position
+from jaxslam.sensors.suite import Part, suite
 
 REGISTRY: dict[str, Callable[..., Sensor]] = {
     "bearing_inverse_depth": bearing_inverse_depth,
@@ -25,6 +26,7 @@ REGISTRY: dict[str, Callable[..., Sensor]] = {
 
 __all__ = [
     "REGISTRY",
+    "Part",
     "bearing_inverse_depth",
     "bearing_only",
     "compass",
@@ -33,4 +35,5 @@ __all__ = [
     "range_bearing_signature",
     "range_only",
     "relative_position",
+    "suite",
 ]

@@ -9,7 +9,8 @@ from jaxslam import se2
 from jaxslam.angles import wrap
 from jaxslam.linalg import is_concrete
 from jaxslam.noise import NoiseCov, noise_model
-from jaxslam.protocols import Sensor
+from jaxslam.protocols import Reduced, Sensor
+from jaxslam.sensors.bearing_only import bearing_only
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
 from jaxslam.sensors.prior import FreeLike, prior
 
@@ -25,6 +26,7 @@ def bearing_inverse_depth(
     mount: ArrayLike = NO_OFFSET,
     min_distance: ArrayLike = 1.0,
     free: FreeLike | None = None,
+    to_point: float | None = None,
 ) -> Sensor:
     """z = (bearing [rad]) of l = (x0 [m], y0 [m], alpha [rad], rho [1/m]), Solà 2.3.6.
 
@@ -44,18 +46,31 @@ def bearing_inverse_depth(
     off, so that a covariance taken through it is huge there, as it should be, and not zero. embed
     bounds the distance below by 1e-6 m.
 
+    to_point: a landmark becomes a point (x, y), which frees two of its coordinates, once a point is
+    as good to a first-order filter. With the point at distance d_0 = 1/ρ from p0 and at d from the
+    sensor, and the angle γ between the two lines of sight, the linearity index of Civera, Davison &
+    Montiel ("Inverse depth to depth conversion for monocular SLAM", ICRA 2007)
+
+        L_d = 4 (σ_ρ/ρ²) |cos γ| / d
+
+    is below it; they take 0.1. A landmark with ρ <= 0 stays a ray.
+
     Args:
         noise_cov: (1, 1) covariance of the bearing, or a function of z.
         mount: (3,) pose of the sensor on the robot, Solà's S.
         min_distance: [m] the least distance of a landmark, Solà's d_min (47). The prior of s then
             has mean 1/(2 d_min) and σ 1/(4 d_min), so that 2 σ span 0 to 1/d_min.
         free: mean (1,) and covariance (1, 1) of s to use instead.
+        to_point: L_d below which landmarks become points; default never.
     Raises:
         ValueError: if noise_cov is not a (1, 1) covariance, mount not a finite (3,), min_distance
-            not positive and finite, or free not a Gaussian of positive variance.
+            not positive and finite, free not a Gaussian of positive variance, or to_point not above
+            0.
     """
     sensor_pose, sensor_pose_jacobian = mounting("bearing_inverse_depth", mount)
     by_distance = _bounded_by(min_distance)
+    if to_point is not None and is_concrete(to_point) and not to_point > 0:
+        raise ValueError(f"bearing_inverse_depth: expected to_point above 0, got {to_point}")
 
     def sight(frame: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
         """v, and the frame's axes at the map's origin, where v is a point."""
@@ -107,6 +122,19 @@ def bearing_inverse_depth(
         eye = jnp.eye(4, dtype=pose.dtype)
         return eye[:, :3] @ sensor_pose_jacobian(pose), eye[:, 2:3], eye[:, 3:]
 
+    def ready(pose: jax.Array, landmark: jax.Array, cov: jax.Array) -> jax.Array:
+        inverse = jnp.where(landmark[3] > 0, landmark[3], 1.0)
+        # v is along the line of sight, scaled by ρ: d = |v|/ρ, cos γ = v·(cos α, sin α)/|v|.
+        v = landmark[3] * (landmark[:2] - sensor_pose(pose)[:2]) + _direction(landmark[2])
+        square = v @ v
+        along = jnp.abs(v @ _direction(landmark[2])) / jnp.where(square > 0, square, 1.0)
+        index = 4 * jnp.sqrt(jnp.maximum(cov[3, 3], 0.0)) / inverse * along
+        return (landmark[3] > 0) & (square > 0) & (index < jnp.asarray(to_point))
+
+    reduced = None
+    if to_point is not None:
+        reduced = Reduced(bearing_only(noise_cov, mount, free=((1.0,), ((1.0,),))), ready)
+
     return Sensor(
         name="bearing_inverse_depth",
         measurements=("bearing [rad]",),
@@ -120,6 +148,7 @@ def bearing_inverse_depth(
         free=prior("bearing_inverse_depth", by_distance if free is None else free, 1),
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,
+        reduced=reduced,
     )
 
 

@@ -162,6 +162,31 @@ def test_euclidean_error_is_the_difference_of_coordinates():
     np.testing.assert_allclose(dx, [0.1, 0.2, 0.5], atol=1e-15)
 
 
+def test_rays_go_as_their_place_and_direction():
+    """Of l = (x0, y0, α, ρ): a retraction undoes `local`, its derivative at zero is the basis, and
+    it is the same in every map frame."""
+    chart, rng = REGISTRY["right_invariant"](rays=True), np.random.default_rng(4)
+
+    def end(ray):
+        return ray[:2] + np.array([np.cos(ray[2]), np.sin(ray[2])]) / ray[3]
+
+    for _ in range(5):
+        pose, ray, dx, dl = (rng.normal(size=n) for n in (3, 4, 3, 4))
+        moved = chart.retract(pose, ray, dx, dl)
+        for back, error in zip(chart.local(pose, ray, *moved), (dx, dl), strict=True):
+            np.testing.assert_allclose(back, error, atol=1e-12)
+        slopes = jax.jacfwd(chart.retract, argnums=(2, 3))(pose, ray, 0 * dx, 0 * dl)
+        basis = chart.basis(pose, ray)
+        np.testing.assert_allclose(slopes[0][0], basis.pose, atol=1e-12)
+        np.testing.assert_allclose(slopes[1][0], basis.cross, atol=1e-12)
+        np.testing.assert_allclose(slopes[1][1], np.eye(4), atol=1e-12)
+        # A motion of the whole takes the point at the ray's end where it takes points.
+        points = REGISTRY["right_invariant"]()
+        turned = chart.retract(pose, ray, dx, np.zeros(4))[1]
+        there = points.retract(pose, end(ray), dx, np.zeros(2))[1]
+        np.testing.assert_allclose(end(turned), there, atol=1e-11)
+
+
 def test_right_invariant_error_is_unchanged_when_the_world_turns_and_shifts():
     """What gives the chart its name and its use: local(g·x̂, g·x) = Ad_g local(x̂, x), so a turn of
     robot and map together about the origin is the error (0, 0, φ), (0, 0) wherever they are."""

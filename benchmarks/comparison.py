@@ -1,0 +1,60 @@
+"""Every estimator of the family on the same draws: `python -m benchmarks.comparison [--runs 40]`.
+
+What a step costs, and what it gives: position RMSE and pose NEES of each beside the wall time of a
+step. `jaxslam consistency --scenario cloister --filters all` says the same, and more; this is the
+figure of it, `figures/comparison.png`. Times are for comparison within one run.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+
+from benchmarks.gate import Metric, report
+from jaxslam import family, monte_carlo, plot
+from jaxslam.scenarios import SCENARIOS
+
+FIGURE = Path(__file__).parent / "figures" / "comparison.png"
+
+
+def measure(runs: int = 40, name: str = "cloister", out: Path | None = None) -> list[Metric]:
+    world = SCENARIOS[name]()
+    filters = {each: make(world) for each, make in family.ALL.items()}
+    campaign = monte_carlo(world, filters, runs, jax.random.key(0), workers=1)
+    print(f"{world.name}, {runs} runs of {world.steps} steps")
+    print(f"{'':24}{'µs a step':>12}{'RMSE [m]':>12}{'pose NEES':>12}  verdict")
+    for each, summary in campaign.filters.items():
+        row = [summary.measures[key].value for key in ("rmse_position", "nees_pose")]
+        seconds = campaign.step_seconds[each]
+        print(f"{each:24}{1e6 * seconds:12.3g}{row[0]:12.4g}{row[1]:12.4g}  {summary.verdict}")
+    if out is not None:
+        out.write_bytes(plot.png(plot.cost_figure(campaign)))
+    rmse = {each: s.measures["rmse_position"].value for each, s in campaign.filters.items()}
+    return [
+        Metric(
+            "localization in the true map: RMSE over the ideal EKF's",
+            rmse["localization"] / rmse["ideal"],
+            high=1.0,
+        ),
+        Metric(
+            "dead reckoning: RMSE over the ideal EKF's",
+            rmse["dead_reckoning"] / rmse["ideal"],
+            low=1.0,
+        ),
+    ]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.comparison")
+    parser.add_argument("--runs", type=int, default=40)
+    parser.add_argument("--scenario", choices=list(SCENARIOS), default="cloister")
+    parser.add_argument("--out", type=Path, default=FIGURE)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    metrics = measure(options.runs, options.scenario, options.out)
+    print()
+    return report(metrics)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

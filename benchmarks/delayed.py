@@ -1,0 +1,189 @@
+"""Bearing-only landmarks: initialized late, or at once in inverse depth; the same draws.
+
+    python -m benchmarks.delayed [--runs 100] [--every 3]
+
+`cloister` with a camera, as in `benchmarks.bearing`: one bearing of 1° a landmark and step, the
+start known, identities known. Every third column stands, so that 100 runs with a table of sightings
+take minutes. `delayed` promotes an intersection that was confirmed three times, `delayed, once`
+once; the landmarks of `inverse_depth` exist from the first bearing on.
+
+The wait is in steps from the first bearing of a landmark to the landmark. A landmark is false when
+it ends farther than 1 m from the column of its name. The robot's heading gains 1.1° (1 σ) a step
+while no landmark holds it, so here waiting costs more than it saves: the yardstick of the pose NEES
+is 3, a few runs go wrong, and the gates only ask that most do not and that no landmark is false.
+
+The second world has no identities: a robot in a circle of 16 m among five landmarks, with little
+noise (`still`), and again with two bearings of nothing a step (`clutter`). A bearing that is of no
+landmark by the chi-square gate meets all others. There, false is farther than 1 m from any.
+"""
+
+import argparse
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxslam
+from benchmarks.gate import Metric, report
+from jaxslam import motion, sensors
+from jaxslam.angles import wrap
+from jaxslam.association import nearest
+from jaxslam.filters import delayed_slam, ekf_slam
+from jaxslam.linalg import mahalanobis_squared
+from jaxslam.scenarios import cloister
+from jaxslam.simulate import Scenario
+from jaxslam.stats import chi2_quantile
+
+SIGMA = np.deg2rad(1.0)
+FALSE = 1.0
+BLOCK = 20
+HEADER = ("pose NEES", "median", "position [m]", "landmarks [m]", "wait", "found", "false")
+
+
+def named(every):
+    world = cloister()
+    columns = world.landmarks[::every]
+    camera = sensors.bearing_only([[SIGMA**2]], free=([5.0], [[2.5**2]]))
+    rays = sensors.bearing_inverse_depth([[SIGMA**2]], min_distance=1.0)
+    scenario = dataclasses.replace(
+        world, name="cloister", sensor=camera, landmarks=columns, filter_options={}, published={}
+    )
+    count = len(columns)
+    parts = world.motion, camera, count
+    tables = {"sightings": 6 * count, "hypotheses": 2 * count}
+    return scenario, {
+        "delayed": delayed_slam(*parts, **tables),
+        "delayed, once": delayed_slam(*parts, persistence=2, lead=0, **tables),
+        "inverse_depth": ekf_slam(world.motion, rays, count, update="joint"),
+    }
+
+
+def nameless():
+    camera = sensors.bearing_only([[SIGMA**2]])
+    scenario = Scenario(
+        name="five without names",
+        motion=motion.increment(np.diag([0.005, 0.003]) ** 2),
+        sensor=camera,
+        landmarks=[[4.0, 5.0], [-3.0, 4.0], [-2.0, 0.5], [5.0, -1.0], [0.5, 8.0]],
+        controls=np.tile([0.2, 0.08], (120, 1)),
+    )
+    gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)
+    filter = delayed_slam(
+        scenario.motion,
+        camera,
+        8,
+        sightings=40,
+        hypotheses=40,
+        persistence=6,
+        decay=0.7,
+        associate=nearest(*gates),
+    )
+    return scenario, filter
+
+
+def clutter(log, key):
+    """Two bearings of nothing a step, beside the others."""
+    steps = log.scan.z.shape[0]
+    false = jax.random.uniform(key, (steps, 2, 1), log.scan.z.dtype, -np.pi, np.pi)
+    scan = log.scan
+    scan = scan._replace(
+        z=jnp.concatenate([scan.z, false], axis=1),
+        tag=jnp.pad(scan.tag, [(0, 0), (0, 2)], constant_values=-1),
+        valid=jnp.pad(scan.valid, [(0, 0), (0, 2)], constant_values=True),
+    )
+    return log._replace(scan=scan)
+
+
+def scores(scenario, filter, runs, names=True, spoil=None):
+    """Of each run: mean pose NEES, mean squares, waits (N,), found and false landmarks."""
+
+    def one(i):
+        key = jax.random.fold_in(jax.random.key(0), i)
+        truth, log = jaxslam.simulate(scenario, key)
+        if spoil is not None:
+            log = spoil(log, jax.random.fold_in(key, 1))
+        trace = jaxslam.run(filter, log, scenario.pose, scenario.pose_cov, key)
+        estimate = trace.estimate
+        error = truth.pose - estimate.pose
+        error = jnp.concatenate([error[:, :2], wrap(error[:, 2:])], axis=1)
+        nees, regular = jax.vmap(mahalanobis_squared)(error, estimate.pose_cov)
+        alive, tag = estimate.alive[-1], estimate.tag[-1]
+        off = estimate.points[-1][:, None] - truth.landmarks[None, :, :2]
+        off = jnp.sqrt((off**2).sum(axis=2))
+        if names:
+            off = jnp.take_along_axis(off, jnp.maximum(tag, 0)[:, None], axis=1)
+        off = off.min(axis=1)
+        false = alive & (off > FALSE)
+        true = alive & ~false
+        wait = jnp.where(true, jnp.argmax(estimate.alive, axis=0), 0)
+        return {
+            "nees": nees.sum() / regular.sum(),
+            "position": (error[:, :2] ** 2).sum(axis=1).mean(),
+            "landmarks": jnp.where(true, off**2, 0.0).sum() / jnp.maximum(true.sum(), 1),
+            "wait": wait.sum() / jnp.maximum(true.sum(), 1),
+            "found": true.sum(),
+            "false": false.sum(),
+        }
+
+    block = jax.jit(jax.vmap(one))
+    blocks = [np.arange(i, i + BLOCK) for i in range(0, runs, BLOCK)]
+    parts = [jax.device_get(block(which)) for which in blocks]
+    return {name: np.concatenate([part[name] for part in parts])[:runs] for name in parts[0]}
+
+
+def line(name, found, count):
+    nees = found["nees"]
+    cells = (
+        f"{nees.mean():.3g} ± {2 * nees.std() / len(nees) ** 0.5:.2g}",
+        f"{np.median(nees):.3g}",
+        f"{np.sqrt(found['position'].mean()):.3f}",
+        f"{np.sqrt(found['landmarks'].mean()):.3f}",
+        f"{found['wait'].mean():.1f}",
+        f"{found['found'].mean():.2f}/{count}",
+        f"{found['false'].mean():.2f}",
+    )
+    print(f"{name:16}" + "".join(f"{cell:>15}" for cell in cells), flush=True)
+
+
+def measure(runs=100, every=3):
+    scenario, filters = named(every)
+    count = len(scenario.landmarks)
+    metrics = []
+    print(f"\n{scenario.name}, {count} columns: {runs} runs × {scenario.steps} steps")
+    print(f"{'':16}" + "".join(f"{name:>15}" for name in HEADER))
+    for name, filter in filters.items():
+        found = scores(scenario, filter, runs)
+        line(name, found, count)
+        if name == "delayed":
+            median = float(np.median(found["nees"]))
+            metrics.append(Metric("delayed, cloister: median pose NEES", median, high=6.0))
+            wrong = float(found["false"].mean())
+            metrics.append(Metric("delayed, cloister: false landmarks", wrong, high=0.5))
+    scenario, filter = nameless()
+    count = len(scenario.landmarks)
+    print(f"\n{scenario.name}: {runs} runs × {scenario.steps} steps")
+    print(f"{'':16}" + "".join(f"{name:>15}" for name in HEADER))
+    for name, spoil in (("still", None), ("clutter", clutter)):
+        found = scores(scenario, filter, runs, names=False, spoil=spoil)
+        line(name, found, count)
+        here = float(found["found"].mean())
+        metrics.append(Metric(f"delayed, {name}: found of {count}", here, low=0.8 * count))
+        wrong = float(found["false"].mean())
+        metrics.append(Metric(f"delayed, {name}: false landmarks", wrong, high=0.5))
+    return metrics
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.delayed")
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--every", type=int, default=3)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    metrics = measure(options.runs, options.every)
+    print()
+    return report(metrics)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

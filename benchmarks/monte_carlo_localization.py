@@ -1,0 +1,180 @@
+"""A robot that may be anywhere, then is carried away: particles against the EKF in a known map.
+
+    python -m benchmarks.monte_carlo_localization [--runs 20] [--particles 5000]
+
+`circle`, its map known: landmarks by tag, seen between 1 and 5 m. As far as the filters know the
+robot starts anywhere; it drives 150 s, is put down at the other side of the ring without being
+told, and drives 150 s more. Monte-Carlo localization with at most so many particles, and with five
+times the sensor's σ, as a precise sensor needs more particles than there are; the EKF told the mean
+and the covariance of the whole box; and the EKF told where it truly starts, with a gate of 99.9 %.
+
+A robot is found where the estimate is within half a metre, from then to the end of that part. The
+gates: particles find it in nine of ten runs in either part, the EKF with a gate after kidnapping in
+one of ten at most, and fewer than a fifth of the particles are in use (median) at the end of either
+part. The EKF without a gate has none: as tags are known, what it measures may pull it back.
+"""
+
+import argparse
+import dataclasses
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.gate import Metric, report
+from jaxslam import run, sensors, simulate
+from jaxslam.filters import cloud, localization, particle_localization
+from jaxslam.scenarios import circle
+from jaxslam.stats import chi2_quantile
+
+FIGURE = Path(__file__).parent / "figures" / "monte_carlo_localization.png"
+BOX = np.array([[-14.0, -4.0], [14.0, 23.0]])
+HALF = 150  # steps of 1 s
+FOUND = 0.5  # [m]
+
+
+def carried(world, key):
+    """True poses (2·HALF, 3) and the log of a robot that is carried across at half time."""
+    radius = 0.25 / np.deg2rad(1.5)
+    keys, poses, logs = jax.random.split(key), [], []
+    for pose, own in (((0.0, 2 * radius, np.pi), keys[0]), ((0.0, 0.0, 0.0), keys[1])):
+        truth, log = simulate(dataclasses.replace(world, pose=pose), own)
+        poses.append(truth.pose)
+        logs.append(log)
+    return jnp.concatenate(poses), jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *logs)
+
+
+def filters_of(world, particles):
+    """Filter, and what it is told of the start, by name."""
+    blunt = sensors.relative_position(0.5**2 * np.eye(2))
+    anywhere = cloud.box_moments(jnp.asarray(BOX))
+    known = jnp.array([0.0, 0.5 / np.deg2rad(1.5), np.pi]), jnp.zeros((3, 3))
+    models = world.motion, world.sensor, world.landmarks
+    gate = chi2_quantile(0.999, 2)
+    return {
+        "particles": (
+            particle_localization(
+                world.motion,
+                blunt,
+                world.landmarks,
+                particles,
+                box=BOX,
+                start="uniform",
+                gate=25.0,
+            ),
+            *anywhere,
+        ),
+        "EKF, box, no gate": (localization(*models), *anywhere),
+        "EKF, start, gate": (localization(*models, gate=gate), *known),
+    }
+
+
+def histories(runs, particles):
+    """By filter: position error [m] (runs, 2·HALF), and its `Info`."""
+    world = circle(HALF)
+    keys = jax.random.split(jax.random.key(0), runs)
+    poses, logs = jax.jit(jax.vmap(partial(carried, world)))(keys)
+    out = {}
+    for name, (filter, pose, cov) in filters_of(world, particles).items():
+
+        def one(row, filter=filter, pose=pose, cov=cov):
+            log, key = row
+            trace = run(filter, log, pose, cov, key)
+            return trace.estimate.pose, trace.info
+
+        found, info = jax.jit(partial(jax.lax.map, one))((logs, keys))
+        error = np.linalg.norm(np.asarray(found)[..., :2] - np.asarray(poses)[..., :2], axis=2)
+        out[name] = error, info
+    return out
+
+
+def seconds_to_find(error):
+    """(runs,) the step from which an error (runs, T) stays within FOUND, or inf."""
+    late = error >= FOUND
+    last = np.where(late.any(axis=1), error.shape[1] - np.argmax(late[:, ::-1], axis=1), 0)
+    return np.where(last < error.shape[1], last, np.inf)
+
+
+def measure(runs=20, particles=5000, out=None):
+    """The gates, with a table printed, and the figure where asked for."""
+    traces = histories(runs, particles)
+    metrics = []
+    title = f"{'':22}{'part':>12}{'found':>8}{'after [s]':>11}{'error at its end [m]':>22}"
+    print(f"\ncircle: {runs} runs of 2 × {HALF} s\n{title}")
+    for name, (error, _) in traces.items():
+        for part, at in (("anywhere", slice(0, HALF)), ("carried away", slice(HALF, None))):
+            own = error[:, at]
+            after = seconds_to_find(own)
+            found = np.isfinite(after)
+            when = f"{np.median(after[found]):.0f}" if found.any() else "-"
+            print(f"{name:22}{part:>12}{found.mean():8.0%}{when:>11}{np.median(own[:, -1]):22.3g}")
+            gate = {}
+            if name == "particles":
+                gate = {"low": 0.9}
+            elif part == "carried away" and name == "EKF, start, gate":
+                gate = {"high": 0.1}
+            metrics.append(Metric(f"{name}, {part}: share found", found.mean(), **gate))
+    info = traces["particles"][1]
+    active = np.median(np.asarray(info.active), axis=0)
+    for part, at in (("anywhere", HALF - 1), ("carried away", 2 * HALF - 1)):
+        metrics.append(Metric(f"particles in use, end of {part}", active[at], high=0.2 * particles))
+    injected = np.asarray(info.injected)
+    metrics.append(Metric("injected a run, before it is carried", injected[:, :HALF].sum(1).mean()))
+    metrics.append(Metric("injected a run, after", injected[:, HALF:].sum(1).mean()))
+    metrics.append(Metric("steps in which no weight was left", float(info.underflow.sum())))
+    metrics.append(Metric("steps at the capacity, a run", float(info.capped.sum(1).mean())))
+    if out is not None:
+        draw(traces, out)
+    return metrics
+
+
+def draw(traces, out):
+    """Error and particles in use against time: medians over the runs, and 10 % to 90 % of them."""
+    import matplotlib.pyplot as plt
+
+    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+    figure, (above, below) = plt.subplots(
+        2, 1, figsize=(6.4, 4.6), sharex=True, layout="constrained", height_ratios=[3, 2]
+    )
+    seconds = np.arange(1, 2 * HALF + 1)
+    colors = ["#1f77b4", "#999999", "#d62728"]
+
+    def band(axes, values, color, label):
+        low, mid, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
+        axes.fill_between(seconds, low, high, color=color, alpha=0.2, lw=0)
+        axes.plot(seconds, mid, color=color, lw=1.3, label=label)
+
+    for (name, (error, _)), color in zip(traces.items(), colors, strict=True):
+        band(above, np.maximum(error, 1e-3), color, name)
+    band(below, np.asarray(traces["particles"][1].active), colors[0], "particles in use")
+    above.set_ylabel("position error [m]")
+    below.set_ylabel("particles in use")
+    below.set_xlabel("time [s]")
+    runs = len(traces["particles"][0])
+    above.set_title(f"circle, map known: anywhere, then carried away; {runs} runs", size=9)
+    for axes in (above, below):
+        axes.set_yscale("log")
+        axes.axvline(HALF, color="black", lw=0.8, ls=":")
+    above.text(HALF + 2, above.get_ylim()[1], "carried away", va="top", size=8)
+    above.legend(frameon=False, fontsize=8, loc="lower left", ncols=3)
+    above.set_ylim(above.get_ylim()[0] / 4, None)
+    out.parent.mkdir(exist_ok=True)
+    figure.savefig(out, dpi=170)
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.monte_carlo_localization")
+    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--particles", type=int, default=5000)
+    parser.add_argument("--out", type=Path, default=FIGURE)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    metrics = measure(options.runs, options.particles, options.out)
+    print()
+    return report(metrics)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

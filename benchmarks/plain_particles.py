@@ -1,0 +1,125 @@
+"""A plain particle filter over path and map against FastSLAM.
+
+    python -m benchmarks.plain_particles [--runs 20] [--particles 500]
+
+Williams's point for Rao-Blackwellization: particles of the joint state (x, y, θ, l_1 … l_N) must
+fill 3 + 2N dimensions, so with any number of them the effective number collapses as N grows.
+FastSLAM samples the pose alone and keeps each landmark as a Gaussian given the path. Same draws,
+same number of particles, a robot on a circle inside N landmarks that it always sees.
+"""
+
+import argparse
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.gate import Metric, report
+from jaxslam import filters, linalg, motion, run, sensors
+from jaxslam.resampling import systematic
+from jaxslam.simulate import Scenario, simulate
+
+MOTION = motion.increment(np.diag([0.01, 0.01]) ** 2)
+SENSOR = sensors.range_bearing(np.diag([0.1, 0.03]) ** 2)
+LANDMARKS = (1, 2, 5, 10, 20)
+STEPS = 100
+
+
+def world(count: int) -> Scenario:
+    around = 2 * np.pi * np.arange(count) / count
+    return Scenario(
+        name=f"{count} landmarks",
+        motion=MOTION,
+        sensor=SENSOR,
+        landmarks=np.stack([4 * np.cos(around), 1.5 + 4 * np.sin(around)], axis=1),
+        controls=np.tile([0.1, 2 * np.pi / STEPS], (STEPS, 1)),
+    )
+
+
+def plain(log, key, count: int, particles: int):
+    """Bootstrap filter of pose and map: the map (N, 2) at the end, and the mean ESS over the steps.
+
+    The landmarks of the first scan are drawn from what it says; all are seen in every scan.
+    """
+
+    def place(z, noise):
+        """A landmark seen from the origin."""
+        z = z + linalg.root_psd(SENSOR.noise_cov(z)) @ noise
+        return z[0] * jnp.array([jnp.cos(z[1]), jnp.sin(z[1])])
+
+    def density(pose, landmark, z):
+        nu = SENSOR.residual(z, SENSOR.observe(pose, landmark))
+        return -0.5 * linalg.mahalanobis_squared(nu, SENSOR.noise_cov(z))[0]
+
+    def moved(pose, u, noise):
+        return MOTION.step(pose, u, linalg.root_psd(MOTION.noise_cov(pose, u)) @ noise)
+
+    key, first = jax.random.split(key)
+    noise = jax.random.normal(first, (particles, count, 2))
+    poses = jnp.zeros((particles, 3))
+
+    def step(carry, row):
+        poses, maps, key, born = carry
+        key, drive, again = jax.random.split(key, 3)
+        poses = jax.vmap(moved, (0, None, 0))(
+            poses, row.control, jax.random.normal(drive, (particles, 2))
+        )
+        z = row.scan.z[jnp.argsort(row.scan.tag)]
+        seen = jax.vmap(jax.vmap(place), (None, 0))(z, noise)
+        cos, sin = jnp.cos(poses[:, 2])[:, None], jnp.sin(poses[:, 2])[:, None]
+        turned = jnp.stack(
+            [cos * seen[..., 0] - sin * seen[..., 1], sin * seen[..., 0] + cos * seen[..., 1]], -1
+        )
+        maps = jnp.where(born, maps, poses[:, None, :2] + turned)
+        weight = jax.vmap(lambda p, m: jax.vmap(density, (None, 0, 0))(p, m, z).sum())(poses, maps)
+        weight = jnp.where(born, weight, 0.0)
+        ess = 1 / (jax.nn.softmax(weight) ** 2).sum()
+        chosen = systematic(weight, again)
+        return (poses[chosen], maps[chosen], key, jnp.asarray(True)), ess
+
+    maps = jnp.zeros((particles, count, 2))
+    (_, maps, _, _), ess = jax.lax.scan(step, (poses, maps, key, jnp.asarray(False)), log)
+    return maps.mean(axis=0), ess[1:].mean()
+
+
+def measure(runs: int = 20, particles: int = 500) -> list[Metric]:
+    print(f"{runs} runs, {particles} particles, {STEPS} steps")
+    print("landmarks   map RMSE [m]: plain   FastSLAM   effective particles: plain   share")
+    ratios = []
+    for count in LANDMARKS:
+        scene = world(count)
+        filter = filters.fastslam(scene.motion, scene.sensor, count, particles)
+
+        def one(key, scene=scene, filter=filter, count=count):
+            truth, log = simulate(scene, key)
+            points, ess = plain(log, key, count, particles)
+            start = jnp.zeros(3), jnp.zeros((3, 3)), key
+            estimate = jax.tree.map(lambda x: x[-1], run(filter, log, *start).estimate)
+            off = estimate.points - truth.landmarks[estimate.tag]
+            mine = points - truth.landmarks
+            return (mine**2).sum(axis=1).mean(), (off**2).sum(axis=1).mean(), ess
+
+        keys = jax.random.split(jax.random.key(3), runs)
+        square, rao, ess = jax.jit(lambda keys, one=one: jax.lax.map(one, keys))(keys)
+        row = float(np.sqrt(square.mean())), float(np.sqrt(rao.mean())), float(ess.mean())
+        ratios.append(row[0] / row[1])
+        print(f"{count:9d}{row[0]:23.4f}{row[1]:11.4f}{row[2]:28.1f}{row[2] / particles:8.1%}")
+    return [
+        Metric("plain particles: map RMSE over FastSLAM's, 1 landmark", ratios[0]),
+        Metric("plain particles: map RMSE over FastSLAM's, 20 landmarks", ratios[-1], low=1.5),
+    ]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.plain_particles")
+    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--particles", type=int, default=500)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    metrics = measure(options.runs, options.particles)
+    print()
+    return report(metrics)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,37 @@
+"""Association that looks only at landmarks whose measurement it can foretell well."""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from jaxslam.linalg import is_concrete
+from jaxslam.protocols import Associate, Association, Pairs, Prediction
+from jaxslam.types import Scan
+
+
+def certain(associate: Associate, spread: float) -> Associate:
+    """Another method, which gets to see a landmark only where √(tr S/Z) <= spread.
+
+    S is the covariance of the innovation: after a long loop that of the first landmarks has grown
+    beyond the distances between landmarks, and judged one by one a measurement then fits a wrong
+    one. What is seen there becomes new landmarks at first; `filters.closing` finds which of the old
+    ones they are, together.
+
+    Args:
+        associate: the method.
+        spread: in units of the measurement, which should all be of one kind.
+    Raises:
+        ValueError: on a spread not above 0.
+    """
+    if is_concrete(spread) and not spread > 0:
+        raise ValueError(f"certain: expected a spread above 0, got {spread}")
+
+    def method(prediction: Prediction, scan: Scan) -> Association:
+        def pairs(scan: Scan) -> Pairs:
+            found = prediction.pairs(scan)
+            variance = jnp.trace(found.cov, axis1=2, axis2=3) / found.cov.shape[-1]
+            return found._replace(possible=found.possible & (variance <= spread**2))
+
+        return Association(*associate(dataclasses.replace(prediction, pairs=pairs), scan))
+
+    return method

@@ -1,0 +1,115 @@
+"""Parameters of the models from a filter's own innovations: what a robot does wrongly each time."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxslam import linalg
+from jaxslam.linalg import check_count
+from jaxslam.types import Info, Status
+
+
+class Calibration(NamedTuple):
+    """What `calibrate` found, and how it went there."""
+
+    parameters: NDArray[np.float64]
+    """(P,)"""
+    cov: NDArray[np.float64]
+    """(P, P) (JᵀJ)⁻¹, as honest as the filter's noise"""
+    path: NDArray[np.float64]
+    """(iterations + 1, P) parameters from the start on"""
+    misfit: NDArray[np.float64]
+    """(iterations,) Σ ‖w‖² / dof before each step"""
+    dof: NDArray[np.int64]
+    """(iterations,) components of fused measurements, before each step"""
+    converged: bool
+    """whether the last step was small enough"""
+
+
+def calibrate(
+    info: Callable[[jax.Array], Info],
+    start: ArrayLike,
+    *,
+    iterations: int = 10,
+    tolerance: float = 0.01,
+) -> Calibration:
+    """Parameters at which the innovations of a run no longer tell about them.
+
+    Gauss-Newton on Σ ‖w(p)‖², w = L⁻¹ ν with S = L Lᵀ, over all fused measurements:
+
+        p ← p - (Jᵀ J)⁻¹ Jᵀ w,    J = ∂w/∂p, S held fixed
+
+    J comes from one run in forward mode. The innovations of a filter with right models are white,
+    and ∂ν/∂p depends on the past alone, so that E[Jᵀ w] = 0 at the true p. This is the prediction
+    error method (Ljung, "System Identification", 1999, section 7.2); where all is linear with
+    Gaussian noise and S does not depend on p it is the maximum of the likelihood.
+
+    Associations are made anew at each p and not differentiated. They need not be given: a filter
+    with `association.nearest` and `life.recency(patience=…)` keeps a local map, in which neighbours
+    in time are told apart whatever the drift, and no loop is closed, rightly or wrongly.
+
+    Several places of a scan are whitened each by its own S; in a joint update what they share
+    beyond the map is not looked at, which costs a little precision.
+
+    Args:
+        info: p (P,) -> the `Info` of a run, `lambda p: jaxslam.run(…).info`, where p may enter the
+            controls, the models or the mounting. Traced once.
+        start: (P,), or a number.
+        iterations: steps at most.
+        tolerance: done when no parameter moves by more than so many of its standard deviations.
+    Returns:
+        `Calibration`; look at `converged`.
+    Raises:
+        ValueError: on a start that is not a finite vector, iterations below 1, a tolerance not
+            above 0; where a run fuses nothing, or its innovations are not finite or do not tell the
+            parameters apart.
+    """
+    p = np.atleast_1d(np.asarray(start, np.float64))
+    if p.ndim != 1 or not p.size or not np.isfinite(p).all():
+        raise ValueError(f"calibrate: expected a start of shape (P,), finite, got {start!r}")
+    check_count("calibrate: iterations", iterations)
+    if not tolerance > 0:
+        raise ValueError(f"calibrate: expected a tolerance above 0, got {tolerance}")
+
+    def white(p: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        found = info(p)
+        fused = found.status == Status.FUSED
+        count, size = fused.size, found.innovation.shape[-1]
+        there = fused.reshape(count)
+        cov = jax.lax.stop_gradient(found.innovation_cov).reshape(count, size, size)
+        # Both before the factor and after: nothing of an empty place reaches a derivative.
+        cov = jnp.where(there[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
+        factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
+        residual = jnp.where(there[:, None], found.innovation.reshape(count, size), 0.0)
+        w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
+        return w, (w, fused.sum() * size)
+
+    step = jax.jit(jax.jacfwd(white, has_aux=True))
+    path, misfit, dofs, converged = [p], [], [], False
+    for _ in range(iterations):
+        slope, (w, dof) = jax.device_get(step(jnp.asarray(p)))
+        slope, w, dof = np.asarray(slope, np.float64), np.asarray(w, np.float64), int(dof)
+        if not dof:
+            raise ValueError(f"calibrate: no measurement is fused at {p}")
+        if not (np.isfinite(slope).all() and np.isfinite(w).all()):
+            raise ValueError(f"calibrate: the innovations or their slopes are not finite at {p}")
+        # Columns of unit length: whether parameters are told apart does not depend on their units.
+        length = np.linalg.norm(slope, axis=0)
+        left, values, right = np.linalg.svd(slope / np.where(length > 0, length, 1.0), False)
+        if values[-1] <= len(p) * np.sqrt(np.finfo(np.float64).eps) * values[0]:
+            raise ValueError(f"calibrate: the innovations do not tell the parameters apart at {p}")
+        inverse = right.T / values / length[:, None]
+        cov = inverse @ inverse.T
+        move = -inverse @ (left.T @ w)
+        p = p + move
+        path.append(p)
+        misfit.append(float(w @ w) / dof)
+        dofs.append(dof)
+        converged = bool((np.abs(move) <= tolerance * np.sqrt(np.diag(cov))).all())
+        if converged:
+            break
+    return Calibration(p, cov, np.array(path), np.array(misfit), np.array(dofs), converged)

@@ -1,0 +1,174 @@
+"""The Plaza data sets: a lawn mower among four radio beacons that measure its distance alone."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.io
+from numpy.typing import NDArray
+
+from jaxslam.datasets.dataset import Dataset, make_log
+from jaxslam.motion import pose_increment
+from jaxslam.noise import NoiseCov
+from jaxslam.sensors import range_only
+
+SOURCE = (
+    "J. Djugash, B. Hamner, S. Roth, Navigating with ranging radios: five data sets with ground "
+    "truth, Journal of Field Robotics 26(9), 2009; Plaza1_.mat and Plaza2_.mat as with GTSAM"
+)
+_TABLES = {"DR": 3, "TD": 4, "TL": 3, "GT": 4}
+_COLUMNS = "DR: t, distance, turn; TD: t, sender, receiver, range; TL: id, x, y; GT: t, x, y, θ"
+RANGE_BIAS = (0.03, 0.069)
+"""Offset [m] and scale by which the ranges of both files exceed the distances: a line through all
+ranges of either file against the distances of the survey from the ground truth, least squares. It
+is taken from the ground truth, as of a radio calibrated beforehand; no estimator here finds it."""
+RANGE_COV = ((0.5**2,),)
+"""What is left after that, in both files: white from one range of a beacon to the next."""
+TRAVEL_DENSITY = (0.03**2, 0.03**2, 0.003**2)
+"""Variance of forward [m²/m], sideways [m²/m] and turn [rad²/m] gained in a metre of travel."""
+
+
+def plaza(
+    path: str | Path,
+    *,
+    range_bias: tuple[float, float] = RANGE_BIAS,
+    odometry_cov: NoiseCov | None = None,
+    measurement_cov: NoiseCov = RANGE_COV,
+) -> Dataset:
+    """Read `Plaza1_.mat` or `Plaza2_.mat`: odometry, ranges, surveyed beacons and ground truth.
+
+    The file's tables are DR (t, distance, turn), TD (t, sender, receiver, range), TL (id, x, y of a
+    beacon) and GT (t, x, y, θ). The log has a row at the time of every range: its control is the
+    pose increment (dx, dy, dθ) of the odometry since the row before, the last odometry row of it
+    cut at that time, in proportion. Ranges of one time share a row; of several of one beacon there
+    the first counts, as ranges before the first odometry do not, and the others are counted as
+    dropped. A range z is corrected to (z - offset)/(1 + scale), `range_bias`.
+
+    `true_path` is the ground truth at the time of each row, linear between its rows. The map's
+    frame is that of the robot's first pose, the survey's and the path's is another.
+
+    Source: Djugash, Hamner & Roth, Journal of Field Robotics 26(9), 2009, as with GTSAM:
+    `gtsam.findExampleDataFile("Plaza1_.mat")`.
+
+    Args:
+        path: the file.
+        range_bias: (offset [m], scale) of the ranges; (0, 0) leaves them as they are.
+        odometry_cov: (3, 3) covariance of (dx, dy, dθ), or a function of (pose, u); by default
+            `TRAVEL_DENSITY` times the distance.
+        measurement_cov: (1, 1) covariance of a range, or a function of z.
+    Raises:
+        ValueError: `path: reason` where the file cannot be read, lacks a table, has one of another
+            shape or not finite, times of odometry or ground truth do not rise, a range is not
+            positive or of a beacon without a survey.
+    """
+    tables = _read(Path(path))
+    odometry, ranges, survey, truth = (tables[name] for name in _TABLES)
+    names = tuple(sorted(int(name) for name in survey[:, 0]))
+    for column, what in ((survey[:, 0], "beacon"), (ranges[:, 2], "receiver")):
+        if np.any(column != np.round(column)):
+            raise ValueError(f"{path}: a {what}'s number is not whole")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{path}: a beacon occurs twice in TL")
+    unknown = sorted({int(name) for name in ranges[:, 2]} - set(names))
+    if unknown:
+        raise ValueError(f"{path}: TD has ranges of beacon {unknown[0]}, which is not in TL")
+    if np.any(ranges[:, 3] <= 0):
+        raise ValueError(f"{path}: a range in TD is not above 0")
+    for name, times in (("DR", odometry[:, 0]), ("GT", truth[:, 0])):
+        if np.any(np.diff(times) <= 0):
+            raise ValueError(f"{path}: the times of {name} do not rise")
+
+    begin, end = truth[0, 0], odometry[-1, 0]
+    ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
+    inside = (ranges[:, 0] > begin) & (ranges[:, 0] <= end)
+    times, row = np.unique(ranges[inside, 0], return_inverse=True)
+    if len(times) == 0:
+        raise ValueError(f"{path}: no range in TD is within the odometry")
+    tag = np.searchsorted(names, ranges[inside, 2].astype(int))
+    first = np.unique(row * len(names) + tag, return_index=True)[1]
+    offset, scale = range_bias
+    z = (ranges[inside, 3] - offset) / (1 + scale)
+    positive = first[z[first] > 0]
+    points = {int(name): (x, y) for name, x, y in survey}
+    return Dataset(
+        name="plaza",
+        log=make_log(
+            _increments(odometry, begin, times), row[positive], tag[positive], z[positive, None]
+        ),
+        time=times,
+        motion=pose_increment(_by_travel if odometry_cov is None else odometry_cov),
+        sensor=range_only(measurement_cov),
+        tags=names,
+        landmarks=np.array([points[name] for name in names]),
+        true_path=_between(truth, times),
+        dropped={
+            "ranges outside the odometry": int((~inside).sum()),
+            "repeated ranges": int(inside.sum() - len(first)),
+            "ranges shorter than their bias": len(first) - len(positive),
+        },
+        corrections=(
+            (f"ranges: {offset} m and {100 * scale} % subtracted",) if any(range_bias) else ()
+        ),
+        source=SOURCE,
+    )
+
+
+def _read(path: Path) -> dict[str, NDArray[np.float64]]:
+    try:
+        content = scipy.io.loadmat(path, appendmat=False)
+    except Exception as problem:  # scipy's own MatReadError is of no public class
+        raise ValueError(f"{path}: cannot be read as a .mat file: {problem}") from problem
+    tables = {}
+    for name, columns in _TABLES.items():
+        if name not in content:
+            raise ValueError(f"{path}: no table {name} in the file ({_COLUMNS})")
+        table = np.asarray(content[name])
+        if table.ndim != 2 or table.shape[1] != columns or len(table) == 0:
+            raise ValueError(
+                f"{path}: expected {name} of shape (at least 1, {columns}), got {table.shape} "
+                f"({_COLUMNS})"
+            )
+        if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
+            raise ValueError(f"{path}: {name} has something other than finite numbers")
+        tables[name] = table.astype(np.float64)
+    return tables
+
+
+def _increments(
+    odometry: NDArray[np.float64], begin: float, times: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(T, 3) the motion since the time before, composed of the odometry's: each row of it is a
+    constant twist from the row before to its own time."""
+    edges = np.unique(np.concatenate([[begin], odometry[:, 0], times]))
+    edges = edges[(edges >= begin) & (edges <= times[-1])]
+    ends = np.concatenate([[begin], odometry[:, 0]])
+    parts = []
+    for total in odometry[:, 1:].T:
+        along = np.interp(edges, ends, np.concatenate([[0.0], np.cumsum(total)]))
+        parts.append(np.diff(along))
+    heading = np.concatenate([[0.0], np.cumsum(parts[1])])
+    middle = heading[:-1] + 0.5 * parts[1]
+    track = np.zeros((len(edges), 2))
+    track[1:, 0] = np.cumsum(parts[0] * np.cos(middle))
+    track[1:, 1] = np.cumsum(parts[0] * np.sin(middle))
+    at = np.searchsorted(edges, times)
+    before = np.concatenate([[0], at[:-1]])
+    step, angle = track[at] - track[before], heading[before]
+    c, s = np.cos(angle), np.sin(angle)
+    return np.column_stack(
+        [c * step[:, 0] + s * step[:, 1], -s * step[:, 0] + c * step[:, 1], heading[at] - angle]
+    )
+
+
+def _between(truth: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+    heading = np.interp(times, truth[:, 0], np.unwrap(truth[:, 3]))
+    x, y = (np.interp(times, truth[:, 0], truth[:, k]) for k in (1, 2))
+    return np.column_stack([x, y, np.arctan2(np.sin(heading), np.cos(heading))])
+
+
+def _by_travel(pose: jax.Array, u: jax.Array) -> jax.Array:
+    square = u[0] ** 2 + u[1] ** 2
+    moved = square > 0
+    travel = jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)
+    return travel * jnp.diag(jnp.asarray(TRAVEL_DENSITY, u.dtype))

@@ -1,0 +1,146 @@
+"""What a scan does to one particle's map, from a pose that is drawn, hence known.
+
+Everything here acts on one particle; `filters.fastslam` vmaps it.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import derivatives, linalg, slots
+from jaxslam.filters.particle_scan import Sight
+from jaxslam.filters.particles import Particles, moments
+from jaxslam.filters.scanning import first_that_holds, seen_before
+from jaxslam.linearize import first_order
+from jaxslam.protocols import Life, Sensor
+from jaxslam.slots import Joint
+from jaxslam.types import Info, Scan, Status
+
+Array = jax.Array
+
+
+def after_scan(
+    own: Particles,
+    sight: Sight,
+    scan: Scan,
+    *,
+    sensor: Sensor,
+    births: int | None,
+    life: Life | None,
+) -> tuple[Particles, Info]:
+    """One particle with its map corrected, then grown, then judged by its `Life`."""
+    landmarks, covs = correct(own.pose, own.landmarks, own.covs, scan.z, sight, sensor=sensor)
+    own = own._replace(landmarks=landmarks, covs=covs)
+    given_up = jnp.zeros_like(own.alive)
+    if life is not None and life.make_room is not None:
+        needed = sight.is_new.sum() - (~own.alive).sum()
+        given_up = life.make_room(_joint(own), needed)
+        own = _without(own, given_up)
+    at, granted, deferred, repeated = births_of(sight, scan.tag, own.alive, births)
+    into = jnp.where(granted, at, own.alive.shape[0])
+    landmarks, covs = start(own.pose, own.landmarks, own.covs, scan.z, into, sensor=sensor)
+    status = first_that_holds(
+        (sight.matched & ~sight.inside, Status.REJECTED),
+        (sight.matched & ~sight.used, Status.SINGULAR),
+        (sight.matched, Status.FUSED),
+        (repeated, Status.REPEATED),
+        (deferred, Status.DEFERRED),
+        (granted, Status.BORN),
+        (sight.is_new, Status.OVERFLOW),
+        (scan.valid, Status.UNMATCHED),
+    )
+    fused = status == Status.FUSED
+    own = own._replace(
+        landmarks=landmarks,
+        covs=covs,
+        alive=own.alive.at[into].set(True, mode="drop"),
+        tag=own.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
+        lost=own.lost + (status == Status.OVERFLOW).sum().astype(jnp.int32),
+    )
+    info = Info(
+        nis=sight.nis,
+        dof=jnp.where(fused, scan.z.shape[1], 0),
+        innovation=sight.innovation,
+        innovation_cov=sight.innovation_cov,
+        slot=jnp.where(fused, sight.slot, jnp.where(granted, at, -1)),
+        status=status,
+        log_likelihood=jnp.zeros((), scan.z.dtype),
+    )
+    if life is not None:
+        memory, dead = life.after(_joint(own), info, lambda: moments(_alone(own), sensor))
+        own = _without(own._replace(life=memory), dead)
+        info = info._replace(removed=given_up | dead)
+    return own, info
+
+
+def correct(
+    pose: Array, landmarks: Array, covs: Array, z: Array, sight: Sight, *, sensor: Sensor
+) -> tuple[Array, Array]:
+    """Each landmark measured, corrected by its own EKF from a pose that is known: the particle's.
+
+    With S = H_l C H_lᵀ + R: l ← l + C H_lᵀ S⁻¹ ν, C ← C - C H_lᵀ S⁻¹ H_l C.
+    """
+
+    def one(z: Array, landmark: Array, cov: Array) -> tuple[Array, Array]:
+        by_landmark = derivatives.observe_jacobians(sensor, pose, landmark)[1]
+        hc = linalg.matmul(by_landmark, cov)
+        s = linalg.symmetrize(linalg.matmul(hc, by_landmark.T) + sensor.noise_cov(z))
+        factor, _ = linalg.cholesky(s)
+        white = linalg.solve_lower(factor, sensor.residual(z, sensor.observe(pose, landmark)))
+        v = linalg.solve_lower(factor, hc)
+        return landmark + (v * white[:, None]).sum(axis=0), cov - linalg.gram(v, v)
+
+    new, new_covs = jax.vmap(one)(z, landmarks[sight.slot], covs[sight.slot])
+    at = jnp.where(sight.used, sight.slot, landmarks.shape[0])
+    return landmarks.at[at].set(new, mode="drop"), covs.at[at].set(new_covs, mode="drop")
+
+
+def start(
+    pose: Array, landmarks: Array, covs: Array, z: Array, at: Array, *, sensor: Sensor
+) -> tuple[Array, Array]:
+    """New landmarks where the pose and z (M, Z) put them, in slots at (M,), N for none.
+
+    l = g(x, z, s̄), C = G_z R G_zᵀ + G_s S G_sᵀ: the pose of a particle has no error.
+    """
+
+    def one(z: Array) -> tuple[Array, Array]:
+        landmark, _, own = first_order.invert_at(sensor, pose, z, pose, z)
+        return landmark, linalg.symmetrize(own)
+
+    new, new_covs = jax.vmap(one)(z)
+    return landmarks.at[at].set(new, mode="drop"), covs.at[at].set(new_covs, mode="drop")
+
+
+def births_of(
+    sight: Sight, tag: Array, alive: Array, quota: int | None
+) -> tuple[Array, Array, Array, Array]:
+    """A free slot (M,) for each new landmark, and which are granted, deferred, repeated (M,)."""
+    m = tag.shape[0]
+    repeated = sight.is_new & seen_before(tag, sight.is_new)
+    wanted = sight.is_new & ~repeated
+    deferred = wanted & (jnp.cumsum(wanted) > (m if quota is None else quota))
+    slot, granted = slots.allocate(alive, wanted & ~deferred)
+    return slot, granted, deferred, repeated
+
+
+def _joint(own: Particles) -> Joint:
+    """As a `Life` sees it; the covariance is that of each landmark alone, (N, L, L)."""
+    return Joint(own.pose, own.landmarks, own.covs, own.alive, own.tag, lin=(), life=own.life)
+
+
+def _alone(own: Particles) -> Particles:
+    """This particle as if there were no other."""
+    alone: Particles = jax.tree.map(lambda x: x[None], own)
+    return alone._replace(
+        log_weight=jnp.zeros_like(alone.log_weight), best=jnp.zeros((), jnp.int32)
+    )
+
+
+def _without(own: Particles, dead: Array) -> Particles:
+    """The slots dead (N,) emptied."""
+    eye = jnp.eye(own.landmarks.shape[1], dtype=own.covs.dtype)
+    return own._replace(
+        landmarks=jnp.where(dead[:, None], 0.0, own.landmarks),
+        covs=jnp.where(dead[:, None, None], eye[None], own.covs),
+        alive=own.alive & ~dead,
+        tag=jnp.where(dead, -1, own.tag),
+    )

@@ -1,0 +1,245 @@
+"""What the scan of one sensor does to a `Joint`: it corrects, then starts new landmarks."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import slots
+from jaxslam.filters import augmentation, correction
+from jaxslam.filters.expectation import prediction_of
+from jaxslam.protocols import Associate, Association, Chart, Life, Linearizer, Sensor
+from jaxslam.sensors.suite import Part, Suite, on_ground
+from jaxslam.slots import Joint
+from jaxslam.staging import where_any
+from jaxslam.types import Info, Scan, Status
+
+
+class Births(NamedTuple):
+    """What became of the measurements of a scan that are of no landmark of the map, (M,) each."""
+
+    slot: jax.Array
+    granted: jax.Array
+    deferred: jax.Array
+    repeated: jax.Array
+    given_up: jax.Array
+    """(N,) slots that were emptied to make room"""
+
+
+ScanUpdate = Callable[[Joint, Scan], tuple[Joint, Info, jax.Array]]
+"""(joint, scan) -> joint, info, and the slots (N,) bool that were emptied to make room."""
+
+
+def scan_update(
+    sensor: Sensor,
+    *,
+    absolute: bool,
+    associate: Associate,
+    update: str,
+    births: int | None,
+    life: Life | None,
+    without: Callable[[Joint, jax.Array], Joint],
+    chart: Chart,
+    linearize: Linearizer,
+    square_root: bool,
+    options: dict[str, Any],
+    reserved: Any = None,
+) -> ScanUpdate:
+    """The update by one sensor, of options as `ekf_slam` has them.
+
+    absolute: every valid measurement corrects the robot. without: (joint, dead) -> the joint with
+    those slots freed. options: gate, iterations, joseph.
+    births: 0 for none at all. reserved: (N,) bool, slots that no new landmark may take.
+    """
+    size_z = len(sensor.measurements)
+    options = options | {
+        "sensor": sensor,
+        "chart": chart,
+        "linearize": linearize,
+        "square_root": square_root,
+    }
+    predict_scan = partial(
+        prediction_of,
+        sensor=sensor,
+        chart=chart,
+        linearize=linearize,
+        square_root=square_root,
+    )
+    at_once = partial(correction.correct, **options)
+    in_turn = partial(correction.correct_in_turn, **options)
+    augment = partial(
+        augmentation.augment,
+        sensor=sensor,
+        chart=chart,
+        linearize=linearize,
+        square_root=square_root,
+    )
+
+    def update_map(joint: Joint, scan: Scan) -> tuple[Joint, Info, jax.Array]:
+        # Padding may hold anything, and is multiplied by zero further down.
+        z = jnp.where(scan.valid[:, None], scan.z, 0.0)
+        if not absolute:
+            found = Association(*associate(predict_scan(joint), scan._replace(z=z)))
+            slot, is_new, exhausted = found.slot, found.is_new, jnp.asarray(found.exhausted)
+            matched = scan.valid & (slot >= 0) & ~is_new
+            is_new = scan.valid & is_new
+        else:
+            slot, is_new = jnp.full_like(scan.tag, -1), jnp.zeros_like(scan.valid)
+            matched, exhausted = scan.valid, jnp.asarray(False)
+        parts = (z, jnp.maximum(slot, 0), matched)
+        correct = at_once if update == "joint" and len(scan.tag) > 0 else in_turn
+        joint, done = correct(joint, *parts)
+
+        def start(joint: Joint) -> tuple[Joint, Births]:
+            repeated = is_new & seen_before(scan.tag, is_new)
+            wanted = is_new & ~repeated
+            quota = wanted.shape[0] if births is None else births
+            deferred = wanted & (jnp.cumsum(wanted) > quota)
+            wanted = wanted & ~deferred
+            given_up = jnp.zeros_like(joint.alive)
+            if life is not None and life.make_room is not None:
+                needed = wanted.sum() - (~joint.alive).sum()
+                given_up = life.make_room(joint, needed)
+                joint = without(joint, given_up)
+            taken = joint.alive if reserved is None else joint.alive | reserved
+            slot, granted = slots.allocate(taken, wanted)
+            joint = augment(joint, z, scan.tag, slot, granted)
+            return joint, Births(slot, granted, deferred, repeated, given_up)
+
+        def start_none(joint: Joint) -> tuple[Joint, Births]:
+            none, given_up = jnp.zeros_like(is_new), jnp.zeros_like(joint.alive)
+            return joint, Births(jnp.zeros_like(slot), none, none, none, given_up)
+
+        if births == 0:  # places that are for robots
+            joint, born = start_none(joint)
+            born = born._replace(deferred=is_new)
+        else:
+            joint, born = where_any(is_new.any(), start, start_none, joint)
+
+        status = first_that_holds(
+            (matched & ~done.inside, Status.REJECTED),
+            (matched & ~done.positive, Status.SINGULAR),
+            (matched, Status.FUSED),
+            (born.repeated, Status.REPEATED),
+            (born.deferred, Status.DEFERRED),
+            (born.granted, Status.BORN),
+            (is_new, Status.OVERFLOW),
+            (scan.valid, Status.UNMATCHED),
+        )
+        fused = status == Status.FUSED
+        info = Info(
+            nis=jnp.where(matched, done.nis, 0.0),
+            dof=jnp.where(fused, size_z, 0),
+            innovation=jnp.where(matched[:, None], done.innovation, 0.0),
+            innovation_cov=jnp.where(matched[:, None, None], done.innovation_cov, 0.0),
+            slot=jnp.where(fused, slot, jnp.where(born.granted, born.slot, -1)),
+            status=status,
+            log_likelihood=done.log_likelihood.sum(),
+            exhausted=exhausted,
+        )
+        return joint, info, born.given_up
+
+    return update_map
+
+
+def part_updates(sensor: Sensor, size_l: int, **options: Any) -> list[tuple[int, ScanUpdate]]:
+    """The update by each sensor of a suite, with how many places of a scan it has.
+
+    Of a sensor that is no suite: its own, with -1 places, which are all of them. Places for robots
+    are left alone.
+    """
+    if not isinstance(sensor, Suite):
+        return [(-1, scan_update(sensor, absolute=not sensor.landmark, **options))]
+    return [
+        (
+            part.places,
+            left_alone if part.sees == "robots" else part_update(part, size_l, **options),
+        )
+        for part in sensor.parts
+    ]
+
+
+def part_update(part: Part, size_l: int, **options: Any) -> ScanUpdate:
+    """The update by one sensor of a suite, whose rows of z may be longer than its own."""
+    one = scan_update(on_ground(part.sensor, size_l), absolute=part.absolute, **options)
+    size_z = len(part.sensor.measurements)
+    return lambda joint, scan: one(joint, scan._replace(z=scan.z[:, :size_z]))
+
+
+def left_alone(joint: Joint, scan: Scan) -> tuple[Joint, Info, jax.Array]:
+    """A `ScanUpdate` that uses nothing: every valid place is `Status.UNMATCHED`."""
+    m, size_z = scan.z.shape
+    zero = jnp.zeros(m, scan.z.dtype)
+    status = jnp.where(scan.valid, Status.UNMATCHED, Status.EMPTY).astype(jnp.int32)
+    info = Info(
+        nis=zero,
+        dof=jnp.zeros(m, jnp.int32),
+        innovation=jnp.zeros_like(scan.z),
+        innovation_cov=jnp.zeros((m, size_z, size_z), scan.z.dtype),
+        slot=jnp.full(m, -1, jnp.int32),
+        status=status,
+        log_likelihood=jnp.zeros((), scan.z.dtype),
+        exhausted=jnp.asarray(False),
+    )
+    return joint, info, jnp.zeros_like(joint.alive)
+
+
+def in_order(
+    joint: Joint, scan: Scan, parts: list[tuple[int, ScanUpdate]]
+) -> tuple[Joint, Info, jax.Array]:
+    """A scan through several updates, one after the other, each with its own places of it.
+
+    Raises ValueError if the scan does not have their places.
+    """
+    if len(parts) == 1 and parts[0][0] == -1:
+        return parts[0][1](joint, scan)
+    if sum(places for places, _ in parts) != scan.tag.shape[0]:
+        wanted = tuple(places for places, _ in parts)
+        raise ValueError(f"expected places {wanted} of a scan, got {scan.tag.shape[0]}")
+    infos, at = [], 0
+    given_up = jnp.zeros_like(joint.alive)
+    for places, update in parts:
+        own: Scan = jax.tree.map(lambda leaf, a=at, n=places: leaf[a : a + n], scan)
+        joint, info, gone = update(joint, own)
+        infos.append(info)
+        given_up = given_up | gone
+        at += places
+    return joint, joined(infos, scan.z.shape[1]), given_up
+
+
+def joined(infos: list[Info], size_z: int) -> Info:
+    """One info of all places; innovations and their covariances padded with zeros to size_z."""
+
+    def together(name: str, padded_axes: int = 0) -> jax.Array:
+        values = [getattr(info, name) for info in infos]
+        wide = [
+            jnp.pad(value, [(0, 0)] + [(0, size_z - value.shape[-1])] * padded_axes)
+            for value in values
+        ]
+        return jnp.concatenate(wide)
+
+    return Info(
+        nis=together("nis"),
+        dof=together("dof"),
+        innovation=together("innovation", 1),
+        innovation_cov=together("innovation_cov", 2),
+        slot=together("slot"),
+        status=together("status"),
+        log_likelihood=jnp.stack([info.log_likelihood for info in infos]).sum(),
+        exhausted=jnp.stack([jnp.asarray(info.exhausted) for info in infos]).any(),
+    )
+
+
+def first_that_holds(*cases: tuple[jax.Array, Status]) -> jax.Array:
+    """`Status` (M,) of the first condition (M,) that holds at a place, EMPTY where none does."""
+    where, status = zip(*cases, strict=True)
+    return jnp.select(list(where), list(status), Status.EMPTY).astype(jnp.int32)
+
+
+def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
+    """Whether the same non-negative tag occurs at an earlier place, (M,)."""
+    earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
+    same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
+    return (same & earlier).any(axis=1)

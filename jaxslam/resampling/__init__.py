@@ -1,0 +1,32 @@
+"""Resampling: which particles go on, one method a file. `REGISTRY` is what their tests run over.
+
+`soft` and `stop_gradient` make of such a method one that gradients pass; `kld` says how many
+particles are enough.
+"""
+
+from jaxslam.protocols import Resample
+from jaxslam.resampling.kld import kld_bound
+from jaxslam.resampling.multinomial import multinomial
+from jaxslam.resampling.residual import residual
+from jaxslam.resampling.soft import soft
+from jaxslam.resampling.stop_gradient import stop_gradient
+from jaxslam.resampling.stratified import stratified
+from jaxslam.resampling.systematic import systematic
+
+REGISTRY: dict[str, Resample] = {
+    "multinomial": multinomial,
+    "residual": residual,
+    "stratified": stratified,
+    "systematic": systematic,
+}
+
+__all__ = [
+    "REGISTRY",
+    "kld_bound",
+    "multinomial",
+    "residual",
+    "soft",
+    "stop_gradient",
+    "stratified",
+    "systematic",
+]

@@ -1,0 +1,75 @@
+"""How many particles are enough: the KLD bound, over the bins that a sample occupies."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.stats import normal_quantile
+
+Array = jax.Array
+
+# Bins are counted in int32, and a pose may be anywhere.
+_FARTHEST = float(2**30)
+
+
+def kld_bound(bins: Array, error: float, confidence: float) -> Array:
+    """Particles that k = `bins` occupied bins ask for, of any shape; 0 where k <= 1.
+
+        n = (k-1)/(2ε) · (1 - 2/(9(k-1)) + √(2/(9(k-1))) z)³
+
+    with z the standard normal quantile of the confidence: with that probability the Kullback-
+    Leibler divergence of the sample's histogram from the distribution it is of is below ε = error.
+    2nK is χ² with k - 1 degrees of freedom, by Wilson & Hilferty's approximation (Fox 2001,
+    "KLD-sampling: Adaptive particle filters"; Fox 2003, IJRR 22(12), eq. 7).
+    """
+    z = normal_quantile(confidence)
+    many = bins > 1
+    dof = jnp.where(many, bins - 1, 1).astype(jnp.result_type(float))
+    part = 2 / (9 * dof)
+    return jnp.where(many, dof / (2 * error) * (1 - part + jnp.sqrt(part) * z) ** 3, 0.0)
+
+
+def bins_of(pose: Array, size: tuple[float, float, float]) -> Array:
+    """The bin (P, 3) int32 of each pose (P, 3): whole multiples of size (x [m], y [m], θ [rad]).
+
+    Headings from -π on, the last bin being narrower where size does not divide 2π.
+    """
+    scale = jnp.asarray(size, pose.dtype)
+    at = jnp.concatenate([pose[:, :2], pose[:, 2:] + math.pi], axis=1) / scale[None]
+    last = math.ceil(2 * math.pi / size[2] - 1e-9) - 1
+    at = at.at[:, 2].set(jnp.clip(at[:, 2], 0, last))
+    return jnp.floor(jnp.clip(at, -_FARTHEST, _FARTHEST)).astype(jnp.int32)
+
+
+def occupied(bins: Array) -> Array:
+    """How many different rows the first 1, 2, …, P of bins (P, 3) have, (P,) int32.
+
+    By sorting, O(P log P) in time and O(P) in memory however large the world is: of equal rows the
+    sort, which is stable, puts the first drawn first.
+    """
+    index = jnp.arange(bins.shape[0], dtype=jnp.int32)
+    x, y, heading, order = jax.lax.sort(
+        (bins[:, 0], bins[:, 1], bins[:, 2], index), num_keys=3, is_stable=True
+    )
+    rows = jnp.stack([x, y, heading])
+    new = jnp.concatenate([jnp.ones(1, bool), (rows[:, 1:] != rows[:, :-1]).any(axis=0)])
+    first = jnp.zeros(bins.shape[0], bool).at[order].set(new)
+    return jnp.cumsum(first.astype(jnp.int32))
+
+
+def enough(bins: Array, least: int, error: float, confidence: float) -> tuple[Array, Array]:
+    """How many of P exchangeable draws suffice, () int32, and whether P were too few, ().
+
+    Fox's loop in fixed shapes: the first m >= least that is no less than `kld_bound` of the bins
+    that the first m draws occupy; P where there is none.
+
+    Args:
+        bins: (P, 3) int, of the draws in the order in which they were drawn; an ordered sample (as
+            systematic resampling gives) has to be shuffled before.
+    """
+    count = bins.shape[0]
+    size = jnp.arange(1, count + 1)
+    fits = (size >= least) & (size >= kld_bound(occupied(bins), error, confidence))
+    some = fits.any()
+    return jnp.where(some, jnp.argmax(fits) + 1, count).astype(jnp.int32), ~some

@@ -1,0 +1,50 @@
+"""Ancestors drawn from flattened weights, and what they weigh then: a gradient, though biased."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.linalg import is_concrete
+from jaxslam.protocols import Differentiable, Resample
+from jaxslam.resampling.systematic import systematic
+from jaxslam.resampling.weights import even, normalized
+
+Array = jax.Array
+
+
+def soft(share: float, resample: Resample = systematic) -> Differentiable:
+    """Soft resampling (Karkus, Hsu & Lee 2018, "Particle filter networks with application to visual
+    localization", CoRL): draw from the mixture of w and the uniform distribution,
+
+        q_j = share · w_j + (1 - share)/P        the copy of j weighs (w_j/q_j)/P
+
+    The weights of the copies are divided by their sum, as a number; gradients go through w_j/q_j.
+
+    **Biased**: expectations keep their value, but as functions of a parameter the draws from q
+    change too, and of that this gradient knows nothing. share = 1 is plain resampling, whose copies
+    all weigh 1/P and pass no gradient; the gradient of share = 0 has no such bias, and resamples
+    nothing. `stop_gradient` is without it for any method.
+
+    Args:
+        share: of the weights in the mixture, 0 to 1.
+        resample: how indices are drawn from q.
+    Raises:
+        ValueError: on a share outside [0, 1].
+    """
+    if is_concrete(share) and not 0 <= share <= 1:
+        raise ValueError(f"soft: expected a share from 0 to 1, got {share}")
+
+    def method(log_weights: Array, key: Array) -> tuple[Array, Array]:
+        log_w = normalized(log_weights)[0]
+        w = jnp.exp(log_w)
+        q = share * w + (1 - share) / w.shape[0]
+        drawn = q > 0
+        log_q = jnp.log(jnp.where(drawn, q, 1.0))
+        ancestor = resample(jax.lax.stop_gradient(jnp.where(drawn, log_q, -jnp.inf)), key)
+        # A ratio of logarithms where there is a weight: double where, for the gradient.
+        there = w > 0
+        ratio = jnp.where(there, log_w, 0.0) - jnp.where(there, log_q, 0.0)
+        ratio = jnp.where(there, ratio, -jnp.inf)[ancestor]
+        _, log_sum, some = normalized(jax.lax.stop_gradient(ratio))
+        return ancestor, jnp.where(some, ratio - log_sum, even(log_weights))
+
+    return method

@@ -1,0 +1,42 @@
+"""Any resampling, with weights whose value is 1/P and whose gradient is the score of the draw."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.protocols import Differentiable, Resample
+from jaxslam.resampling.systematic import systematic
+from jaxslam.resampling.weights import even, normalized
+
+Array = jax.Array
+
+
+def stop_gradient(resample: Resample = systematic) -> Differentiable:
+    """The stop-gradient estimator (Ścibior & Wood 2021, "Differentiable particle filtering without
+    modifying the forward pass"): a copy of j weighs
+
+        (1/P) · w_j/⊥(w_j)        ⊥ being `jax.lax.stop_gradient`
+
+    that is 1/P, so no number changes; its derivative is (1/P) ∂ log w_j, and
+
+        E Σ_i (1/P) f(a_i) ∂ log w_{a_i} = Σ_j f_j ∂w_j
+
+    **Unbiased** for expectations, so that the gradient of the filter's estimate of the likelihood
+    has the gradient of the likelihood for its mean, and that of its logarithm tends to the score
+    with the number of particles (its bias is of order 1/P, as that of the logarithm itself). The
+    price is variance, which grows with the length of the log: all terms of a lost line are lost.
+
+    A caller must not normalize these weights again: their sum is 1, but its gradient is not 0.
+
+    Args:
+        resample: how indices are drawn; unbiased, as those of `jaxslam.resampling` are.
+    """
+
+    def method(log_weights: Array, key: Array) -> tuple[Array, Array]:
+        log_w, _, some = normalized(log_weights)
+        ancestor = resample(jax.lax.stop_gradient(log_weights), key)
+        chosen = jnp.where(some, log_w, 0.0)[ancestor]
+        # Nothing without weight is drawn; the where is for gradients of what is not.
+        chosen = jnp.where(jnp.isfinite(chosen), chosen, 0.0)
+        return ancestor, even(log_weights) + (chosen - jax.lax.stop_gradient(chosen))
+
+    return method

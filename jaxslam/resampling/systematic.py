@@ -1,0 +1,23 @@
+"""One draw, and P points at equal distances from it: the least noise for the least work."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.resampling.weights import at_points, weights_of
+
+
+def systematic(log_weights: jax.Array, key: jax.Array) -> jax.Array:
+    """Ancestors (P,) where points (i + u)/P, one u uniform in [0, 1) for all, fall; ascending.
+
+    The number of copies of j is P w_j rounded down or up, with mean P w_j: no particle of at least
+    an even weight is lost (Carpenter, Clifford & Fearnhead 1999, "Improved particle filter for
+    nonlinear problems", IEE Proc. Radar Sonar Navig. 146(1)).
+
+    Args:
+        log_weights: (P,), of any scale; what is not finite is never drawn, unless nothing is.
+        key: a PRNG key, consumed.
+    """
+    weights = weights_of(log_weights)
+    count = weights.shape[0]
+    u = jax.random.uniform(key, (), weights.dtype)
+    return at_points(weights, (jnp.arange(count) + u) / count)

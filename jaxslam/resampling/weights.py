@@ -1,0 +1,63 @@
+"""What resampling methods share: weights from logarithms, and places in a cumulative sum."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.protocols import Differentiable, Resample
+
+Array = jax.Array
+
+
+def normalized(log_weights: Array) -> tuple[Array, Array, Array]:
+    """log w of Σ w = 1 (P,), log Σ exp(log_weights) (), and whether there was a sum, ().
+
+    What is not finite weighs nothing. Where nothing is left, all weigh 1/P and the flag is False:
+    the caller counts it. The log of the sum is then 0.
+    """
+    there = jnp.isfinite(log_weights)
+    some = there.any()
+    highest = jnp.where(some, jnp.max(jnp.where(there, log_weights, -jnp.inf)), 0.0)
+    safe = jnp.where(there, log_weights - highest, 0.0)
+    total = jnp.where(there, jnp.exp(safe), 0.0).sum()
+    log_total = jnp.where(some, jnp.log(jnp.where(some, total, 1.0)), 0.0)
+    out = jnp.where(there, safe - log_total, -jnp.inf)
+    return jnp.where(some, out, even(log_weights)), highest + log_total, some
+
+
+def even(log_weights: Array) -> Array:
+    """log 1/P, (), for log-weights (P,)."""
+    return -jnp.log(jnp.asarray(float(log_weights.shape[0]), log_weights.dtype))
+
+
+def survivors(
+    resample: Resample | Differentiable, log_weights: Array, key: Array
+) -> tuple[Array, Array]:
+    """The ancestor (P,) of each that goes on, and its log-weight (P,): 1/P unless the method,
+    being a `Differentiable`, says something else."""
+    found = resample(log_weights, key)
+    if isinstance(found, tuple):
+        return found
+    return found, jnp.broadcast_to(even(log_weights), log_weights.shape)
+
+
+def weights_of(log_weights: Array) -> Array:
+    """w (P,) with Σ w = 1 of log-weights of any scale; even where all underflow."""
+    return jnp.exp(normalized(log_weights)[0])
+
+
+def effective_size(log_weights: Array) -> Array:
+    """ESS = 1/Σ w², between 1 and P (Kong, Liu & Wong 1994, "Sequential imputations and Bayesian
+    missing data problems", JASA 89(425))."""
+    return 1.0 / (weights_of(log_weights) ** 2).sum()
+
+
+def at_points(weights: Array, points: Array) -> Array:
+    """The index (K,) int32 in whose share of the cumulative sum of weights (P,) points (K,) lie.
+
+    points are in [0, 1); the share of i is [W_{i-1}, W_i)/W_P, so that no zero weight is chosen,
+    also where a point is rounded up to 1.
+    """
+    above = jnp.cumsum(weights)
+    index = jnp.searchsorted(above, points * above[-1], side="right")
+    last = weights.shape[0] - 1 - jnp.argmax((weights > 0)[::-1])
+    return jnp.minimum(index, last).astype(jnp.int32)

@@ -1,0 +1,155 @@
+"""Several sensors on one robot, each with its own model, mount, rate and places of a scan."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NoReturn
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.linalg import check_count
+from jaxslam.protocols import Free, Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One sensor of a suite. Raises ValueError on places or every below 1, or a bad start."""
+
+    sensor: Sensor
+    places: int
+    """measurement places of a scan that are its own; 1 of an absolute sensor"""
+    every: int = 1
+    """in a simulation it measures every so many steps,"""
+    start: int = 0
+    """beginning with this one; a filter goes by `Scan.valid` alone"""
+    visible: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
+    sees: Literal["landmarks", "robots"] = "landmarks"
+    """what its places are for in a simulation. A filter of one robot leaves places for robots
+    alone (`Status.UNMATCHED`); that of a team goes by the tags, and starts no landmark there."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.sensor, Sensor) or isinstance(self.sensor, Suite):
+            raise ValueError(f"suite: expected one sensor a part, got {self.sensor!r}")
+        check_count(f"suite: places of {self.sensor.name}", self.places)
+        check_count(f"suite: every of {self.sensor.name}", self.every)
+        if type(self.start) is not int or self.start < 0:
+            raise ValueError(f"suite: expected a start of at least 0, got {self.start!r}")
+        if self.sees not in ("landmarks", "robots"):
+            raise ValueError(f'suite: expected sees "landmarks" or "robots", got {self.sees!r}')
+        if not self.sensor.landmark and self.places != 1:
+            raise ValueError(
+                f"suite: the absolute sensor {self.sensor.name} has one place, not {self.places}"
+            )
+
+    @property
+    def absolute(self) -> bool:
+        """Whether it measures the robot itself, and no landmark."""
+        return not self.sensor.landmark
+
+
+@dataclass(frozen=True, eq=False)
+class Suite(Sensor):
+    """Sensors side by side; made by `suite`.
+
+    The first places of a scan are the first part's, the next ones the second's, and so on. Rows of
+    z are padded with zeros to the largest measurement. As a `Sensor` it says of what size logs and
+    landmarks are; its parts measure.
+    """
+
+    parts: tuple[Part, ...] = ()
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """How many places of a scan each part has."""
+        return tuple(part.places for part in self.parts)
+
+
+def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
+    """The sensors of one robot (Solà's loop over sensors), to be used where a `Sensor` is.
+
+    A filter takes the parts one after the other: each corrects by what it measured of known
+    landmarks, then starts its new ones, which the next part may correct already in the same scan.
+    A tag may occur once a part. Absent data are places that are not valid, whatever the reason.
+
+        eyes = suite((range_bearing(R, mount=front), 8), Part(compass(S), 1, every=10))
+        filter = ekf_slam(motion, eyes, capacity)
+
+    Args:
+        parts: a `Part`, or (sensor, places), each.
+    Raises:
+        ValueError: without parts, on a part that is none, or if sensors of landmarks do not share
+            landmarks (x, y): only a single one may have others.
+    """
+    made = tuple(part if isinstance(part, Part) else _part(part) for part in parts)
+    if not made:
+        raise ValueError("suite: expected at least one sensor")
+    grounded = [part.sensor for part in made if not part.absolute]
+    first = grounded[0] if grounded else made[0].sensor
+    for sensor in grounded[1:]:
+        if sensor.landmark != first.landmark or len(sensor.landmark) != 2:
+            raise ValueError(
+                f"suite: the sensors {first.name} and {sensor.name} do not share landmarks (x, y): "
+                f"{first.landmark} and {sensor.landmark}"
+            )
+    size = max(len(part.sensor.measurements) for part in made)
+
+    def not_one(*_: Any) -> NoReturn:
+        raise ValueError("suite: several sensors have no measurement in common; ask its parts")
+
+    return Suite(
+        name=" + ".join(part.sensor.name for part in made),
+        measurements=tuple(f"entry {i} of its sensor" for i in range(size)),
+        landmark=first.landmark,
+        observe=not_one,
+        residual=not_one,
+        noise_cov=not_one,
+        invert=not_one,
+        position=first.position,
+        embed=first.embed,
+        free=Free(jnp.zeros(0), jnp.zeros((0, 0))),
+        reduced=first.reduced,
+        parts=made,
+    )
+
+
+def _part(given: Any) -> Part:
+    if not isinstance(given, tuple) or len(given) != 2:
+        raise ValueError(f"suite: expected a Part or (sensor, places), got {given!r}")
+    return Part(*given)
+
+
+def on_ground(sensor: Sensor, size: int) -> Sensor:
+    """The sensor among landmarks of `size` numbers, the first of which are its own.
+
+    Of the others a measurement says nothing: an absolute sensor ignores them all, and a new
+    landmark gets them with zero mean, unit variance and no correlation, as padding has it.
+    """
+    own, spare = len(sensor.landmark), size - len(sensor.landmark)
+    if spare == 0:
+        return sensor
+    kept = sensor.free.mean.shape[0]
+
+    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+        return jnp.concatenate([sensor.invert(pose, z, s[:kept]), s[kept:]])
+
+    def embed(pose: jax.Array, point: jax.Array) -> jax.Array:
+        return jnp.concatenate([sensor.embed(pose, point), jnp.zeros(spare, pose.dtype)])
+
+    dtype = sensor.free.mean.dtype
+    free = Free(
+        jnp.concatenate([sensor.free.mean, jnp.zeros(spare, dtype)]),
+        jnp.eye(kept + spare, dtype=dtype).at[:kept, :kept].set(sensor.free.cov),
+    )
+    return Sensor(
+        name=sensor.name,
+        measurements=sensor.measurements,
+        landmark=(*sensor.landmark, *("-",) * spare),
+        observe=lambda pose, landmark: sensor.observe(pose, landmark[:own]),
+        residual=sensor.residual,
+        noise_cov=sensor.noise_cov,
+        invert=invert,
+        position=lambda landmark: sensor.position(landmark[:own]),
+        embed=embed,
+        free=free,
+    )

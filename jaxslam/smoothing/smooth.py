@@ -1,0 +1,125 @@
+"""The fixed-interval smoother of EKF-SLAM: each pose given the whole log."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from jaxslam.angles import wrap
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.filters.moments import moments
+from jaxslam.protocols import Associate, Estimator, Motion, Sensor
+from jaxslam.slots import Joint
+from jaxslam.smoothing import history as forward
+from jaxslam.smoothing.chain import Chain, Policy, eliminate
+from jaxslam.smoothing.marginals import marginals
+from jaxslam.types import Estimate, Info, Log, Status, Trace
+
+Array = jax.Array
+
+
+class Smoothed(NamedTuple):
+    """The `final` of a smoother's trace."""
+
+    start: Array
+    """(3,) pose before the first control"""
+    start_cov: Array
+    """(3, 3)"""
+    joint: Joint
+    """the last pose and the map, which a filter may go on from"""
+    regular: Array
+    """() bool: the information on the map is positive definite; else covariances mean nothing"""
+    filtered: Estimate
+    """with leading T, of the filter that went first"""
+
+
+def smooth(
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
+    *,
+    associate: Associate | None = None,
+    gate: float | None = None,
+    births: int | None = None,
+) -> Estimator:
+    """The Rauch-Tung-Striebel smoother of `ekf_slam(update="joint")`, without its matrices.
+
+    p(x_t | all scans) of the linear system that the EKF made of the log: the Jacobians are where
+    the filter took them, so the last pose and the map are the filter's own, to rounding, and every
+    pose before knows what came after. The recursion of Rauch, Tung & Striebel 1965 ("Maximum
+    likelihood estimates of linear dynamic systems", AIAA Journal 3(8)) would keep T covariances of
+    the map and invert each, where landmarks are yet to be born and the noise of a motion may be
+    singular; `chain.eliminate` gives the same numbers from the Jacobians alone, O(T N²). A landmark
+    has no prior, and its birth is a measurement of it.
+
+    What it returns maps (log, key) to a `Trace`: estimates with leading T, the poses smoothed and
+    the map, which stands still, the same final one at every step; the filter's infos, where a place
+    whose noise is singular becomes `Status.SINGULAR`, since it cannot be smoothed with; and
+    a `Smoothed`.
+
+        estimator = smooth(world.motion, world.sensor, 20, world.pose, world.pose_cov)
+        trace = jax.jit(estimator)(log, jax.random.key(0))
+
+    Args:
+        motion, sensor: the models; Jacobians come from `jax.jacfwd`.
+        capacity: landmark slots N.
+        pose, pose_cov: (3,) and (3, 3) where the robot is before the first control.
+        associate, gate, births: of the filter, as for `ekf_slam`.
+    Raises:
+        ValueError: as `ekf_slam` does; for a suite, landmarks that turn into points, or landmarks
+            with more parameters than are measured and have a prior (rays); and, when called, as
+            `run` does.
+    """
+    filter = forward.filter_of(
+        motion, sensor, capacity, name="smooth", associate=associate, gate=gate, births=births
+    )
+
+    def estimator(log: Log, key: Array) -> Trace:
+        history = forward.filtered(filter, log, pose, pose_cov, key)
+        log = in_one_width(log)
+        root = jnp.asarray(pose_cov, log.control.dtype)
+        roots = forward.roots_of(motion, history, log.control)
+        chain, used = forward.chain_of(motion, sensor, history, log, root, roots)
+        final = history.trace.final
+        policy = eliminate(chain, final.alive)
+        begin = jnp.asarray(pose, log.control.dtype)
+        path = jnp.concatenate([begin[None], history.after])
+        estimate, solved = solution(sensor, chain, policy, path, final)
+        smoothed = Smoothed(*solved, history.trace.estimate)
+        return Trace(estimate, counted(history.trace.info, used), smoothed, ())
+
+    return estimator
+
+
+def solution(
+    sensor: Sensor, chain: Chain, policy: Policy, path: Array, joint: Joint
+) -> tuple[Estimate, tuple[Array, Array, Joint, Array]]:
+    """The optimum of a chain about a path (T+1, 3) and the map of a joint, as estimates; and the
+    first fields of a `Smoothed`."""
+    found = marginals(chain, policy)
+    poses = path + found.path
+    poses = poses.at[:, 2].set(wrap(poses[:, 2]))
+    landmarks = jnp.where(joint.alive[:, None], joint.landmarks + policy.landmarks, 0.0)
+    last = joint._replace(pose=poses[-1], landmarks=landmarks, cov=found.cov)
+    at_end = moments(last, sensor, euclidean())
+    steps = path.shape[0] - 1
+    always = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), at_end)
+    estimate = always._replace(pose=poses[1:], pose_cov=found.covs[1:])
+    return estimate, (poses[0], found.covs[0], last, policy.regular)
+
+
+def counted(info: Info, used: Array) -> Info:
+    """The filter's infos, with the status of what it used and a smoother cannot."""
+    taken = (info.status == Status.FUSED) | (info.status == Status.BORN)
+    status = jnp.where(taken & ~used, Status.SINGULAR, info.status)
+    return info._replace(status=status.astype(info.status.dtype))
+
+
+def in_one_width(log: Log) -> Log:
+    """Arrays, controls and measurements in the wider dtype of the two, as `run` computes."""
+    log = jax.tree.map(jnp.asarray, log)
+    dtype = jnp.result_type(log.control, log.scan.z)
+    return Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))

@@ -1,0 +1,161 @@
+"""The canonical form is the same filter: EIF-SLAM against the EKF, number by number."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import filters, motion, sensors
+from jaxslam.run import run
+from jaxslam.scenarios import cloister
+from jaxslam.scenarios.view import between_ranges
+from jaxslam.simulate import simulate
+from jaxslam.types import Status
+
+KEY = jax.random.key(0)
+P0 = np.diag([0.1, 0.1, 0.05]) ** 2
+
+
+def world(steps=60, **changes):
+    """Three metres of sight in the cloister, from a start that is not exactly known."""
+    changes = {"visible": between_ranges(0.0, 3.0), "places": 14, "pose_cov": P0} | changes
+    return dataclasses.replace(cloister(steps), **changes)
+
+
+def driven(filter, scene, log, dtype=None):
+    if dtype is not None:
+        log = jax.tree.map(
+            lambda leaf: leaf.astype(dtype) if leaf.dtype == jnp.float64 else leaf, log
+        )
+    return jax.jit(lambda log: run(filter, log, scene.pose, scene.pose_cov, KEY))(log)
+
+
+@pytest.mark.parametrize("gate", [None, 6.0])
+def test_eif_is_the_ekf(gate):
+    scene = world()
+    _, log = simulate(scene, jax.random.key(1))
+    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint", gate=gate)
+    eif = filters.eif_slam(scene.motion, scene.sensor, 36, gate=gate)
+    a, b = driven(ekf, scene, log), driven(eif, scene, log)
+    for name in ("pose", "pose_cov", "points", "point_covs", "alive", "tag"):
+        np.testing.assert_allclose(
+            getattr(b.estimate, name), getattr(a.estimate, name), rtol=0, atol=1e-8, err_msg=name
+        )
+    np.testing.assert_array_equal(a.info.status, b.info.status)
+    np.testing.assert_array_equal(a.info.slot, b.info.slot)
+    np.testing.assert_array_equal(a.info.dof, b.info.dof)
+    for name in ("nis", "innovation", "innovation_cov", "log_likelihood"):
+        np.testing.assert_allclose(
+            getattr(b.info, name), getattr(a.info, name), rtol=1e-7, atol=1e-8, err_msg=name
+        )
+    if gate is not None:
+        assert a.info.tally(Status.REJECTED).sum() > 0
+    final = b.final
+    mean = np.concatenate([final.pose, np.ravel(final.landmarks)])
+    np.testing.assert_allclose(np.linalg.solve(final.omega, final.xi), mean, atol=1e-8)
+    assert int(final.broken) == 0
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_certain_start_gets_the_floor(dtype):
+    """P0 = 0 has no inverse: the filter is the EKF that starts with floor² I."""
+    scene = world(20, pose_cov=np.zeros((3, 3)))
+    _, log = simulate(scene, jax.random.key(1))
+    eif = filters.eif_slam(scene.motion, scene.sensor, 36, floor=1e-3)
+    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint")
+    softer = dataclasses.replace(scene, pose_cov=1e-6 * np.eye(3))
+    a, b = driven(ekf, softer, log), driven(eif, scene, log, dtype)
+    assert b.estimate.pose.dtype == dtype
+    atol = 1e-8 if dtype == jnp.float64 else 1e-3
+    np.testing.assert_allclose(b.estimate.pose, a.estimate.pose, atol=atol)
+    np.testing.assert_allclose(b.estimate.points, a.estimate.points, atol=10 * atol)
+    assert int(b.final.broken) == 0
+
+
+def test_full_maps_unknown_tags_and_empty_scans():
+    scene = world(15)
+    _, log = simulate(scene, jax.random.key(1))
+    tag = np.array(log.scan.tag)
+    tag[:, 0] = -1
+    valid = np.array(log.scan.valid)
+    valid[7] = False
+    log = log._replace(scan=log.scan._replace(tag=jnp.asarray(tag), valid=jnp.asarray(valid)))
+    a = driven(filters.ekf_slam(scene.motion, scene.sensor, 5, update="joint"), scene, log)
+    b = driven(filters.eif_slam(scene.motion, scene.sensor, 5), scene, log)
+    np.testing.assert_array_equal(a.info.status, b.info.status)
+    assert b.info.tally(Status.OVERFLOW).sum() > 0
+    assert b.info.tally(Status.UNMATCHED).sum() > 0
+    np.testing.assert_allclose(b.estimate.pose, a.estimate.pose, atol=1e-8)
+
+
+def test_other_models():
+    """A landmark of three parameters, in the canonical form as in the other."""
+    sensor = sensors.range_bearing_signature(np.diag([0.1, 0.02, 0.1]) ** 2)
+    points = np.concatenate([cloister().landmarks, np.arange(36)[:, None] * 0.3], axis=1)
+    scene = world(15, sensor=sensor, landmarks=points)
+    _, log = simulate(scene, jax.random.key(3))
+    a = driven(filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint"), scene, log)
+    b = driven(filters.eif_slam(scene.motion, scene.sensor, 36), scene, log)
+    np.testing.assert_allclose(b.final.landmarks, a.final.landmarks, atol=1e-8)
+
+
+def test_a_lost_definiteness_is_refused_counted_and_recovered():
+    scene = world(6)
+    _, log = simulate(scene, jax.random.key(1))
+    eif = filters.eif_slam(scene.motion, scene.sensor, 36)
+    state = driven(eif, scene, log).final
+    bad = state._replace(omega=state.omega.at[0, 0].set(-1.0))
+    scan = jax.tree.map(lambda leaf: leaf[-1], log.scan)
+    after, info = jax.jit(eif.update)(bad, scan, KEY)
+    assert int(after.broken) == 1
+    np.testing.assert_array_equal(after.pose, bad.pose)
+    assert np.all(np.asarray(info.status)[np.asarray(scan.valid)] == Status.SINGULAR)
+    # One that is indefinite by rounding alone comes back with what the next scan brings.
+    part = np.flatnonzero(np.concatenate([[True] * 3, np.repeat(state.alive, 2)]))
+    omega = np.array(state.omega)
+    size, axes = np.linalg.eigh(omega[np.ix_(part, part)])
+    slip = size[0] + 1e-12 * size[-1]
+    omega[np.ix_(part, part)] -= slip * np.outer(axes[:, 0], axes[:, 0])
+    bad = state._replace(omega=jnp.asarray(omega))
+    after, _ = jax.jit(eif.update)(bad, scan, KEY)
+    assert int(after.broken) == 1
+    after, info = jax.jit(eif.update)(after, scan, KEY)
+    assert int(after.broken) == 1
+    assert (np.asarray(info.status) == Status.FUSED).any()
+
+
+def test_gradients_and_batches():
+    scene = world(6)
+    _, log = simulate(scene, jax.random.key(1))
+
+    def loss(sigma, z):
+        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
+        eif = filters.eif_slam(motion.increment(np.diag([0.01, 0.02]) ** 2), sensor, 36)
+        changed = log._replace(scan=log.scan._replace(z=z))
+        return run(eif, changed, scene.pose, P0, KEY).estimate.pose[-1, :2].sum()
+
+    slope = jax.jit(jax.grad(loss, argnums=(0, 1)))(0.1, log.scan.z)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+    step = 1e-5
+    rise = (loss(0.1 + step, log.scan.z) - loss(0.1 - step, log.scan.z)) / (2 * step)
+    np.testing.assert_allclose(slope[0], rise, rtol=1e-4)
+    both = jax.vmap(loss, (None, 0))(0.1, jnp.stack([log.scan.z, log.scan.z + 0.01]))
+    np.testing.assert_allclose(both[0], loss(0.1, log.scan.z), rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"capacity": 0}, "capacity"),
+        ({"gate": 0.0}, "gate above 0"),
+        ({"floor": 0.0}, "floor above 0"),
+        ({"sensor": sensors.compass([[1e-4]])}, "no landmarks"),
+    ],
+)
+def test_refusals(changes, message):
+    scene = world(2)
+    options = {"motion": scene.motion, "sensor": scene.sensor, "capacity": 36} | changes
+    with pytest.raises(ValueError, match=message):
+        filters.eif_slam(**options)

@@ -1,0 +1,134 @@
+"""Calibration from innovations is least squares where all is linear, and needs no identities."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import association, motion, run, sensors
+from jaxslam.calibration import calibrate
+from jaxslam.filters import ekf_slam
+from jaxslam.life import recency
+from jaxslam.types import Info, Log, Scan
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+KEY = jax.random.key(0)
+Q, R = np.diag([0.03, 0.02, 0.0]) ** 2, 0.1**2 * np.eye(2)
+
+
+def test_it_is_generalized_least_squares_where_all_is_linear():
+    """A robot that never turns: z_t = l - Σ_{s<=t} (u_s + p ∘ u_s + w_s) + v_t, nothing known of l."""
+    rng, steps, truth = np.random.default_rng(0), 12, np.array([0.05, -0.1])
+    control = np.column_stack([rng.uniform(0.5, 1.0, (steps, 2)), np.zeros(steps)])
+    noise = rng.normal(size=(steps, 2)) * np.sqrt(np.diag(Q)[:2])
+    at = np.cumsum(control[:, :2] * (1 + truth) + noise, axis=0)
+    z = np.array([5.0, -3.0]) - at + rng.normal(size=(steps, 2)) * 0.1
+    scan = Scan(z[:, None], np.zeros((steps, 1), np.int32), np.ones((steps, 1), bool))
+
+    def info(p):
+        filter = ekf_slam(motion.pose_increment(Q), sensors.relative_position(R), 1, update="joint")
+        scaled = control * jnp.concatenate([1 + p, jnp.ones(1)])[None]
+        return run(filter, Log(scaled, scan), np.zeros(3), np.zeros((3, 3)), KEY).info
+
+    found = calibrate(info, np.zeros(2))
+    shared = np.minimum(*np.indices((steps, steps))) + 1
+    for axis in range(2):
+        # Unknowns l and p; the first has no prior.
+        slope = np.column_stack([np.ones(steps), -np.cumsum(control[:, axis])])
+        weight = np.linalg.inv(Q[axis, axis] * shared + 0.1**2 * np.eye(steps))
+        cov = np.linalg.inv(slope.T @ weight @ slope)
+        best = cov @ slope.T @ weight @ (z[:, axis] + np.cumsum(control[:, axis]))
+        np.testing.assert_allclose(found.parameters[axis], best[1], rtol=1e-8)
+        np.testing.assert_allclose(found.cov[axis, axis], cov[1, 1], rtol=1e-8)
+    assert abs(found.cov[0, 1]) < 1e-12
+    assert found.converged and len(found.misfit) == 2 and found.path.shape == (3, 2)
+    np.testing.assert_array_equal(found.dof, 2 * (steps - 1))
+
+
+def drive(seed, steps=160, drift=0.02, turn=0.1):
+    """Odometry that turns too little and to one side, among trees 3 m apart, and no identity."""
+    rng = np.random.default_rng(seed)
+    trees = np.stack(np.meshgrid(np.arange(-9, 10, 3.0), np.arange(-9, 10, 3.0)), -1).reshape(-1, 2)
+    trees = trees + rng.uniform(-0.5, 0.5, trees.shape)
+    pose, rows = np.zeros(3), []
+    for t in range(steps):
+        u = np.array([0.3, 0.0, 0.08 * np.sin(2 * np.pi * t / 80)])
+        w = rng.normal(size=3) * np.sqrt(np.diag(NOISE))
+        true = u + w + [0, 0, drift * u[0] + turn * u[2]]
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        pose = pose + [c * true[0] - s * true[1], s * true[0] + c * true[1], true[2]]
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        seen = (trees - pose[:2]) @ np.array([[c, -s], [s, c]])
+        near = seen[(seen[:, 0] > 0) & (np.hypot(*seen.T) < 5.0)][:PLACES]
+        z = np.zeros((PLACES, 2))
+        z[: len(near)] = near + rng.normal(size=near.shape) * 0.1
+        rows.append((u, z, np.arange(PLACES) < len(near)))
+    control, z, valid = map(np.array, zip(*rows, strict=True))
+    return Log(control, Scan(z, np.full(valid.shape, -1, np.int32), valid))
+
+
+PLACES, NOISE = 3, np.diag([0.01, 0.01, 0.002]) ** 2
+
+
+def test_odometry_is_calibrated_without_identities():
+    logs = [drive(seed) for seed in range(4)]
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *logs)
+    model, sensor = motion.pose_increment(NOISE), sensors.relative_position(R)
+    near, life = association.nearest(11.8), recency(patience=20)
+    filter = ekf_slam(model, sensor, 20, associate=near, life=life, update="joint")
+
+    def info(p):
+        def one(log):
+            u = log.control
+            u = u.at[:, 2].add(p[0] * u[:, 0] + p[1] * u[:, 2])
+            return run(filter, log._replace(control=u), np.zeros(3), np.zeros((3, 3)), KEY).info
+
+        return jax.vmap(one)(together)
+
+    found = calibrate(info, np.zeros(2))
+    off = found.parameters - [0.02, 0.1]
+    assert found.converged
+    assert off @ np.linalg.solve(found.cov, off) < 13.8  # 99.9 % of χ²(2)
+    assert (np.sqrt(np.diag(found.cov)) < [0.003, 0.015]).all()  # and that says something
+    assert found.misfit[-1] < found.misfit[0] and abs(found.misfit[-1] - 1) < 0.2
+
+
+def plain(innovation, status=1):
+    """An Info of two places of one step: a fused one, and an empty one that is not finite."""
+    empty = jnp.full((1, 1), jnp.nan)
+    return Info(
+        *[None] * 2,
+        innovation=jnp.concatenate([jnp.reshape(innovation, (1, 1)), empty])[None],
+        innovation_cov=jnp.stack([jnp.eye(1), empty])[None],
+        slot=None,
+        status=jnp.array([[status, 0]]),
+        log_likelihood=None,
+    )
+
+
+def test_what_is_empty_does_not_count_and_a_number_will_do():
+    found = calibrate(lambda p: plain(p[0] ** 2 - 4.0), 1.0)  # Newton's √4
+    np.testing.assert_allclose(found.parameters, [2.0], atol=1e-3)
+    np.testing.assert_allclose(found.path[1], [2.5])
+    assert found.converged
+    assert not calibrate(lambda p: plain(p[0] ** 2 - 4.0), 1.0, iterations=1).converged
+
+
+@pytest.mark.parametrize(
+    ("info", "start", "options", "message"),
+    [
+        (plain, [[1.0]], {}, "start"),
+        (plain, [np.nan], {}, "start"),
+        (plain, [], {}, "start"),
+        (plain, 1.0, {"iterations": 0}, "iterations"),
+        (plain, 1.0, {"tolerance": 0.0}, "tolerance"),
+        (lambda p: plain(p[0], status=3), 1.0, {}, "no measurement is fused"),
+        (lambda p: plain(jnp.log(p[0])), -1.0, {}, "not finite"),
+        (lambda p: plain(p[0] + p[1]), [1.0, 2.0], {}, "apart"),
+        (lambda p: plain(p[0] * 0), 1.0, {}, "apart"),
+    ],
+)
+def test_refusals(info, start, options, message):
+    with pytest.raises(ValueError, match=message):
+        calibrate(info, start, **options)

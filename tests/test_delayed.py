@@ -1,0 +1,481 @@
+"""Delayed initialization: meetings, hypotheses, what a landmark is made of, and the filter."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam import Scenario, monte_carlo, motion, sensors
+from jaxslam.association import nearest
+from jaxslam.filters import delayed_slam, ekf_slam, hypotheses, placing
+from jaxslam.filters.meeting import circles, meeting_of, rays
+from jaxslam.filters.waiting import Layout
+from jaxslam.stats import chi2_quantile
+from jaxslam.types import Status
+
+CAMERA = sensors.bearing_only([[0.01**2]])
+BEACON = sensors.range_only([[0.05**2]])
+KINDS = {"rays": rays(CAMERA), "circles": circles(BEACON)}
+
+
+# --- where two sightings meet -------------------------------------------------------------------
+
+
+def seen_by(kind, places, point):
+    """Perfect sightings (q, 3) of a point from places (q, 2), in plain NumPy."""
+    delta = point - places
+    seen = np.arctan2(delta[:, 1], delta[:, 0]) if kind == "rays" else np.hypot(*delta.T)
+    return np.column_stack([places, seen])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_perfect_sightings_meet_at_the_point(kind):
+    rng = np.random.default_rng(0)
+    places, points = rng.uniform(-5, 5, (200, 2, 2)), rng.uniform(-5, 5, (200, 2))
+    seen = np.stack([seen_by(kind, p, x) for p, x in zip(places, points, strict=True)])
+    met, ok = jax.vmap(KINDS[kind].meet)(seen[:, 0], seen[:, 1])
+    miss = np.linalg.norm(np.asarray(met) - points[:, None], axis=2).min(axis=1)
+    # The angle at the point between the two directions to it decides whether the meeting is sharp.
+    a, b = points - places[:, 0], points - places[:, 1]
+    sine = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    sine = sine / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+    least = np.sin(0.1 if kind == "rays" else 0.3)
+    np.testing.assert_array_equal(np.asarray(ok).all(axis=1), sine >= least)
+    assert 100 < ok[:, 0].sum() < 200
+    np.testing.assert_allclose(miss[sine >= least], 0, atol=1e-9)
+    wrong = jax.vmap(KINDS[kind].miss)(seen[:, 0], points)
+    np.testing.assert_allclose(wrong, 0, atol=1e-12)
+
+
+def test_two_circles_meet_in_mirrored_points():
+    points, ok = KINDS["circles"].meet(jnp.asarray([0.0, 0, 5]), jnp.asarray([6.0, 0, 5]))
+    assert ok.all()
+    np.testing.assert_allclose(points, [[3, 4], [3, -4]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "a", "b"),
+    [
+        ("rays", [0, 0, 0.0], [0, 1, 0.0]),  # parallel
+        ("rays", [0, 0, 0.0], [0, 0, 0.0]),
+        ("rays", [0, 0, 0.0], [1, 1, np.pi / 2]),  # behind the second
+        ("rays", [0, 0, np.pi], [1, 1, -np.pi / 2]),  # behind the first
+        ("circles", [0, 0, 1.0], [2, 0, 1.0]),  # touching
+        ("circles", [0, 0, 1.0], [3, 0, 1.0]),  # apart
+        ("circles", [0, 0, 3.0], [1, 0, 1.0]),  # one in the other
+        ("circles", [0, 0, 1.0], [0, 0, 1.0]),
+        ("circles", [0, 0, 0.0], [1, 0, 1.0]),
+        ("circles", [0, 0, -2.0], [1, 0, 2.0]),  # noise can make a range negative
+    ],
+)
+def test_what_does_not_meet_is_not_ok_and_finite(kind, a, b):
+    a, b = jnp.asarray(a, float), jnp.asarray(b, float)
+    points, ok = KINDS[kind].meet(a, b)
+    assert not ok.any()
+    slopes = jax.jacfwd(lambda a, b: KINDS[kind].meet(a, b)[0], argnums=(0, 1))(a, b)
+    assert all(np.isfinite(x).all() for x in (points, *slopes))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_sighting_is_where_the_sensor_is_mounted(kind):
+    mount = (0.3, -0.2, 0.7)
+    factory = sensors.bearing_only if kind == "rays" else sensors.range_only
+    sensor = factory([[1e-4]], mount=mount)
+    pose, point = np.array([1.0, 2.0, 2.5]), np.array([-3.0, 4.0])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    place = pose[:2] + np.array([[c, -s], [s, c]]) @ mount[:2]
+    seen = meeting_of(sensor).sight(jnp.asarray(pose), sensor.observe(pose, point))
+    np.testing.assert_allclose(seen, seen_by(kind, place[None], point)[0], atol=1e-12)
+
+
+def test_bad_meetings_are_refused():
+    with pytest.raises(ValueError, match="one bearing"):
+        rays(BEACON)
+    with pytest.raises(ValueError, match="one range"):
+        circles(CAMERA)
+    with pytest.raises(ValueError, match="angle in"):
+        rays(CAMERA, parallax=2.0)
+
+
+# --- hypotheses in the table --------------------------------------------------------------------
+
+LAYOUT = Layout(2, 2, 4)
+
+
+def table(kind, seed=0, scale=0.01):
+    """A joint state with a random covariance and four sightings of the point (1, 5)."""
+    rng = np.random.default_rng(seed)
+    size = 3 + 3 * LAYOUT.slots
+    root = rng.normal(size=(size, size)) * scale
+    cov = root @ root.T / size**0.5
+    joint = jaxslam.slots.empty(jnp.asarray([0.1, 0.2, 0.3]), jnp.eye(3), LAYOUT.slots, 3)
+    # One landmark, no hypothesis, sightings.
+    alive = np.array([True, False, False, False, True, True, True, True])
+    live = np.concatenate([np.ones(3, bool), np.repeat(alive, 3)])
+    live[5] = False  # the landmark's padding
+    cov = np.where(live[:, None] & live[None, :], cov, np.eye(size))
+    places = np.array([[0.0, 0.0], [2.0, 0.5], [-2.0, 1.0], [3.0, 3.0]])
+    seen = seen_by(kind, places, np.array([1.0, 5.0])) + 0.003 * rng.normal(size=(4, 3))
+    landmarks = np.zeros((LAYOUT.slots, 3))
+    landmarks[0, :2] = [4.0, 4.0]
+    landmarks[4:] = seen
+    return joint._replace(
+        landmarks=jnp.asarray(landmarks),
+        cov=jnp.asarray(cov),
+        alive=jnp.asarray(alive),
+        tag=jnp.where(alive, 0, -1).astype(jnp.int32),
+    )
+
+
+def closest_point(kind, seen):
+    """The number of the meeting point of two sightings that is near (1, 5)."""
+    points = np.asarray(KINDS[kind].meet(*map(jnp.asarray, seen))[0])
+    return int(np.argmin(np.linalg.norm(points - [1, 5], axis=1)))
+
+
+def formed(kind, joint):
+    which = closest_point(kind, joint.landmarks[4:6])
+    born = jnp.asarray([True, False])
+    parents, which = jnp.asarray([[4, 5], [4, 4]]), jnp.asarray([which, 0])
+    return hypotheses.form(joint, LAYOUT, KINDS[kind], born, parents, which, jnp.zeros(2, int))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_covariance_of_an_intersection_is_that_of_draws(kind):
+    joint = table(kind, scale=0.002)
+    new = formed(kind, joint)
+    rng = np.random.default_rng(1)
+    live = np.r_[0:5, 15:27]
+    mean = np.concatenate([joint.pose, np.asarray(joint.landmarks).reshape(-1)])[live]
+    root = np.linalg.cholesky(np.asarray(joint.cov)[np.ix_(live, live)])
+    draws = mean + rng.normal(size=(20_000, len(live))) @ root.T
+    at = closest_point(kind, joint.landmarks[4:6])
+    meet = jax.jit(jax.vmap(lambda a, b: KINDS[kind].meet(a, b)[0][at]))
+    points = meet(draws[:, 5:8], draws[:, 8:11])
+    together = np.cov(np.column_stack([draws, points]).T)
+    rows = np.r_[live, 9, 10]
+    claimed = np.asarray(new.cov)[np.ix_(rows, rows)]
+    scale = np.sqrt(np.diag(claimed))
+    difference = (together - claimed) / scale[:, None] / scale[None, :]
+    assert np.abs(difference).max() < 0.04
+    np.testing.assert_allclose(new.landmarks[2, :2], points.mean(axis=0), atol=0.01)
+    assert new.alive[2]
+    assert not new.alive[3]
+    # The third parameter is padding, and what was there is as it was.
+    np.testing.assert_array_equal(new.cov[11], np.eye(len(new.cov))[11])
+    others = np.delete(np.arange(len(new.cov)), [9, 10])
+    np.testing.assert_array_equal(
+        np.asarray(new.cov)[np.ix_(others, others)], np.asarray(joint.cov)[np.ix_(others, others)]
+    )
+    np.testing.assert_array_equal(new.cov, new.cov.T)
+
+
+def slope_rows(kind, joint, point, sightings, differences):
+    """G by the whole state, and the differences g, of a point against sightings; numerically."""
+
+    def miss(s, x):
+        return np.asarray(jax.vmap(KINDS[kind].miss)(s, x))
+
+    seen = np.asarray(joint.landmarks)[sightings]
+    points = np.broadcast_to(point, (len(seen), 2))
+    by_sight = differences(miss, (seen, points), 0)
+    by_point = differences(miss, (seen, points), 1)
+    rows = np.zeros((len(seen), len(joint.cov)))
+    for k, slot in enumerate(sightings):
+        rows[k, 3 + 3 * slot : 6 + 3 * slot] = by_sight[k]
+    return miss(seen, points), rows, by_point
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
+    joint = formed(kind, table(kind))
+    slots = jnp.asarray([2, 3])
+    found = hypotheses.misses(joint, KINDS[kind], slots, jnp.asarray([6, 7]))
+    value, rows, by_point = slope_rows(
+        kind, joint, np.asarray(joint.landmarks)[2, :2], [6], differences
+    )
+    rows[0, 9:11] = by_point[0]
+    cov = np.asarray(joint.cov)
+    s = rows @ cov @ rows.T
+    np.testing.assert_allclose(found.value[0, 0], value[0], rtol=1e-9)
+    np.testing.assert_allclose(found.variance[0, 0], s[0, 0], rtol=1e-6)
+
+    gain = cov @ rows.T / s
+    gain[np.delete(np.arange(len(gain)), [9, 10])] = 0
+    left = np.eye(len(cov)) - gain @ rows
+    part = (found.value[:, 0], found.by_point[:, 0], found.by_sight[:, 0])
+    constraint = hypotheses.constraints(joint, slots, jnp.asarray([6, 6]), *part)
+    new = hypotheses.move_hypotheses(joint, LAYOUT, constraint, jnp.asarray([True, False]))
+    np.testing.assert_allclose(new.cov, left @ cov @ left.T, atol=1e-9 * cov.max())
+    np.testing.assert_allclose(
+        new.landmarks[2, :2], joint.landmarks[2, :2] - gain[9:11, 0] * value, atol=1e-8
+    )
+    np.testing.assert_array_equal(new.pose, joint.pose)
+    np.testing.assert_array_equal(new.landmarks[4:], joint.landmarks[4:])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_landmark_of_all_its_sightings_is_the_constrained_least_squares(kind, differences):
+    """Against the solution of minimize δᵀP⁻¹δ subject to the four constraints, by one inverse."""
+    joint = table(kind)
+    sightings = jnp.asarray([4, 5, 6, 7, 4])
+    use = jnp.asarray([True, True, True, True, False])
+    start = jnp.asarray([1.1, 5.1])
+    fit = placing.fit(joint, KINDS[kind], start, sightings, use)
+    new = placing.enter(joint, fit, jnp.asarray(1), sightings)
+    # At the point where Gauss-Newton ends, the linear problem in plain NumPy.
+    point = np.array([1.1, 5.1])
+    for _ in range(20):
+        value, rows, by_point = slope_rows(kind, joint, point, [4, 5, 6, 7], differences)
+        weight = np.linalg.inv(rows @ np.asarray(joint.cov) @ rows.T)
+        lhs = by_point.T @ weight @ by_point
+        point = point - np.linalg.solve(lhs, by_point.T @ weight @ value)
+    value, rows, by_point = slope_rows(kind, joint, point, [4, 5, 6, 7], differences)
+    live = np.r_[0:5, 15:27]
+    n = len(live)
+    system = np.zeros((n + 6, n + 6))
+    system[:n, :n] = np.linalg.inv(np.asarray(joint.cov)[np.ix_(live, live)])
+    system[n + 2 :, :n] = rows[:, live]
+    system[n + 2 :, n : n + 2] = by_point
+    system[:, n + 2 :] = system[n + 2 :].T
+    inverse = np.linalg.inv(system)
+    moved = inverse @ np.concatenate([np.zeros(n + 2), -value])
+    rows = np.r_[live, 6, 7]
+    np.testing.assert_allclose(
+        np.asarray(new.cov)[np.ix_(rows, rows)], inverse[: n + 2, : n + 2], atol=1e-9
+    )
+    np.testing.assert_allclose(new.landmarks[1, :2], point + moved[n : n + 2], atol=1e-6)
+    np.testing.assert_allclose(new.pose, joint.pose + moved[:3], atol=1e-7)
+    np.testing.assert_allclose(
+        new.landmarks[4:].reshape(-1), joint.landmarks[4:].reshape(-1) + moved[5:n], atol=1e-7
+    )
+    assert fit.regular
+    step = moved[:n]
+    cost = step @ system[:n, :n] @ step
+    np.testing.assert_allclose(fit.nis, cost, rtol=1e-4)
+    assert new.alive[1]
+
+
+def test_gaussians_are_told_apart_by_either_distance():
+    cov = np.diag([0.04, 0.01])
+    points, others = np.array([[0.0, 0.0]]), np.array([[0.5, 0.0], [0.5, 0.0], [0.0, 2.0]])
+    other_covs = np.stack([cov, 9 * cov, cov])
+    d2 = np.array([0.25 / 0.08, 0.25 / 0.4, 4 / 0.02])
+    log_det = [0.0, np.log(5) - np.log(3), 0.0]
+    bhattacharyya = d2 / 4 + np.array(log_det)
+    for distance, by_hand in (("mahalanobis", d2), ("bhattacharyya", bhattacharyya)):
+        for limit in (0.3, 0.7, 1.0, 4.0):
+            near = hypotheses.near(distance, limit, points, cov[None], others, other_covs)
+            np.testing.assert_array_equal(near[0], by_hand < limit)
+
+
+# --- the filter ---------------------------------------------------------------------------------
+
+
+def world(kind, steps=120, **options):
+    """A robot that drives in a circle among five landmarks, all seen, with little noise."""
+    landmarks = np.array([[4.0, 5.0], [-3.0, 4.0], [-2.0, 0.5], [5.0, -1.0], [0.5, 8.0]])
+    sensor = CAMERA if kind == "rays" else BEACON
+    return Scenario(
+        name=f"five, {kind}",
+        motion=motion.increment(np.diag([0.005, 0.003]) ** 2),
+        sensor=sensor,
+        landmarks=landmarks,
+        controls=np.tile([0.2, 0.08], (steps, 1)),
+        pose=(0.0, 0.0, 0.0),
+        **options,
+    )
+
+
+def filter_of(scenario, capacity=5, **options):
+    options = {"sightings": 30, "hypotheses": 12} | options
+    return delayed_slam(scenario.motion, scenario.sensor, capacity, **options)
+
+
+def driven(filter, log, **options):
+    def go(log):
+        return jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0), **options)
+
+    return jax.jit(go)(log)
+
+
+@pytest.fixture(scope="module", params=list(KINDS))
+def drive(request, quick_compilation):
+    scenario = world(request.param)
+    truth, log = jaxslam.simulate(scenario, jax.random.key(2))
+    return scenario, truth, log, driven(filter_of(scenario), log)
+
+
+def test_every_landmark_is_found_where_it_is(drive):
+    scenario, truth, log, trace = drive
+    final = trace.estimate
+    assert final.alive[-1].all()
+    assert sorted(np.asarray(final.tag[-1])) == [0, 1, 2, 3, 4]
+    off = np.asarray(final.points[-1]) - np.asarray(truth.landmarks)[final.tag[-1]]
+    assert np.linalg.norm(off, axis=1).max() < 0.3
+    assert trace.info.tally(Status.BORN).sum() == 5
+    assert trace.final.counts.promoted == 5
+    # Afterwards nothing is left of how they came about.
+    joint = trace.final.joint
+    assert not joint.alive[5:].any()
+    np.testing.assert_array_equal(joint.cov[18:], np.eye(len(joint.cov))[18:])
+
+
+def test_every_measurement_is_accounted_for(drive):
+    scenario, truth, log, trace = drive
+    counts = {s.name: int(trace.info.tally(s).sum()) for s in Status}
+    assert sum(counts.values()) == log.scan.valid.size
+    assert counts["SIGHTED"] > 10
+    assert counts["FUSED"] > 300
+    assert counts["EMPTY"] == counts["OVERFLOW"] == counts["SINGULAR"] == 0
+    born = np.asarray(trace.info.status) == Status.BORN
+    slot = np.asarray(trace.info.slot)[born]
+    tag = np.asarray(log.scan.tag)[born]
+    np.testing.assert_array_equal(np.asarray(trace.estimate.tag[-1])[slot], tag)
+
+
+def test_the_covariance_stays_positive(drive):
+    trace = drive[-1]
+    cov = np.asarray(trace.final.joint.cov)
+    np.testing.assert_allclose(cov, cov.T, atol=1e-12)
+    assert np.linalg.eigvalsh(cov)[0] > 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_filter_is_honest(kind, quick_compilation):
+    scenario = world(kind)
+    campaign = monte_carlo(scenario, {"delayed": filter_of(scenario)}, 40, jax.random.key(5))
+    found = campaign.filters["delayed"]
+    assert found.counts["not_finite"] == 0
+    assert found.measures["rmse_landmarks"].value < 0.2
+    for name, dof in (("nees_pose", 3), ("nees_landmarks", 2), ("nis_per_dof", 1)):
+        measure = found.measures[name]
+        assert measure.low < 1.15 * dof, name
+        assert measure.high > 0.85 * dof, name
+        assert measure.value < 1.5 * dof, name
+
+
+def small(kind, **options):
+    """A filter that compiles fast, and a short log of three landmarks."""
+    scenario = world(kind, steps=60)
+    scenario = dataclasses.replace(scenario, landmarks=scenario.landmarks[:3])
+    options = {"sightings": 15, "hypotheses": 6, "promotions": 1} | options
+    capacity = options.pop("capacity", 3)
+    return scenario, delayed_slam(scenario.motion, scenario.sensor, capacity, **options)
+
+
+def test_a_full_map_refuses_and_says_so(quick_compilation):
+    scenario, filter = small("rays", capacity=1)
+    _, log = jaxslam.simulate(scenario, jax.random.key(0))
+    trace = driven(filter, log)
+    assert trace.estimate.alive[-1].sum() == 1
+    assert trace.info.tally(Status.BORN).sum() == 1
+    assert trace.info.tally(Status.OVERFLOW).sum() > 0
+    assert trace.final.counts.promoted == 1
+
+
+def test_spurious_bearings_move_no_robot_and_empty_scans_neither(quick_compilation):
+    """Random bearings make no landmark, so all is as without them, to the bit."""
+    scenario, filter = small("rays")
+    _, log = jaxslam.simulate(scenario, jax.random.key(0))
+    z = jax.random.uniform(jax.random.key(3), log.scan.z.shape, float, -np.pi, np.pi)
+    spoiled = log._replace(scan=log.scan._replace(z=z))
+    empty = log._replace(scan=log.scan._replace(valid=jnp.zeros_like(log.scan.valid)))
+    nameless = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
+    logs = jax.tree.map(lambda *x: jnp.stack(x), spoiled, empty, nameless)
+
+    def go(log):
+        return jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
+
+    trace = jax.jit(jax.vmap(go))(logs)
+    plain = ekf_slam(scenario.motion, scenario.sensor, 3)
+    alone = driven(plain, empty).estimate
+    for i in range(3):
+        assert not trace.estimate.alive[i].any()
+        np.testing.assert_allclose(trace.estimate.pose[i], alone.pose, atol=1e-12)
+        np.testing.assert_allclose(trace.estimate.pose_cov[i], alone.pose_cov, atol=1e-15)
+    counts = jax.tree.map(np.asarray, trace.final.counts)
+    assert counts.vanished[0] > 5
+    assert (trace.info.status[1] == Status.EMPTY).all()
+    assert (trace.info.status[2] == Status.UNMATCHED).all()  # no names, and none asked for
+
+    none = log._replace(scan=jax.tree.map(lambda x: x[:, :0], log.scan))
+    np.testing.assert_allclose(driven(filter, none).estimate.pose, alone.pose, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_float32_finds_the_landmarks(kind, quick_compilation):
+    scenario, filter = small(kind)
+    truth, log = jaxslam.simulate(scenario, jax.random.key(1))
+    narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, log)
+    trace = driven(filter, narrow)
+    floats = [x for x in jax.tree.leaves(trace) if jnp.issubdtype(x.dtype, jnp.floating)]
+    assert all(x.dtype == np.float32 and np.isfinite(x).all() for x in floats)
+    final = jax.tree.map(lambda x: np.asarray(x[-1]), trace.estimate)
+    assert final.alive.sum() >= 2
+    off = final.points - np.asarray(truth.landmarks)[final.tag]
+    assert np.linalg.norm(off[final.alive], axis=1).max() < 0.3
+    np.testing.assert_allclose(trace.estimate.pose, truth.pose, atol=0.2)
+
+
+def test_gradients_reach_the_noise_and_are_finite(quick_compilation):
+    scenario, _ = small("circles")
+    _, log = jaxslam.simulate(scenario, jax.random.key(1))
+
+    def likelihood(sigma):
+        sensor = sensors.range_only(sigma[None, None] ** 2)
+        filter = delayed_slam(scenario.motion, sensor, 3, sightings=15, hypotheses=6, promotions=1)
+        trace = jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
+        return trace.info.log_likelihood.sum()
+
+    both = jax.jit(jax.value_and_grad(likelihood))
+    at = jnp.asarray(0.05)
+    by_differences = (both(at + 1e-6)[0] - both(at - 1e-6)[0]) / 2e-6
+    np.testing.assert_allclose(both(at)[1], by_differences, rtol=1e-4)
+
+
+def test_without_names_intersections_find_the_landmarks(quick_compilation):
+    """Every bearing may be of any landmark; the names in the log are not looked at."""
+    scenario = world("rays")
+    gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)
+    filter = filter_of(
+        scenario,
+        8,
+        hypotheses=40,
+        sightings=40,
+        persistence=6.0,
+        decay=0.7,
+        associate=nearest(*gates),
+    )
+    truth, log = jaxslam.simulate(scenario, jax.random.key(4))
+    log = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
+    final = jax.tree.map(lambda x: np.asarray(x[-1]), driven(filter, log).estimate)
+    off = np.linalg.norm(final.points[:, None] - np.asarray(truth.landmarks)[None], axis=2)
+    assert (off[final.alive].min(axis=1) < 0.5).all()  # none is false
+    assert len(set(off[final.alive].argmin(axis=1))) >= 4
+    assert final.alive.sum() <= 6
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sensor": sensors.range_bearing(np.eye(2))}, "one bearing or one range"),
+        ({"capacity": 0}, "capacity"),
+        ({"sightings": 0}, "sightings"),
+        ({"promotions": 1.5}, "promotions"),
+        ({"persistence": 0}, "persistence above 0"),
+        ({"decay": -1}, "decay not below 0"),
+        ({"spread": np.nan}, "spread above 0"),
+        ({"distance": "euclid"}, "unknown distance"),
+        ({"meet": 3}, "meet to be a Meeting"),
+    ],
+)
+def test_bad_arguments_are_refused(options, message):
+    parts = {"sensor": CAMERA, "capacity": 3} | options
+    with pytest.raises(ValueError, match=message):
+        delayed_slam(
+            motion.increment(np.eye(2)), parts.pop("sensor"), parts.pop("capacity"), **parts
+        )

@@ -1,0 +1,385 @@
+"""The exactly sparse information filter: every step against dense NumPy; it never claims more."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import filters, motion, sensors
+from jaxslam.filters import blankets, sparse_map
+from jaxslam.filters.eseif import fixes_pose, tied, without_pose
+from jaxslam.filters.recovery import relaxed
+from jaxslam.scenarios import cloister
+from jaxslam.scenarios.view import between_ranges
+from jaxslam.simulate import simulate
+from jaxslam.types import Status
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+KEY = jax.random.key(0)
+P0 = np.diag([0.01, 0.01, 0.005]) ** 2
+COUNT, STEPS, RUNS = 36, 60, 12
+ODOMETRY = np.diag([0.002, 0.004]) ** 2  # good, so that the robot's links last
+NOISE = np.diag([0.1, np.deg2rad(2.0)]) ** 2
+MODELS = motion.increment(ODOMETRY), sensors.range_bearing(NOISE), COUNT
+
+
+@functools.cache
+def logs():
+    """Logs of RUNS draws, and as number 0 one without any noise; and the true poses."""
+    scene = dataclasses.replace(
+        cloister(STEPS),
+        motion=MODELS[0],
+        sensor=MODELS[1],
+        visible=between_ranges(0.0, 2.2),
+        places=8,
+        pose_cov=P0,
+    )
+    silent = dataclasses.replace(
+        scene,
+        motion=motion.increment(1e-30 * np.eye(2)),
+        sensor=sensors.range_bearing(1e-30 * np.eye(2)),
+        pose_cov=1e-30 * np.eye(3),
+    )
+    keys = jax.random.split(jax.random.key(2), RUNS)
+    first = jax.jit(functools.partial(simulate, silent))(keys[0])
+    rest = jax.jit(jax.vmap(functools.partial(simulate, scene)))(keys)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+
+
+@functools.cache
+def made(name, **options):
+    """Predict and update, of one run after the other and of all of `logs` at once."""
+    make = getattr(filters, name)
+    f = make(*MODELS, **options) if name != "eif_slam" else make(*MODELS)
+    return f, jax.jit(lambda s, u, scan: f.update(f.predict(s, u, KEY), scan, KEY))
+
+
+def start(f, dtype=float):
+    return f.init(jnp.asarray(cloister(2).pose, dtype), jnp.asarray(P0, dtype))
+
+
+def rows(run=0, upto=STEPS):
+    log = jax.tree.map(lambda leaf: leaf[run], logs()[1])
+    for t in range(upto):
+        yield log.control[t], jax.tree.map(lambda leaf: leaf[t], log.scan)
+
+
+dense = jax.jit(lambda state: blankets.information_of(state, jnp.arange(COUNT)))
+
+
+def at(slots, robot=True):
+    """Rows of robot and landmarks in Ω."""
+    return np.array(([0, 1, 2] if robot else []) + [3 + 2 * s + k for s in slots for k in (0, 1)])
+
+
+def h_of(pose, point, slot):
+    """(2, D) of range and bearing, and what is expected."""
+    dx, dy = point - pose[:2]
+    q = dx * dx + dy * dy
+    r = np.sqrt(q)
+    h = np.zeros((2, 3 + 2 * COUNT))
+    h[:, at([slot])] = [
+        [-dx / r, -dy / r, 0, dx / r, dy / r],
+        [dy / q, -dx / q, -1, -dy / q, dx / q],
+    ]
+    return h, np.array([r, np.arctan2(dy, dx) - pose[2]])
+
+
+def close(a, b, tolerance=1e-8):
+    np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.abs(b).max())
+
+
+def least(matrix):
+    """The least eigenvalue, as a share of the largest diagonal entry."""
+    return np.linalg.eigvalsh(matrix)[0] / np.abs(np.diagonal(matrix)).max()
+
+
+@functools.cache
+def driven(name, **options):
+    """States of the noise-free run, after each step, and infos."""
+    f, step = made(name, **options)
+    state, out = start(f), []
+    for u, scan in rows():
+        state, info = step(state, u, scan)
+        out.append((state, info))
+    return out
+
+
+# --- one relocation ------------------------------------------------------------------------------
+
+
+def test_tachers_counter_example_and_relocation_on_the_same_information():
+    """Sparsification claims more in some direction: Ω - Ω̃ is not PSD. Relocation never does."""
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(13, 13))
+    omega = root @ root.T + 0.1 * np.eye(13)
+    gone = np.array([False, False, False, True, True])
+    h = rng.normal(size=(6, 13))
+    h[:, 9:] = 0  # measurements of the landmarks that stay
+    after = np.asarray(sparse_map.sparsified(jnp.asarray(omega), jnp.asarray(gone))[0])
+    assert np.linalg.eigvalsh(omega - after)[0] < -1e-3
+    owed = rng.normal(size=13)
+    less, owed_less = (np.asarray(x) for x in without_pose(jnp.asarray(omega), jnp.asarray(owed)))
+    assert not less[:3].any() and not owed_less[:3].any()
+    # the marginal of the landmarks: covariance and mean
+    close(np.linalg.inv(less[3:, 3:]), np.linalg.inv(omega)[3:, 3:])
+    close(np.linalg.solve(less[3:, 3:], owed_less[3:]), np.linalg.solve(omega, owed)[3:])
+    relocated, full = less + h.T @ h, omega + h.T @ h
+    assert np.linalg.eigvalsh(full - relocated)[0] > -1e-9
+    assert np.linalg.eigvalsh(np.linalg.inv(relocated) - np.linalg.inv(full))[0] > -1e-9
+    np.testing.assert_array_equal(tied(jnp.asarray(relocated)), ~gone)
+
+
+def test_every_step_is_the_dense_formula():
+    """Relocation, measurements of both kinds and births, by dense NumPy, on a noisy run."""
+    options = {"active": 10, "links": COUNT - 1, "passive": 5}
+    f, step = made("eseif", **options)
+    predict, relax = jax.jit(f.predict), jax.jit(functools.partial(relaxed, share=5))
+    state, relocations, late = start(f), 0, 0
+    there = list(rows(run=1, upto=40))
+    back = [(-u, scan) for (u, _), (_, scan) in zip(there[:20:-1], there[19:0:-1], strict=False)]
+    for u, scan in there + back:
+        before = relax(predict(state, u, KEY))
+        state, info = step(state, u, scan)
+        omega = np.array(dense(before))
+        owed = np.concatenate([before.owed_robot, np.ravel(before.owed)])
+        mean = np.concatenate([before.pose, np.ravel(before.landmarks)])
+        xi = omega @ mean + owed
+        active = sorted(set(np.asarray(before.slot)) - {COUNT})
+        status = np.asarray(info.status)
+        fused = np.flatnonzero(status == Status.FUSED)
+        relocated = int(state.counts.relocated) > int(before.counts.relocated)
+        if relocated:
+            relocations += 1
+            inner = np.linalg.inv(omega[:3, :3])
+            marginal = omega - omega[:, :3] @ inner @ omega[:3]
+            xi_marginal = xi - omega[:, :3] @ inner @ xi[:3]
+            full, omega, xi = omega, marginal, xi_marginal
+            omega[:3], omega[:, :3], xi[:3] = 0, 0, 0
+        for known in (True, False):
+            for i in fused:
+                slot = int(scan.tag[i])
+                if (slot in active) is not known:
+                    continue
+                late += not known
+                h, expected = h_of(mean[:3], mean[at([slot], robot=False)], slot)
+                nu = np.asarray(scan.z[i]) - expected
+                nu[1] = np.angle(np.exp(1j * nu[1]))
+                more = h.T @ np.linalg.inv(NOISE)
+                omega, xi = omega + more @ h, xi + more @ (nu + h @ mean)
+                if relocated:
+                    full = full + more @ h
+            # the area moves to where its block says, with all others where they are
+            here = at(active) if known else at(sorted(set(np.asarray(state.slot)) - {COUNT}))
+            left = xi - omega @ mean
+            if known:
+                mean[here] += np.linalg.solve(omega[np.ix_(here, here)], left[here])
+        if relocated:
+            assert least(full - omega) > -1e-9
+        mean = np.concatenate([state.pose, np.ravel(state.landmarks)])
+        for i in np.flatnonzero(status == Status.BORN):
+            slot = int(scan.tag[i])
+            h, _ = h_of(mean[:3], mean[at([slot], robot=False)], slot)
+            more = h.T @ np.linalg.inv(NOISE) @ h
+            omega, xi = omega + more, xi + more @ mean
+            own = at([slot], robot=False)
+            omega[own, own] -= 1.0  # padding
+        close(np.asarray(dense(state)), omega)
+        xi_after = dense(state) @ mean + np.concatenate([state.owed_robot, np.ravel(state.owed)])
+        close(np.asarray(xi_after), xi, 1e-6)
+        ties = np.flatnonzero(np.abs(omega[:3, 3:]).max(axis=0).reshape(-1, 2).max(axis=1))
+        assert len(ties) <= 10
+    assert relocations >= 2 and late > 2
+    assert int(state.counts.relocated) == relocations
+    assert int(state.counts.dropped) == int(state.counts.broken) == 0
+    assert int(state.counts.cut) > 0 and float(state.counts.cut_nats) > 0
+
+
+# --- whole runs ----------------------------------------------------------------------------------
+
+
+def test_while_nothing_is_cut_it_is_the_eif():
+    ours, theirs = driven("eseif", active=99, links=COUNT - 1), driven("eif_slam")
+    for t in (10, 30, STEPS - 1):
+        (a, info), (b, other) = ours[t], theirs[t]
+        np.testing.assert_allclose(a.pose, b.pose, atol=1e-8)
+        np.testing.assert_array_equal(info.status, other.status)
+        np.testing.assert_allclose(info.nis, other.nis, atol=1e-8)
+        tag = np.asarray(b.tag)
+        there = np.flatnonzero(tag >= 0)
+        order = at(tag[there])
+        close(
+            np.asarray(dense(a))[np.ix_(order, order)], np.asarray(b.omega)[at(there)][:, at(there)]
+        )
+    assert int(a.counts.relocated) == int(a.counts.cut) == 0
+
+
+def test_relocation_is_conservative_over_a_run_and_sparsification_is_not():
+    """Without noise in the data all filters linearize at the truth: covariances alone differ."""
+    options = {"active": 9, "links": COUNT - 1}
+    eif, exact, sparse = driven("eif_slam"), driven("eseif", **options), driven("seif", **options)
+    claims_more = 0
+    for t in range(9, STEPS, 10):
+        tag = np.asarray(eif[t][0].tag)
+        whole = np.linalg.inv(eif[t][0].omega)
+        ours, theirs = (np.linalg.inv(dense(run[t][0])) for run in (exact, sparse))
+        there = [s for s in np.flatnonzero(tag >= 0) if bool(exact[t][0].alive[tag[s]])]
+        order, map_order = at(there), at(tag[there])
+        # in units of what the full filter claims
+        factor = np.linalg.cholesky(whole[np.ix_(order, order)])
+        square = np.ix_(map_order, map_order)
+        ours, theirs = (
+            np.linalg.eigvalsh(np.linalg.solve(factor, np.linalg.solve(factor, cov[square]).T))
+            for cov in (ours, theirs)
+        )
+        assert ours[0] > 1 - 1e-6
+        claims_more += theirs[0] < 1 - 1e-4
+    assert int(exact[-1][0].counts.relocated) >= 2
+    assert claims_more > 0
+    np.testing.assert_allclose(exact[-1][0].pose, eif[-1][0].pose, atol=1e-6)
+
+
+def test_its_nees_is_that_of_an_honest_filter():
+    """Of pose and landmarks together, by the whole Ω, at three times of four noisy runs."""
+    f, step = made("eseif", active=9, links=COUNT - 1)
+    total = []
+    for run in range(1, 5):
+        truth = jax.tree.map(lambda leaf, run=run: np.asarray(leaf[run]), logs()[0])
+        state = start(f)
+        for t, (u, scan) in enumerate(rows(run)):
+            state, _ = step(state, u, scan)
+            if t % 20 == 19:
+                off = np.ravel(truth.landmarks - np.asarray(state.landmarks))
+                error = np.concatenate([truth.pose[t] - np.asarray(state.pose), off])
+                error[2] = np.angle(np.exp(1j * error[2]))
+                here = at(np.flatnonzero(state.alive))
+                omega = np.asarray(dense(state))[np.ix_(here, here)]
+                total.append(error[here] @ omega @ error[here] / len(here))
+        assert int(state.counts.relocated) > 0
+    # about 50 numbers each, of four independent runs: 4 standard deviations are 0.4
+    assert 0.6 < np.mean(total) < 1.4
+
+
+# --- when it must wait ---------------------------------------------------------------------------
+
+
+def test_what_gives_a_pose():
+    """Against the inverse of the information, by range and bearing from the origin."""
+
+    def rows_of(*points):
+        return np.concatenate(
+            [np.linalg.solve(np.sqrt(NOISE), h_of(np.zeros(3), p, 0)[0][:, :3]) for p in points]
+        )
+
+    one, two = rows_of([1.0, 2.0]), rows_of([1.0, 2.0], [-2.0, 1.0])
+    spread = np.sqrt(np.linalg.inv(two.T @ two)[2, 2])
+    assert not fixes_pose(jnp.asarray(one), 10.0)
+    assert fixes_pose(jnp.asarray(two), 1.01 * spread)
+    assert not fixes_pose(jnp.asarray(two), 0.99 * spread)
+    assert not fixes_pose(jnp.zeros((4, 3)), 10.0)
+    ranges = rows_of([1.0, 2.0], [-2.0, 1.0], [0.5, 3.0])[::2]
+    assert not fixes_pose(jnp.asarray(ranges), 10.0)
+
+
+def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
+    """A full area, and a scan of strangers: nothing is cut, all are deferred, counted and later
+    fused or born."""
+    f, step = made("eseif", active=9, links=COUNT - 1)
+    state, scans = start(f), list(rows(run=1))
+    for u, scan in scans:
+        state, info = step(state, u, scan)
+    known = np.flatnonzero(state.alive)
+    away = np.setdiff1d(known, np.asarray(state.slot))[:2]
+    new = np.setdiff1d(np.arange(COUNT), known)[:2]
+    # every place tied to the robot, so that none is open
+    places = np.flatnonzero(np.asarray(state.slot) < COUNT)
+    omega = np.array(state.omega)
+    for p in places:
+        omega[0, 3 + 2 * p] = omega[3 + 2 * p, 0] = omega[0, 3 + 2 * p] or 1e-6
+    full = state._replace(omega=jnp.asarray(omega))
+    assert len(places) == 9 and len(away) == 2 and len(new) == 2
+    tag = np.array(scan.tag)
+    tag[:4] = [*new, *away]
+    z = np.array(scan.z)
+    for i, slot in zip((2, 3), away, strict=True):
+        z[i] = h_of(np.asarray(state.pose), np.asarray(state.landmarks[slot]), 0)[1]
+    odd = scan._replace(tag=jnp.asarray(tag), z=jnp.asarray(z), valid=jnp.arange(len(tag)) < 4)
+    after, info = jax.jit(f.update)(full, odd, KEY)
+    np.testing.assert_array_equal(info.status[:4], [Status.DEFERRED] * 4)
+    assert np.all(np.asarray(info.slot) == -1)
+    np.testing.assert_array_equal(after.slot, full.slot)
+    assert int(after.counts.relocated) == int(state.counts.relocated)
+    # or links are cut instead, and counted
+    bold = filters.eseif(*MODELS, active=9, links=COUNT - 1, wait=False)
+    cut, info = jax.jit(bold.update)(full, odd, KEY)
+    np.testing.assert_array_equal(info.status[:4], [Status.BORN] * 2 + [Status.FUSED] * 2)
+    assert int(cut.counts.cut) == int(full.counts.cut) + 4
+    assert int(cut.counts.relocated) == int(full.counts.relocated)
+    # two open places: the known ones have them
+    omega[:3, 3:7], omega[3:7, :3] = 0, 0
+    after, info = jax.jit(f.update)(full._replace(omega=jnp.asarray(omega)), odd, KEY)
+    np.testing.assert_array_equal(info.status[:4], [Status.DEFERRED] * 2 + [Status.FUSED] * 2)
+    assert set(away) <= set(np.asarray(after.slot).tolist())
+
+
+# --- the house ------------------------------------------------------------------------------------
+
+
+def test_float32_gradients_and_a_lost_area():
+    f, step = made("eseif", active=9, links=COUNT - 1)
+
+    def narrow(tree):
+        return jax.tree.map(
+            lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, tree
+        )
+
+    state = start(f, jnp.float32)
+    for u, scan in rows(run=1):
+        state, info = step(state, narrow(u), narrow(scan))
+    kinds = {leaf.dtype for leaf in jax.tree.leaves(state)}
+    assert kinds == {jnp.dtype("float32"), jnp.dtype("int32"), jnp.dtype("bool")}
+    assert int(state.counts.broken) == 0 and int(state.counts.relocated) > 0
+    lost = state._replace(omega=state.omega.at[0, 0].set(-1.0))
+    after, info = step(lost, narrow(u), narrow(scan))
+    assert int(after.counts.broken) == 1
+    assert set(np.asarray(info.status)[np.asarray(scan.valid)]) == {int(Status.SINGULAR)}
+
+    before, row = next(
+        (a, row)
+        for (a, _), (b, _), row in zip(
+            driven("eseif", active=9, links=COUNT - 1),
+            driven("eseif", active=9, links=COUNT - 1)[1:],
+            list(rows())[1:],
+            strict=False,
+        )
+        if int(b.counts.relocated) > int(a.counts.relocated)
+    )
+
+    def loss(sigma):
+        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.03])) ** 2)
+        other = filters.eseif(MODELS[0], sensor, COUNT, active=9, links=COUNT - 1, passive=1)
+        scan = row[1]._replace(z=row[1].z + 0.01)
+        after, _ = other.update(other.predict(before, row[0], KEY), scan, KEY)
+        return after.pose[:2].sum() + after.omega[0, 0] * 1e-3, after.counts.relocated
+
+    slope, relocated = jax.jit(jax.grad(loss, has_aux=True))(0.1)
+    assert int(relocated) > int(before.counts.relocated)
+    assert np.isfinite(slope) and abs(slope) > 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"active": 0}, "eseif: active"),
+        ({"links": 0}, "links"),
+        ({"turn": 0.0}, "turn above 0"),
+        ({"gate": -1.0}, "gate"),
+    ],
+)
+def test_refusals(changes, message):
+    with pytest.raises(ValueError, match=message):
+        filters.eseif(*MODELS, **({"active": 10, "links": 10} | changes))

@@ -1,0 +1,462 @@
+"""FastSLAM: against plain NumPy, against the EKF where that is right, and at its limits."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import association, life, monte_carlo, motion, resampling, sensors
+from jaxslam.filters import fastslam, particles
+from jaxslam.filters.particles import Particles
+from jaxslam.run import run
+from jaxslam.simulate import simulate
+from jaxslam.types import Scan, Status
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+KEY = jax.random.key(5)
+MOUNT = np.array([0.1, -0.05, 0.3])  # of worlds.ring
+R = np.diag([0.05, 0.02]) ** 2
+
+
+def of(world, count, capacity=6, **options):
+    return fastslam(world.motion, world.sensor, capacity, count, **options)
+
+
+def drive(world, filter, seed=1, probe=None):
+    truth, log = jax.jit(partial(simulate, world))(jax.random.key(seed))
+    go = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, KEY, probe=probe))
+    return go(log), truth, log
+
+
+def still(steps=4):
+    """The ring with a robot that moves exactly as told."""
+    return dataclasses.replace(worlds.ring(steps), motion=motion.increment(np.zeros((2, 2))))
+
+
+# --- against plain NumPy ------------------------------------------------------------------------
+
+
+def mapped_by_hand(poses, log):
+    """Per-landmark EKFs from a known path, range and bearing: {tag: (mean, cov)}, log-likelihood."""
+    maps, log_likelihood = {}, 0.0
+    for pose, z, tags, valid in zip(poses, *map(np.asarray, log.scan), strict=True):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        eye = pose[:2] + np.array([[c, -s], [s, c]]) @ MOUNT[:2]
+        heading = pose[2] + MOUNT[2]
+        for (r, b), tag, there in zip(z, tags, valid, strict=True):
+            if not there:
+                continue
+            a = heading + b
+            if tag not in maps:
+                g = np.array([[np.cos(a), -r * np.sin(a)], [np.sin(a), r * np.cos(a)]])
+                maps[tag] = eye + r * np.array([np.cos(a), np.sin(a)]), g @ R @ g.T
+                continue
+            mean, cov = maps[tag]
+            dx, dy = mean - eye
+            d2 = dx**2 + dy**2
+            h = np.array([[dx / d2**0.5, dy / d2**0.5], [-dy / d2, dx / d2]])
+            nu = np.array([r - d2**0.5, b - (np.arctan2(dy, dx) - heading)])
+            nu[1] = (nu[1] + np.pi) % (2 * np.pi) - np.pi
+            total = h @ cov @ h.T + R
+            gain = cov @ h.T @ np.linalg.inv(total)
+            maps[tag] = mean + gain @ nu, cov - gain @ total @ gain.T
+            log_likelihood -= 0.5 * (
+                nu @ np.linalg.solve(total, nu) + np.log(np.linalg.det(2 * np.pi * total))
+            )
+    return maps, log_likelihood
+
+
+@pytest.mark.parametrize("proposal", ["motion", "measurement"])
+def test_one_particle_without_process_noise_maps_from_the_known_path(proposal):
+    world = still(40)
+    trace, truth, log = drive(world, of(world, 1, proposal=proposal))
+    np.testing.assert_allclose(trace.estimate.pose, truth.pose, atol=1e-12)
+    maps, log_likelihood = mapped_by_hand(np.asarray(truth.pose), log)
+    assert len(maps) == 6
+    for slot, tag in enumerate(np.asarray(trace.final.tag[0])):
+        np.testing.assert_allclose(trace.final.landmarks[0, slot], maps[tag][0], atol=1e-9)
+        np.testing.assert_allclose(trace.final.covs[0, slot], maps[tag][1], atol=1e-9)
+        np.testing.assert_allclose(trace.estimate.points[-1, slot], maps[tag][0], atol=1e-9)
+    np.testing.assert_allclose(trace.info.log_likelihood.sum(), log_likelihood, atol=1e-8)
+    assert np.all(np.asarray(trace.estimate.pose_cov) == 0)
+    assert not np.any(trace.info.resampled)
+
+
+def cloud(rng, count=7, capacity=3):
+    """A state of random numbers."""
+    log_weight = np.log(rng.dirichlet(np.ones(count)))
+    roots = rng.normal(size=(count, capacity, 2, 2))
+    pose = rng.normal(size=(count, 3)) * 0.2 + [0, 0, np.pi]  # across the seam
+    pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return Particles(
+        pose=pose,
+        pose_cov=np.zeros((count, 3, 3)),
+        log_weight=log_weight,
+        landmarks=rng.normal(size=(count, capacity, 2)),
+        covs=roots @ roots.transpose(0, 1, 3, 2),
+        alive=np.ones((count, capacity), bool),
+        tag=np.tile(np.arange(capacity, dtype=np.int32), (count, 1)),
+        best=np.int32(np.argmax(log_weight)),
+        lost=np.zeros(count, np.int32),
+        invalid=np.zeros(count, bool),
+    )
+
+
+def test_moments_of_the_pose_against_plain_arithmetic():
+    state = cloud(np.random.default_rng(0))
+    w = np.exp(state.log_weight)
+    assert np.ptp(state.pose[:, 2]) > 6  # a plain mean of headings would be far off
+    mean, cov = particles.pose_moments(jax.tree.map(jnp.asarray, state))
+    theta = np.angle((w * np.exp(1j * state.pose[:, 2])).sum())
+    np.testing.assert_allclose(mean, [*(w @ state.pose[:, :2]), theta], atol=1e-12)
+    d = state.pose - np.asarray(mean)
+    d[:, 2] = np.angle(np.exp(1j * d[:, 2]))
+    share = (w**2).sum()
+    wanted = (1 + share) / (1 - share) * np.einsum("p,pi,pj->ij", w, d, d)
+    np.testing.assert_allclose(cov, wanted, rtol=1e-10)
+
+
+def test_the_covariance_is_the_mean_square_of_truth_minus_mean():
+    """Monte-Carlo over samples of 6 from one Gaussian, the truth being a seventh draw."""
+    rng = np.random.default_rng(1)
+    root = np.diag([0.3, 0.1, 0.05])
+    draws = rng.normal(size=(20000, 7, 3)) @ root
+    start = jax.tree.map(jnp.asarray, cloud(rng, 6))._replace(log_weight=jnp.full(6, -np.log(6)))
+    one = jax.jit(jax.vmap(lambda poses: particles.pose_moments(start._replace(pose=poses))))
+    mean, cov = one(jnp.asarray(draws[:, :6]))
+    error = draws[:, 6] - np.asarray(mean)
+    np.testing.assert_allclose(np.asarray(cov).mean(0).diagonal(), error.var(0), rtol=0.04)
+    # and its NEES is that of a small sample, 3 (n-1)/(n-5) = 15, as the docstring has it
+    nees = np.einsum("ri,rij,rj->r", error, np.linalg.inv(cov), error)
+    assert 3 < np.median(nees) < 8
+
+
+def test_the_map_is_a_mixture_by_slot_where_tags_agree():
+    rng = np.random.default_rng(2)
+    state = cloud(rng)
+    best = int(state.best)
+    other = [p for p in range(7) if p != best]
+    state.tag[other[0], 0] = 9  # another landmark in that slot
+    state.alive[other[1], 0], state.tag[other[1], 0] = False, -1
+    state.tag[:, 1] = -1  # unknown: the most likely particle's own
+    state.alive[best, 2], state.tag[best, 2] = False, -1
+    out = particles.moments(jax.tree.map(jnp.asarray, state), worlds.ring(1).sensor)
+    keep = np.array([p not in other[:2] for p in range(7)])
+    w = np.exp(state.log_weight) * keep
+    w = w / w.sum()
+    mean = w @ state.landmarks[:, 0]
+    d = state.landmarks[:, 0] - mean
+    cov = np.einsum("p,pij->ij", w, state.covs[:, 0]) + np.einsum("p,pi,pj->ij", w, d, d)
+    np.testing.assert_allclose(out.points[0], mean, rtol=1e-12)
+    np.testing.assert_allclose(out.point_covs[0], cov, rtol=1e-12)
+    np.testing.assert_allclose(out.points[1], state.landmarks[best, 1], rtol=1e-12)
+    np.testing.assert_allclose(out.point_covs[1], state.covs[best, 1], rtol=1e-12)
+    np.testing.assert_array_equal(out.alive, [True, True, False])
+    np.testing.assert_array_equal(out.points[2], [0, 0])
+
+
+def test_headings_that_cancel_have_no_mean_and_no_nan():
+    state = cloud(np.random.default_rng(0), 2)._replace(log_weight=np.log([0.5, 0.5]))
+    state.pose[:, 2] = [0.0, np.pi]
+    mean, slope = jax.value_and_grad(
+        lambda pose: particles.pose_moments(jax.tree.map(jnp.asarray, state)._replace(pose=pose))[
+            0
+        ].sum()
+    )(jnp.asarray(state.pose))
+    assert np.isfinite(mean)
+    assert np.all(np.isfinite(slope))
+
+
+# --- against the EKF, on worlds where linearization does no harm ---------------------------------
+
+
+@pytest.mark.parametrize("proposal", ["motion", "measurement"])
+def test_many_particles_are_the_posterior_of_the_ekf(proposal):
+    """Mean within 5 standard errors, covariance within 15 %, and the evidence of the log."""
+    world = dataclasses.replace(worlds.ring(100), pose_cov=np.diag([0.05, 0.05, 0.02]) ** 2)
+    world = dataclasses.replace(world, controls=world.controls[:6])
+    filter = of(world, 4000, proposal=proposal)
+    ours, _, log = drive(world, filter)
+    theirs = run(worlds.ekf(world), log, world.pose, world.pose_cov, KEY)
+    mean, cov = np.asarray(theirs.estimate.pose[-1]), np.asarray(theirs.estimate.pose_cov[-1])
+    error = np.asarray(ours.estimate.pose[-1]) - mean
+    assert np.all(np.abs(error) < 5 * np.sqrt(cov.diagonal() / 1000))  # ESS may be a quarter of P
+    np.testing.assert_allclose(
+        np.asarray(ours.estimate.pose_cov[-1]).diagonal(), cov.diagonal(), rtol=0.15
+    )
+    points = np.asarray(ours.estimate.points[-1] - theirs.estimate.points[-1])
+    spread = np.sqrt(np.einsum("nii->ni", np.asarray(theirs.estimate.point_covs[-1])))
+    assert np.all(np.abs(points) < 0.2 * spread)
+    np.testing.assert_allclose(
+        np.einsum("nii->ni", np.asarray(ours.estimate.point_covs[-1])), spread**2, rtol=0.2
+    )
+    np.testing.assert_allclose(
+        ours.info.log_likelihood.sum(), theirs.info.log_likelihood.sum(), atol=0.3
+    )
+    assert np.all(np.asarray(ours.final.pose_cov) == 0)
+    np.testing.assert_allclose(np.exp(np.asarray(ours.final.log_weight)).sum(), 1.0, rtol=1e-12)
+
+
+def test_the_start_is_reported_before_anything_is_drawn():
+    world = worlds.ring(2)
+    cov = np.diag([0.1, 0.2, 0.3])
+    state = of(world, 5).init(jnp.array([1.0, 2.0, 3.0]), jnp.asarray(cov))
+    out = of(world, 5).estimate(state)
+    np.testing.assert_allclose(out.pose, [1, 2, 3], atol=1e-12)
+    np.testing.assert_allclose(out.pose_cov, cov, atol=1e-12)
+    assert not np.any(out.alive)
+
+
+# --- association of each particle ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "method",
+    [association.maximum_likelihood(16.0), association.joint(0.9999)],
+    ids=["maximum_likelihood", "joint"],
+)
+def test_unknown_identities_of_landmarks_far_apart_give_the_same_filter(method):
+    world = worlds.ring(20)
+    known, _, log = drive(world, of(world, 20))
+    blind = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
+    filter = of(world, 20, associate=method)
+    unknown = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, KEY))(blind)
+    assert np.all(unknown.estimate.alive.sum(axis=1)[-1] == 6)
+    np.testing.assert_allclose(unknown.estimate.pose, known.estimate.pose, atol=1e-9)
+    np.testing.assert_allclose(unknown.final.landmarks, known.final.landmarks, atol=1e-9)
+    np.testing.assert_array_equal(unknown.info.status, known.info.status)
+    assert np.all(unknown.final.tag == -1)
+
+
+# --- what a scan may do -------------------------------------------------------------------------
+
+
+def scan_of(rows, places=2):
+    """A scan of (tag, range, bearing) rows, padded."""
+    z, tag = np.zeros((places, 2)), np.full(places, -1, np.int32)
+    for i, (name, *value) in enumerate(rows):
+        z[i], tag[i] = value, name
+    return Scan(jnp.asarray(z), jnp.asarray(tag), jnp.asarray(np.arange(places) < len(rows)))
+
+
+def known_map(tags):
+    """A state of one particle a row of tags (N,), -1 for a free slot, tag k at (k + 1, 0)."""
+    tags = np.asarray(tags, np.int32)
+    count, capacity = tags.shape
+    alive = tags >= 0
+    return jax.tree.map(
+        jnp.asarray,
+        Particles(
+            pose=np.tile([0.0, 0.0, 0.1], (count, 1)),
+            pose_cov=np.tile(np.diag([0.01, 0.01, 0.01]), (count, 1, 1)),
+            log_weight=np.full(count, -np.log(count)),
+            landmarks=np.where(alive[:, :, None], np.stack([tags + 1.0, 0.0 * tags], axis=2), 0.0),
+            covs=np.where(alive[:, :, None, None], 0.01 * np.eye(2), np.eye(2)),
+            alive=alive,
+            tag=tags,
+            best=np.int32(0),
+            lost=np.zeros(count, np.int32),
+            invalid=np.zeros(count, bool),
+        ),
+    )
+
+
+def test_particles_of_different_maps_with_full_tables_lose_what_they_must_and_count_it():
+    world = worlds.ring(1)
+    filter = of(world, 3, capacity=2, threshold=0.0)
+    state = known_map([[0, 1], [0, -1], [5, 6]])
+    state, info = jax.jit(filter.update)(state, scan_of([(1, 2.0, -0.4), (7, 3.0, 0.5)]), KEY)
+    np.testing.assert_array_equal(state.lost, [1, 1, 2])
+    np.testing.assert_array_equal(state.tag, [[0, 1], [0, 1], [5, 6]])
+    assert np.all(state.alive)
+    assert np.isfinite(np.asarray(state.log_weight)).all()
+    best = int(state.best)
+    wanted = [
+        [Status.FUSED, Status.OVERFLOW],
+        [Status.BORN, Status.OVERFLOW],
+        [Status.OVERFLOW] * 2,
+    ]
+    np.testing.assert_array_equal(info.status, wanted[best])
+    assert info.overflow
+
+
+def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
+    """A measurement so far off that no particle gives it a density above zero."""
+    world = worlds.ring(1)
+    filter = of(world, 4, capacity=2)
+    start = known_map([[0, 1]] * 4)
+    after, info = jax.jit(filter.update)(start, scan_of([(0, 1e200, 0.0)]), KEY)
+    assert info.underflow
+    assert not info.resampled
+    np.testing.assert_array_equal(info.status, [Status.REJECTED, Status.EMPTY])
+    np.testing.assert_allclose(np.exp(after.log_weight), 0.25)
+    np.testing.assert_array_equal(after.landmarks, start.landmarks)
+    assert np.all(np.abs(np.asarray(after.pose - start.pose)) < 1.0)  # drawn, and no more
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((info, filter.estimate(after))))
+    _, info = jax.jit(filter.update)(start, scan_of([(0, 0.9, -0.4)]), KEY)
+    assert not info.underflow
+
+
+def test_a_gate_drops_an_outlier_and_says_so():
+    world = worlds.ring(1)
+    filter = of(world, 4, capacity=2, gate=16.0)
+    after, info = jax.jit(filter.update)(known_map([[0, 1]] * 4), scan_of([(0, 3.0, 0.0)]), KEY)
+    np.testing.assert_array_equal(info.status, [Status.REJECTED, Status.EMPTY])
+    assert info.nis[0] > 16
+    assert info.dof[0] == 0
+    np.testing.assert_array_equal(after.landmarks[:, 0], np.tile([1.0, 0.0], (4, 1)))
+
+
+def test_births_have_a_quota_and_a_tag_is_born_once():
+    world = worlds.ring(1)
+    filter = of(world, 4, capacity=3, births=1)
+    rows = [(3, 1.0, 0.0), (3, 1.0, 0.1), (4, 2.0, 0.0)]
+    after, info = jax.jit(filter.update)(known_map([[0, -1, -1]] * 4), scan_of(rows, 4), KEY)
+    wanted = [Status.BORN, Status.REPEATED, Status.DEFERRED, Status.EMPTY]
+    np.testing.assert_array_equal(info.status, wanted)
+    np.testing.assert_array_equal(after.tag, [[0, 3, -1]] * 4)
+
+
+def test_negative_evidence_removes_a_landmark_from_every_map():
+    """One that is measured once and then never again, though in view."""
+    world = worlds.ring(6)
+    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    gone = (log.scan.tag == 5) & (jnp.arange(6) > 0)[:, None]
+    log = log._replace(scan=log.scan._replace(valid=log.scan.valid & ~gone))
+    filter = of(world, 8, life=life.existence(lambda pose, landmark: jnp.asarray(True)))
+    trace = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, KEY))(log)
+    assert trace.final.life.log_odds.shape == (8, 6)
+    np.testing.assert_array_equal(np.sort(trace.final.tag), [[-1, 0, 1, 2, 3, 4]] * 8)
+    # log(0.1/0.9) a miss: at the second the odds fall below 0.05/0.95
+    np.testing.assert_array_equal(trace.info.removed.sum(axis=1), [0, 0, 1, 0, 0, 0])
+    dead = ~np.asarray(trace.final.alive)
+    np.testing.assert_array_equal(np.asarray(trace.final.landmarks)[dead], 0.0)
+    np.testing.assert_array_equal(
+        np.asarray(trace.final.covs)[dead], np.tile(np.eye(2), (dead.sum(), 1, 1))
+    )
+
+
+# --- resampling within the filter ----------------------------------------------------------------
+
+
+def test_it_resamples_where_the_threshold_says():
+    world = worlds.ring(30)
+    never, _, _ = drive(world, of(world, 30, threshold=0.0))
+    often, _, _ = drive(world, of(world, 30, threshold=0.5))
+    assert not np.any(never.info.resampled)
+    ess = np.asarray(often.info.ess)
+    np.testing.assert_array_equal(often.info.resampled, ess < 15)
+    assert 0 < np.sum(ess < 15) < 30
+    assert np.all((ess > 1 - 1e-9) & (ess < 30 + 1e-9))
+    assert never.info.ess[-1] < often.info.ess[-1]
+    assert np.ptp(often.final.log_weight) == 0 or not often.info.resampled[-1]
+
+
+@pytest.mark.parametrize("name", sorted(resampling.REGISTRY))
+def test_any_method_resamples_whole_particles(name):
+    """Weights that leave only the second: all descend from it, maps, tags and counts."""
+    world = worlds.ring(1)
+    filter = of(world, 3, capacity=2, resample=resampling.REGISTRY[name])
+    state = known_map([[0, 1], [1, 0], [0, 1]])
+    state = state._replace(
+        log_weight=jnp.array([-900.0, 0.0, -900.0]), lost=jnp.array([1, 2, 3], jnp.int32)
+    )
+    after, info = jax.jit(filter.update)(state, scan_of([]), KEY)
+    assert info.resampled
+    np.testing.assert_array_equal(after.tag, [[1, 0]] * 3)
+    np.testing.assert_array_equal(after.landmarks[:, 0], np.tile([2.0, 0.0], (3, 1)))
+    np.testing.assert_array_equal(after.lost, [2, 2, 2])
+    np.testing.assert_allclose(np.exp(after.log_weight), 1 / 3)
+    assert len(np.unique(after.pose[:, 0])) == 3  # each drew a pose of its own
+
+
+# --- the house ----------------------------------------------------------------------------------
+
+
+def test_a_batch_is_a_loop_and_keys_matter():
+    world = worlds.ring(5)
+    filter = of(world, 12)
+    _, logs = jax.jit(jax.vmap(partial(simulate, world)))(jax.random.split(KEY, 2))
+    keys = jax.random.split(jax.random.key(3), 2)
+    go = jax.jit(lambda log, key: run(filter, log, world.pose, world.pose_cov, key))
+    both = jax.jit(jax.vmap(go))(logs, keys)
+    each = [go(jax.tree.map(lambda x, i=i: x[i], logs), keys[i]) for i in range(2)]
+    alone = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-11), both, alone)
+    first = jax.tree.map(lambda x: x[0], logs)
+    assert np.all(go(first, keys[0]).final.pose != go(first, keys[1]).final.pose)
+
+
+@pytest.mark.parametrize("proposal", ["motion", "measurement"])
+def test_float32_stays_float32_and_near(proposal):
+    world = still(10)
+    filter = of(world, 3, proposal=proposal)
+    double, _, log = drive(world, filter)
+    single = jax.tree.map(lambda x: x.astype("f4") if x.dtype == float else x, log)
+    trace = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, KEY))(single)
+    for leaf in jax.tree.leaves((trace.estimate, trace.info, trace.final)):
+        assert leaf.dtype != np.float64
+        assert np.isfinite(np.asarray(leaf, np.float64)).all()
+    np.testing.assert_allclose(trace.estimate.points, double.estimate.points, atol=2e-4)
+
+
+@pytest.mark.parametrize("proposal", ["motion", "measurement"])
+def test_gradients_are_finite_from_a_start_that_is_known_exactly(proposal):
+    """By both noises, through predictions, resampling and births, P0 = 0."""
+    world = worlds.ring(4)
+    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+
+    def cost(sigma):
+        ours = dataclasses.replace(
+            world,
+            motion=motion.increment(jnp.diag(sigma[:2]) ** 2),
+            sensor=sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
+        )
+        method = resampling.stop_gradient() if proposal == "motion" else resampling.systematic
+        filter = of(ours, 4, proposal=proposal, resample=method)
+        trace = run(filter, log, world.pose, world.pose_cov, KEY)
+        return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()
+
+    slope = jax.jit(jax.grad(cost))(np.array([0.01, 0.04, 0.05]))
+    assert np.isfinite(slope).all()
+    assert np.all(slope != 0)
+
+
+def test_a_campaign_counts_resamplings():
+    world = worlds.ring(8)
+    campaign = monte_carlo(world, {"fast": of(world, 5)}, 2, KEY, workers=1)
+    counts = campaign.filters["fast"].counts
+    assert counts["runs"] == 2
+    assert counts["resampled"] > 0
+    assert counts["underflow"] == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"particles": 0}, "particles: expected an integer"),
+        ({"particles": 2.5}, "particles: expected an integer"),
+        ({"capacity": 0}, "capacity: expected an integer"),
+        ({"births": 0}, "births: expected an integer"),
+        ({"proposal": "optimal"}, 'expected proposal "motion" or "measurement"'),
+        ({"threshold": 1.5}, "threshold from 0 to 1"),
+        ({"threshold": np.nan}, "threshold from 0 to 1"),
+        ({"gate": 0.0}, "gate above 0"),
+        ({"resample": "systematic"}, "resample to be a function"),
+        ({"life": "existence"}, "life to be a Life"),
+        ({"sensor": sensors.compass(np.eye(1))}, "not a suite"),
+        (
+            {"sensor": sensors.bearing_inverse_depth(np.eye(1), min_distance=1.0, to_point=0.1)},
+            "turn into points",
+        ),
+    ],
+)
+def test_bad_input_is_refused(change, why):
+    world = worlds.ring(1)
+    arguments = {"motion": world.motion, "sensor": world.sensor, "capacity": 6, "particles": 5}
+    with pytest.raises(ValueError, match=why):
+        fastslam(**(arguments | change))

@@ -1,0 +1,251 @@
+"""Localization is EKF-SLAM in a map without error, and dead reckoning is that without measurements."""
+
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import ring
+
+from jaxslam import association, charts, linearize, monte_carlo, run, sensors, simulate
+from jaxslam.filters import dead_reckoning, ekf_slam, localization
+from jaxslam.sensors import Part, suite
+from jaxslam.stats import chi2_quantile
+from jaxslam.types import Log, Status
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+KEY = jax.random.key(0)
+START, SPREAD = np.array([0.1, -0.05, 0.02]), np.diag([0.2, 0.1, 0.05]) ** 2
+GATE, NEW = chi2_quantile(0.999, 2), chi2_quantile(0.99999, 2)
+
+
+@cache
+def world():
+    scenario = dataclasses.replace(ring(40), pose=START, pose_cov=SPREAD)
+    return scenario, simulate(scenario, jax.random.key(3))
+
+
+def here(**options):
+    scenario, _ = world()
+    return localization(scenario.motion, scenario.sensor, scenario.landmarks, **options)
+
+
+def driven(filter, log):
+    return jax.jit(lambda log: run(filter, log, jnp.asarray(START), jnp.asarray(SPREAD), KEY))(log)
+
+
+def slam_in_a_known_map(scenario, log, chart_name, options):
+    """Poses and covariances of EKF-SLAM from a state whose landmarks are known exactly."""
+    chart = charts.REGISTRY[chart_name]()
+    points = jnp.asarray(scenario.landmarks)
+    count = len(points)
+    filter = ekf_slam(scenario.motion, scenario.sensor, count, chart=chart, **options)
+    joint = filter.init(jnp.asarray(START), jnp.asarray(SPREAD))
+    rows = [jnp.eye(3)]
+    if chart.basis is None:
+        rows += [jnp.zeros((2, 3))] * count
+    else:  # coordinates without error: cross dx + B dl = 0
+        for point in points:
+            basis = chart.basis(joint.pose, point)
+            own = jnp.eye(2) if basis.landmark is None else basis.landmark
+            rows.append(-jnp.linalg.solve(own, basis.cross))
+    lift = jnp.concatenate(rows)
+    joint = joint._replace(
+        landmarks=points,
+        cov=lift @ joint.cov[:3, :3] @ lift.T,
+        alive=jnp.ones(count, bool),
+        tag=jnp.arange(count, dtype=jnp.int32),
+    )
+
+    def step(joint, row):
+        joint, _ = filter.update(filter.predict(joint, row.control, KEY), row.scan, KEY)
+        return joint, filter.estimate(joint)
+
+    return jax.jit(lambda joint: jax.lax.scan(step, joint, log)[1])(joint)
+
+
+@pytest.mark.parametrize(
+    ("chart", "options"),
+    [
+        ("euclidean", {}),
+        ("euclidean", {"update": "joint"}),
+        ("euclidean", {"iterations": 3}),
+        ("euclidean", {"joseph": True, "gate": 4.0}),
+        ("right_invariant", {}),
+        ("left_invariant", {"update": "joint"}),
+    ],
+)
+def test_it_is_slam_in_a_map_without_error(chart, options):
+    scenario, (_, log) = world()
+    expected = slam_in_a_known_map(scenario, log, chart, options)
+    trace = driven(here(chart=charts.REGISTRY[chart](), **options), log)
+    np.testing.assert_allclose(trace.estimate.pose, expected.pose, atol=1e-9)
+    np.testing.assert_allclose(trace.estimate.pose_cov, expected.pose_cov, rtol=1e-7, atol=1e-12)
+
+
+def by_hand(scenario, log, angles):
+    """A plain EKF of the pose with a range and a bearing of each landmark, then a compass."""
+    x, p, out = START.copy(), SPREAD.copy(), []
+    q, points = np.diag([0.01, 0.01]) ** 2, np.asarray(scenario.landmarks)
+    mount = np.array([0.1, -0.05, 0.3])
+
+    def wrap(angle):
+        return np.pi - np.mod(np.pi - angle, 2 * np.pi)
+
+    def fuse(x, p, nu, h, r):
+        gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
+        x = x + gain @ nu
+        return np.array([*x[:2], wrap(x[2])]), p - gain @ h @ p
+
+    for t, (d, turn) in enumerate(np.asarray(log.control)):
+        c, s = np.cos(x[2]), np.sin(x[2])
+        f = np.array([[1, 0, -d * s], [0, 1, d * c], [0, 0, 1]])
+        w = np.array([[c, 0], [s, 0], [0, 1]])
+        x = np.array([x[0] + d * c, x[1] + d * s, wrap(x[2] + turn)])
+        p = f @ p @ f.T + w @ q @ w.T
+        for z, point in zip(np.asarray(log.scan.z[t])[: len(points)], points, strict=True):
+            c, s = np.cos(x[2]), np.sin(x[2])
+            lever = np.array([c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]])
+            off = point - x[:2] - lever
+            r = np.hypot(*off)
+            nu = np.array([z[0] - r, wrap(z[1] - np.arctan2(off[1], off[0]) + x[2] + mount[2])])
+            by_lever = np.array([-off / r, np.array([off[1], -off[0]]) / r**2])
+            turned = by_lever @ np.array([-lever[1], lever[0]])
+            h = np.column_stack([by_lever, turned + [0, -1]])
+            x, p = fuse(x, p, nu, h, np.diag([0.05, 0.02]) ** 2)
+        if angles is not None:
+            nu = np.array([wrap(angles[t] - x[2])])
+            x, p = fuse(x, p, nu, np.array([[0.0, 0.0, 1.0]]), np.array([[0.01]]))
+        out.append((x, p))
+    return [np.array(part) for part in zip(*out, strict=True)]
+
+
+@pytest.mark.parametrize("with_compass", [False, True])
+def test_it_is_the_textbooks_filter_with_absolute_sensors_too(with_compass):
+    scenario, (truth, log) = world()
+    angles, sensor = None, scenario.sensor
+    if with_compass:
+        rng = np.random.default_rng(4)
+        angles = np.asarray(truth.pose[:, 2]) + 0.1 * rng.normal(size=scenario.steps)
+        sensor = suite((scenario.sensor, 6), Part(sensors.compass(np.array([[0.01]])), 1))
+        z, tag, valid = (np.asarray(part) for part in log.scan)
+        extra = np.stack([angles, 0 * angles], axis=1)[:, None]
+        log = Log(
+            log.control,
+            log.scan._replace(
+                z=np.concatenate([z, extra], axis=1),
+                tag=np.concatenate([tag, np.full((len(tag), 1), -1, tag.dtype)], axis=1),
+                valid=np.concatenate([valid, np.ones((len(tag), 1), bool)], axis=1),
+            ),
+        )
+    poses, covs = by_hand(scenario, log, angles)
+    filter = localization(scenario.motion, sensor, scenario.landmarks)
+    trace = driven(filter, jax.tree.map(jnp.asarray, log))
+    np.testing.assert_allclose(trace.estimate.pose, poses, atol=1e-9)
+    np.testing.assert_allclose(trace.estimate.pose_cov, covs, rtol=1e-7, atol=1e-12)
+    assert (trace.info.status == Status.FUSED).all()
+
+
+@pytest.mark.parametrize("method", ["nearest", "maximum_likelihood", "global_nearest", "joint"])
+def test_it_finds_its_landmarks_without_tags(method):
+    scenario, (_, log) = world()
+    make = getattr(association, method)
+    associate = make(0.999, NEW) if method == "joint" else make(GATE, NEW)
+    nameless = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
+    trace = driven(here(associate=associate), nameless)
+    fused = np.asarray(trace.info.status == Status.FUSED)
+    assert fused.mean() > 0.98
+    right = np.asarray(trace.info.slot) == np.asarray(log.scan.tag)
+    assert right[fused].all()
+
+
+def test_what_is_not_in_the_map_is_counted_and_not_started():
+    scenario, (_, log) = world()
+    part = localization(
+        scenario.motion, scenario.sensor, np.asarray(scenario.landmarks)[:4], tags=[5, 1, 2, 3]
+    )
+    trace = driven(part, log)
+    status = np.asarray(trace.info.status)
+    np.testing.assert_array_equal(status[:, [0, 4]], Status.UNMATCHED)
+    np.testing.assert_array_equal(status[:, [1, 2, 3]], Status.FUSED)
+    np.testing.assert_array_equal(trace.final.tag, [5, 1, 2, 3])
+
+
+def test_sigma_points_are_close_to_jacobians():
+    _, (_, log) = world()
+    plain, sigma = (driven(here(**o), log) for o in ({}, {"linearize": linearize.unscented()}))
+    np.testing.assert_allclose(sigma.estimate.pose, plain.estimate.pose, atol=0.02)
+    assert not np.array_equal(sigma.estimate.pose, plain.estimate.pose)
+
+
+def test_it_is_honest_and_dead_reckoning_is_what_it_says():
+    """NEES of every block in its interval, with a start that is not known either."""
+    scenario, _ = world()
+    filters = {
+        "localization": here(),
+        "dead_reckoning": dead_reckoning(scenario.motion, scenario.sensor),
+    }
+    campaign = monte_carlo(scenario, filters, 200, jax.random.key(7))
+    for name, summary in campaign.filters.items():
+        measure = summary.measures["nees_pose"]
+        assert measure.low < 3 < measure.high, (name, measure)
+    found, lost = (campaign.filters[name].measures["rmse_position"] for name in filters)
+    assert found.high < 0.5 * lost.low
+    counts = campaign.filters["dead_reckoning"].counts
+    assert counts["unmatched"] == 200 * 40 * 6
+
+
+def test_dead_reckoning_is_the_motion_alone():
+    scenario, (_, log) = world()
+    trace = driven(dead_reckoning(scenario.motion, scenario.sensor), log)
+    pose = START
+    for u, estimate in zip(log.control, trace.estimate.pose, strict=True):
+        pose = scenario.motion.step(pose, u, jnp.zeros(2))
+        np.testing.assert_allclose(estimate, pose, atol=1e-12)
+    assert not trace.estimate.alive.any()
+
+
+def test_gradient_and_float32():
+    scenario, (_, log) = world()
+    short = jax.tree.map(lambda leaf: leaf[:5], log)
+
+    @jax.jit
+    def last(landmarks):
+        filter = localization(scenario.motion, scenario.sensor, landmarks)
+        trace = run(filter, short, jnp.asarray(START), jnp.asarray(SPREAD), KEY)
+        return (trace.estimate.pose[-1] ** 2).sum()
+
+    slope = jax.grad(last)(jnp.asarray(scenario.landmarks))
+    assert np.isfinite(slope).all() and (slope != 0).all()
+    low = jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, log
+    )
+    start = START.astype(np.float32), SPREAD.astype(np.float32)
+    trace = jax.jit(lambda log: run(here(), log, *start, KEY))(low)
+    assert trace.estimate.pose.dtype == trace.final.cov.dtype == jnp.float32
+    np.testing.assert_allclose(trace.estimate.pose, driven(here(), log).estimate.pose, atol=1e-3)
+
+
+BAD = {
+    "shape": ({"landmarks": np.zeros((3, 3))}, r"landmarks of shape \(at least 1, 2\)"),
+    "none": ({"landmarks": np.zeros((0, 2))}, "at least 1"),
+    "nan": ({"landmarks": np.full((2, 2), np.nan)}, "not finite"),
+    "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
+    "negative tag": ({"tags": [-1, 0, 1, 2, 3, 4]}, "different tags"),
+    "chart": ({"chart": charts.robocentric()}, "composes a map"),
+    "linearizer": ({"linearize": linearize.first_estimate()}, "for maps with errors"),
+    "iterated": ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
+    "update": ({"update": "whole"}, "sequential"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_refusals(case):
+    options, message = BAD[case]
+    scenario, _ = world()
+    options = {"landmarks": scenario.landmarks} | options
+    with pytest.raises(ValueError, match=message):
+        localization(scenario.motion, scenario.sensor, options.pop("landmarks"), **options)

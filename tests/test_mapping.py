@@ -1,0 +1,120 @@
+"""Mapping from known poses is EKF-SLAM of a robot that knows where it is."""
+
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import ring
+
+from jaxslam import association, motion, run, sensors, simulate
+from jaxslam.filters import ekf_slam, mapping
+from jaxslam.filters.mapping import as_prior
+from jaxslam.stats import chi2_band, chi2_quantile
+from jaxslam.types import Status
+
+KEY = jax.random.key(0)
+
+
+@cache
+def world():
+    scenario = ring(40)
+    truth, log = simulate(scenario, jax.random.key(5))
+    return scenario, truth, log
+
+
+def on_poses(filter, truth, log):
+    start = jnp.zeros(3), jnp.zeros((3, 3)), KEY
+    return jax.jit(lambda log: run(filter, log, *start))(log._replace(control=truth.pose))
+
+
+@pytest.mark.parametrize("options", [{}, {"gate": 4.0}, {"births": 1}])
+def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
+    scenario, truth, log = world()
+    capacity = 8
+    # A motion without noise whose control is the pose: P_RR stays zero, and P block-diagonal.
+    exact = dataclasses.replace(
+        motion.pose_increment(np.zeros((3, 3))), step=lambda pose, u, w: u + 0 * w
+    )
+    slam = ekf_slam(exact, scenario.sensor, capacity, update="joint", **options)
+    expected = on_poses(slam, truth, log)
+    trace = on_poses(mapping(scenario.sensor, capacity, **options), truth, log)
+    for name in ("pose", "points", "point_covs", "alive", "tag"):
+        actual, wanted = getattr(trace.estimate, name), getattr(expected.estimate, name)
+        np.testing.assert_allclose(actual, wanted, rtol=1e-9, atol=1e-12)
+    for name in ("status", "slot", "nis", "dof", "innovation_cov"):
+        actual, wanted = getattr(trace.info, name), getattr(expected.info, name)
+        np.testing.assert_allclose(actual, wanted, rtol=1e-8, atol=1e-10)
+    np.testing.assert_array_equal(trace.estimate.pose_cov, 0)
+
+
+def test_it_is_honest():
+    """NEES of the landmarks over 200 worlds in the chi-square band of so many."""
+    scenario, _, _ = world()
+    filter = mapping(scenario.sensor, 6)
+
+    @jax.jit
+    @jax.vmap
+    def last(key):
+        truth, log = simulate(scenario, key)
+        start = jnp.zeros(3), jnp.zeros((3, 3)), KEY
+        trace = run(filter, log._replace(control=truth.pose), *start)
+        joint = as_prior(trace.final, jnp.zeros(3), jnp.eye(3))
+        off = truth.landmarks[trace.final.tag] - trace.final.landmarks
+        return off.reshape(-1) @ jnp.linalg.solve(joint.cov[3:, 3:], off.reshape(-1))
+
+    nees = np.asarray(last(jax.random.split(jax.random.key(9), 200)))
+    low, high = chi2_band(12, 200, 0.999)
+    assert low < nees.mean() < high
+
+
+def test_a_prior_for_slam():
+    """Filtered on from the map, and from the map's inverse variances by hand."""
+    scenario, truth, log = world()
+    final = on_poses(mapping(scenario.sensor, 8), truth, log).final
+    pose, cov = np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.01])
+    joint = as_prior(final, pose, cov)
+    np.testing.assert_array_equal(joint.cov[:3, :3], cov)
+    np.testing.assert_array_equal(joint.cov[:3, 3:], 0)
+    blocks = np.asarray(joint.cov)[3:, 3:].reshape(8, 2, 8, 2)
+    for i in range(8):
+        for j in range(8):
+            own = np.asarray(final.covs[i]) if final.alive[i] else np.eye(2)
+            np.testing.assert_array_equal(blocks[i, :, j], own if i == j else 0)
+    slam = ekf_slam(scenario.motion, scenario.sensor, 8)
+    row = jax.tree.map(lambda leaf: leaf[0], log.scan)
+    after, info = slam.update(joint, row, KEY)
+    assert (info.status == Status.FUSED).all()
+    assert np.trace(after.cov) < np.trace(joint.cov)
+
+
+def test_without_tags():
+    scenario, truth, log = world()
+    gates = chi2_quantile(0.999, 2), chi2_quantile(0.99999, 2)
+    nameless = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
+    for method in (association.nearest(*gates), association.joint(0.999, gates[1])):
+        trace = on_poses(mapping(scenario.sensor, 8, associate=method), truth, nameless)
+        assert (trace.final.alive).sum() == 6
+        np.testing.assert_array_equal(trace.info.slot, log.scan.tag)
+
+
+def test_a_full_map_refuses():
+    scenario, truth, log = world()
+    trace = on_poses(mapping(scenario.sensor, 1), truth, log)
+    status = np.asarray(trace.info.status)
+    assert (status[:, 1:] == Status.OVERFLOW).all() and (status[1:, 0] == Status.FUSED).all()
+    assert trace.final.lost == 40 * 5
+
+
+def test_refusals():
+    sensor = ring(3).sensor
+    for options, message in (({"capacity": 0}, "capacity"), ({"gate": 0.0}, "gate above 0")):
+        with pytest.raises(ValueError, match=f"mapping: .*{message}"):
+            mapping(sensor, **({"capacity": 3} | options))
+    with pytest.raises(ValueError, match="absolute"):
+        mapping(sensors.compass(np.eye(1)), 3)
+    final = mapping(sensor, 2).init(jnp.zeros(3), jnp.eye(3))
+    with pytest.raises(ValueError, match=r"pose \(3,\)"):
+        as_prior(final, jnp.zeros(2), jnp.eye(3))

@@ -1,0 +1,361 @@
+"""Monte-Carlo localization: the EKF's posterior, a robot anywhere, one carried away, bad particles."""
+
+import dataclasses
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import association, motion, resampling, run, sensors, simulate
+from jaxslam.filters import cloud, fastslam, localization, particle_localization
+from jaxslam.sensors import Part, suite
+from jaxslam.types import Scan, Status
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+KEY = jax.random.key(5)
+WORLD = worlds.ring(100)
+MOUNT = (0.1, -0.05, 0.3)
+BLUNT = sensors.range_bearing(np.diag([0.3, 0.1]) ** 2, mount=MOUNT)
+BOX = np.array([[-4.0, -3.0], [4.0, 5.0]])
+
+
+def of(count, sensor=WORLD.sensor, move=WORLD.motion, **options):
+    return particle_localization(move, sensor, WORLD.landmarks, count, **options)
+
+
+def drive(filter, log, pose=(0.0, 0.0, 0.0), cov=None):
+    cov = np.zeros((3, 3)) if cov is None else cov
+    return jax.jit(lambda log, key: run(filter, log, pose, cov, key))(log, KEY)
+
+
+def history(steps, pose=(0.0, 0.0, 0.0), seed=1, sensor=WORLD.sensor):
+    """Truth and log of so many steps of the ring from a pose."""
+    world = dataclasses.replace(
+        WORLD, controls=np.asarray(WORLD.controls)[:steps], pose=pose, sensor=sensor
+    )
+    return jax.jit(partial(simulate, world))(jax.random.key(seed))
+
+
+# --- the right posterior ------------------------------------------------------------------------
+
+
+def test_many_particles_are_the_posterior_of_the_ekf():
+    """Mean within 5 standard errors, covariance within 15 %, and the evidence of the log."""
+    _, log = history(6)
+    start = (0.02, -0.03, 0.01), np.diag([0.05, 0.05, 0.02]) ** 2
+    theirs = run(localization(WORLD.motion, WORLD.sensor, WORLD.landmarks), log, *start, KEY)
+    ours = drive(of(4000, least=4000), log, *start)
+    mean, cov = np.asarray(theirs.estimate.pose[-1]), np.asarray(theirs.estimate.pose_cov[-1])
+    error = np.asarray(ours.estimate.pose[-1]) - mean
+    effective = float(ours.info.ess[-1])
+    assert effective > 200
+    assert np.all(np.abs(error) < 5 * np.sqrt(cov.diagonal() / (effective / 4)))
+    np.testing.assert_allclose(
+        np.asarray(ours.estimate.pose_cov[-1]).diagonal(), cov.diagonal(), rtol=0.25
+    )
+    np.testing.assert_allclose(
+        ours.info.log_likelihood.sum(), theirs.info.log_likelihood.sum(), atol=0.5
+    )
+    assert (np.asarray(ours.info.active) == 4000).all()
+    np.testing.assert_array_equal(ours.info.status, theirs.info.status)
+    np.testing.assert_array_equal(ours.estimate.points, theirs.estimate.points)
+
+
+def by_hand(pose, scan, gate=math.inf, edge=9.21034037197618):
+    """Σ of what counts of d² for one pose: range and bearing to the landmarks of their tags."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    eye = pose[:2] + np.array([[c, -s], [s, c]]) @ MOUNT[:2]
+    total = 0.0
+    for (r, b), tag, there in zip(*map(np.asarray, scan), strict=True):
+        if not there:
+            continue
+        if tag < 0:
+            total += min(edge, gate)
+            continue
+        dx, dy = np.asarray(WORLD.landmarks)[tag] - eye
+        turn = b - (np.arctan2(dy, dx) - pose[2] - MOUNT[2])
+        turn = (turn + np.pi) % (2 * np.pi) - np.pi
+        total += min(((r - np.hypot(dx, dy)) / 0.3) ** 2 + (turn / 0.1) ** 2, gate)
+    return total
+
+
+@pytest.mark.parametrize("gate", [math.inf, 16.0])
+def test_weights_are_the_scans_densities(gate):
+    _, log = history(1)
+    scan = jax.tree.map(lambda x: x[0], log.scan)
+    tag = scan.tag.at[2].set(-1)
+    scan = Scan(scan.z.at[4].add(jnp.array([3.0, 0.0])), tag, scan.valid.at[5].set(False))
+    filter = of(30, BLUNT, gate=None if gate == math.inf else gate)
+    start = filter.init(jnp.zeros(3), jnp.diag(jnp.array([0.3, 0.3, 0.2])) ** 2)
+    after, info = jax.jit(filter.update)(start, scan, KEY)
+    assert len(np.unique(after.pose[:, 0])) == 30  # drawn, each for itself
+    edge = {} if gate == math.inf else {"edge": gate}
+    off = np.array([by_hand(p, scan, gate, **edge) for p in np.asarray(after.pose)])
+    w = np.exp(-0.5 * (off - off.min()))
+    np.testing.assert_allclose(np.exp(after.log_weight), w / w.sum(), rtol=1e-9)
+    best = int(after.best)
+    assert best == np.argmax(w)
+    wanted = [Status.FUSED] * 6
+    wanted[2], wanted[5] = Status.UNMATCHED, Status.EMPTY
+    if gate == 16.0 and info.nis[4] > 16:
+        wanted[4] = Status.REJECTED
+    np.testing.assert_array_equal(info.status, wanted)
+    np.testing.assert_allclose(info.ess, w.sum() ** 2 / (w**2).sum(), rtol=1e-9)
+    # the average of how well they fit, by 5 places
+    np.testing.assert_allclose(after.fast, np.exp(-off / 10).mean(), rtol=1e-9)
+    np.testing.assert_allclose(after.slow, after.fast)
+
+
+def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
+    truth, log = history(8)
+    blind = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
+    likeliest = association.maximum_likelihood(1e6)
+    trace = drive(of(60, BLUNT, associate=likeliest), blind, cov=np.diag([0.1, 0.1, 0.05]) ** 2)
+    np.testing.assert_array_equal(trace.info.slot, log.scan.tag)
+    assert np.linalg.norm(trace.estimate.pose[-1, :2] - truth.pose[-1, :2]) < 0.3
+
+
+def test_absolute_sensors_of_a_suite_weigh_too():
+    eyes = suite((BLUNT, 6), Part(sensors.compass(np.array([[0.04]])), 1))
+    _, log = history(1)
+    scan = jax.tree.map(lambda x: x[0], log.scan)
+    whole = Scan(
+        jnp.concatenate([scan.z, jnp.array([[0.3, 0.0]])]),
+        jnp.append(scan.tag, jnp.int32(-1)),
+        jnp.append(scan.valid, True),
+    )
+    filter = of(20, eyes)
+    start = filter.init(jnp.zeros(3), jnp.diag(jnp.array([0.3, 0.3, 0.4])) ** 2)
+    after, info = jax.jit(filter.update)(start, whole, KEY)
+    pose = np.asarray(after.pose)
+    off = np.array([by_hand(p, scan) for p in pose]) + (0.3 - pose[:, 2]) ** 2 / 0.04
+    w = np.exp(-0.5 * (off - off.min()))
+    np.testing.assert_allclose(np.exp(after.log_weight), w / w.sum(), rtol=1e-9)
+    np.testing.assert_array_equal(info.dof, [2] * 6 + [1])
+    np.testing.assert_array_equal(info.status, [Status.FUSED] * 7)
+    assert filter.places == (6, 1)
+
+
+# --- from anywhere, and carried away --------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def carried(quick_compilation):
+    """A robot anywhere, put down elsewhere after 40 steps: error [m] (runs, T), both filters."""
+    first, second = (
+        history(40, pose, seed) for pose, seed in (((0.5, 1.0, 2.0), 1), ((1.5, 2.5, -2.0), 2))
+    )
+    log = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first[1], second[1])
+    truth = np.concatenate([first[0].pose, second[0].pose])
+    lost = of(1000, BLUNT, box=BOX, start="uniform")
+    keys = jax.random.split(KEY, 6)
+    go = jax.jit(jax.vmap(lambda key: run(lost, log, np.zeros(3), np.zeros((3, 3)), key)))
+    ours = go(keys)
+    ekf = localization(WORLD.motion, BLUNT, WORLD.landmarks, gate=16.0)
+    theirs = drive(ekf, log, (0.5, 1.0, 2.0))  # which is told where it starts
+    off = np.linalg.norm(np.asarray(ours.estimate.pose)[:, :, :2] - truth[:, :2], axis=2)
+    ekf_off = np.linalg.norm(np.asarray(theirs.estimate.pose)[:, :2] - truth[:, :2], axis=1)
+    return ours, off, ekf_off
+
+
+def test_a_robot_that_may_be_anywhere_is_found(carried):
+    _, off, _ = carried
+    assert (off[:, 30:40].max(axis=1) < 0.6).all()
+
+
+def test_a_kidnapped_robot_is_found_again_and_by_the_ekf_it_is_not(carried):
+    ours, off, ekf_off = carried
+    assert (off[:, 41] > 1.0).all()
+    assert (off[:, 72:].max(axis=1) < 0.6).sum() >= 5
+    assert ekf_off[39] < 0.3
+    assert ekf_off[40:].min() > 1.0
+    injected = np.asarray(ours.info.injected)
+    assert (injected[:, 41:60].sum(axis=1) > 0).all()
+    assert injected[:, 42:60].sum() > 5 * injected[:, 22:40].sum()
+
+
+def test_the_number_of_particles_follows_the_uncertainty(carried):
+    ours, _, _ = carried
+    active = np.asarray(ours.info.active)
+    assert (active[:, 0] == 1000).all()
+    assert (np.median(active[:, 10:40], axis=1) < 200).all()
+    assert (active >= 50).all() and (active <= 1000).all()
+    # all that is in use weighs, and nothing else
+    weight = np.asarray(ours.final.log_weight)
+    for row, count in zip(weight, np.asarray(ours.final.active), strict=True):
+        assert np.isneginf(row[count:]).all()
+        np.testing.assert_allclose(np.exp(row[:count]).sum(), 1.0, rtol=1e-9)
+    poses = np.asarray(ours.final.pose)
+    assert np.isfinite(poses).all()
+
+
+def test_what_is_not_in_use_is_inert():
+    _, log = history(2)
+    filter = of(40, BLUNT, threshold=0.0)
+    state = filter.init(jnp.zeros(3), jnp.diag(jnp.array([0.1, 0.1, 0.05])) ** 2)
+    start = jax.jit(lambda s: filter.predict(s, log.control[0], KEY))(state)
+    even = jnp.where(jnp.arange(40) < 25, -math.log(25), -jnp.inf)
+    start = start._replace(active=jnp.int32(25), log_weight=even)
+    other = start._replace(pose=start.pose.at[25:].set(jnp.array([7.0, -9.0, 1.0])))
+    scan = jax.tree.map(lambda x: x[1], log.scan)
+
+    @jax.jit
+    def go(state):
+        state = filter.predict(state, log.control[1], KEY)
+        state, info = filter.update(state, scan, KEY)
+        return info, filter.estimate(state), state.log_weight
+
+    jax.tree.map(np.testing.assert_array_equal, go(start), go(other))
+
+
+# --- particles that are no use ------------------------------------------------------------------
+
+
+def breaking(level):
+    """A motion that loses the pose of those whose noise is above level."""
+
+    def step(pose, u, w):
+        moved = WORLD.motion.step(pose, u, w)
+        return jnp.where(w[0] > level, jnp.nan, moved)
+
+    return dataclasses.replace(WORLD.motion, step=step)
+
+
+@pytest.mark.parametrize("kind", ["localization", "fastslam"])
+def test_poses_that_are_not_finite_weigh_nothing_and_are_counted(kind):
+    _, log = history(3)
+
+    @jax.jit
+    def go(level):
+        if kind == "localization":
+            filter = of(16, BLUNT, breaking(level))
+        else:
+            filter = fastslam(breaking(level), BLUNT, 6, 16, proposal="motion")
+        probe = lambda s: (s.pose, s.log_weight)  # noqa: E731
+        return run(filter, log, np.zeros(3), np.zeros((3, 3)), KEY, probe=probe)
+
+    some, every = go(0.0), go(-9.0)
+    for trace in (some, every):
+        for leaf in jax.tree.leaves((trace.estimate, trace.info, trace.probe[0])):
+            assert np.isfinite(np.asarray(leaf, float)).all()
+    invalid = np.asarray(some.info.invalid)
+    assert ((invalid > 0) & (invalid < 16)).all()
+    assert not np.any(some.info.underflow)
+    if kind == "localization":  # whose weights are those before resampling
+        np.testing.assert_array_equal((np.exp(some.probe[1]) == 0).sum(axis=1), invalid)
+    np.testing.assert_array_equal(every.info.invalid, 16)
+    assert np.all(every.info.underflow)
+    np.testing.assert_allclose(np.exp(every.probe[1]), 1 / 16)
+    np.testing.assert_array_equal(every.estimate.pose, 0.0)  # as before
+
+
+def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
+    scan = Scan(jnp.array([[1e200, 0.0]]), jnp.array([0], jnp.int32), jnp.array([True]))
+    filter = of(4, BLUNT)
+    start = filter.init(jnp.zeros(3), 0.01 * jnp.eye(3))
+    after, info = jax.jit(filter.update)(start, scan, KEY)
+    assert info.underflow
+    np.testing.assert_allclose(np.exp(after.log_weight), 0.25)
+    np.testing.assert_array_equal(info.status, [Status.REJECTED])
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((info, filter.estimate(after))))
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_without_any_noise_or_with_one_particle_it_is_dead_reckoning(count):
+    """A proposal without spread, from a start without any: all particles are one."""
+    _, log = history(5)
+    trace = drive(of(count, BLUNT, motion.increment(np.zeros((2, 2)))), log)
+    pose = np.zeros(3)
+    for u, ours in zip(np.asarray(log.control), np.asarray(trace.estimate.pose), strict=True):
+        pose = np.asarray(WORLD.motion.step(jnp.asarray(pose), jnp.asarray(u), jnp.zeros(2)))
+        np.testing.assert_allclose(ours, pose, atol=1e-12)
+    np.testing.assert_allclose(trace.estimate.pose_cov, 0.0, atol=1e-24)
+    assert not np.any(trace.info.underflow)
+    np.testing.assert_array_equal(trace.info.active, count)
+
+
+# --- the house ----------------------------------------------------------------------------------
+
+
+def test_the_start_is_reported_before_anything_is_drawn():
+    cov = np.diag([0.1, 0.2, 0.3])
+    state = of(5).init(jnp.array([1.0, 2.0, 3.0]), jnp.asarray(cov))
+    out = of(5).estimate(state)
+    np.testing.assert_allclose(out.pose, [1, 2, 3], atol=1e-12)
+    np.testing.assert_allclose(out.pose_cov, cov, atol=1e-12)
+    anywhere = of(5, box=BOX, start="uniform")
+    out = anywhere.estimate(anywhere.init(jnp.ones(3), jnp.zeros((3, 3))))
+    np.testing.assert_allclose(out.pose, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(out.pose_cov, np.diag([64, 64, 4 * np.pi**2]) / 12, rtol=1e-12)
+    draws = np.asarray(cloud.uniform(jnp.asarray(BOX), 20000, KEY))
+    assert (draws[:, :2] > BOX[0]).all() and (draws[:, :2] < BOX[1]).all()
+    np.testing.assert_allclose(np.cov(draws.T), out.pose_cov, atol=0.15)
+
+
+def test_runs_of_a_batch_know_nothing_of_each_other_and_float32_stays_float32():
+    _, log = history(4)
+    filter = of(30, BLUNT, box=BOX)
+    go = jax.jit(lambda log, key: run(filter, log, np.zeros(3), np.eye(3) * 0.01, key))
+    keys = jax.random.split(KEY, 2)
+    batch = jax.jit(jax.vmap(go, (None, 0)))
+    both, swapped = batch(log, keys), batch(log, keys[::-1])
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[::-1]), both, swapped)
+    assert np.all(both.final.pose[0] != both.final.pose[1])
+    single = jax.tree.map(lambda x: x.astype("f4") if x.dtype == float else x, log)
+    for leaf in jax.tree.leaves(jax.eval_shape(go, single, KEY)):
+        assert leaf.dtype != np.float64
+
+
+def test_gradients_are_finite_from_a_start_that_is_known_exactly():
+    _, log = history(3)
+
+    def cost(sigma):
+        move = motion.increment(jnp.diag(sigma[:2]) ** 2)
+        sensor = sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2), mount=MOUNT)
+        filter = of(12, sensor, move, resample=resampling.stop_gradient(), box=BOX)
+        trace = run(filter, log, np.zeros(3), np.zeros((3, 3)), KEY)
+        return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()
+
+    slope = jax.jit(jax.grad(cost))(np.array([0.01, 0.04, 0.3]))
+    assert np.isfinite(slope).all()
+    assert np.all(slope != 0)
+
+
+BAD = {
+    "none": ({"particles": 0}, "particles: expected an integer"),
+    "half": ({"particles": 2.5}, "particles: expected an integer"),
+    "least": ({"least": 0}, "least: expected an integer"),
+    "more": ({"least": 6}, "least <= particles = 5"),
+    "map": ({"landmarks": np.zeros((3, 3))}, "particle_localization: expected landmarks of shape"),
+    "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
+    "start": ({"start": "anywhere"}, 'start "gaussian" or "uniform"'),
+    "no box": ({"start": "uniform"}, "needs a box"),
+    "box": ({"box": [[0, 0, 0], [1, 1, 1]]}, r"a box of shape \(2, 2\)"),
+    "inside out": ({"box": [[1, 1], [0, 2]]}, "a box of"),
+    "threshold": ({"threshold": 1.5}, "threshold from 0 to 1"),
+    "gate": ({"gate": 0.0}, "gate above 0"),
+    "bins": ({"bins": (0.5, 0.0, 0.1)}, "three sizes above 0"),
+    "error": ({"error": 0.0}, "error above 0"),
+    "confidence": ({"confidence": 1.0}, "confidence between 0 and 1"),
+    "forget": ({"forget": (0.2, 0.1)}, "0 < slow <= fast <= 1"),
+    "slack": ({"slack": 0.0}, "slack above 0"),
+    "resample": ({"resample": "systematic"}, "resample to be a function"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_refused(case):
+    change, why = BAD[case]
+    options = {"landmarks": WORLD.landmarks, "particles": 5} | change
+    with pytest.raises(ValueError, match=why):
+        particle_localization(
+            WORLD.motion,
+            WORLD.sensor,
+            options.pop("landmarks"),
+            options.pop("particles"),
+            **options,
+        )

@@ -1,0 +1,239 @@
+"""Rays that become points: the same map in fewer parameters, and the same filter from then on."""
+
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import charts, motion, run, sensors, slots
+from jaxslam.charts import right_invariant
+from jaxslam.filters import compressed_ekf_slam, ekf_slam
+from jaxslam.filters.reduction import ready, reduce
+from jaxslam.linearize import unscented
+from jaxslam.protocols import Basis
+from jaxslam.types import Log, Scan, Status
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+MOTION = motion.increment(np.diag([0.02, 0.02]) ** 2)
+NOISE = np.array([[0.01**2]])
+POINTS = np.array([[4.0, 2.0], [3.0, -3.0], [7.0, 4.0]])
+
+
+def camera(**options):
+    return sensors.bearing_inverse_depth(NOISE, min_distance=1.0, **options)
+
+
+@cache
+def a_log(steps=40, seed=0, dtype=np.float64):
+    """A robot on a bend that sees the direction of POINTS."""
+    rng = np.random.default_rng(seed)
+    sensor, pose, rows = sensors.bearing_only(NOISE, free=((1.0,), ((1.0,),))), np.zeros(3), []
+    for _ in range(steps):
+        pose = np.asarray(MOTION.step(pose, np.array([0.2, 0.05]), rng.normal(size=2) * 0.02))
+        z = np.asarray(jax.vmap(sensor.observe, (None, 0))(pose, POINTS))
+        rows.append(z + 0.01 * rng.normal(size=z.shape))
+    tag = np.tile(np.arange(3, dtype=np.int32), (steps, 1))
+    control = np.tile([0.2, 0.05], (steps, 1)).astype(dtype)
+    return Log(control, Scan(np.array(rows, dtype), tag, np.ones((steps, 3), bool)))
+
+
+def driven(filter, log):
+    dtype = log.control.dtype
+    start = jnp.zeros(3, dtype), jnp.zeros((3, 3), dtype), jax.random.key(0)
+    return jax.jit(lambda log: run(filter, log, *start))(log)
+
+
+CHARTS = {"euclidean": charts.euclidean, "right_invariant": lambda: right_invariant(rays=True)}
+
+
+@cache
+def joint_of(name="euclidean", square_root=False):
+    """The state of a filter on rays after 15 steps, with room for points."""
+    options = {"chart": CHARTS[name](), "square_root": square_root, "watch": True}
+    return driven(ekf_slam(MOTION, camera(to_point=1e-9), 4, **options), a_log(15)).final
+
+
+@pytest.mark.parametrize("square_root", [False, True])
+@pytest.mark.parametrize("name", CHARTS)
+def test_the_covariance_goes_through_the_derivative_of_position(name, square_root):
+    chart, sensor = CHARTS[name](), camera(to_point=0.1)
+    joint = joint_of(name, square_root)
+    which = jnp.array([True, False, True, False])
+    less = reduce(joint, which, sensor, square_root)
+
+    # Brute force: retract by all errors, take positions, ask the chart of points for their errors.
+    of_points = charts.REGISTRY[name]()
+
+    def errors(xi):
+        rows = xi[3:].reshape(4, 4)
+        pose, moved = jax.vmap(chart.retract, (None, 0, None, 0))(
+            joint.pose, joint.landmarks, xi[:3], rows
+        )
+        points, points0 = (
+            jax.vmap(sensor.position)(moved),
+            jax.vmap(sensor.position)(joint.landmarks),
+        )
+        dx, dl = jax.vmap(of_points.local, (None, 0, None, 0))(joint.pose, points0, pose[0], points)
+        own = jnp.where(which[:, None], jnp.pad(dl, [(0, 0), (0, 2)]), rows)
+        return jnp.concatenate([dx[0], own.reshape(-1)])
+
+    slope = np.asarray(jax.jacfwd(errors)(jnp.zeros(19)))
+    full = np.asarray(joint.cov @ joint.cov.T if square_root else joint.cov)
+    expected = slope @ full @ slope.T
+    freed = [3 + 4 * slot + k for slot in (0, 2) for k in (2, 3)]
+    expected[freed, freed] = 1.0
+    actual = np.asarray(less.cov @ less.cov.T if square_root else less.cov)
+    np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(less.landmarks[0, :2], sensor.position(joint.landmarks[0]))
+    np.testing.assert_array_equal(less.landmarks[0, 2:], [0, 0])
+    np.testing.assert_array_equal(less.landmarks[1], joint.landmarks[1])
+    np.testing.assert_array_equal(less.reduced, which)
+    directions = slope @ np.asarray(joint.watch.directions)
+    np.testing.assert_allclose(less.watch.directions, directions, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("square_root", [False, True])
+def test_nothing_to_reduce_changes_nothing(square_root):
+    joint = joint_of("euclidean", square_root)
+    same = reduce(joint, jnp.zeros(4, bool), camera(to_point=0.1), square_root)
+    for a, b in zip(jax.tree.leaves(joint), jax.tree.leaves(same), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("options", [{}, {"linearize": unscented()}, {"update": "joint"}])
+def test_a_reduced_map_is_filtered_as_one_of_points(options):
+    """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
+    log, sensor = a_log(), camera(to_point=0.1)
+    start = reduce(joint_of(), jnp.array([1, 1, 1, 0], bool), sensor, False)
+    # Without a watch, and never to be reduced again.
+    start = start._replace(watch=())
+    keep = np.r_[0:3, np.arange(3, 19).reshape(4, 4)[:, :2].reshape(-1)]
+    point = slots.Joint(
+        start.pose,
+        start.landmarks[:, :2],
+        start.cov[np.ix_(keep, keep)],
+        start.alive,
+        start.tag,
+        start.lin,
+    )
+    of_points = sensors.bearing_only(NOISE, free=((1.0,), ((1.0,),)))
+    finals = []
+    for state, model in ((start, sensor), (point, of_points)):
+        filter = ekf_slam(MOTION, model, 4, **options)
+
+        @jax.jit
+        def step(state, row, filter=filter):
+            state = filter.predict(state, row.control, jax.random.key(0))
+            return filter.update(state, row.scan, jax.random.key(0))
+
+        for t in range(15, 25):
+            state, info = step(state, jax.tree.map(lambda leaf, t=t: jnp.asarray(leaf[t]), log))
+        finals.append((state, filter.estimate(state), info))
+    (wide, estimate, info), (narrow, expected, plain) = finals
+    # Sigma points of 7 variables are not those of 5.
+    near = {"rtol": 1e-5, "atol": 1e-8} if "linearize" in options else {"rtol": 1e-8, "atol": 1e-12}
+    np.testing.assert_allclose(wide.pose, narrow.pose, **near)
+    np.testing.assert_allclose(wide.cov[np.ix_(keep, keep)], narrow.cov, **near)
+    for name in ("pose_cov", "points", "point_covs"):
+        a, b = getattr(estimate, name), getattr(expected, name)
+        np.testing.assert_allclose(a[:3], b[:3], **near)
+    np.testing.assert_allclose(info.nis, plain.nis, rtol=10 * near["rtol"])
+    # What was freed stays inert.
+    rest = np.setdiff1d(np.arange(19), keep)
+    np.testing.assert_array_equal(wide.cov[np.ix_(rest, rest)], np.eye(len(rest)))
+    np.testing.assert_array_equal(wide.cov[np.ix_(rest, keep)], 0)
+
+
+@pytest.mark.parametrize("square_root", [False, True])
+@pytest.mark.parametrize("name", CHARTS)
+def test_a_run_turns_rays_into_points_where_the_index_allows(name, square_root):
+    options = {"chart": CHARTS[name](), "square_root": square_root}
+    sensor = camera(to_point=0.1)
+    trace = driven(ekf_slam(MOTION, sensor, 4, **options), a_log())
+    became = np.asarray(trace.info.reduced)
+    assert became.sum() >= 2
+    assert became.sum(axis=0).max() == 1  # once a slot
+    np.testing.assert_array_equal(became.any(axis=0), trace.final.reduced)
+    assert (trace.info.status != Status.REJECTED).all()
+    last = jax.tree.map(lambda leaf: leaf[-1], trace.estimate)
+    off = np.linalg.norm(np.asarray(last.points[:3]) - POINTS, axis=1)
+    spread = np.sqrt(np.asarray(jnp.trace(last.point_covs[:3], axis1=1, axis2=2)))
+    assert (off < 3 * spread).all(), (off, spread)
+    # A conversion is no news: estimates go on where they would have.
+    never = driven(ekf_slam(MOTION, camera(), 4, **options), a_log())
+    np.testing.assert_allclose(trace.estimate.pose, never.estimate.pose, atol=0.02)
+
+
+def index_of(pose, landmark, sigma):
+    """Civera, Davison & Montiel's L_d, from their picture."""
+    direction = np.array([np.cos(landmark[2]), np.sin(landmark[2])])
+    point = landmark[:2] + direction / landmark[3]
+    sight = point - pose[:2]
+    distance = np.linalg.norm(sight)
+    return 4 * sigma / landmark[3] ** 2 / distance * abs(sight @ direction) / distance
+
+
+def test_the_index_is_that_of_the_paper():
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        pose = rng.normal(size=3)
+        landmark = np.array([*rng.normal(size=2), rng.uniform(-3, 3), rng.uniform(0.05, 1)])
+        sigma = rng.uniform(0.001, 0.1)
+        cov = np.diag([1.0, 2.0, 3.0, sigma**2])
+        index = index_of(pose, landmark, sigma)
+        for factor, expected in ((1.001, True), (0.999, False)):
+            yes = camera(to_point=float(index * factor)).reduced.ready(pose, landmark, cov)
+            assert bool(yes) == expected
+
+
+def test_rays_to_infinity_and_beyond_stay_rays():
+    known = np.diag([1e-6, 1e-6, 1e-6, 1e-12])
+    test = camera(to_point=10.0).reduced.ready
+    for inverse in (0.0, -0.1):
+        assert not test(np.zeros(3), np.array([0.0, 0.0, 0.3, inverse]), known)
+    # … and a robot that stands at the landmark has no index.
+    assert not test(np.array([2.0, 0, 0]), np.array([0.0, 0, 0, 0.5]), known)
+
+
+def test_dead_and_reduced_slots_are_not_ready():
+    sensor = camera(to_point=1e6)
+    joint = joint_of()
+    np.testing.assert_array_equal(ready(joint, sensor, False), [True, True, True, False])
+    less = reduce(joint, jnp.array([True, False, False, False]), sensor, False)
+    np.testing.assert_array_equal(ready(less, sensor, False), [False, True, True, False])
+    gone = slots.remove(less, jnp.array([True, False, False, False]))
+    assert not gone.reduced.any()
+
+
+def test_gradients_and_float32():
+    log = a_log(12, dtype=np.float32)
+
+    def last(sigma):
+        sensor = sensors.bearing_inverse_depth(sigma[None, None] ** 2, to_point=1.0)
+        trace = driven(ekf_slam(MOTION, sensor, 3), log)
+        return trace.estimate.pose[-1].sum() + trace.estimate.points.sum(), trace
+
+    (_, trace), slope = jax.jit(jax.value_and_grad(last, has_aux=True))(jnp.float32(0.01))
+    assert np.isfinite(slope) and slope != 0
+    assert trace.final.cov.dtype == jnp.float32
+    assert trace.info.reduced.any()
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="to_point above 0"):
+        camera(to_point=0.0)
+    turning = dataclasses.replace(
+        right_invariant(rays=True), basis=lambda x, y: Basis(jnp.eye(3), y[:, None], jnp.eye(4))
+    )
+    with pytest.raises(ValueError, match="must not turn with the robot"):
+        ekf_slam(MOTION, camera(to_point=0.1), 4, chart=turning)
+    with pytest.raises(ValueError, match="does not act on the 4-parameter"):
+        ekf_slam(MOTION, camera(), 4, chart=right_invariant())
+    with pytest.raises(ValueError, match="does not act on the 2-parameter"):
+        ekf_slam(MOTION, sensors.range_bearing(np.eye(2)), 4, chart=right_invariant(rays=True))
+    with pytest.raises(ValueError, match="become points"):
+        compressed_ekf_slam(MOTION, camera(to_point=0.1), 8, area=4)

@@ -1,0 +1,113 @@
+"""Resampling: every method is unbiased, keeps to its own bound, and survives weights that do not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam.resampling import REGISTRY
+from jaxslam.resampling.weights import at_points, effective_size, normalized, weights_of
+
+WEIGHTS = np.array([0.02, 0.0, 0.35, 0.1, 0.03, 0.25, 0.05, 0.2])
+
+
+def copies(method, log_weights, runs, seed=0):
+    """How often each particle was chosen, (runs, P)."""
+    keys = jax.random.split(jax.random.key(seed), runs)
+    chosen = jax.jit(jax.vmap(method, (None, 0)))(jnp.asarray(log_weights), keys)
+    count = len(log_weights)
+    assert chosen.shape == (runs, count)
+    assert chosen.dtype == jnp.int32
+    return (np.asarray(chosen)[:, :, None] == np.arange(count)).sum(axis=1)
+
+
+@pytest.fixture(params=sorted(REGISTRY))
+def named(request):
+    return request.param, REGISTRY[request.param]
+
+
+def test_the_expected_number_of_copies_is_the_weight(named):
+    """Against P w_j, within 5 standard errors of the multinomial, which has the most variance."""
+    _, method = named
+    with np.errstate(divide="ignore"):
+        found = copies(method, np.log(WEIGHTS) + 700.0, runs=4000)  # of any scale
+    count = len(WEIGHTS)
+    error = np.sqrt(count * WEIGHTS * (1 - WEIGHTS) / 4000)
+    assert np.all(np.abs(found.mean(axis=0) - count * WEIGHTS) <= 5 * error)
+    assert np.all(found[:, 1] == 0)
+
+
+def test_each_keeps_its_bound_on_the_number_of_copies(named):
+    name, method = named
+    with np.errstate(divide="ignore"):
+        found = copies(method, np.log(WEIGHTS), runs=500)
+    share = len(WEIGHTS) * WEIGHTS
+    if name == "systematic":
+        assert np.all(found >= np.floor(share))
+        assert np.all(found <= np.ceil(share))
+    elif name == "residual":
+        assert np.all(found >= np.floor(share))
+    elif name == "stratified":
+        assert np.all(np.abs(found - share) < 2)
+    else:  # the variance of the plain bootstrap, within a fifth
+        np.testing.assert_allclose(found.var(axis=0), share * (1 - WEIGHTS), rtol=0.2)
+
+
+def test_one_particle_goes_on(named):
+    _, method = named
+    for log_weight in (0.0, -1e300, -np.inf, np.nan):
+        assert np.asarray(method(jnp.array([log_weight]), jax.random.key(0))) == [0]
+
+
+def test_where_all_underflow_all_weigh_the_same(named):
+    name, method = named
+    for lost in (-np.inf, np.nan):
+        found = copies(method, np.full(6, lost), runs=2000)
+        np.testing.assert_allclose(found.mean(axis=0), 1.0, atol=0.12)
+        if name in ("systematic", "residual", "stratified"):
+            assert np.all(found == 1)
+
+
+def test_what_is_not_finite_is_not_chosen(named):
+    _, method = named
+    found = copies(method, np.array([-np.inf, 0.0, np.nan, np.inf, 0.0]), runs=200)
+    assert np.all(found[:, [0, 2, 3]] == 0)
+
+
+def test_all_of_the_weight_on_one(named):
+    _, method = named
+    found = copies(method, np.array([-1e5, 0.0, -1e5, -1e5]), runs=50)
+    assert np.all(found == [0, 4, 0, 0])
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+def test_both_precisions_many_particles(named, dtype):
+    _, method = named
+    log_weights = jnp.asarray(np.random.default_rng(0).normal(size=5000), dtype)
+    ancestors = jax.jit(method)(log_weights, jax.random.key(1))
+    assert ancestors.dtype == jnp.int32
+    assert np.all((ancestors >= 0) & (ancestors < 5000))
+    np.testing.assert_array_equal(ancestors, method(log_weights, jax.random.key(1)))
+
+
+def test_normalized_weights_against_plain_arithmetic():
+    log_weights = np.array([-1000.0, -1001.0, -np.inf, -999.5])
+    w = np.exp(log_weights + 1000)
+    out, total, some = normalized(jnp.asarray(log_weights))
+    np.testing.assert_allclose(np.exp(out), w / w.sum(), rtol=1e-13)
+    np.testing.assert_allclose(total, np.log(w.sum()) - 1000, rtol=1e-14)
+    assert some
+    np.testing.assert_allclose(effective_size(out), w.sum() ** 2 / (w**2).sum(), rtol=1e-13)
+    np.testing.assert_allclose(weights_of(jnp.full(4, jnp.nan)), 0.25)
+
+
+def test_gradients_of_the_weights_are_finite():
+    """Also where some or all weigh nothing."""
+    for log_weights in ([0.0, -np.inf, -3.0], [-np.inf] * 3, [0.0, np.nan, -1e308]):
+        slope = jax.grad(lambda x: normalized(x)[1] + effective_size(x))(jnp.array(log_weights))
+        assert np.all(np.isfinite(slope))
+
+
+def test_points_rounded_to_one_choose_the_last_that_weighs():
+    weights = jnp.array([0.5, 0.5, 0.0])
+    np.testing.assert_array_equal(at_points(weights, jnp.array([0.0, 0.5, 1.0])), [0, 1, 1])

@@ -1,0 +1,423 @@
+"""The sparse information filter: every step against the dense formulas, and what it gives up."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import filters, sensors
+from jaxslam.filters import blankets, sparse_map
+from jaxslam.filters.recovery import relaxed
+from jaxslam.run import run
+from jaxslam.scenarios import cloister
+from jaxslam.scenarios.view import between_ranges
+from jaxslam.simulate import simulate
+from jaxslam.types import Status
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+KEY = jax.random.key(0)
+P0 = np.diag([0.1, 0.1, 0.05]) ** 2
+COUNT = 36
+
+
+@functools.cache
+def world(steps=40):
+    """Few landmarks in sight at a time, in the cloister; its log."""
+    scene = dataclasses.replace(
+        cloister(steps), visible=between_ranges(0.0, 2.2), places=8, pose_cov=P0
+    )
+    return scene, jax.jit(functools.partial(simulate, scene))(jax.random.key(1))[1]
+
+
+@functools.cache
+def made(active=10, links=COUNT - 1, **options):
+    scene, _ = world()
+    f = filters.seif(scene.motion, scene.sensor, COUNT, active=active, links=links, **options)
+    return f, jax.jit(f.predict), jax.jit(f.update)
+
+
+def start(f, dtype=float):
+    return f.init(jnp.asarray(world()[0].pose, dtype), jnp.asarray(P0, dtype))
+
+
+def driven(active=10, links=COUNT - 1, upto=40, **options):
+    f, predict, update = made(active, links, **options)
+    state = start(f)
+    for u, scan in rows(upto):
+        state, info = update(predict(state, u, KEY), scan, KEY)
+    return state, info
+
+
+def rows(upto=40):
+    log = world()[1]
+    for t in range(upto):
+        yield log.control[t], jax.tree.map(lambda leaf: leaf[t], log.scan)
+
+
+@jax.jit
+def dense(state):
+    return blankets.information_of(state, jnp.arange(state.own.shape[0]))
+
+
+def canonical(state):
+    """Ω and ξ of all, in NumPy."""
+    omega = np.asarray(dense(state))
+    mean = np.concatenate([state.pose, np.ravel(state.landmarks)])
+    return omega, omega @ mean + np.concatenate([state.owed_robot, np.ravel(state.owed)]), mean
+
+
+def picks(slots_, robot=False):
+    """F, (D, n): the columns of the unit matrix of robot and landmarks."""
+    at = [*range(3)] if robot else []
+    for s in slots_:
+        at += [3 + 2 * s, 4 + 2 * s]
+    return np.eye(3 + 2 * COUNT)[:, at]
+
+
+def projected(omega, f):
+    return omega @ f @ np.linalg.inv(f.T @ omega @ f) @ f.T @ omega
+
+
+def sparsified(omega, plus, zero):
+    """ERRATA's formula, by projections."""
+    f0 = picks([*plus, *zero], robot=True)
+    conditioned = f0 @ f0.T @ omega @ f0 @ f0.T
+    robot = picks([], robot=True)
+    return (
+        omega
+        - projected(conditioned, picks(zero))
+        + projected(conditioned, picks(zero, robot=True))
+        - projected(omega, robot)
+    )
+
+
+def h_of(pose, point):
+    dx, dy = point - pose[:2]
+    q = dx * dx + dy * dy
+    r = np.sqrt(q)
+    z = np.array([r, np.arctan2(dy, dx) - pose[2]])
+    h = np.array([[-dx / r, -dy / r, 0, dx / r, dy / r], [dy / q, -dx / q, -1, -dy / q, dx / q]])
+    return z, h
+
+
+def close(a, b, tolerance=1e-9):
+    scale = np.abs(b).max()
+    np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * scale)
+
+
+def test_every_step_is_the_dense_formula():
+    """Motion, sparsification, measurement and birth, in Ω and ξ, by dense NumPy."""
+    f, predict, update = made(active=10, passive=5)
+    relax = jax.jit(functools.partial(relaxed, share=5))
+    noise = np.diag([0.1, np.deg2rad(1.0)]) ** 2
+    state, cut, born = start(f), 0, 0
+    for u, scan in rows():
+        omega, xi, mean = canonical(state)
+        c, sine, d = np.cos(mean[2]), np.sin(mean[2]), float(u[0])
+        moved = predict(state, u, KEY)
+        g = np.eye(3 + 2 * COUNT)
+        g[:2, 2] = [-d * sine, d * c]
+        by_noise = np.array([[c, 0.0], [sine, 0.0], [0.0, 1.0]])
+        q = by_noise @ np.diag([0.01, 0.02]) ** 2 @ by_noise.T
+        phi = np.linalg.inv(g).T @ omega @ np.linalg.inv(g)
+        cov = np.linalg.inv(phi)
+        cov[:3, :3] += q
+        after = np.linalg.inv(cov)
+        there = np.linalg.solve(omega, xi) - mean  # the mean, as an error
+        there = g @ there + np.concatenate([moved.pose, np.ravel(moved.landmarks)])
+        omega_bar, xi_bar, _ = canonical(moved)
+        close(omega_bar, after)
+        close(xi_bar, after @ there, 1e-8)
+        # mean recovery moves μ and leaves Ω and ξ
+        state = relax(moved)
+        omega, xi, mean = canonical(state)
+        close(omega, omega_bar, 1e-12)
+        close(xi, xi_bar, 1e-12)
+        # the scan
+        after_scan, info = update(moved, scan, KEY)
+        old, new = (set(np.asarray(s.slot)) - {COUNT} for s in (state, after_scan))
+        gone = sorted(old - new)
+        if gone:
+            cut += 1
+            less = sparsified(omega, sorted(old & new), gone)
+            assert np.linalg.eigvalsh(less)[0] > 0
+            assert np.abs(less[:3][:, [3 + 2 * s for s in gone]]).max() < 1e-6 * np.abs(less).max()
+            xi = xi + (less - omega) @ mean
+            omega = less
+        for i in np.flatnonzero(np.asarray(info.status) == Status.FUSED):
+            s = int(scan.tag[i])
+            expected, h = h_of(mean[:3], mean[3 + 2 * s : 5 + 2 * s])
+            wide = h @ picks([s], robot=True).T
+            nu = np.asarray(scan.z[i]) - expected
+            nu[1] = np.angle(np.exp(1j * nu[1]))
+            omega = omega + wide.T @ np.linalg.inv(noise) @ wide
+            xi = xi + wide.T @ np.linalg.inv(noise) @ (nu + wide @ mean)
+        mean = np.concatenate([after_scan.pose, np.ravel(after_scan.landmarks)])
+        for i in np.flatnonzero(np.asarray(info.status) == Status.BORN):
+            born += 1
+            s = int(scan.tag[i])
+            # of a landmark where it was measured, H and its noise say the same as g and its own
+            _, h = h_of(mean[:3], mean[3 + 2 * s : 5 + 2 * s])
+            wide = h @ picks([s], robot=True).T
+            unit = picks([s])
+            more = wide.T @ np.linalg.inv(noise) @ wide
+            omega = omega - unit @ unit.T + more
+            xi = xi + more @ mean
+        state = after_scan
+        omega_after, xi_after, _ = canonical(state)
+        close(omega_after, omega, 1e-8)
+        close(xi_after, xi, 1e-7)
+        assert int(state.counts.dropped) == 0
+    assert cut >= 2
+    assert born > 10
+    assert int(state.counts.cut) >= cut
+    assert float(state.counts.cut_nats) > 0
+
+
+def test_with_all_active_it_is_the_eif():
+    scene, log = world()
+    eif = filters.eif_slam(scene.motion, scene.sensor, COUNT)
+    sparse = filters.seif(scene.motion, scene.sensor, COUNT, active=99, links=COUNT - 1)
+    a, b = (jax.jit(lambda log, f=f: run(f, log, scene.pose, P0, KEY))(log) for f in (eif, sparse))
+    np.testing.assert_allclose(a.estimate.pose, b.estimate.pose, atol=1e-8)
+    np.testing.assert_allclose(a.estimate.pose_cov, b.estimate.pose_cov, atol=1e-8)
+    np.testing.assert_allclose(a.info.nis, b.info.nis, rtol=1e-6, atol=1e-8)
+    np.testing.assert_array_equal(a.info.status, b.info.status)
+    final = np.asarray(a.final.tag)
+    alive = np.flatnonzero(final >= 0)
+    for name in ("points", "point_covs"):
+        ours, theirs = getattr(b.estimate, name)[-1], getattr(a.estimate, name)[-1]
+        np.testing.assert_allclose(ours[final[alive]], theirs[alive], atol=1e-8)
+    assert int(b.final.counts.cut) == 0
+
+
+def test_mean_recovery_converges_to_the_whole_mean():
+    state, _ = driven()
+    pose, landmarks = blankets.whole_mean(state)
+    f, _, update = made(active=10, passive=COUNT)
+    _, scan = next(rows(1))
+    nothing = scan._replace(valid=jnp.zeros_like(scan.valid))
+    for _ in range(1500):
+        state, _ = update(state, nothing, KEY)
+    np.testing.assert_allclose(state.pose, pose, atol=1e-4)
+    alive = np.asarray(state.alive)
+    np.testing.assert_allclose(state.landmarks[alive], landmarks[alive], atol=1e-4)
+
+
+def test_whole_map_and_blankets():
+    state, _ = driven()
+    omega = blankets.whole_information(state).toarray()
+    np.testing.assert_allclose(omega, dense(state), atol=1e-12 * np.abs(omega).max())
+    cov = np.linalg.inv(omega)
+    found = np.asarray(jax.jit(blankets.marginals)(state)[1])
+    for slot in np.flatnonzero(state.alive):
+        at = [0, 1, 2, 3 + 2 * slot, 4 + 2 * slot]
+        local = np.asarray(blankets.local_cov(state, jnp.asarray(slot)))
+        # given more, it is less: never above the marginal covariance
+        assert np.linalg.eigvalsh(cov[np.ix_(at, at)] - local)[0] > -1e-9
+        np.testing.assert_allclose(found[slot], local[3:, 3:], atol=1e-12)
+        # and it is the inverse of the block of the blanket
+        row = np.asarray(state.neighbours[slot])
+        members = sorted({int(slot), *row[row < COUNT], *np.asarray(state.slot)} - {COUNT})
+        f = picks(members, robot=True)
+        inner = np.linalg.inv(f.T @ omega @ f)
+        k = 3 + 2 * members.index(slot)
+        at = [0, 1, 2, k, k + 1]
+        np.testing.assert_allclose(local, inner[np.ix_(at, at)], atol=1e-9)
+
+
+def test_sparsification_is_overconfident():
+    """Tacher's counter-example: Ω - Ω̃ is not positive semi-definite."""
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(9, 9))
+    omega = root @ root.T + 0.1 * np.eye(9)
+    gone = np.array([False, False, True])
+    after, nats = sparse_map.sparsified(jnp.asarray(omega), jnp.asarray(gone))
+    after = np.asarray(after)
+    assert np.linalg.eigvalsh(after)[0] > 0
+    assert np.abs(after[:3, 7:]).max() == 0
+    size = np.linalg.eigvalsh(omega - after)
+    assert size[0] < -1e-3  # claims more in some direction
+    assert size[-1] > 1e-3  # and less in another
+    # What it keeps: the moments of (x, m+) and of (m0, m+), hence all its own marginals.
+    a, b = np.linalg.inv(omega), np.linalg.inv(after)
+    np.testing.assert_allclose(a[:7, :7], b[:7, :7], atol=1e-10)
+    np.testing.assert_allclose(a[3:, 3:], b[3:, 3:], atol=1e-10)
+    # The nats are the divergence of the two.
+    divergence = 0.5 * (np.trace(after @ a) - 9 - np.linalg.slogdet(after @ a)[1])
+    np.testing.assert_allclose(nats, divergence, rtol=1e-9)
+    same, none = sparse_map.sparsified(jnp.asarray(omega), jnp.zeros(3, bool))
+    np.testing.assert_array_equal(same, omega)
+    assert float(none) == 0
+
+
+def test_sparsification_of_some_is_overconfident_about_the_rest():
+    """With passive landmarks held at their means, covariances of the whole map shrink."""
+    rng, smaller = np.random.default_rng(0), 0
+    for _ in range(20):
+        root = rng.normal(size=(3 + 2 * COUNT, 3 + 2 * COUNT))
+        omega = root @ root.T + np.eye(len(root))
+        f = picks([*range(8, COUNT)])
+        omega[:3] = np.where((f.sum(axis=1) > 0)[None, :], 0.0, omega[:3])
+        omega[:, :3] = omega[:3].T
+        omega += np.eye(len(omega)) * max(0.0, 0.1 - np.linalg.eigvalsh(omega)[0])
+        before, after = np.linalg.inv(omega), np.linalg.inv(sparsified(omega, range(6), [6, 7]))
+        smaller += np.linalg.eigvalsh(after - before)[0] < -1e-9
+    assert smaller == 20
+
+
+def test_springs():
+    rng = np.random.default_rng(0)
+    links = [*rng.normal(size=(20, 2, 2)), np.zeros((2, 2)), np.outer([1.0, 2.0], [3.0, 1.0])]
+    for link in links:
+        u, v = (np.asarray(part) for part in sparse_map.spring(jnp.asarray(link)))
+        np.testing.assert_allclose(u @ u, link @ link.T, atol=1e-12)
+        np.testing.assert_allclose(v @ v, link.T @ link, atol=1e-12)
+        assert np.linalg.eigvalsh(np.block([[u, link], [link.T, v]]))[0] > -1e-12
+    slope = jax.grad(lambda b: sparse_map.spring(b)[0].sum())(jnp.zeros((2, 2)))
+    assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("conservative", [False, True])
+def test_a_full_list_drops_its_weakest_link(conservative):
+    """Three links enter a list of two: the weakest goes, on both sides, and Ω̃ ⪰ Ω, or ⪯."""
+    state = sparse_map.empty(jnp.zeros(3), jnp.eye(3), 5, 1, 2)
+    state = state._replace(own=100.0 * state.own)
+    enter = jax.jit(
+        functools.partial(sparse_map.linked, conservative=conservative), static_argnames=()
+    )
+    link = jnp.asarray([[-2.0, 0.5], [0.1, -1.0]])
+    yes = jnp.asarray(True)
+    at = [jnp.asarray(k) for k in range(5)]
+    state = enter(state, at[0], at[1], 2 * link, yes)
+    state = enter(state, at[2], at[0], link, yes)
+    assert int(state.counts.dropped) == 0
+    before = np.array(dense(state))
+    np.testing.assert_array_equal(before[3:5, 7:9], np.asarray(link).T)
+    state = enter(state, at[0], at[3], 3 * link, yes)
+    after = np.asarray(dense(state))
+    assert sorted(np.asarray(state.neighbours[0])) == [1, 3]
+    assert np.all(np.asarray(state.neighbours[2]) == 5)
+    before[3:5, 9:11], before[9:11, 3:5] = 3 * link, 3 * link.T
+    change = np.linalg.eigvalsh(after - before)
+    assert (change[-1] < 1e-12) if conservative else (change[0] > -1e-12)
+    assert np.abs(change).max() > 1
+    # a link weaker than all that the list holds is not entered
+    state = enter(state, at[0], at[4], 0.1 * link, yes)
+    assert sorted(np.asarray(state.neighbours[0])) == [1, 3]
+    assert np.all(np.asarray(state.neighbours[4]) == 5)
+    assert int(state.counts.dropped) == 2
+    assert int(state.counts.anchored) == (0 if conservative else 2)
+    norm = np.linalg.norm(np.asarray(link))
+    np.testing.assert_allclose(state.counts.dropped_links, 1.1 * norm)
+    # where the conservative way would take too much, it is not taken
+    weak = state._replace(own=jnp.tile(0.5 * jnp.eye(2), (5, 1, 1)))
+    weak = enter(weak, at[0], at[4], 0.5 * link, yes)
+    assert int(weak.counts.anchored) == (1 if conservative else 3)
+
+
+def test_few_links_stay_definite_and_are_counted():
+    state, info = driven(active=10, links=8)
+    assert int(state.counts.dropped) > 0
+    assert int(state.counts.broken) == 0
+    omega = blankets.whole_information(state).toarray()
+    np.testing.assert_array_equal(omega, omega.T)
+    assert np.linalg.eigvalsh(omega)[0] > 0
+
+
+def test_statuses_of_strange_scans():
+    f, predict, update = made()
+    state, _ = driven(upto=10)
+    _, scan = list(rows(11))[-1]
+    tag = np.array(scan.tag)
+    there = np.flatnonzero(np.asarray(scan.valid))
+    tag[there[:2]] = [-1, COUNT + 3]
+    after, info = update(state, scan._replace(tag=jnp.asarray(tag)), KEY)
+    assert int(info.status[there[0]]) == Status.UNMATCHED
+    assert int(info.status[there[1]]) == Status.OVERFLOW
+    tag[there[0]] = tag[there[2]]
+    after, info = update(state, scan._replace(tag=jnp.asarray(tag)), KEY)
+    assert int(info.status[there[2]]) == Status.REPEATED
+    assert int(after.counts.broken) == 0
+
+
+def test_lost_definiteness_is_refused_and_counted():
+    f, predict, update = made()
+    state, _ = driven(upto=10)
+    _, scan = list(rows(11))[-1]
+    bad = state._replace(omega=state.omega.at[0, 0].set(-1.0))
+    after, info = update(bad, scan, KEY)
+    assert int(after.counts.broken) == 1
+    np.testing.assert_array_equal(after.pose, bad.pose)
+    status = np.asarray(info.status)[np.asarray(scan.valid)]
+    assert np.all(status == Status.SINGULAR)
+
+
+def test_float32_keeps_its_type_and_its_definiteness():
+    scene, log = world()
+    f, predict, update = made()
+
+    def narrow(tree):
+        return jax.tree.map(
+            lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, tree
+        )
+
+    state, wide = start(f, jnp.float32), start(f)
+    for u, scan in rows():
+        state, _ = update(predict(state, narrow(u), KEY), narrow(scan), KEY)
+        wide, _ = update(predict(wide, u, KEY), scan, KEY)
+    kinds = {leaf.dtype for leaf in jax.tree.leaves(state)}
+    assert kinds == {jnp.dtype("float32"), jnp.dtype("int32"), jnp.dtype("bool")}
+    assert int(state.counts.broken) == 0
+    np.testing.assert_allclose(state.pose, wide.pose, atol=1e-2)
+
+
+def test_gradients_and_batches():
+    scene, log = world()
+    short = jax.tree.map(lambda leaf: leaf[:12], log)
+
+    def loss(sigma):
+        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
+        f = filters.seif(scene.motion, sensor, COUNT, active=8, links=4, passive=2)
+
+        def step(state, row):
+            state, _ = f.update(f.predict(state, row[0], KEY), row[1], KEY)
+            return state, ()
+
+        return jax.lax.scan(step, start(f), tuple(short))[0].pose[:2].sum()
+
+    slope = jax.jit(jax.grad(loss))(0.1)
+    assert np.isfinite(slope) and abs(slope) > 0
+    several = jax.jit(jax.vmap(loss))(jnp.array([0.1, 0.2]))
+    alone = jax.jit(loss)(0.2)
+    np.testing.assert_allclose(several[1], alone, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"active": 0}, "active"),
+        ({"links": 0}, "links"),
+        ({"passive": 0}, "passive"),
+        ({"sweeps": 0}, "sweeps"),
+        ({"capacity": 0}, "capacity"),
+        ({"floor": -1.0}, "floor"),
+        ({"sensor": sensors.range_bearing_signature(0.01 * np.eye(3))}, "points"),
+    ],
+)
+def test_refusals(changes, message):
+    scene, _ = world()
+    options = {"motion": scene.motion, "sensor": scene.sensor, "capacity": COUNT}
+    with pytest.raises(ValueError, match=message):
+        filters.seif(**(options | {"active": 10, "links": 10} | changes))
+
+
+def test_an_area_smaller_than_a_scan_is_refused():
+    scene, log = world()
+    f = filters.seif(scene.motion, scene.sensor, COUNT, active=7, links=10)
+    with pytest.raises(ValueError, match="8 places, the active set holds 7"):
+        run(f, log, scene.pose, P0, KEY)

@@ -1,0 +1,342 @@
+"""Several robots in one map: against a plain reference, alone, unknown to each other, in campaigns."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference.team import Team
+from worlds import ring
+
+import jaxslam
+from jaxslam import charts, motion, sensors, team
+from jaxslam.filters import ekf_slam, entering, team_slam
+from jaxslam.scenarios import between_ranges
+from jaxslam.sensors import Part, suite
+from jaxslam.simulate import simulate
+from jaxslam.types import Log, Scan, Status
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+Q = np.diag([0.01, 0.01]) ** 2
+R1, R2 = np.diag([0.05, 0.02]) ** 2, np.diag([0.08, 0.03]) ** 2
+MOUNT = (0.1, -0.05, 0.3)
+STARTS = [
+    None,
+    ((0.8, 0.6, 1.0), np.diag([0.05, 0.05, 0.05]) ** 2),
+    ((-0.7, 1.5, -2.0), np.diag([0.05, 0.05, 0.05]) ** 2),
+]
+NOTHING = np.zeros((3, 3))
+
+
+def crew(count=2, mutual=True, reach=3.2):
+    eyes = sensors.range_bearing(R1, mount=MOUNT)
+    back = sensors.range_bearing(R2, mount=(0.0, 0.0, 3.0))
+    parts = [Part(eyes, 4, visible=between_ranges(0.0, reach)), Part(back, 2, every=3)]
+    if mutual and count > 1:
+        parts.append(Part(eyes, count - 1, every=2, sees="robots"))
+    return [team.Robot(motion.increment(Q), suite(*parts), start) for start in STARTS[:count]]
+
+
+def unknown(robots):
+    return [dataclasses.replace(robot, start=None) for robot in robots]
+
+
+def world(robots, steps=40, **options):
+    rng = np.random.default_rng(5)
+    around = 2 * np.pi * np.arange(8) / 8
+    radius = 3.0 + rng.uniform(-0.5, 0.5, 8)
+    points = np.stack([radius * np.cos(around), 1.0 + radius * np.sin(around)], axis=1)
+    turns = [4 * np.pi / 100, -0.1, 0.15][: len(robots)]
+    controls = np.tile(np.ravel([(0.12, turn) for turn in turns]), (steps, 1))
+    return team.world(robots, points, controls, **options)
+
+
+def go(filter, scenario, log, probe=None):
+    start = scenario.pose, scenario.pose_cov, jax.random.key(0)
+    return jax.jit(lambda log: jaxslam.run(filter, log, *start, probe=probe))(log)
+
+
+def as_reference(robots, log, tags):
+    """The log as (controls, scans) of the reference: scans[b] of (sensor, tag, z)."""
+    for control, z, tag, valid in zip(log.control, *log.scan, strict=True):
+        scans, at = [], 0
+        for robot in robots:
+            scan = []
+            for s, places in enumerate(robot.sensors.places):
+                scan += [
+                    (s, int(tag[k]), np.asarray(z[k])) for k in range(at, at + places) if valid[k]
+                ]
+                at += places
+            scans.append(scan)
+        yield np.asarray(control).reshape(len(robots), 2), scans
+
+
+def reference_of(robots, tags, scenario):
+    plain = [
+        {"Q": Q, "sensors": [(MOUNT, R1), ((0.0, 0.0, 3.0), R2), (MOUNT, R1)], "start": r.start}
+        for r in robots
+    ]
+    return Team(plain, tags, scenario.pose, scenario.pose_cov)
+
+
+def test_a_team_of_one_is_ekf_slam():
+    alone = ring(60)
+    log = simulate(alone, jax.random.key(0))[1]
+    one = team_slam([team.Robot(alone.motion, suite((alone.sensor, 6)))], 6)
+    a, b = (go(f, alone, log) for f in (ekf_slam(alone.motion, alone.sensor, 6), one))
+    pairs = zip(
+        jax.tree.leaves((a.estimate, a.info)), jax.tree.leaves((b.estimate, b.info)), strict=True
+    )
+    for left, right in pairs:
+        np.testing.assert_allclose(left, right, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("count", "way"), [(2, "known"), (2, "landmarks"), (2, "mutual"), (3, "mutual")]
+)
+def test_a_team_is_its_plain_reference(count, way):
+    """Means, covariances and cross-covariances of everything, step by step, to 1e-9."""
+    robots = crew(count)
+    scenario = world(robots, 30, pose=(0.5, -0.2, 0.1), pose_cov=np.diag([0.05, 0.05, 0.02]) ** 2)
+    _, log = simulate(scenario, jax.random.key(count))
+    tags = tuple(range(8, 8 + count))
+    if way != "known":
+        # At first the others see robots alone, or landmarks alone.
+        robots, places = unknown(robots), sum(robots[0].sensors.places)
+        of_robots = np.asarray(log.scan.tag) >= 8
+        hidden = (of_robots == (way == "landmarks")) & (np.arange(30) < 5)[:, None]
+        hidden[:, :places] = False
+        valid = np.asarray(log.scan.valid) & ~hidden
+        log = log._replace(scan=log.scan._replace(valid=valid))
+    trace = go(team_slam(robots, 8), scenario, log, lambda joint: joint)
+    plain = reference_of(robots, tags, scenario)
+    for t, (controls, scans) in enumerate(as_reference(robots, log, tags)):
+        plain.predict(controls)
+        plain.update(scans)
+        state = jax.tree.map(lambda leaf, t=t: np.asarray(leaf[t]), trace.probe)
+        mean = np.concatenate([state.pose, state.landmarks.ravel()])
+        slot_of = {int(tag): s for s, tag in enumerate(state.tag) if tag >= 0}
+        order = []
+        for name, at in plain.at.items():
+            if name == ("robot", 0):
+                order.append(np.arange(3))
+                continue
+            slot = slot_of.pop(tags[name[1]] if name[0] == "robot" else name[1])
+            order.append(3 + 3 * slot + np.arange(len(at)))
+        assert not slot_of
+        at = np.concatenate(order)
+        by_place = np.concatenate(list(plain.at.values()))
+        np.testing.assert_allclose(mean[at], plain.x[by_place], rtol=0, atol=1e-9)
+        cov = plain.P[np.ix_(by_place, by_place)]
+        np.testing.assert_allclose(state.cov[np.ix_(at, at)], cov, rtol=0, atol=1e-9)
+    assert len(plain.at) == 8 + count
+    assert plain.entered == [way] * (count - 1) * (way != "known")
+
+
+def test_padding_stays_inert():
+    robots = unknown(crew(3))
+    scenario = world(crew(3), 30)
+    _, log = simulate(scenario, jax.random.key(0))
+    final = go(team_slam(robots, 12, tags=(20, 21, 22)), scenario, relabelled(log, 8, 20)).final
+    cov = np.asarray(final.cov)
+    np.testing.assert_array_equal(np.asarray(final.landmarks)[:12, 2], 0.0)
+    third = 3 + 3 * np.arange(12) + 2
+    expected = np.zeros((12, cov.shape[1]))
+    expected[np.arange(12), third] = 1.0
+    np.testing.assert_array_equal(cov[third], expected)
+
+
+def relabelled(log, first, to):
+    tag = jnp.asarray(log.scan.tag)
+    return log._replace(scan=log.scan._replace(tag=jnp.where(tag >= first, tag - first + to, tag)))
+
+
+def test_sightings_of_each_other_help():
+    """Without landmarks a sighting is all that ties the robots; all covariances shrink."""
+    robots = crew(2)
+    scenario = world(robots, 60)
+    _, log = simulate(scenario, jax.random.key(3))
+    valid, tag = np.asarray(log.scan.valid), np.asarray(log.scan.tag)
+    landmarks = (tag < 8) & (tag >= 0)
+    blind = log._replace(scan=log.scan._replace(valid=valid & ~landmarks))
+    deaf = log._replace(scan=log.scan._replace(valid=np.zeros_like(valid)))
+    without = log._replace(scan=log.scan._replace(valid=valid & landmarks))
+    filter, start = team_slam(robots, 8), (scenario.pose, scenario.pose_cov, jax.random.key(0))
+
+    @jax.jit
+    def covs(log):
+        probe = partial(team.poses, robots=2)
+        return jaxslam.run(filter, log, *start, probe=probe).probe[1][-1]
+
+    spread = {"all": covs(log), "blind": covs(blind), "deaf": covs(deaf), "alone": covs(without)}
+    for b in range(2):
+        assert np.linalg.eigvalsh(spread["deaf"][b] - spread["blind"][b]).min() > -1e-12
+    assert np.trace(spread["blind"][1]) < 0.8 * np.trace(spread["deaf"][1])
+    assert np.trace(spread["all"][1]) < np.trace(spread["alone"][1])
+
+
+def test_nothing_of_an_absent_robot_is_lost():
+    """It sees one landmark and nobody: counted, and without effect; then it meets the other."""
+    robots = unknown(crew(2))
+    filter = team_slam(robots, 8)
+    scenario = world(crew(2), 2)
+    places = sum(robots[0].sensors.places)
+    z = jnp.tile(jnp.array([2.0, 0.1]), (2, 2 * places, 1))
+    tag = np.full((2, 2 * places), -1, np.int32)
+    tag[:, 0], tag[:, places] = 0, 0
+    tag[:, 6], tag[:, places + 6] = 9, 8  # robot 0 sees 1, 1 sees 0
+    valid = tag >= 0
+    valid[0, places + 6] = False
+    log = Log(jnp.asarray(scenario.controls), Scan(z, tag, valid))
+    info = go(filter, scenario, log).info
+    status, slot = np.asarray(info.status), np.asarray(info.slot)
+    assert status[0, 0] == Status.BORN
+    assert status[0, 6] == status[0, places] == Status.UNMATCHED
+    assert status[1, 6] == status[1, places + 6] == Status.BORN
+    assert slot[1, 6] == slot[1, places + 6] == 8
+    assert status[1, 0] == status[1, places] == Status.FUSED
+    assert (status[~valid] == Status.EMPTY).all()
+
+
+@pytest.mark.parametrize("way", ["mutual", "landmarks"])
+def test_a_way_in_is_exact_without_noise(way):
+    a, b = np.array([1.0, 2.0, 0.7]), np.array([-1.0, 3.0, -2.5])
+
+    def to(pose, point):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        return jnp.asarray(np.array([[c, s], [-s, c]]) @ (point - pose[:2]))
+
+    cov = jnp.eye(2) * 1e-4
+    if way == "mutual":
+        found = entering.by_mutual_sight(
+            jnp.asarray(a), jnp.eye(3, 9), jnp.eye(3), (to(a, b[:2]), cov), (to(b, a[:2]), cov)
+        )
+    else:
+        points = np.array([[0.0, 0.5], [3.0, -1.0]])
+        seen = jnp.stack([to(b, point) for point in points])
+        found = entering.by_two_landmarks(
+            jnp.asarray(points), jnp.eye(4, 9), jnp.eye(4), seen, jnp.stack([cov, cov])
+        )
+    np.testing.assert_allclose(found[0], b, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("report", "first"), [(0, 0), (1, 10)])
+def test_every_robot_is_honest(report, first):
+    """The pose NEES of each of two robots over 100 runs, started from known and unknown places.
+
+    In the second world robot 1 sees landmarks only later, so that it enters by mutual sight.
+    """
+    eyes = sensors.range_bearing(R1, mount=MOUNT)
+    sight = between_ranges(0.0, 3.2)
+    other = Part(eyes, 1, every=2, sees="robots")
+    robots = [
+        team.Robot(motion.increment(Q), suite(Part(eyes, 6, start=start, visible=sight), other), at)
+        for start, at in ((0, None), (first, STARTS[1]))
+    ]
+    scenario = world(robots, 30, report=report)
+    filters = {
+        "known": team_slam(robots, 8, report=report),
+        "unknown": team_slam(unknown(robots), 8, report=report),
+    }
+    campaign = jaxslam.monte_carlo(scenario, filters, 100, jax.random.key(2))
+    for name, summary in campaign.filters.items():
+        nees, landmarks = (summary.measures[m] for m in ("nees_pose", "nees_landmarks"))
+        print(name, report, nees, landmarks, summary.counts)
+        assert summary.counts["divergent"] == summary.counts["unmatched"] == 0
+        assert nees.low < 3.0 < nees.high, (name, nees)
+        assert landmarks.low < 2.0 < landmarks.high, (name, landmarks)
+
+
+def test_a_world_is_the_same_whatever_is_reported():
+    robots = crew(3)
+    truths, logs = zip(
+        *(simulate(world(robots, 5, report=b), jax.random.key(0)) for b in range(3)), strict=True
+    )
+    for log in logs[1:]:
+        jax.tree.map(np.testing.assert_array_equal, log, logs[0])
+    starts, paths, _ = team.histories(world(robots, 5), robots, jax.random.key(0))
+    for b, truth in enumerate(truths):
+        np.testing.assert_array_equal(truth.pose, paths[b])
+        np.testing.assert_array_equal(truth.start, starts[b])
+
+
+def test_gradients_are_finite():
+    scenario = world(crew(2), 4)
+    _, log = simulate(scenario, jax.random.key(0))
+
+    def loss(theta):
+        eyes = sensors.range_bearing(jnp.diag(theta[:2]) ** 2, mount=theta[2:5])
+        back = sensors.range_bearing(jnp.diag(theta[:2]) ** 2)
+        each = suite((eyes, 4), (back, 2), (eyes, 1))
+        robots = [team.Robot(motion.increment(jnp.diag(theta[5:7]) ** 2), each) for _ in range(2)]
+        filter = team_slam(robots, 8, update="joint")
+        trace = jaxslam.run(filter, log, scenario.pose, NOTHING, jax.random.key(0))
+        return trace.info.log_likelihood.sum()
+
+    slope = jax.jit(jax.grad(loss))(jnp.array([0.05, 0.02, 0.1, 0.0, 0.3, 0.01, 0.01]))
+    assert np.isfinite(slope).all()
+    assert (np.asarray(slope) != 0).all()
+
+
+def test_float32():
+    robots = crew(2)
+    scenario = world(robots, 20)
+    _, log = simulate(scenario, jax.random.key(0))
+    single = jax.tree.map(
+        lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, log
+    )
+    filter = team_slam(unknown(robots), 8)
+    a, b = go(filter, scenario, log), go(filter, scenario, single)
+    assert b.final.cov.dtype == jnp.float32
+    np.testing.assert_allclose(a.estimate.pose, b.estimate.pose, atol=2e-4)
+    np.testing.assert_array_equal(a.info.status, b.info.status)
+
+
+def compass_only():
+    return team.Robot(motion.increment(Q), suite((sensors.compass([[0.01]]), 1)))
+
+
+def signs():
+    sensor = sensors.range_bearing_signature(np.eye(3) * 0.01)
+    return team.Robot(motion.increment(Q), suite((sensor, 1)))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: team_slam([], 3), "at least one robot"),
+        (lambda: team_slam([ring()], 3), "expected a team.Robot"),
+        (lambda: team_slam(crew(2)[::-1], 3), "robot 0 has no start of its own"),
+        (lambda: team_slam(crew(2), 3, tags=(7, 7)), "2 different tags"),
+        (lambda: team_slam(crew(2), 3, tags=(7,)), "2 different tags"),
+        (lambda: team_slam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
+        (lambda: team_slam(crew(2), 0), "capacity"),
+        (lambda: team_slam(crew(2), 3, report=2), "no robot 2 to report"),
+        (lambda: team_slam(crew(2), 3, chart=charts.right_invariant()), "chart euclidean"),
+        (lambda: team_slam(crew(2), 3, gate=0.0), "gate above 0"),
+        (lambda: team_slam(crew(2), 3, update="at once"), "expected update"),
+        (lambda: team_slam([signs()], 3), "are not points"),
+        (lambda: team_slam([crew(1)[0], compass_only()], 3), "robot 1 has no start"),
+        (lambda: team.Robot(motion.increment(Q), ring().sensor), "a motion and a sensors.suite"),
+        (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
+        (lambda: world(crew(2), tags=(3, 9)), "the tag 3 is a landmark's"),
+        (lambda: world(unknown(crew(2))), "needs a start"),
+        (lambda: world(crew(2), report=2), "no robot 2 to report"),
+        (lambda: world(crew(2), places=2), "does not take places"),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_scan_with_other_places_is_refused():
+    robots = crew(2)
+    scenario = world(robots, 3)
+    _, log = simulate(scenario, jax.random.key(0))
+    short = log._replace(scan=jax.tree.map(lambda leaf: leaf[:, :10], log.scan))
+    with pytest.raises(ValueError, match="expected 14 places"):
+        go(team_slam(robots, 8), scenario, short)

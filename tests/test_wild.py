@@ -1,0 +1,122 @@
+"""The whole pipeline, association, life and merging together, on logs that nobody would wish for."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import association, life, motion, run, sensors
+from jaxslam.filters import ekf_slam
+from jaxslam.filters.merging import duplicates
+from jaxslam.stats import chi2_quantile
+from jaxslam.types import Log, Scan, Status
+
+STEPS, PLACES = 1000, 4
+MOTION = motion.increment(np.diag([0.01, 0.01]) ** 2)
+SENSOR = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2)
+GATE, NEW = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
+METHODS = {
+    "nearest": lambda: association.nearest(GATE, NEW),
+    "maximum_likelihood": lambda: association.maximum_likelihood(GATE, NEW),
+    "global_nearest": lambda: association.global_nearest(GATE, NEW),
+    "joint": lambda: association.joint(0.99, NEW, budget=50),
+    "gates of 0 and ∞": lambda: association.nearest(0.0, np.inf),
+    "gates of ∞": lambda: association.nearest(np.inf, np.inf),
+}
+CASES = [(method, 6) for method in METHODS] + [("nearest", 1), ("joint", 1)]
+
+
+@cache
+def go(method, capacity):
+    manager = life.existence(
+        lambda pose, point: ((point - pose[:2]) ** 2).sum() < 25, patience=5, replace=True
+    )
+    filter = ekf_slam(
+        MOTION,
+        SENSOR,
+        capacity,
+        associate=METHODS[method](),
+        life=manager,
+        merge=duplicates(0.3),
+    )
+    start = jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)
+    return jax.jit(lambda log: run(filter, log, *start))
+
+
+def log_of(z, valid):
+    """Measurements (STEPS, PLACES, 2) without tags, of a robot that goes round in a circle."""
+    z = np.broadcast_to(np.asarray(z, float), (STEPS, PLACES, 2))
+    valid = np.broadcast_to(valid, (STEPS, PLACES))
+    tag = np.full((STEPS, PLACES), -1, np.int32)
+    return Log(np.tile([0.05, 0.05], (STEPS, 1)), Scan(z.copy(), tag, valid.copy()))
+
+
+def seen_from_the_path(points, sigma=1.0):
+    """What a robot without noise of its own measures of points (PLACES, 2)."""
+    rng, pose, rows = np.random.default_rng(1), np.zeros(3), []
+    for _ in range(STEPS):
+        # Solà's increment: forward, then turn.
+        pose = pose + [0.05 * np.cos(pose[2]), 0.05 * np.sin(pose[2]), 0.05]
+        off = points - pose[:2]
+        bearing = np.arctan2(off[:, 1], off[:, 0]) - pose[2]
+        z = np.stack([np.hypot(*off.T), (bearing + np.pi) % (2 * np.pi) - np.pi], axis=1)
+        rows.append(z + sigma * rng.normal(size=z.shape) * [0.05, 0.02])
+    return np.array(rows)
+
+
+def worlds():
+    rng = np.random.default_rng(0)
+    square = np.array([[3.0, 0], [0, 3], [-3, 0], [0, -3]])
+    one_place = np.array([[3.0, 0.0]] * 2 + [[0.0, 3.0]] * 2)
+    false = rng.uniform([0.5, -3], [5, 3], size=(STEPS, PLACES, 2))
+    return {
+        "nothing seen": log_of(np.zeros(2), False),
+        "nothing but clutter": log_of(false, True),
+        "four landmarks": log_of(seen_from_the_path(square), True),
+        "two landmarks at one place": log_of(seen_from_the_path(one_place), True),
+        "a landmark on the robot": log_of(np.zeros(2), True),
+        "negative ranges": log_of(-seen_from_the_path(square), True),
+    }
+
+
+WORLDS = worlds()
+
+
+@pytest.mark.parametrize(("method", "capacity"), CASES)
+def test_everything_stays_finite_and_nothing_is_lost_uncounted(method, capacity):
+    for name, log in WORLDS.items():
+        trace = go(method, capacity)(log)
+        for leaf in jax.tree.leaves(trace):
+            assert np.isfinite(leaf).all() if leaf.dtype.kind == "f" else True, name
+        # Every measurement has a status; every landmark of the map was born, and every one that
+        # left it was removed or merged.
+        status = np.asarray(trace.info.status)
+        np.testing.assert_array_equal(status != Status.EMPTY, log.scan.valid, err_msg=name)
+        born = (status == Status.BORN).sum()
+        left = (
+            np.asarray(trace.info.removed).sum() + (np.asarray(trace.info.merged)[:, 0] >= 0).sum()
+        )
+        assert born - left == np.asarray(trace.final.alive).sum(), name
+        cov = np.asarray(trace.final.cov)
+        assert np.linalg.eigvalsh(cov).min() > -1e-12, name
+        np.testing.assert_allclose(cov, cov.T, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("method", ["nearest", "joint", "maximum_likelihood", "global_nearest"])
+def test_what_the_worlds_hold_is_found(method):
+    clean = go(method, 6)(WORLDS["four landmarks"])
+    assert np.asarray(clean.final.alive).sum() == 4
+    assert (np.asarray(clean.info.status)[1:] == Status.FUSED).mean() > 0.97
+    nothing = go(method, 6)(WORLDS["nothing seen"])
+    assert not np.asarray(nothing.final.alive).any()
+    assert (np.asarray(nothing.estimate.pose_cov)[-1, :2, :2].trace()) > 0
+
+
+def test_clutter_alone_confirms_nothing_for_long():
+    trace = go("joint", 6)(WORLDS["nothing but clutter"])
+    removed = np.asarray(trace.info.removed).sum()
+    assert removed > 50  # it comes and goes …
+    confirmed = np.asarray(trace.final.life.confirmed) & np.asarray(trace.final.alive)
+    assert confirmed.sum() <= 2  # … and little of it is believed
