@@ -3,7 +3,10 @@
 SEIF and the exactly sparse ESEIF beside the EKF, on the same draws of `circle` and of a cloister
 seen 3 m far: their maps, and their honesty, by the covariances of Markov blankets that they report
 unless told otherwise and by the whole of their Ω. --park: Victoria Park instead, where there is no
-truth; their maps against the EKF's. What a step costs is in `benchmarks.scaling`.
+truth: their maps, aligned, from the batch solution's, against the EKF's from it. There a scan has
+two places and a loop hundreds of scans, and what decides is mean recovery: with the ten landmarks a
+scan of the default most means lag behind, and models are linearized at them. So each filter runs
+with `passive` 10 and 150, all landmarks. What a step costs is in `benchmarks.scaling`.
 """
 
 import argparse
@@ -156,11 +159,15 @@ def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Me
     data = datasets.victoria_park(path or gtsam.findExampleDataFile("victoria_park.txt"))
     models = data.motion, data.sensor, data.capacity
     options = {"active": active, "links": links}
+    all_means = {"passive": data.capacity, "sweeps": 3}
+    waits = {"wait": False}  # two measurements a scan rarely fix a pose: `eseif` else fails here
     candidates = {
         "EKF": filters.ekf_slam(*models, update="joint"),
         "SEIF": filters.seif(*models, **options),
+        "SEIF, all means": filters.seif(*models, **options, **all_means),
         "ESEIF": filters.eseif(*models, **options),
-        "ESEIF, wait=False": filters.eseif(*models, **options, wait=False),
+        "ESEIF, wait=False": filters.eseif(*models, **options, **waits),
+        "ESEIF, wait=False, all means": filters.eseif(*models, **options, **waits, **all_means),
     }
     found, metrics = {}, []
     places = data.log.scan.tag.shape[1]
@@ -179,17 +186,20 @@ def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Me
         apart = compare(found[name], found["EKF"])
         if name == "EKF":
             batch = run_batch(data, found[name]).solution
-        apart["map RMSE from batch [m]"] = compare(found[name], batch)["map RMSE [m]"]
+        from_batch = compare(found[name], batch)["map RMSE [m]"]
+        apart["map RMSE from batch [m]"] = from_batch
         apart["map RMSE unaligned [m]"] = float(
             np.sqrt(((found[name].points - found["EKF"].points) ** 2).sum(axis=1).mean())
         )
         row = "  ".join(f"{k} {v:.3f}" for k, v in apart.items())
         ends = f"√|P| of position at the end {spread[0]:.4f} m², whole {spread[1]:.4f} m²"
-        print(f"  {name:18}{row}  {ends}  deferred {int(deferred)}")
+        print(f"  {name:30}{row}  {ends}  deferred {int(deferred)}")
         if hasattr(state, "counts"):
             print(20 * " " + "  ".join(f"{k} {v:.5g}" for k, v in state.counts._asdict().items()))
+        share = from_batch / compare(found["EKF"], batch)["map RMSE [m]"]
         if name != "EKF":
-            metrics.append(Metric(f"{name} from the EKF, Victoria Park [m]", apart["map RMSE [m]"]))
+            high = 1.1 if "all means" in name else np.inf
+            metrics.append(Metric(f"{name}, map RMSE by EKF's, Victoria Park", share, high=high))
     return metrics
 
 

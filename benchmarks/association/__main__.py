@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from benchmarks.association import closing, clutter, cost, heading, park
 from benchmarks.gate import Metric, report
@@ -37,6 +38,12 @@ def measure(quick=False, out=None):
         if name not in ("correction", "joint"):
             ratio = value / seconds["correction"]
             metrics.append(Metric(f"association, {name} / correction", ratio, high=2.0))
+
+    print("\nthe whole pipeline, 20 measurements, 200 landmarks, life and merging, compiled in:")
+    for name, value in cost.compile_seconds().items():
+        print(f"{name:24}{value:10.1f} s")
+        high = np.inf if "gradient" in name else 20.0  # nothing was asked of the gradient
+        metrics.append(Metric(f"compile time, {name} [s]", value, high=high))
 
     found = heading.measure()
     save(heading.draw(found), "heading.png")

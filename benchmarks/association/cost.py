@@ -1,20 +1,26 @@
-"""What association costs beside the correction it serves: 20 measurements, a map of 200."""
+"""What association costs beside the correction it serves: 20 measurements, a map of 200.
+
+And how long the whole pipeline compiles: association, life and merging of landmarks, with that map
+and scan, under `lax.scan`; and its gradient.
+"""
 
 import dataclasses
+import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.speed.timing import together
-from jaxslam import association
+from jaxslam import association, life, run
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters import correction
+from jaxslam.filters import correction, ekf_slam
 from jaxslam.filters.expectation import prediction_of
+from jaxslam.filters.merging import duplicates
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.scenarios import cloister
 from jaxslam.slots import Joint
-from jaxslam.types import Scan
+from jaxslam.types import Log, Scan
 
 COUNT, SEEN, RUNS = 200, 20, 16
 GATE = 9.21
@@ -66,3 +72,32 @@ def measure():
         actions[name] = lambda compiled=compiled: jax.block_until_ready(compiled(joint, scan))
     seconds = together(actions)
     return {name: value / RUNS for name, value in seconds.items()}
+
+
+def compile_seconds():
+    """Of `run` with everything that decides about landmarks, traced and compiled; {method: s}."""
+    world, found = cloister(), {}
+    scans = Scan(jnp.ones((50, SEEN, 2)), jnp.full((50, SEEN), -1), jnp.ones((50, SEEN), bool))
+    log = Log(jnp.ones((50, len(world.motion.controls))), scans)
+    near = life.existence(lambda pose, point: ((point - pose[:2]) ** 2).sum() < 9.0, replace=True)
+
+    def loss(noise, log, method):
+        sensor = dataclasses.replace(world.sensor, noise_cov=lambda z: noise)
+        filter = ekf_slam(
+            world.motion, sensor, COUNT, associate=METHODS[method], life=near, merge=duplicates(0.3)
+        )
+        trace = run(filter, log, world.pose, world.pose_cov, jax.random.key(0))
+        return trace.info.log_likelihood.sum(), trace
+
+    noise = jnp.diag(jnp.array([0.01, 0.0003]))
+    for method in METHODS:
+        programs = {method: lambda noise, log, m=method: loss(noise, log, m)}
+        if method == "nearest":
+            programs["nearest, gradient"] = jax.grad(
+                lambda noise, log: loss(noise, log, "nearest")[0]
+            )
+        for name, program in programs.items():
+            began = time.perf_counter()
+            jax.jit(program).lower(noise, log).compile()
+            found[name] = time.perf_counter() - began
+    return found

@@ -6,13 +6,14 @@ Everything here acts on one particle; `filters.fastslam` vmaps it.
 import jax
 import jax.numpy as jnp
 
-from jaxslam import derivatives, linalg, slots
+from jaxslam import linalg, slots
 from jaxslam.filters.particle_scan import Sight
 from jaxslam.filters.particles import Particles, moments
 from jaxslam.filters.scanning import first_that_holds, seen_before
 from jaxslam.linearize import first_order
 from jaxslam.protocols import Life, Sensor
 from jaxslam.slots import Joint
+from jaxslam.staging import where_any
 from jaxslam.types import Info, Scan, Status
 
 Array = jax.Array
@@ -35,9 +36,16 @@ def after_scan(
         needed = sight.is_new.sum() - (~own.alive).sum()
         given_up = life.make_room(_joint(own), needed)
         own = _without(own, given_up)
-    at, granted, deferred, repeated = births_of(sight, scan.tag, own.alive, births)
+    at, granted, deferred, repeated, new, new_covs = where_any(
+        sight.is_new.any(),
+        lambda own: (
+            *births_of(sight, scan.tag, own.alive, births),
+            *start(own.pose, scan.z, sensor=sensor),
+        ),
+        lambda own: no_births(own, sight),
+        own,
+    )
     into = jnp.where(granted, at, own.alive.shape[0])
-    landmarks, covs = start(own.pose, own.landmarks, own.covs, scan.z, into, sensor=sensor)
     status = first_that_holds(
         (sight.matched & ~sight.inside, Status.REJECTED),
         (sight.matched & ~sight.used, Status.SINGULAR),
@@ -50,8 +58,8 @@ def after_scan(
     )
     fused = status == Status.FUSED
     own = own._replace(
-        landmarks=landmarks,
-        covs=covs,
+        landmarks=own.landmarks.at[into].set(new, mode="drop"),
+        covs=own.covs.at[into].set(new_covs, mode="drop"),
         alive=own.alive.at[into].set(True, mode="drop"),
         tag=own.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
         lost=own.lost + (status == Status.OVERFLOW).sum().astype(jnp.int32),
@@ -81,23 +89,21 @@ def correct(
     """
 
     def one(z: Array, landmark: Array, cov: Array) -> tuple[Array, Array]:
-        by_landmark = derivatives.observe_jacobians(sensor, pose, landmark)[1]
+        by_landmark = jax.jacfwd(sensor.observe, argnums=1)(pose, landmark)
         hc = linalg.matmul(by_landmark, cov)
         s = linalg.symmetrize(linalg.matmul(hc, by_landmark.T) + sensor.noise_cov(z))
         factor, _ = linalg.cholesky(s)
         white = linalg.solve_lower(factor, sensor.residual(z, sensor.observe(pose, landmark)))
         v = linalg.solve_lower(factor, hc)
-        return landmark + (v * white[:, None]).sum(axis=0), cov - linalg.gram(v, v)
+        return landmark + linalg.matmul(white[None], v)[0], cov - linalg.gram(v, v)
 
     new, new_covs = jax.vmap(one)(z, landmarks[sight.slot], covs[sight.slot])
     at = jnp.where(sight.used, sight.slot, landmarks.shape[0])
     return landmarks.at[at].set(new, mode="drop"), covs.at[at].set(new_covs, mode="drop")
 
 
-def start(
-    pose: Array, landmarks: Array, covs: Array, z: Array, at: Array, *, sensor: Sensor
-) -> tuple[Array, Array]:
-    """New landmarks where the pose and z (M, Z) put them, in slots at (M,), N for none.
+def start(pose: Array, z: Array, *, sensor: Sensor) -> tuple[Array, Array]:
+    """The landmarks (M, L) that z (M, Z) would begin, and their covariances (M, L, L).
 
     l = g(x, z, s̄), C = G_z R G_zᵀ + G_s S G_sᵀ: the pose of a particle has no error.
     """
@@ -106,8 +112,7 @@ def start(
         landmark, _, own = first_order.invert_at(sensor, pose, z, pose, z)
         return landmark, linalg.symmetrize(own)
 
-    new, new_covs = jax.vmap(one)(z)
-    return landmarks.at[at].set(new, mode="drop"), covs.at[at].set(new_covs, mode="drop")
+    return jax.vmap(one)(z)
 
 
 def births_of(
@@ -120,6 +125,14 @@ def births_of(
     deferred = wanted & (jnp.cumsum(wanted) > (m if quota is None else quota))
     slot, granted = slots.allocate(alive, wanted & ~deferred)
     return slot, granted, deferred, repeated
+
+
+def no_births(own: Particles, sight: Sight) -> tuple[Array, ...]:
+    """What `births_of` and `start` say where nothing is new."""
+    m, size = sight.slot.shape[0], own.landmarks.shape[1]
+    none, kind = jnp.zeros_like(sight.is_new), own.landmarks.dtype
+    slot = jnp.zeros(m, jnp.int32)
+    return slot, none, none, none, jnp.zeros((m, size), kind), jnp.zeros((m, size, size), kind)
 
 
 def _joint(own: Particles) -> Joint:

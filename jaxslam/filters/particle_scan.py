@@ -90,12 +90,12 @@ def look(
         s = linalg.symmetrize(s + linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T))
         factor, positive = linalg.cholesky(s)
         white = linalg.solve_lower(factor, nu)
-        nis = (white**2).sum()
+        nis = linalg.total(white**2)
         finite = jnp.isfinite(nis)
         inside = finite if gate is None else finite & (nis <= gate)
         used = matched & positive & inside
         v = jnp.where(used, linalg.solve_lower(factor, hp), 0.0)
-        x = x + (v * jnp.where(used, white, 0.0)[:, None]).sum(axis=0)
+        x = x + linalg.matmul(jnp.where(used, white, 0.0)[None], v)[0]
         x = jnp.concatenate([x[:2], wrap(x[2:])])
         p = p - linalg.gram(v, v)
         clipped = nis if gate is None else jnp.where(inside, nis, gate)

@@ -148,10 +148,18 @@ def moments(state: Particles, sensor: Sensor) -> Estimate:
 
     points, covs = jax.vmap(jax.vmap(point))(state.landmarks, state.covs)
     alive = state.alive[best]
-    mean = jnp.where(w[:, :, None] > 0, w[:, :, None] * points, 0.0).sum(axis=0)
-    d = jnp.where(w[:, :, None] > 0, points - mean[None], 0.0)
-    cov = covs + d[:, :, :, None] * d[:, :, None, :]
-    cov = jnp.where(w[:, :, None, None] > 0, w[:, :, None, None] * cov, 0.0).sum(axis=0)
+
+    # Coordinate by coordinate: XLA goes through (P, N) much faster than through (P, N, 2, 2).
+    def weighed(values: Array) -> Array:
+        return jnp.where(w > 0, w * values, 0.0).sum(axis=0)
+
+    def spread(i: int, j: int) -> Array:
+        off_i, off_j = points[:, :, i] - mean[None, :, i], points[:, :, j] - mean[None, :, j]
+        return weighed(covs[:, :, i, j] + off_i * off_j)
+
+    mean = jnp.stack([weighed(points[:, :, 0]), weighed(points[:, :, 1])], axis=1)
+    xx, xy, yy = spread(0, 0), spread(0, 1), spread(1, 1)
+    cov = jnp.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     return Estimate(
         pose=pose,
         pose_cov=pose_cov,

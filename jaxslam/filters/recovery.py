@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxslam import linalg
 from jaxslam.filters import canonical
 from jaxslam.filters.sparse_map import Sparse
+from jaxslam.staging import settle
 
 
 def owed_of(state: Sparse) -> jax.Array:
@@ -30,8 +31,11 @@ def passed_on(state: Sparse, slot: jax.Array, step: jax.Array) -> Sparse:
     n = state.own.shape[0]
     row = state.neighbours.at[slot].get(mode="fill", fill_value=n)
     links = state.links.at[slot].get(mode="fill", fill_value=0)
+    # Who writes to the lists next needs the slots, so waits for this, and needs no copy of all N.
+    row, links, own = settle((row, links, state.slot))
     change = jnp.einsum("mkij,mi->mkj", links, step)
     return state._replace(
+        slot=own,
         landmarks=state.landmarks.at[slot].add(step, mode="drop"),
         owed=state.owed.at[row.reshape(-1)].add(-change.reshape(-1, 2), mode="drop"),
     )
