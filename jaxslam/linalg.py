@@ -229,6 +229,12 @@ def check_count(name: str, value: Any) -> None:
         raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
 
 
+def check_gate(name: str, gate: Any) -> None:
+    """Raise ValueError unless the gate is None, a tracer, or above 0."""
+    if gate is not None and is_concrete(gate) and not gate > 0:
+        raise ValueError(f"{name}: expected a gate above 0, got {gate}")
+
+
 def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
     """Raise ValueError unless cov is real, finite, symmetric, positive semi-definite (size, size).
 

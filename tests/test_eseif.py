@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxslam import filters, motion, sensors
-from jaxslam.filters import blankets, sparse_map
+from jaxslam.filters import blankets, sparsification
 from jaxslam.filters.eseif import fixes_pose, tied, without_pose
 from jaxslam.filters.recovery import relaxed
 from jaxslam.scenarios import cloister
@@ -120,7 +120,7 @@ def test_tachers_counter_example_and_relocation_on_the_same_information():
     gone = np.array([False, False, False, True, True])
     h = rng.normal(size=(6, 13))
     h[:, 9:] = 0  # measurements of the landmarks that stay
-    after = np.asarray(sparse_map.sparsified(jnp.asarray(omega), jnp.asarray(gone))[0])
+    after = np.asarray(sparsification.sparsified(jnp.asarray(omega), jnp.asarray(gone))[0])
     assert np.linalg.eigvalsh(omega - after)[0] < -1e-3
     owed = rng.normal(size=13)
     less, owed_less = (np.asarray(x) for x in without_pose(jnp.asarray(omega), jnp.asarray(owed)))

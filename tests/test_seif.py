@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxslam import filters, sensors
-from jaxslam.filters import blankets, sparse_map
+from jaxslam.filters import blankets, sparse_map, sparsification
 from jaxslam.filters.recovery import relaxed
 from jaxslam.run import run
 from jaxslam.scenarios import cloister
@@ -236,7 +236,7 @@ def test_sparsification_is_overconfident():
     root = rng.normal(size=(9, 9))
     omega = root @ root.T + 0.1 * np.eye(9)
     gone = np.array([False, False, True])
-    after, nats = sparse_map.sparsified(jnp.asarray(omega), jnp.asarray(gone))
+    after, nats = sparsification.sparsified(jnp.asarray(omega), jnp.asarray(gone))
     after = np.asarray(after)
     assert np.linalg.eigvalsh(after)[0] > 0
     assert np.abs(after[:3, 7:]).max() == 0
@@ -250,7 +250,7 @@ def test_sparsification_is_overconfident():
     # The nats are the divergence of the two.
     divergence = 0.5 * (np.trace(after @ a) - 9 - np.linalg.slogdet(after @ a)[1])
     np.testing.assert_allclose(nats, divergence, rtol=1e-9)
-    same, none = sparse_map.sparsified(jnp.asarray(omega), jnp.zeros(3, bool))
+    same, none = sparsification.sparsified(jnp.asarray(omega), jnp.zeros(3, bool))
     np.testing.assert_array_equal(same, omega)
     assert float(none) == 0
 
@@ -274,11 +274,11 @@ def test_springs():
     rng = np.random.default_rng(0)
     links = [*rng.normal(size=(20, 2, 2)), np.zeros((2, 2)), np.outer([1.0, 2.0], [3.0, 1.0])]
     for link in links:
-        u, v = (np.asarray(part) for part in sparse_map.spring(jnp.asarray(link)))
+        u, v = (np.asarray(part) for part in sparsification.spring(jnp.asarray(link)))
         np.testing.assert_allclose(u @ u, link @ link.T, atol=1e-12)
         np.testing.assert_allclose(v @ v, link.T @ link, atol=1e-12)
         assert np.linalg.eigvalsh(np.block([[u, link], [link.T, v]]))[0] > -1e-12
-    slope = jax.grad(lambda b: sparse_map.spring(b)[0].sum())(jnp.zeros((2, 2)))
+    slope = jax.grad(lambda b: sparsification.spring(b)[0].sum())(jnp.zeros((2, 2)))
     assert np.isfinite(slope).all()
 
 
@@ -288,7 +288,7 @@ def test_a_full_list_drops_its_weakest_link(conservative):
     state = sparse_map.empty(jnp.zeros(3), jnp.eye(3), 5, 1, 2)
     state = state._replace(own=100.0 * state.own)
     enter = jax.jit(
-        functools.partial(sparse_map.linked, conservative=conservative), static_argnames=()
+        functools.partial(sparsification.linked, conservative=conservative), static_argnames=()
     )
     link = jnp.asarray([[-2.0, 0.5], [0.1, -1.0]])
     yes = jnp.asarray(True)

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from numpy.typing import ArrayLike
 
 from jaxslam import linalg
 from jaxslam.angles import wrap
@@ -232,9 +231,3 @@ def loaded(omega: jax.Array) -> jax.Array:
 def _squared(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
     factor, positive = linalg.cholesky(cov)
     return (linalg.solve_lower(factor, nu) ** 2).sum(), positive
-
-
-def check_gate(name: str, gate: ArrayLike | None) -> None:
-    """Raise ValueError unless the gate is None or above 0."""
-    if gate is not None and linalg.is_concrete(gate) and not gate > 0:  # type: ignore[operator]
-        raise ValueError(f"{name}: expected a gate above 0, got {gate}")

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.filters.merging import Duplicates
-from jaxslam.linalg import check_count, is_concrete
+from jaxslam.linalg import check_count, check_gate
 from jaxslam.protocols import Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Suite
 
@@ -22,8 +22,7 @@ def check_numbers(
             check_count(f"ekf_slam: {name}", value)
     if update not in ("sequential", "joint"):
         raise ValueError(f'ekf_slam: expected update "sequential" or "joint", got {update!r}')
-    if gate is not None and is_concrete(gate) and not gate > 0:
-        raise ValueError(f"ekf_slam: expected a gate above 0, got {gate}")
+    check_gate("ekf_slam", gate)
 
 
 def check_chart(sensor: Sensor, chart: Chart) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 
 from jaxslam import linalg
 from jaxslam.filters.coordinates import cov_of_coordinates
-from jaxslam.filters.matching import Limits, Match, Points, limits, match
-from jaxslam.filters.merging import closest_pair, merge
+from jaxslam.filters.doubles import double, merged
+from jaxslam.filters.matching import Limits, Match, limits, match
+from jaxslam.filters.pairing import Points
 from jaxslam.filters.relocalization import check_points, check_policy
 from jaxslam.linalg import check_count
 from jaxslam.protocols import Chart, Filter
@@ -125,7 +126,7 @@ def close_loop(
 
             def one(joint: Joint, pair: tuple[Array, Array]) -> tuple[Joint, None]:
                 old, new = pair
-                return _merged(joint, chart, jnp.where(old >= 0, old, new), new), None
+                return merged(joint, chart, jnp.where(old >= 0, old, new), new), None
 
             joint = where_any(
                 ok,
@@ -201,11 +202,11 @@ def closing(
         joint, report = where_any(due, look, lambda joint: (joint, _no_look()), joint)
         doubles = jnp.zeros((), jnp.int32)
         if reach is not None:
-            i, j, near = _double(joint, chart, reach, spread)
+            i, j, near = double(joint, chart, reach, spread)
             twice = near <= gate
             joint = where_any(
                 twice,
-                lambda joint: _merged(joint, chart, jnp.where(twice, i, j), j),
+                lambda joint: merged(joint, chart, jnp.where(twice, i, j), j),
                 lambda joint: joint,
                 joint,
             )
@@ -286,46 +287,3 @@ def _jointly(delta: Array, points: Points, found: Match) -> Array:
     spread = jnp.where(jnp.broadcast_to(both, spread.shape), spread, unit).reshape(2 * m, 2 * m)
     error = jnp.where(there[:, None], delta[jnp.arange(m), at], 0.0).reshape(2 * m)
     return _distance(error, linalg.symmetrize(spread))
-
-
-def _merged(joint: Joint, chart: Chart, old: Array, new: Array) -> Joint:
-    """The landmark of slot new made that of slot old, with both histories; nothing if the same."""
-    after = merge(joint, chart, old, new)
-    known = joint.life
-    gone = joint.alive & ~after.alive
-    one = gone.any()
-
-    def grown(times: Array, value: Array) -> Array:
-        return jnp.where(gone, 0, times.at[old].set(jnp.where(one, value, times[old])))
-
-    life = known._replace(
-        born=grown(known.born, jnp.minimum(known.born[old], known.born[new])),
-        last=grown(known.last, jnp.maximum(known.last[old], known.last[new])),
-        seen=grown(known.seen, known.seen[old] + known.seen[new]),
-    )
-    return after._replace(life=life)
-
-
-def _double(joint: Joint, chart: Chart, reach: float, spread: float) -> tuple[Array, Array, Array]:
-    """The older and the younger of the two landmarks most likely one, and their d²."""
-    known, capacity = joint.life, joint.alive.shape[0]
-    later = known.born[:, None] > known.last[None, :]
-    near = ((joint.landmarks[:, None] - joint.landmarks[None, :]) ** 2).sum(axis=2) <= reach**2
-    pairs = (later | later.T) & joint.alive[:, None] & joint.alive[None, :] & near
-
-    def search(joint: Joint) -> tuple[Array, Array, Array]:
-        cov = cov_of_coordinates(joint, chart)[3:, 3:].reshape(capacity, 2, capacity, 2)
-        every = jnp.arange(capacity)
-        own = jnp.trace(cov[every, :, every], axis1=1, axis2=2)
-        mixed = cov[:, 0, :, 0] + cov[:, 1, :, 1]
-        variance = own[:, None] + own[None, :] - 2 * mixed
-        i, j, d = closest_pair(joint, chart, reach, pairs & (variance <= 2 * spread**2))
-        first = known.born[i] <= known.born[j]
-        i, j = jnp.where(first, i, j), jnp.where(first, j, i)
-        return i.astype(jnp.int32), j.astype(jnp.int32), d
-
-    def nothing(joint: Joint) -> tuple[Array, Array, Array]:
-        zero = jnp.zeros((), jnp.int32)
-        return zero, zero, jnp.full((), jnp.inf, joint.cov.dtype)
-
-    return where_any(pairs.any(), search, nothing, joint)

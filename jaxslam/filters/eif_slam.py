@@ -10,7 +10,7 @@ from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import canonical
 from jaxslam.filters.moments import moments
 from jaxslam.filters.scanning import seen_before
-from jaxslam.linalg import check_count
+from jaxslam.linalg import check_count, check_gate
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
@@ -148,7 +148,7 @@ def check_models(
 ) -> None:
     """Raise ValueError on what no filter in canonical form takes."""
     check_count(f"{name}: capacity", capacity)
-    canonical.check_gate(name, gate)
+    check_gate(name, gate)
     canonical.check_floor(name, floor)
     if isinstance(sensor, Suite):
         raise ValueError(f"{name}: expected one sensor, not a suite")

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxslam import linalg
 from jaxslam.filters import canonical
 from jaxslam.filters.recovery import owed_of, relaxed, solved, swept
-from jaxslam.filters.sparse_map import Sparse, activated, departed, retired
+from jaxslam.filters.sparse_map import Sparse
 from jaxslam.filters.sparse_parts import (
     Asked,
     allotted,
@@ -16,6 +16,7 @@ from jaxslam.filters.sparse_parts import (
     in_area,
     sparse_filter,
 )
+from jaxslam.filters.sparsification import activated, departed, retired
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.types import Info, Scan, Status
 

@@ -220,8 +220,7 @@ def _check(
         )
     if linalg.is_concrete(threshold) and not 0 <= threshold <= 1:
         raise ValueError(f"fastslam: expected a threshold from 0 to 1, got {threshold}")
-    if gate is not None and linalg.is_concrete(gate) and not gate > 0:
-        raise ValueError(f"fastslam: expected a gate above 0, got {gate}")
+    linalg.check_gate("fastslam", gate)
     if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
         raise ValueError(
             "fastslam: expected one sensor of landmarks that stay what they are, not a suite, an "

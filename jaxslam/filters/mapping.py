@@ -49,8 +49,7 @@ def mapping(
     for name, value in (("capacity", capacity), ("births", births)):
         if value is not None:
             linalg.check_count(f"mapping: {name}", value)
-    if gate is not None and linalg.is_concrete(gate) and not gate > 0:
-        raise ValueError(f"mapping: expected a gate above 0, got {gate}")
+    linalg.check_gate("mapping", gate)
     if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
         raise ValueError(
             "mapping: expected one sensor of landmarks that stay what they are, not a suite, an "

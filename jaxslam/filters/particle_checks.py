@@ -50,8 +50,7 @@ def check_numbers(
         raise ValueError(f"{name}: expected a confidence between 0 and 1, got {confidence}")
     if linalg.is_concrete(threshold) and not 0 <= threshold <= 1:
         raise ValueError(f"{name}: expected a threshold from 0 to 1, got {threshold}")
-    if gate is not None and linalg.is_concrete(gate) and not gate > 0:
-        raise ValueError(f"{name}: expected a gate above 0, got {gate}")
+    linalg.check_gate(name, gate)
     if linalg.is_concrete(slack) and not slack > 0:
         raise ValueError(f"{name}: expected a slack above 0, got {slack}")
     if forget is not None and not (np.shape(forget) == (2,) and 0 < forget[0] <= forget[1] <= 1):

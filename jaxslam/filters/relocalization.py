@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxslam import linalg
 from jaxslam.filters.coordinates import cov_of_coordinates, with_cov_of_coordinates
-from jaxslam.filters.matching import Match, Points, limits, match, solve
+from jaxslam.filters.matching import Match, limits, match, solve
+from jaxslam.filters.pairing import Points
 from jaxslam.linalg import check_count, check_covariance
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.slots import Joint

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxslam import linalg
 from jaxslam.filters import canonical
 from jaxslam.filters.recovery import owed_of, relaxed, solved, swept
-from jaxslam.filters.sparse_map import Sparse, activated, retired
+from jaxslam.filters.sparse_map import Sparse
 from jaxslam.filters.sparse_parts import (
     allotted,
     asked,
@@ -15,6 +15,7 @@ from jaxslam.filters.sparse_parts import (
     in_area,
     sparse_filter,
 )
+from jaxslam.filters.sparsification import activated, retired
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.types import Info, Scan, Status
 
@@ -39,8 +40,8 @@ def seif(
     most `links` others. Four steps, none of which touches the rest of a `Sparse` map:
 
     1. motion update (`canonical.moved`), on the robot and the active landmarks;
-    2. sparsification (`sparse_map.sparsified`) of as many of the least recent active landmarks as
-       the scan needs places for; then measurement update and new landmarks (`canonical`);
+    2. sparsification (`sparsification.sparsified`) of as many of the least recent active landmarks
+       as the scan needs places for; then measurement update and new landmarks (`canonical`);
     3. mean recovery (`filters.recovery`), one block at a time: the block of robot and active
        landmarks, and `passive` landmarks in rotation.
 
@@ -59,9 +60,9 @@ def seif(
         links: most links K of a landmark to others while one of both is passive.
         passive: landmarks a scan whose means are recovered in rotation, beside the active.
         sweeps: how often mean recovery goes round a scan: the passive share, then the area.
-        conservative: how a full list gives up its weakest link (`sparse_map.without_link`). False:
-            overconfidently, Ω stays definite. True: claiming less, which in a map that needs many
-            more links than it may have costs Ω its definiteness.
+        conservative: how a full list gives up its weakest link, `sparsification.without_link`.
+            False: overconfidently, Ω stays definite. True: claiming less, which in a map that needs
+            many more links than it may have costs Ω its definiteness.
         whole: `estimate` inverts Ω of all landmarks, O(N³): what the filter believes.
         gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
         floor: standard deviation [m, rad] added to a singular pose_cov, which has no inverse.

@@ -16,7 +16,7 @@ from jaxslam.filters import propagation
 from jaxslam.filters.entering import Entry
 from jaxslam.filters.joining import SIZE, best_way, entered, points_seen, sees_in_full
 from jaxslam.filters.scanning import ScanUpdate, in_order, joined, part_update
-from jaxslam.linalg import check_count, is_concrete
+from jaxslam.linalg import check_count, check_gate
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.protocols import Associate, Chart, Filter
 from jaxslam.slots import Joint
@@ -287,8 +287,7 @@ def _check(
         raise ValueError(f"team_slam: expected the chart euclidean, got {chart.name}")
     if update not in ("sequential", "joint"):
         raise ValueError(f'team_slam: expected update "sequential" or "joint", got {update!r}')
-    if gate is not None and is_concrete(gate) and not gate > 0:
-        raise ValueError(f"team_slam: expected a gate above 0, got {gate}")
+    check_gate("team_slam", gate)
     for b, robot in enumerate(robots):
         for part in robot.sensors.parts:
             if len(part.sensor.landmark) not in (0, 2):
