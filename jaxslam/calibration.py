@@ -86,7 +86,7 @@ def calibrate(
         factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
         residual = jnp.where(there[:, None], found.innovation.reshape(count, size), 0.0)
         w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
-        return w, (w, fused.sum() * size)
+        return w, (w, jnp.where(fused, found.dof, 0).sum())
 
     step = jax.jit(jax.jacfwd(white, has_aux=True))
     path, misfit, dofs, converged = [p], [], [], False

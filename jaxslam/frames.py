@@ -54,15 +54,18 @@ def reverse(a: Frame) -> Frame:
 def merge(a: Frame, b: Frame) -> tuple[Frame, Array]:
     """Two independent estimates of one frame as one (parallel), and whether P_a + P_b is regular.
 
-        K = P_a (P_a + P_b)⁻¹,  x = x_a + K (x_b ⊖ x_a),  P = P_a - K P_a
+        K = P_a (P_a + P_b)⁻¹,  x = x_a + K (x_b ⊖ x_a),  P = (I - K) P_a (I - K)ᵀ + K P_b Kᵀ
 
-    so P⁻¹ = P_a⁻¹ + P_b⁻¹ where these exist. Where the sum is singular, a is returned.
+    so P⁻¹ = P_a⁻¹ + P_b⁻¹ where these exist, and a vague frame does not cancel a sharp one. Where
+    the sum is singular, a is returned.
     """
     solved, regular = linalg.solve_psd(a.cov + b.cov, a.cov)
     gain = jnp.where(regular, solved.T, 0.0)
     pose = a.pose + gain @ _difference(b, a)
     pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
-    return Frame(pose, linalg.symmetrize(a.cov - gain @ a.cov)), regular
+    left = jnp.eye(3, dtype=gain.dtype) - gain
+    cov = left @ a.cov @ left.T + gain @ b.cov @ gain.T
+    return Frame(pose, linalg.symmetrize(cov)), regular
 
 
 def mahalanobis_squared(a: Frame, b: Frame) -> tuple[Array, Array]:

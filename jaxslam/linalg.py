@@ -62,6 +62,8 @@ def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     triangle is read. Non-finite input gives False.
     """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    if n == 0:
+        return matrix, jnp.asarray(True)
     if n > _UNROLLED:
         return _cholesky_beyond(matrix)
     zero = jnp.zeros((), matrix.dtype)
@@ -152,6 +154,8 @@ def triangular_root(wide: jax.Array) -> jax.Array:
 def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
     """L⁻¹ B for lower L (n, n) and B (n, …); rows whose pivot is zero come out zero."""
     n = factor.shape[-1]
+    if n == 0:
+        return rhs
     if n > _UNROLLED:
         singular = jnp.diagonal(factor) == 0
         safe = factor + jnp.diag(singular.astype(factor.dtype))

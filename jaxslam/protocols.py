@@ -234,9 +234,10 @@ class Life:
     after: Callable[[Joint, Info, Callable[[], Estimate]], tuple[Any, Array]]
     """(joint, info, estimate) -> memory, slots to remove (N,) bool; after a scan, with what became
     of it. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
-    make_room: Callable[[Joint, Array], Array] | None = None
-    """(joint, needed () int) -> slots (N,) bool to remove before new landmarks enter a map that
-    lacks so many places; None where a full map refuses."""
+    make_room: Callable[[Joint, Array, Array], Array] | None = None
+    """(joint, needed () int, measured (N,) bool) -> slots (N,) bool to remove before new landmarks
+    enter a map that lacks so many places, none of those this scan measured; None where a full map
+    refuses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,6 +258,8 @@ class Filter:
     chart: Chart
     places: tuple[int, ...] = ()
     """how many places of a scan each sensor has, in order; () where all are of one sensor."""
+    square_root: bool = False
+    """whether its state is a `slots.Joint` with a root of the covariance."""
 
 
 Estimator = Callable[[Log, Array], Trace]

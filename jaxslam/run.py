@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Filter
-from jaxslam.types import Log, Trace, check_log
+from jaxslam.types import Log, Status, Trace, check_log
 
 
 def run(
@@ -26,7 +26,8 @@ def run(
     """Drive a filter along a log: per row predict with the control, then update with the scan.
 
     Traceable: wrap it in `jax.jit`, `jax.vmap` over logs and keys, or `jax.grad`. The arithmetic
-    runs in the wider dtype of the log's controls and measurements.
+    runs in the wider dtype of the log's controls and measurements. A valid measurement that is not
+    finite is refused where its value is concrete, and dropped as `Status.REJECTED` under a trace.
 
     Args:
         filter: made by a factory of `jaxslam.filters`.
@@ -65,7 +66,12 @@ def run(
     def step(state: Any, row: tuple[Log, jax.Array]) -> tuple[Any, Any]:
         (control, scan), (key_predict, key_update) = row
         state = filter.predict(state, control, key_predict)
+        # Under jit nobody has looked for NaN, and one would go through the whole state.
+        lost = scan.valid & ~jnp.isfinite(scan.z).all(axis=1)
+        scan = scan._replace(valid=scan.valid & ~lost)
         state, info = filter.update(state, scan, key_update)
+        status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
+        info = info._replace(status=status.astype(info.status.dtype))
         return state, (filter.estimate(state), info, () if probe is None else probe(state))
 
     # What a scan runs cannot be merged with its own recomputation, so no barrier is needed.

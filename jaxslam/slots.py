@@ -230,7 +230,15 @@ def remove(joint: Joint, dead: jax.Array, *, square_root: bool = False) -> Joint
 
     In covariance form the marginal is what is left when rows and columns are dropped (Solà Table 1,
     state reduction); here they are overwritten with padding. Removing a dead slot changes nothing.
+    square_root: the state holds a root of P, as that of a filter with square_root=True does.
+
+    Raises ValueError unless dead is bool, one for each slot.
     """
+    if jnp.shape(dead) != joint.alive.shape or jnp.result_type(dead) != jnp.bool_:
+        raise ValueError(
+            f"remove: expected bool of shape {joint.alive.shape}, got {jnp.result_type(dead)} of "
+            f"{jnp.shape(dead)}"
+        )
     size = joint.landmarks.shape[1]
     keep = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(~dead, size)])
     eye = jnp.eye(joint.cov.shape[0], dtype=joint.cov.dtype)

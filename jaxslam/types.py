@@ -25,7 +25,7 @@ class Status(IntEnum):
     BORN = 2
     """Started a new landmark."""
     REJECTED = 3
-    """Failed the gate; dropped."""
+    """Failed the gate, or not finite; dropped."""
     OVERFLOW = 4
     """A new landmark, but the map is full; dropped."""
     DEFERRED = 5
@@ -169,8 +169,8 @@ def check_log(
     """Raise ValueError, naming the row, unless a log is well formed.
 
     Shapes and kinds are always checked, values (finite controls, finite valid measurements, tags
-    >= -1 and not repeated within a scan) only where they are concrete. parts: how many places of a
-    scan each sensor has, where there are several; a tag may then occur once with each.
+    >= -1, of 32 bits and not repeated within a scan) only where they are concrete. parts: how many
+    places of a scan each sensor has, where there are several; a tag may then occur once with each.
     """
     control, (z, tag, valid) = log.control, log.scan
     steps = np.shape(control)[0] if np.ndim(control) == 2 else -1
@@ -188,6 +188,7 @@ def check_log(
     finite = np.isfinite(np.asarray(z)).all(axis=2)
     _refuse((there & ~finite).any(axis=1), "a valid measurement is not finite")
     _refuse((there & (tags < -1)).any(axis=1), "a tag is below -1")
+    _refuse((there & (tags > np.iinfo(np.int32).max)).any(axis=1), "a tag is beyond int32")
     named = np.where(there & (tags >= 0), tags, -1 - np.arange(places))
     for part in np.split(named, np.cumsum(parts)[:-1].astype(int), axis=1) if parts else (named,):
         ordered = np.sort(part, axis=1)

@@ -32,6 +32,19 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
         return run(filter, Log(scaled, scan), np.zeros(3), np.zeros((3, 3)), KEY).info
 
     found = calibrate(info, np.zeros(2))
+
+    def wider(p):
+        """As a suite has it whose other sensor measures more."""
+        plain = info(p)
+        return plain._replace(
+            innovation=jnp.pad(plain.innovation, [(0, 0), (0, 0), (0, 1)]),
+            innovation_cov=jnp.pad(plain.innovation_cov, [(0, 0), (0, 0), (0, 1), (0, 1)]),
+        )
+
+    again = calibrate(wider, np.zeros(2))
+    np.testing.assert_array_equal(again.dof, found.dof)
+    np.testing.assert_allclose(again.misfit, found.misfit, rtol=1e-12)
+    np.testing.assert_allclose(again.parameters, found.parameters, rtol=1e-12)
     shared = np.minimum(*np.indices((steps, steps))) + 1
     for axis in range(2):
         # Unknowns l and p; the first has no prior.
@@ -98,7 +111,8 @@ def plain(innovation, status=1):
     """An Info of two places of one step: a fused one, and an empty one that is not finite."""
     empty = jnp.full((1, 1), jnp.nan)
     return Info(
-        *[None] * 2,
+        nis=None,
+        dof=jnp.array([[int(status == 1), 0]]),
         innovation=jnp.concatenate([jnp.reshape(innovation, (1, 1)), empty])[None],
         innovation_cov=jnp.stack([jnp.eye(1), empty])[None],
         slot=None,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam import association, charts, motion, sensors, slots
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import eif_slam, ekf_slam
 from jaxslam.filters.closing import close_loop, closing
 from jaxslam.filters.merging import merge
 from jaxslam.life import recency
@@ -216,3 +216,15 @@ def test_refusals():
         closing(plain, reach=-1.0)
     with pytest.raises(ValueError, match="recency"):
         closing(plain).init(jnp.zeros(3), jnp.eye(3))
+    models = motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2)), 3
+    with pytest.raises(ValueError, match="root"):
+        closing(ekf_slam(*models, life=recency(), square_root=True))
+    with pytest.raises(ValueError, match="Joint"):
+        closing(eif_slam(*models)).init(jnp.zeros(3), jnp.eye(3))
+
+
+def test_a_filter_of_several_sensors_keeps_its_places():
+    one = sensors.relative_position(np.eye(2))
+    both = sensors.suite((one, 2), (one, 2))
+    filter = ekf_slam(motion.pose_increment(np.eye(3)), both, 4, life=recency())
+    assert closing(filter).places == filter.places == (2, 2)

@@ -450,6 +450,21 @@ def test_a_repeated_tag_that_escapes_the_check_under_jit_is_born_once(good_trace
     assert list(trace.final.tag) == [0, 2, -1]
 
 
+def test_what_is_not_finite_and_escapes_the_check_under_jit_is_dropped(good_trace):
+    """Neither a landmark that is known nor one that is new takes NaN in."""
+    log = spoiled("z", (1, 1, 0), np.nan)
+    log = log._replace(scan=log.scan._replace(z=log.scan.z.copy()))
+    log.scan.z[0, 2, 1] = np.inf
+    trace = good_trace(log)
+    valid = log.scan.valid.copy()
+    valid[1, 1] = valid[0, 2] = False
+    expected = good_trace(log._replace(scan=log.scan._replace(valid=valid)))
+    assert trace.info.status[1, 1] == trace.info.status[0, 2] == Status.REJECTED
+    assert_finite(trace.estimate)
+    assert_unchanged(expected.estimate, trace.estimate)
+    np.testing.assert_array_equal(expected.info.log_likelihood, trace.info.log_likelihood)
+
+
 @pytest.mark.parametrize("update", ["sequential", "joint"])
 @pytest.mark.parametrize(("steps", "places"), [(0, 2), (3, 0)])
 def test_a_log_without_rows_or_without_places_is_a_log(update, steps, places):

@@ -122,3 +122,15 @@ def test_batches_and_dtypes(dtype):
     assert both.cov.dtype == dtype
     first = jax.tree.map(lambda x: x[0], (a, b))
     np.testing.assert_allclose(both.cov[0], frames.compound(*first).cov, rtol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_vague_frame_does_not_cancel_a_sharp_one(dtype):
+    sharp = Frame(jnp.array([1, 2, 0.5], dtype), jnp.diag(jnp.array([1e-4, 1e-4, 1e-6], dtype)))
+    for vague in (1e2, 1e4, 1e8):
+        other = Frame(jnp.zeros(3, dtype), vague * jnp.eye(3, dtype=dtype))
+        for pair in ((sharp, other), (other, sharp)):
+            merged, regular = merge(*pair)
+            assert regular
+            np.testing.assert_allclose(merged.cov, sharp.cov, rtol=1e-5, atol=1e-12)
+            np.testing.assert_allclose(merged.pose, sharp.pose, rtol=2e-5)

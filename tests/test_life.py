@@ -189,9 +189,33 @@ def test_making_room_takes_the_least_likely_provisional_ones():
         jnp.array([-1.0, -2.0, 3.0, 0.0]), jnp.array([False, False, True, False]), 0, 0, 0
     )
     joint = Joint(0, 0, 0, alive, 0, 0, life=memory)
+    none = jnp.zeros(4, bool)
     for needed, slots_given_up in ((-1, []), (0, []), (1, [1]), (2, [0, 1]), (4, [0, 1])):
-        given_up = manager.make_room(joint, jnp.asarray(needed))
+        given_up = manager.make_room(joint, jnp.asarray(needed), none)
         assert list(np.flatnonzero(given_up)) == slots_given_up
+    given_up = manager.make_room(joint, jnp.asarray(2), none.at[1].set(True))
+    assert list(np.flatnonzero(given_up)) == [0]
+
+
+def test_a_landmark_that_the_scan_measured_stays_in_a_full_map():
+    a, b, c = [2.0, 0.0], [2.0, 1.5], [2.0, -1.5]
+    z = np.array([[a, b]] + [[a, c]] * 4)
+    tag = np.array([[0, 1]] + [[0, 2]] * 4, np.int32)
+    log = Log(np.zeros((5, 2)), Scan(z, tag, np.ones((5, 2), bool)))
+    manager = life.existence(lambda pose, point: jnp.asarray(False), replace=True)
+    trace = jax.jit(
+        lambda log: run(
+            ekf_slam(MOTION, SENSOR, 2, life=manager),
+            log,
+            jnp.zeros(3),
+            jnp.zeros((3, 3)),
+            jax.random.key(0),
+        )
+    )(log)
+    assert (np.asarray(trace.info.status[1:, 0]) == Status.FUSED).all()
+    np.testing.assert_array_equal(trace.info.removed[1], [False, True])
+    np.testing.assert_array_equal(trace.estimate.tag[-1], [0, 2])
+    assert not trace.info.removed[2:].any()
 
 
 def test_what_is_no_manager_is_refused():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from worlds import ring
 
-from jaxslam import association, motion, run, sensors, simulate
+from jaxslam import association, charts, linearize, motion, run, sensors, simulate
 from jaxslam.filters import ekf_slam, mapping
 from jaxslam.filters.mapping import as_prior
 from jaxslam.stats import chi2_band, chi2_quantile
@@ -54,6 +54,7 @@ def test_it_is_honest():
     """NEES of the landmarks over 200 worlds in the chi-square band of so many."""
     scenario, _, _ = world()
     filter = mapping(scenario.sensor, 6)
+    slam = ekf_slam(scenario.motion, scenario.sensor, 6)
 
     @jax.jit
     @jax.vmap
@@ -61,7 +62,7 @@ def test_it_is_honest():
         truth, log = simulate(scenario, key)
         start = jnp.zeros(3), jnp.zeros((3, 3)), KEY
         trace = run(filter, log._replace(control=truth.pose), *start)
-        joint = as_prior(trace.final, jnp.zeros(3), jnp.eye(3))
+        joint = as_prior(trace.final, slam, jnp.zeros(3), jnp.eye(3))
         off = truth.landmarks[trace.final.tag] - trace.final.landmarks
         return off.reshape(-1) @ jnp.linalg.solve(joint.cov[3:, 3:], off.reshape(-1))
 
@@ -75,7 +76,8 @@ def test_a_prior_for_slam():
     scenario, truth, log = world()
     final = on_poses(mapping(scenario.sensor, 8), truth, log).final
     pose, cov = np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.01])
-    joint = as_prior(final, pose, cov)
+    slam = ekf_slam(scenario.motion, scenario.sensor, 8)
+    joint = as_prior(final, slam, pose, cov)
     np.testing.assert_array_equal(joint.cov[:3, :3], cov)
     np.testing.assert_array_equal(joint.cov[:3, 3:], 0)
     blocks = np.asarray(joint.cov)[3:, 3:].reshape(8, 2, 8, 2)
@@ -83,7 +85,6 @@ def test_a_prior_for_slam():
         for j in range(8):
             own = np.asarray(final.covs[i]) if final.alive[i] else np.eye(2)
             np.testing.assert_array_equal(blocks[i, :, j], own if i == j else 0)
-    slam = ekf_slam(scenario.motion, scenario.sensor, 8)
     row = jax.tree.map(lambda leaf: leaf[0], log.scan)
     after, info = slam.update(joint, row, KEY)
     assert (info.status == Status.FUSED).all()
@@ -117,4 +118,14 @@ def test_refusals():
         mapping(sensors.compass(np.eye(1)), 3)
     final = mapping(sensor, 2).init(jnp.zeros(3), jnp.eye(3))
     with pytest.raises(ValueError, match=r"pose \(3,\)"):
-        as_prior(final, jnp.zeros(2), jnp.eye(3))
+        as_prior(final, ekf_slam(ring(3).motion, sensor, 2), jnp.zeros(2), jnp.eye(3))
+    for options, message in (
+        ({"capacity": 3}, "no 2 landmarks"),
+        ({"chart": charts.right_invariant()}, "Euclidean"),
+        ({"chart": charts.robocentric()}, "Euclidean"),
+        ({"square_root": True}, "covariance"),
+        ({"linearize": linearize.first_estimate()}, "Jacobians"),
+    ):
+        other = ekf_slam(ring(3).motion, sensor, **({"capacity": 2} | options))
+        with pytest.raises(ValueError, match=message):
+            as_prior(final, other, jnp.zeros(3), jnp.eye(3))

@@ -1,5 +1,6 @@
 """Merging two landmarks that are one: the joint test, the constraint, and what it equals."""
 
+import dataclasses
 from functools import cache
 
 import jax
@@ -226,3 +227,30 @@ def test_refusals_of_duplicates():
     for sensor in (rays, sensors.compass(np.eye(1))):
         with pytest.raises(ValueError, match="cannot be merged"):
             ekf_slam(MOTION, sensor, 3, merge=RULE)
+
+
+@pytest.mark.parametrize("square_root", [False, True])
+def test_landmarks_that_differ_stay_two_in_either_form(square_root):
+    """0.45 m apart, known to centimetres, and seen by turns: only their distance tells them apart."""
+    sensor = sensors.range_bearing(np.diag([0.02, 0.01]) ** 2)
+    filter = ekf_slam(MOTION, sensor, 4, merge=duplicates(0.5), square_root=square_root)
+    z = np.array([[[2.0, 0.0]], [[2.0, 0.225]]] * 5)
+    scan = Scan(z, np.array([[0], [1]] * 5, np.int32), np.ones((10, 1), bool))
+    log = Log(np.zeros((10, 3)), scan)
+    start = np.zeros(3), np.zeros((3, 3)), KEY
+    trace = jax.jit(lambda log: run(ekf_slam_still(filter), log, *start))(log)
+    assert (np.asarray(trace.info.merged) == -1).all()
+    assert trace.estimate.alive[-1].sum() == 2
+
+
+def ekf_slam_still(filter):
+    """Without the noise of motion, which would make the two one in the robot's eyes."""
+    return dataclasses.replace(filter, predict=lambda state, u, key: state)
+
+
+def test_the_closest_pair_of_a_root_is_that_of_its_covariance():
+    joint = some_joint()
+    root = joint._replace(cov=jnp.linalg.cholesky(joint.cov))
+    expected = closest_pair(joint, EUCLIDEAN, 100.0)
+    found = closest_pair(root, EUCLIDEAN, 100.0, square_root=True)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

@@ -225,3 +225,11 @@ def test_operations_keep_float32():
     ):
         assert {out.pose.dtype, out.landmarks.dtype, out.cov.dtype} == {np.dtype("f4")}
         assert out.tag.dtype == np.int32
+
+
+def test_a_mask_of_another_kind_or_shape_is_refused():
+    joint = scatter(start(), *births(np.random.default_rng(5), [True, False, True, False]))
+    with pytest.raises(ValueError, match="bool"):
+        remove(joint, np.array([1, 0, 0, 0]))
+    with pytest.raises(ValueError, match="shape"):
+        remove(joint, np.array([True, False]))

@@ -41,6 +41,12 @@ BAD_VALUES = {
     "z nan": (changed("z", (1, 2, 0), np.nan), r"a valid measurement is not finite \(row 1\)"),
     "z inf": (changed("z", (0, 0, 1), -np.inf), r"a valid measurement is not finite \(row 0\)"),
     "tag -2": (changed("tag", (3, 1), -2), r"a tag is below -1 \(row 3\)"),
+    "tag 2**32": (
+        good_log()._replace(
+            scan=good_log().scan._replace(tag=good_log().scan.tag.astype(np.int64) + 2**32)
+        ),
+        r"a tag is beyond int32 \(row 0\)",
+    ),
     "repeated": (changed("tag", 2, [5, 6, 5]), r"a tag repeats within the scan \(row 2\)"),
 }
 

@@ -18,7 +18,7 @@ def certain(associate: Associate, spread: float) -> Associate:
     ones they are, together.
 
     Args:
-        associate: the method.
+        associate: the method; one that goes by tags alone, as `known`, does not ask what it sees.
         spread: in units of the measurement, which should all be of one kind.
     Raises:
         ValueError: on a spread not above 0.

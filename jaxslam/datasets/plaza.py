@@ -42,8 +42,9 @@ def plaza(
     beacon) and GT (t, x, y, θ). The log has a row at the time of every range: its control is the
     pose increment (dx, dy, dθ) of the odometry since the row before, the last odometry row of it
     cut at that time, in proportion. Ranges of one time share a row; of several of one beacon there
-    the first counts, as ranges before the first odometry do not, and the others are counted as
-    dropped. A range z is corrected to (z - offset)/(1 + scale), `range_bias`.
+    the first counts, and those before the first ground truth or after the last odometry do not;
+    the others are counted as dropped. A range z is corrected to (z - offset)/(1 + scale) by
+    `range_bias`.
 
     `true_path` is the ground truth at the time of each row, linear between its rows. The map's
     frame is that of the robot's first pose, the survey's and the path's is another.
@@ -84,7 +85,9 @@ def plaza(
     inside = (ranges[:, 0] > begin) & (ranges[:, 0] <= end)
     times, row = np.unique(ranges[inside, 0], return_inverse=True)
     if len(times) == 0:
-        raise ValueError(f"{path}: no range in TD is within the odometry")
+        raise ValueError(
+            f"{path}: no range in TD is between the first ground truth and the last odometry"
+        )
     tag = np.searchsorted(names, ranges[inside, 2].astype(int))
     first = np.unique(row * len(names) + tag, return_index=True)[1]
     offset, scale = range_bias

@@ -84,7 +84,7 @@ def rows_at(by_pose: jax.Array, own: jax.Array, place: jax.Array, count: int) ->
     m, k, size = own.shape
     at = (place[:, None] == jnp.arange(count)[None, :]).astype(own.dtype)
     wide = jnp.einsum("mkl,ma->mkal", own, at).reshape(m, k, count * size)
-    return jnp.concatenate([by_pose, wide], axis=2).reshape(m * k, -1)
+    return jnp.concatenate([by_pose, wide], axis=2).reshape(m * k, 3 + count * size)
 
 
 def weigh(
@@ -117,12 +117,12 @@ def weigh(
     marginal = s[jnp.arange(m), :, jnp.arange(m)]
     distance, positive = jax.vmap(_squared)(nu, marginal)
     root, noisy = jax.vmap(linalg.cholesky)(noise)
-    inside = jnp.ones(m, bool) if gate is None else ~positive | (distance <= gate)
+    inside = ~positive | (jnp.isfinite(distance) if gate is None else distance <= gate)
     positive = positive & noisy & sound
     fused = known & inside & positive
     both = fused[:, None, None, None] & fused[None, None, :, None]
     unit = same * jnp.eye(size_z, dtype=z.dtype)[None, :, None]
-    whole = linalg.cholesky(jnp.where(both, s, unit).reshape(m * size_z, -1))[0]
+    whole = linalg.cholesky(jnp.where(both, s, unit).reshape(m * size_z, m * size_z))[0]
     fused_nu = jnp.where(fused[:, None], nu, 0.0)
     white = linalg.solve_lower(whole, fused_nu.reshape(-1)).reshape(m, size_z)
     nis = (white**2).sum(axis=1)
@@ -133,14 +133,14 @@ def weigh(
     def whitened(root: jax.Array, values: jax.Array) -> jax.Array:
         return linalg.solve_lower(root, values)
 
-    rows = jax.vmap(whitened)(root, h.reshape(m, size_z, -1))
+    rows = jax.vmap(whitened)(root, h.reshape(m, size_z, h.shape[1]))
     status = first_that_holds(
         (known & ~inside, Status.REJECTED),
         (known & ~positive, Status.SINGULAR),
         (known, Status.FUSED),
     )
     return Weighed(
-        rows=jnp.where(fused[:, None, None], rows, 0.0).reshape(m * size_z, -1),
+        rows=jnp.where(fused[:, None, None], rows, 0.0).reshape(h.shape),
         innovation=jax.vmap(whitened)(root, fused_nu).reshape(-1),
         fused=fused,
         info=Info(

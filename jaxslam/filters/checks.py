@@ -18,7 +18,7 @@ def check_numbers(
 ) -> None:
     """Counts are counts, the update is one of two, the gate positive."""
     for name, value in (("capacity", capacity), ("iterations", iterations), ("births", births)):
-        if value is not None:
+        if value is not None or name != "births":
             check_count(f"ekf_slam: {name}", value)
     if update not in ("sequential", "joint"):
         raise ValueError(f'ekf_slam: expected update "sequential" or "joint", got {update!r}')

@@ -171,15 +171,20 @@ def closing(
         spread: [m]
         **options: of `close_loop`.
     Raises:
-        ValueError: on every below 1, a reach or spread not above 0, and as `close_loop`.
+        ValueError: on a square-root filter, on every below 1, a reach or spread not above 0, and as
+            `close_loop`.
     """
     check_count("closing: every", every)
     if not (reach is None or reach > 0) or not spread > 0:
         raise ValueError(f"closing: expected a reach and a spread above 0, got {reach}, {spread}")
+    if filter.square_root:
+        raise ValueError(f"closing: the state of {filter.name} holds a root of its covariance")
     chart, gate = filter.chart, chi2_quantile(0.99, 2)
 
     def init(pose: Array, pose_cov: Array) -> Closed:
         joint, none = filter.init(pose, pose_cov), jnp.zeros((), jnp.int32)
+        if not isinstance(joint, Joint):
+            raise ValueError(f"closing: the state of {filter.name} is no slots.Joint")
         _times(joint, chart)
         return Closed(joint, none, none, none, none, _no_look())
 
@@ -235,6 +240,7 @@ def closing(
         update=update,
         estimate=estimate,
         chart=chart,
+        places=filter.places,
     )
 
 

@@ -153,7 +153,7 @@ def ekf_slam(
         joint, info, given_up = in_order(joint, scan, parts)
         if merge is not None:
             joint = joint._replace(apart=told_apart(joint, info, places))
-            kept, gone, same = find_duplicate(joint, chart, merge)
+            kept, gone, same = find_duplicate(joint, chart, merge, square_root=square_root)
 
             def merged(joint: Joint) -> Joint:
                 one = merge_pair(joint, chart, kept, gone, square_root=square_root)
@@ -191,4 +191,5 @@ def ekf_slam(
         estimate=estimate,
         chart=chart,
         places=places,
+        square_root=square_root,
     )

@@ -225,11 +225,15 @@ def checked_map(
         raise ValueError(
             f"{name}: expected landmarks of shape (at least 1, {size}), got {np.shape(landmarks)}"
         )
+    if not np.issubdtype(jnp.result_type(landmarks), np.number) or jnp.iscomplexobj(landmarks):
+        raise ValueError(f"{name}: the map is not of real numbers")
     if is_concrete(landmarks) and not np.isfinite(np.asarray(landmarks)).all():
         raise ValueError(f"{name}: the map is not finite")
     count = np.shape(landmarks)[0]
     names = np.arange(count) if tags is None else np.asarray(tags)
     good = names.shape == (count,) and np.issubdtype(names.dtype, np.integer)
-    if not good or len(set(names.tolist())) != count or names.min() < 0:
-        raise ValueError(f"{name}: expected {count} different tags from 0 on, got {tags!r}")
-    return landmarks, names.astype(np.int32)
+    most = np.iinfo(np.int32).max
+    if not good or len(set(names.tolist())) != count or not 0 <= names.min() <= names.max() <= most:
+        raise ValueError(f"{name}: expected {count} different tags from 0 to {most}, got {tags!r}")
+    points = landmarks if hasattr(landmarks, "shape") else np.asarray(landmarks)
+    return points, names.astype(np.int32)

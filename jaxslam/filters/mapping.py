@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import linalg
+from jaxslam.angles import wrap
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import particle_map, particle_scan
@@ -13,7 +14,6 @@ from jaxslam.filters.particles import Particles, empty, moments
 from jaxslam.protocols import Associate, Filter, Life, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
-from jaxslam.slots import empty as empty_joint
 from jaxslam.stats import chi2_quantile
 from jaxslam.types import Estimate, Info, Scan
 
@@ -47,7 +47,7 @@ def mapping(
             suite, absolute, or whose landmarks turn into points.
     """
     for name, value in (("capacity", capacity), ("births", births)):
-        if value is not None:
+        if value is not None or name != "births":
             linalg.check_count(f"mapping: {name}", value)
     linalg.check_gate("mapping", gate)
     if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
@@ -73,7 +73,7 @@ def mapping(
         return one if life is None else one._replace(life=life.init(pose, one.landmarks))
 
     def predict(state: Particles, u: Array, key: Array) -> Particles:
-        return state._replace(pose=u)
+        return state._replace(pose=jnp.concatenate([u[:2], wrap(u[2:])]))
 
     def update(state: Particles, scan: Scan, key: Array) -> tuple[Particles, Info]:
         # Padding may hold anything, and is multiplied by zero further down.
@@ -107,14 +107,19 @@ def mapping(
     )
 
 
-def as_prior(state: Particles, pose: Array, pose_cov: Array) -> Joint:
-    """The state of an `ekf_slam` filter that begins in this map, with nothing correlated yet.
+def as_prior(state: Particles, filter: Filter, pose: Array, pose_cov: Array) -> Joint:
+    """The state of a filter that begins in this map, with nothing correlated yet.
+
+    `run` begins in it by `dataclasses.replace(filter, init=partial(as_prior, final, filter))`.
 
     Args:
         state: the final state of `mapping`.
-        pose, pose_cov: (3,) and (3, 3) where the robot of the new filter begins.
+        filter: an `ekf_slam` of as many landmarks, in the Euclidean chart.
+        pose, pose_cov: (3,) and (3, 3) where its robot begins.
     Raises:
-        ValueError: on other shapes.
+        ValueError: on other shapes; on a filter whose state is no `slots.Joint` of as many
+            landmarks, holds a root of its covariance, is in another chart, or remembers where it
+            linearized.
     """
     if jnp.shape(pose) != (3,) or jnp.shape(pose_cov) != (3, 3):
         raise ValueError(
@@ -123,7 +128,17 @@ def as_prior(state: Particles, pose: Array, pose_cov: Array) -> Joint:
         )
     capacity, size = state.landmarks.shape
     kind = state.landmarks.dtype
-    joint = empty_joint(jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind), capacity, size)
+    joint = filter.init(jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind))
+    if not isinstance(joint, Joint) or joint.landmarks.shape != (capacity, size):
+        raise ValueError(
+            f"as_prior: the state of {filter.name} has no {capacity} landmarks of {size} numbers"
+        )
+    plain = filter.chart.basis is None and not filter.chart.motion_apart
+    if not plain or filter.square_root or jax.tree.leaves(joint.lin):
+        raise ValueError(
+            "as_prior: expected a filter in the Euclidean chart, with a covariance and Jacobians "
+            "at the estimate"
+        )
     blocks = jnp.where(state.alive[:, None, None], state.covs, jnp.eye(size, dtype=kind)[None])
     rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
     return joint._replace(

@@ -64,20 +64,30 @@ def _together(status: Array, slot: Array, capacity: int) -> Array:
     return here[:, None] & here[None, :]
 
 
-def find_duplicate(joint: Joint, chart: Chart, rule: Duplicates) -> tuple[Array, Array, Array]:
+def find_duplicate(
+    joint: Joint, chart: Chart, rule: Duplicates, *, square_root: bool = False
+) -> tuple[Array, Array, Array]:
     """Slots i < j of two landmarks that are taken for one, and whether there are such."""
-    i, j, distance = closest_pair(joint, chart, rule.reach, allowed=~joint.apart)
+    i, j, distance = closest_pair(
+        joint, chart, rule.reach, allowed=~joint.apart, square_root=square_root
+    )
     return i, j, distance <= chi2_quantile(rule.probability, joint.landmarks.shape[1])
 
 
 def closest_pair(
-    joint: Joint, chart: Chart, reach: float, allowed: Array | None = None
+    joint: Joint,
+    chart: Chart,
+    reach: float,
+    allowed: Array | None = None,
+    *,
+    square_root: bool = False,
 ) -> tuple[Array, Array, Array]:
     """Slots i < j of the two landmarks that are most likely one, and their squared distance.
 
     d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), in which the correlation of the two counts:
     of landmarks that are each known badly, but well against one another, d² is large. i = j = 0 and
-    d² infinite where no pair is within reach [m] of another and allowed (N, N).
+    d² infinite where no pair is within reach [m] of another and allowed (N, N). square_root: as in
+    `merge`.
 
     Raises ValueError on a reach not above 0, or allowed of another shape.
     """
@@ -91,9 +101,10 @@ def closest_pair(
         )
     delta = joint.landmarks[:, None] - joint.landmarks[None, :]
     by_robot, by_landmark = _derivatives(joint, chart)
-    robot = joint.cov[:3, :3]
-    cross = joint.cov[:3, 3:].reshape(3, capacity, size)
-    blocks = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)
+    whole = joint.cov @ joint.cov.T if square_root else joint.cov
+    robot = whole[:3, :3]
+    cross = whole[:3, 3:].reshape(3, capacity, size)
+    blocks = whole[3:, 3:].reshape(capacity, size, capacity, size)
     # Of coordinates: l_i = A_i dx + B_i dl_i, so cov(l_i, l_j) has four terms.
     with_robot = jnp.einsum("nij,jmk,mlk->nmil", by_robot, cross, by_landmark)
     apart = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)

@@ -34,7 +34,9 @@ def after_scan(
     given_up = jnp.zeros_like(own.alive)
     if life is not None and life.make_room is not None:
         needed = sight.is_new.sum() - (~own.alive).sum()
-        given_up = life.make_room(_joint(own), needed)
+        there = jnp.where(sight.used, sight.slot, own.alive.shape[0])
+        measured = jnp.zeros_like(own.alive).at[there].set(True, mode="drop")
+        given_up = life.make_room(_joint(own), needed, measured)
         own = _without(own, given_up)
     at, granted, deferred, repeated, new, new_covs = where_any(
         sight.is_new.any(),

@@ -97,6 +97,8 @@ def relocalize(
         ValueError: on shapes that do not fit, a probability not between 0 and 1, least below 3,
             or margin, pairs or candidates below 1.
     """
+    points, cov, alive = jnp.asarray(points), jnp.asarray(cov), jnp.asarray(alive)
+    seen, seen_covs, valid = jnp.asarray(seen), jnp.asarray(seen_covs), jnp.asarray(valid)
     n, m = np.shape(points)[0], np.shape(seen)[0]
     expected = ((points, (n, 2)), (cov, (2 * n, 2 * n)), (alive, (n,)), (seen, (m, 2)))
     for value, shape in (*expected, (seen_covs, (m, 2, 2)), (valid, (m,))):

@@ -139,7 +139,9 @@ def weigh(
         if iteration == 0:
             marginal = s[jnp.arange(m), :, jnp.arange(m)]
             distance, positive = jax.vmap(_squared_distance)(nu, marginal)
-            inside = jnp.ones(m, bool) if gate is None else ~positive | (distance <= gate)
+            # A finite measurement so far off that its d² is not is outside any gate.
+            near = jnp.isfinite(distance) if gate is None else distance <= gate
+            inside = ~positive | near
             fuse = known & inside & positive
             innovation = nu
         hp = hp.reshape(m * size_z, -1)

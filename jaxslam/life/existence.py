@@ -61,7 +61,8 @@ def existence(
         patience: a provisional landmark not measured for so many scans is removed.
         spread: [m] a landmark with a larger standard deviation, √(tr P/2), is removed.
         replace: in a full map, new landmarks take the place of those least likely to exist among
-            the provisional ones; otherwise the map refuses (`Status.OVERFLOW`).
+            the provisional ones that the scan did not measure; otherwise the map refuses
+            (`Status.OVERFLOW`).
     Raises:
         ValueError: on a visible that is no function; unless 0 < false < detected < 1 and
             0 < remove < 1/2 < confirm < 1; on a patience below 1 or a spread not above 0.
@@ -111,8 +112,8 @@ def existence(
         )
         return memory, dead & joint.alive
 
-    def make_room(joint: Joint, needed: Array) -> Array:
-        provisional = joint.alive & ~joint.life.confirmed
+    def make_room(joint: Joint, needed: Array, measured: Array) -> Array:
+        provisional = joint.alive & ~joint.life.confirmed & ~measured
         odds = jnp.where(provisional, joint.life.log_odds, jnp.inf)
         rank = jnp.argsort(jnp.argsort(odds))
         given_up: Array = provisional & (rank < needed)

@@ -5,6 +5,7 @@ import math
 import jax
 import jax.numpy as jnp
 
+from jaxslam.linalg import is_concrete
 from jaxslam.stats import normal_quantile
 
 Array = jax.Array
@@ -22,7 +23,11 @@ def kld_bound(bins: Array, error: float, confidence: float) -> Array:
     Leibler divergence of the sample's histogram from the distribution it is of is below ε = error.
     2nK is χ² with k - 1 degrees of freedom, by Wilson & Hilferty's approximation (Fox 2001,
     "KLD-sampling: Adaptive particle filters"; Fox 2003, IJRR 22(12), eq. 7).
+
+    Raises ValueError on a concrete error not above 0.
     """
+    if is_concrete(error) and not error > 0:
+        raise ValueError(f"kld_bound: expected an error above 0, got {error}")
     z = normal_quantile(confidence)
     many = bins > 1
     dof = jnp.where(many, bins - 1, 1).astype(jnp.result_type(float))

@@ -13,7 +13,11 @@ def normalized(log_weights: Array) -> tuple[Array, Array, Array]:
 
     What is not finite weighs nothing. Where nothing is left, all weigh 1/P and the flag is False:
     the caller counts it. The log of the sum is then 0.
+
+    Raises ValueError unless log_weights has shape (P,), P at least 1.
     """
+    if jnp.ndim(log_weights) != 1 or jnp.shape(log_weights)[0] == 0:
+        raise ValueError(f"expected log-weights of shape (P,), got {jnp.shape(log_weights)}")
     there = jnp.isfinite(log_weights)
     some = there.any()
     highest = jnp.where(some, jnp.max(jnp.where(there, log_weights, -jnp.inf)), 0.0)

@@ -196,7 +196,7 @@ def batch_map(
             ending=search.ending,
         )
         info = counted(history.trace.info, used)
-        if tolerance is not None:
+        if tolerance is not None and info.exhausted.shape[0] > 0:
             cut_short = info.exhausted.at[-1].max(search.ending != Ending.CONVERGED)
             info = info._replace(exhausted=cut_short)
         return Trace(estimate, info, solved, ())

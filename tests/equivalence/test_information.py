@@ -12,7 +12,7 @@ from jaxslam.run import run
 from jaxslam.scenarios import cloister
 from jaxslam.scenarios.view import between_ranges
 from jaxslam.simulate import simulate
-from jaxslam.types import Status
+from jaxslam.types import Log, Scan, Status
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.1, 0.1, 0.05]) ** 2
@@ -159,3 +159,32 @@ def test_refusals(changes, message):
     options = {"motion": scene.motion, "sensor": scene.sensor, "capacity": 36} | changes
     with pytest.raises(ValueError, match=message):
         filters.eif_slam(**options)
+
+
+SPARSE = {"active": 2, "links": 1}
+FAMILY = {
+    "ekf_slam": (filters.ekf_slam, {}),
+    "ekf_slam, joint": (filters.ekf_slam, {"update": "joint"}),
+    "eif_slam": (filters.eif_slam, {}),
+    "seif": (filters.seif, SPARSE),
+    "eseif": (filters.eseif, SPARSE),
+}
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_scans_without_places_and_measurements_beyond_all_numbers(name):
+    """A scan of none is none; a d² that overflows is outside any gate, and moves nothing."""
+    make, options = FAMILY[name]
+    scene = world(2, pose_cov=P0)
+    filter = make(scene.motion, scene.sensor, 2, **options)
+    control = jnp.asarray(scene.controls[:3]) if len(scene.controls) > 2 else jnp.zeros((3, 2))
+    empty = Scan(jnp.zeros((3, 0, 2)), jnp.zeros((3, 0), jnp.int32), jnp.zeros((3, 0), bool))
+    none = driven(filter, scene, Log(control, empty))
+    assert np.isfinite(none.estimate.pose_cov).all()
+    z = jnp.array([[[2.0, 0.1]], [[1e200, 0.1]], [[2.0, 0.1]]])
+    scan = Scan(z, jnp.zeros((3, 1), jnp.int32), jnp.ones((3, 1), bool))
+    far = driven(filter, scene, Log(control, scan))
+    left = driven(filter, scene, Log(control, scan._replace(valid=scan.valid.at[1].set(False))))
+    assert far.info.status[1, 0] == Status.REJECTED
+    np.testing.assert_allclose(far.estimate.pose, left.estimate.pose, atol=1e-12)
+    np.testing.assert_allclose(far.estimate.pose_cov, left.estimate.pose_cov, atol=1e-12)
