@@ -129,7 +129,8 @@ def draw(data, runs, out):
             spread.plot(seconds[: bins * 1000 : 1000], mean, style, color=colour, lw=1, label=label)
     spread.set(xlabel="time [s]", ylabel="σ of the position [m]", yscale="log")
     spread.set_title("what each robot's filter claims (means of 1,000 rows)")
-    spread.legend(fontsize=7)
+    spread.set_ylim(top=2 * spread.get_ylim()[1])  # room for the legend
+    spread.legend(fontsize=7, ncol=2, loc="upper right")
     figure.tight_layout()
     out.parent.mkdir(exist_ok=True)
     figure.savefig(out, dpi=110)

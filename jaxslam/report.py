@@ -124,9 +124,10 @@ def json_text(content: Mapping[str, Any]) -> str:
 
 def as_csv(campaign: Campaign) -> str:
     """The curves: one row a filter and step; an empty cell where there is no number."""
-    keys = list(_of(campaign)[0].curves)
+    keys = list(dict.fromkeys(key for s in _of(campaign) for key in s.curves))
+    nothing = np.full(campaign.steps, np.nan)  # a filter without landmarks, say, lacks some
     rows = [
-        [name, str(step + 1), *(_blank(s.curves[key][step]) for key in keys)]
+        [name, str(step + 1), *(_blank(s.curves.get(key, nothing)[step]) for key in keys)]
         for name, s in campaign.filters.items()
         for step in range(campaign.steps)
     ]

@@ -20,7 +20,8 @@ def cache(tmp_path_factory):
 
 
 def command(out, cache, *more, runs=RUNS):
-    asked = ["--scenario", "circle", "--steps", "60", "--no-bound", "--runs", str(runs)]
+    asked = ["--scenario", "circle", "--filters", "ekf", "--steps", "60", "--no-bound"]
+    asked += ["--runs", str(runs)]
     shape = ["--devices", "1", "--block", "2", "--cache", str(cache), "--out", str(out)]
     return [sys.executable, "-m", "jaxslam", "consistency", *asked, *shape, *more]
 

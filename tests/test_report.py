@@ -1,6 +1,7 @@
 """Tables, JSON and CSV say what the campaign says; files appear whole or not at all."""
 
 import csv
+import dataclasses
 import io
 import json
 
@@ -53,6 +54,18 @@ def test_csv_holds_the_curves(campaign):
     found = [r["nees_pose"] for r in rows if r["filter"] == "other"]
     assert found[0] == ""  # the covariance is singular after one step
     np.testing.assert_allclose([float(x) for x in found[1:]], curve[1:], rtol=1e-8)
+
+
+def test_a_filter_that_lacks_a_curve_has_empty_cells(campaign):
+    first, other = campaign.filters.values()
+    less = {key: values for key, values in first.curves.items() if key != "nees_pose"}
+    lacking = dataclasses.replace(other, curves=less)
+    for filters in ({"whole": first, "less": lacking}, {"less": lacking, "whole": first}):
+        part = dataclasses.replace(campaign, filters=filters)
+        rows = list(csv.DictReader(io.StringIO(report.as_csv(part))))
+        assert set(rows[0]) == {"filter", "step", *first.curves}
+        assert all(row["nees_pose"] == "" for row in rows if row["filter"] == "less")
+        assert any(row["nees_pose"] for row in rows if row["filter"] == "whole")
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path):

@@ -1,8 +1,8 @@
 """`python -m benchmarks.association [--quick] [--out FOLDER]`: association methods compared.
 
 One scan as the heading becomes uncertain; whole runs against clutter and odometry noise; the cost
-beside a correction; Victoria Park without its identities. --quick, some 3 minutes, leaves the whole
-runs out; these have been tried at one setting of clutter and noise, not yet as the whole sweep.
+beside a correction, and of compiling; Victoria Park without its identities. --quick, some five
+minutes, leaves the whole runs out, which take some 15 more.
 """
 
 import argparse

@@ -26,7 +26,7 @@ BLOCKS = "blocks"
 
 DEFAULTS: dict[str, Any] = {
     "scenario": "circle",
-    "filters": "ekf",
+    "filters": "ekf,dead_reckoning",
     "runs": 100,
     "steps": None,
     "seed": 0,
