@@ -128,7 +128,8 @@ class Info(NamedTuple):
     resampled: Any = ()
     """() bool: the particles were resampled."""
     underflow: Any = ()
-    """() bool: no particle had a weight left, and all were given the same."""
+    """() bool: no particle had a weight left, and all were given the same; log_likelihood is then
+    0, not -∞."""
     invalid: Any = ()
     """() int: particles that a motion or a scan left with a pose that is not finite; they keep the
     pose before, and weigh nothing."""

@@ -332,6 +332,7 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"devices": []}, "device"),
         ({"filters": {}}, "at least one"),
         ({"filters": {"x": 3}}, "neither"),
+        ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
         (
             {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), SHORT.sensor, 2)}},
             "size 3",

@@ -62,8 +62,9 @@ def fastslam(
     poses of their own.
 
     Resampling happens in steps with ESS = 1/Σ w² below threshold·P. Where all weights underflow,
-    all become 1/P, `Info.underflow` says so and the log-likelihood is -∞. A particle that a motion
-    or a scan leaves without a finite pose keeps the one before and weighs nothing (`Info.invalid`).
+    all become 1/P and `Info.underflow` says so; the log-likelihood, -∞, is then given as 0, so who
+    adds it up looks at `underflow` too. A particle that a motion or a scan leaves without a finite
+    pose keeps the one before and weighs nothing (`Info.invalid`).
 
     What an `Info` says of places is said of the most likely particle (by its weight before
     resampling), whose slots are those of the estimate; its innovations are given its path, with the
@@ -138,7 +139,7 @@ def fastslam(
             state.pose, state.pose_cov, state.landmarks, state.covs, state.alive, state.tag
         )
         state = _kept_finite(state, pose, cov)
-        _, log_likelihood, likely = normalized(state.log_weight + fit)
+        log_likelihood = normalized(state.log_weight + fit)[1]
         weight, _, some = normalized(state.log_weight + fit + rest)
         nis = over_particles(sight.nis, sight.matched, weight)
         ess = 1.0 / jnp.exp(2 * weight).sum()
@@ -167,7 +168,7 @@ def fastslam(
         info: Info = jax.tree.map(lambda of_all: of_all[best], infos)
         info = info._replace(
             nis=jnp.where(sight.matched[best], nis, 0.0),
-            log_likelihood=jnp.where(likely, log_likelihood, -jnp.inf),
+            log_likelihood=log_likelihood,
             exhausted=sight.exhausted.any(),
             ess=ess,
             resampled=resampled,

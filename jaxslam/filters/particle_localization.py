@@ -197,7 +197,7 @@ def particle_localization(
         # Padding may hold anything, and is multiplied by zero further down.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         fit = jax.vmap(look, (0, None))(state.pose, scan)
-        _, log_likelihood, likely = normalized(state.log_weight + fit.log_density.sum(axis=1))
+        log_likelihood = normalized(state.log_weight + fit.log_density.sum(axis=1))[1]
         # Beside d², a weight has log |2πR|, which is the same for all.
         off = 0.5 * fit.counted.sum(axis=1)
         weight, _, some = normalized(state.log_weight - off)
@@ -227,7 +227,7 @@ def particle_localization(
             innovation_cov=own.cov,
             slot=jnp.where(fused, own.slot, -1),
             status=status,
-            log_likelihood=jnp.where(likely, log_likelihood, -jnp.inf),
+            log_likelihood=log_likelihood,
             exhausted=fit.exhausted.any(),
             ess=ess,
             resampled=state.resampled,

@@ -6,6 +6,7 @@ the devices with `shard_map`: no device ever waits for another.
 """
 
 import hashlib
+import inspect
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -264,6 +265,13 @@ def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
     if not isinstance(candidate, Filter):
         if not callable(candidate):
             raise ValueError(f"monte_carlo: {name} is neither a filter nor a function of the truth")
+        try:
+            inspect.signature(candidate).bind(None)
+        except TypeError:
+            raise ValueError(
+                f"monte_carlo: {name} does not take the truth alone; an estimator of (log, key), "
+                "as of smoothing.smooth, is given as lambda truth: estimator"
+            ) from None
         return
     for what, has, needs in (
         ("control", candidate.control_size, len(scenario.motion.controls)),
