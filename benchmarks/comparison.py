@@ -46,7 +46,7 @@ def measure(runs: int = 40, name: str = "cloister", out: Path | None = None) -> 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.comparison")
-    parser.add_argument("--runs", type=int, default=40)
+    parser.add_argument("--runs", type=int, default=16)
     parser.add_argument("--scenario", choices=list(SCENARIOS), default="cloister")
     parser.add_argument("--out", type=Path, default=FIGURE)
     options = parser.parse_args()
