@@ -169,6 +169,31 @@ def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
     return jnp.stack(rows)
 
 
+def whitener(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lower W = L⁻¹ (n, n), so W A Wᵀ = I, for A = L Lᵀ of a few rows; and `cholesky`'s flag.
+
+    A pivot that counts as zero gives a row of zeros. One division and root a pivot, where
+    `cholesky` and `solve_lower` take three: for a matrix that whitens many columns, millions of
+    times.
+    """
+    n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    zero = jnp.zeros((), matrix.dtype)
+    factor = [[zero] * n for _ in range(n)]
+    rows = [[zero] * n for _ in range(n)]
+    positive = jnp.asarray(True)
+    for j in range(n):
+        pivot = matrix[j, j] - sum((factor[j][k] ** 2 for k in range(j)), zero)
+        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        positive = positive & good
+        rows[j][j] = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        for k in range(j):
+            rows[j][k] = -rows[j][j] * total(factor[j][i] * rows[i][k] for i in range(k, j))
+        for i in range(j + 1, n):
+            rest = matrix[i, j] - sum((factor[i][k] * factor[j][k] for k in range(j)), zero)
+            factor[i][j] = jnp.where(good, rest * rows[j][j], 0.0)
+    return jnp.stack([jnp.stack(row) for row in rows]), positive
+
+
 def inverse(matrix: jax.Array) -> jax.Array:
     """A⁻¹ of a regular (n, n) matrix: by cofactors up to 3×3, which fuses; by LU beyond."""
     n = matrix.shape[-1]

@@ -1,5 +1,6 @@
 """What XLA has to be told: what to compute once, and what to skip for a whole batch."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -18,8 +19,14 @@ def apart(function: Callable[..., _T], *arguments: Any) -> _T:
     fuses nothing across a call that may not be inlined. (An `optimization_barrier` is gone by the
     time it fuses.)
     """
+
+    @functools.wraps(function)
+    def whole(*arguments: Any) -> _T:
+        with set_xla_metadata(inlineable="true"):  # what it calls in turn
+            return function(*arguments)
+
     with set_xla_metadata(inlineable="false"):
-        return cast(_T, jax.jit(function)(*arguments))
+        return cast(_T, jax.jit(whole)(*arguments))
 
 
 def settle(values: _T) -> _T:

@@ -122,6 +122,28 @@ def test_gradients_through_semi_definite_matrices_are_finite(n):
     assert any(np.any(slope) for slope in slopes) == (n in (2, 3))  # n = 1: 0; n = 9: all masked
 
 
+@pytest.mark.parametrize("n", UNROLLED)
+def test_whitener_is_the_inverse_of_the_factor(n):
+    a = random_covariances(n)
+    whiten, flags = jax.jit(jax.vmap(linalg.whitener))(a)
+    assert flags.all()
+    assert not np.triu(whiten, 1).any()
+    np.testing.assert_allclose(
+        whiten @ np.linalg.cholesky(a), np.tile(np.eye(n), (20, 1, 1)), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_whitener_of_a_semi_definite_matrix_leaves_out_what_the_factor_leaves_out(n):
+    a, b = semi_definite(n), np.ones(n)
+    whiten, flags = jax.jit(jax.vmap(linalg.whitener))(a)
+    assert not flags.any()
+    half = jax.vmap(lambda a: linalg.solve_lower(linalg.cholesky(a)[0], b))(a)
+    np.testing.assert_allclose(whiten @ b, half, rtol=1e-12, atol=1e-12)
+    slopes = jax.jit(jax.vmap(jax.grad(lambda a: jnp.sum(linalg.whitener(a)[0]))))(a)
+    assert np.isfinite(slopes).all()
+
+
 @pytest.mark.parametrize("n", [4, 12])
 def test_indefinite_and_non_finite_matrices_are_flagged(n):
     good = random_covariances(n, 1)[0]

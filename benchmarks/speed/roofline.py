@@ -33,7 +33,7 @@ def ceilings(dtype) -> tuple[float, float]:
     return peak, 3 * large.nbytes / seconds
 
 
-def corrections(landmarks: int, steps: int, group: int = 4) -> tuple[int, float, float]:
+def corrections(landmarks: int, steps: int, group: int = 3) -> tuple[int, float, float]:
     """Of `cloister` a run: rank-2 corrections, their flops, and bytes of P read and written.
 
     One landmark enters a step and all of the map are measured, so step t corrects min(t, N).

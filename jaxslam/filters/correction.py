@@ -18,9 +18,13 @@ from jaxslam.protocols import Chart, Linearizer, Sensor
 from jaxslam.slots import Joint
 from jaxslam.staging import apart, settle, where_any
 
-# Measurements that one pass over the covariance corrects by. More rows a pass cost more loads of
-# P_I, fewer more of P; 3 to 6 are alike on the CPUs tried.
-_GROUP = 4
+# Up to this many rows P stays in the cache next to a core: the pass over it is bound by arithmetic,
+# vectors of this many entries at a time, and what is left of a row costs as much again.
+_CACHED, _LANES = 128, 16
+
+# Measurements that one pass over P corrects by, where it is cached and where it is not. More cost
+# more loads of P_I, fewer more of P.
+_GROUP, _GROUP_BEYOND = 3, 4
 
 
 def correct(
@@ -122,7 +126,9 @@ def correct_in_turn(
     """
     whole = joseph or square_root or chart.motion_apart
     m, size_l = z.shape[0], joint.landmarks.shape[1]
-    group = 1 if whole else max(1, min(_GROUP, m))
+    size = joint.cov.shape[1]
+    cached = size <= _CACHED
+    group = 1 if whole else max(1, min(_GROUP if cached else _GROUP_BEYOND, m))
     groups = -(-m // group)
 
     def padded(part: jax.Array) -> jax.Array:
@@ -160,12 +166,14 @@ def correct_in_turn(
             done = jax.tree.map(lambda leaf: leaf[0], found.correction)
             return moved, (reach, found.whitened, done)
 
-        local, (reach, whitened, done) = jax.lax.scan(one, local, (jnp.arange(group), part))
+        local, (reach, whitened, done) = jax.lax.scan(
+            one, local, (jnp.arange(group), part), unroll=True
+        )
         v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
-        landmarks = _moved_map(joint, v, whitened, chart)
+        landmarks = _moved_map(joint, v[:, :size], whitened, chart)
         if watch:
             watch = local.watch._replace(directions=joint.watch.directions)
-        cov = joint.cov - linalg.gram(v, v)
+        cov = joint.cov - linalg.gram(v[:, :size], v)
         return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov, watch=watch), done
 
     work = one_of_all if whole else in_group
@@ -176,7 +184,10 @@ def correct_in_turn(
         )
         return where_any(part[2].any(), lambda j: work(j, part), lambda j: (j, nothing), joint)
 
+    if cached and not whole:
+        joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
     joint, done = jax.lax.scan(of_group, joint, jax.tree.map(padded, (z, slot, known)))
+    joint = joint._replace(cov=joint.cov[:, :size])
     return joint, jax.tree.map(lambda leaf: leaf.reshape(groups * group, *leaf.shape[2:])[:m], done)
 
 

@@ -11,7 +11,7 @@ from jaxslam.filters.expectation import in_chart, innovation_cov
 from jaxslam.filters.reduction import at_slot
 from jaxslam.protocols import Chart, Here, Linearizer, Sensor
 from jaxslam.slots import Joint
-from jaxslam.staging import settle
+from jaxslam.staging import apart, settle
 
 
 class Correction(NamedTuple):
@@ -76,7 +76,7 @@ def view_of(joint: Joint, slot: jax.Array, square_root: bool = False) -> View:
     """What measurements of the landmarks in slot (m,) see."""
     own = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
     local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
-    return View(joint.cov[:3], settle(own), local)
+    return View(joint.cov[:3], own, local)
 
 
 def weigh(
@@ -126,24 +126,22 @@ def weigh(
         if iteration > 0:
             nu = nu + jnp.einsum("mzi,i->mz", by_pose, xi[:3])
             nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, xi_l)
-        by_pose, by_landmark, nu = settle((by_pose, by_landmark, nu))
-        hp = linalg.total(by_pose[:, :, k, None] * view.robot[None, None, k] for k in range(3))
-        if size_l > 0:
-            hp = hp + linalg.total(
-                by_landmark[:, :, k, None] * view.own[:, None, k] for k in range(size_l)
-            )
-        hp = hx = settle(hp)
+        # One array, and so one kernel and not three.
+        found = settle(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
+        by_pose, by_landmark, nu = found[:, :, :3], found[:, :, 3:-1], found[:, :, -1]
+        hp = hx = apart(_seen_rows, by_pose, by_landmark, view.robot, view.own)
         if square_root:
             hp = settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
         s = innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
+        marginal = s[jnp.arange(m), :, jnp.arange(m)]
+        own, definite = apart(jax.vmap(linalg.whitener), marginal)
         if iteration == 0:
-            marginal = s[jnp.arange(m), :, jnp.arange(m)]
-            distance, positive = jax.vmap(_squared_distance)(nu, marginal)
+            innovation, alone, positive = nu, marginal, definite
+            distance = (_product(own, nu[:, :, None]) ** 2).sum(axis=(1, 2))
             # A finite measurement so far off that its d² is not is outside any gate.
             near = jnp.isfinite(distance) if gate is None else distance <= gate
             inside = ~positive | near
             fuse = known & inside & positive
-            innovation = nu
         hp = hp.reshape(m * size_z, -1)
         both = fuse[:, None, None, None] & fuse[None, None, :, None]
         s = jnp.where(both, s, same * jnp.eye(size_z, dtype=z.dtype)[None, :, None])
@@ -151,22 +149,26 @@ def weigh(
         factor = settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
         pivots = jnp.diagonal(factor).reshape(m, size_z)
         # Measurements that are regular one by one can still be singular together.
-        regular = (pivots > 0).all(axis=1)
+        regular = (pivots > 0).all(axis=1) if m > 1 else definite
         # A row without a pivot says nothing, and costs no mask of what it would say.
         factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
-        v, whitened = linalg.solve_lower(factor, hp), linalg.solve_lower(factor, nu.reshape(-1))
-        v, whitened = settle((v, whitened))
+        if m > 1:
+            v, whitened = apart(_solved, factor, hp, nu.reshape(-1))
+        else:
+            whiten = jnp.where((fuse & regular)[:, None, None], own, 0.0)
+            v, whitened = apart(_whitened, whiten, hp, nu)
+            pivots = jnp.diagonal(own, axis1=1, axis2=2)
         xi = linalg.gram(v, whitened[:, None])[:, 0]
         if iteration == 0:
             positive = positive & regular
-            first_pivots = pivots
+            log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
+            log_det = log_det if m > 1 else -log_det  # of L⁻¹
             nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
         if iteration + 1 < iterations:
             xi_l = xi[3:width].reshape(capacity, size_l)[slot]
             poses, landmark = over_landmarks(joint.pose, prior_l, xi[:3], xi_l)
             pose = poses[0]
 
-    log_det = 2 * jnp.log(jnp.where(first_pivots > 0, first_pivots, 1.0)).sum(axis=1)
     log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
     return Weighed(
         xi=xi,
@@ -183,7 +185,7 @@ def weigh(
         fuse=fuse,
         correction=Correction(
             innovation=innovation,
-            innovation_cov=marginal,
+            innovation_cov=alone,
             nis=jnp.where(fuse, nis, distance),
             log_likelihood=jnp.where(fuse & positive, log_likelihood, 0.0),
             inside=inside,
@@ -192,7 +194,24 @@ def weigh(
     )
 
 
-def _squared_distance(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """νᵀ S⁻¹ ν () and whether S (Z, Z) is positive definite; finite where it is not."""
-    factor, positive = linalg.cholesky(cov)
-    return (linalg.solve_lower(factor, nu) ** 2).sum(), positive
+def _seen_rows(
+    by_pose: jax.Array, by_landmark: jax.Array, robot: jax.Array, own: jax.Array
+) -> jax.Array:
+    """H P (m, Z, D) of H by pose (m, Z, 3) and landmark (m, Z, L), rows (3, D) and (m, L, D)."""
+    terms = [by_pose[:, :, k, None] * robot[None, None, k] for k in range(3)]
+    terms += [by_landmark[:, :, k, None] * own[:, None, k] for k in range(own.shape[1])]
+    return linalg.total(terms)
+
+
+def _solved(factor: jax.Array, hp: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return linalg.solve_lower(factor, hp), linalg.solve_lower(factor, nu)
+
+
+def _whitened(whiten: jax.Array, hp: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return _product(whiten, hp[None])[0], _product(whiten, nu[:, :, None]).reshape(-1)
+
+
+def _product(whiten: jax.Array, rhs: jax.Array) -> jax.Array:
+    """W B (m, Z, k) of W (m, Z, Z) and B (m, Z, k)."""
+    each = range(whiten.shape[1])
+    return linalg.total(whiten[:, :, k, None] * rhs[:, k, None] for k in each)
