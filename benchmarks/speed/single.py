@@ -111,7 +111,7 @@ def scaling():
     _, logs = logs_of(scenario, 1)
     log = jax.tree.map(lambda leaf: leaf[0], logs)
 
-    def seconds(capacity, visible, places=None, steps=40):
+    def program(capacity, visible, places=None, steps=40):
         def cut(leaf):
             return leaf[:steps, :visible]
 
@@ -129,13 +129,16 @@ def scaling():
             **(scenario.filter_options | {"births": None}),
         )
         part = log._replace(control=log.control[:steps], scan=scan)
-        return best(compiled(final_pose(filter, scenario), part, jax.random.key(0))[0], 3)
+        return compiled(final_pose(filter, scenario), part, jax.random.key(0))[0]
+
+    def seconds(*arguments, **options):
+        return best(program(*arguments, **options), 3)
 
     by_landmarks = [seconds(n, VISIBLE) for n in SIZES]
     seen = (4, 8, 16, 32)
     by_visible = [seconds(300, n) for n in seen]
     by_steps = [seconds(100, VISIBLE, steps=n) for n in (10, 20, 40)]
-    wide = seconds(100, VISIBLE, places=100)
+    padding = together({n: program(100, VISIBLE, places=n) for n in (VISIBLE, 100)}, 15)
     scan = jax.tree.map(lambda leaf: leaf[:40, :VISIBLE], log.scan)
     local, ordinary = compressed(scenario, log._replace(control=log.control[:40], scan=scan), SIZES)
     return {
@@ -143,7 +146,7 @@ def scaling():
         "exponent in landmarks, 300 to 1000": exponent(SIZES[-2:], by_landmarks[-2:]),
         "exponent in visible landmarks, 4 to 32 of 300": exponent(seen, by_visible),
         "exponent in steps, 10 to 40": exponent((10, 20, 40), by_steps),
-        "100 places for 20 measurements / 20 places": wide / by_steps[-1],
+        "100 places for 20 measurements / 20 places": padding[100] / padding[VISIBLE],
         "compressed, exponent in landmarks, 36 to 1000, 20 visible": exponent(SIZES, local),
         "compressed, exponent in landmarks, 300 to 1000": exponent(SIZES[-2:], local[-2:]),
         "ordinary / compressed, a step, 1000 landmarks": ordinary / local[-1],
