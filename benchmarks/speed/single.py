@@ -16,13 +16,14 @@ import numpy as np
 from benchmarks.speed import roofline
 from benchmarks.speed.area import compressed
 from benchmarks.speed.dense import dense_ekf
+from benchmarks.speed.peers import dynamax_ekf
 from jaxslam.family import FILTERS
 from jaxslam.filters.ekf_slam import ekf_slam
 from jaxslam.run import run
 from jaxslam.scenarios import cloister
 from jaxslam.simulate import simulate
 
-RUNS = 32
+RUNS, PEERS_RUNS = 32, 4
 VISIBLE = 20
 SIZES = (36, 100, 300, 1000)
 
@@ -68,6 +69,10 @@ def throughput(dtype):
     limit = Limit(dtype)
     if limit.there:
         actions["limit"] = lambda: limit.run(RUNS)
+    few = jax.tree.map(lambda leaf: leaf[:PEERS_RUNS], logs)
+    peer = dynamax_ekf(scenario, few)
+    if peer is not None:
+        actions["dynamax"] = peer
     seconds = together(actions)
     each = seconds["batch"] / RUNS
     numpy_seconds = best(lambda: dense_ekf(numpy_log, scenario.pose, noise_u, noise_z), 1)
@@ -97,6 +102,8 @@ def throughput(dtype):
             "limit / ours, one trajectory": fair / seconds["single"],
             "limit [s a run]": fair,
         }
+    if peer is not None:
+        out["dynamax / ours, a run"] = seconds["dynamax"] / PEERS_RUNS / each
     return out
 
 

@@ -4,7 +4,6 @@ import argparse
 import shutil
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from jaxslam.protocols import Candidate, Filter
 from jaxslam.run import run
 from jaxslam.scenarios import SCENARIOS
 from jaxslam.simulate import Scenario, simulate
+from jaxslam.types import Estimate, Truth
 
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
@@ -126,12 +126,18 @@ def _campaign_files(
 ) -> dict[str, str | Callable[[Path], object]]:
     """The campaign, and pictures of its first run under its first filter."""
     name = next(iter(campaign.filters))
-    key_world, key_filter = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0))
-    truth, log = jax.jit(partial(simulate, scenario))(key_world)
-    candidate = ALL[name](scenario)
-    filter = candidate if isinstance(candidate, Filter) else candidate(truth)
-    assert isinstance(filter, Filter)
-    trace = run(filter, log, scenario.pose, scenario.pose_cov, key_filter)
+
+    def first_run(key: jax.Array) -> tuple[Truth, Estimate]:
+        key_world, key_filter = jax.random.split(jax.random.fold_in(key, 0))
+        truth, log = simulate(scenario, key_world)
+        candidate = ALL[name](scenario)
+        filter = candidate if isinstance(candidate, Filter) else candidate(truth)
+        assert isinstance(filter, Filter)
+        trace = run(filter, log, scenario.pose, scenario.pose_cov, key_filter)
+        return truth, trace.estimate
+
+    # One program, and arrays of the host: what is computed piece by piece compiles piece by piece.
+    truth, estimate = jax.device_get(jax.jit(first_run)(jax.random.key(seed)))
     title = f"{scenario.name}, {name}, run 0 of seed {seed}"
     figures = {
         "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
@@ -143,8 +149,8 @@ def _campaign_files(
         "coverage": ("Coverage of the ellipsoids", plot.coverage_figure(campaign)),
         "whiteness": ("Autocorrelation of innovations", plot.whiteness_figure(campaign)),
         "gained": ("Information wrongly gained of a turn", plot.gained_figure(campaign)),
-        "errors": (f"Errors: {title}", plot.errors_figure(trace.estimate, truth, title=title)),
-        "map": (f"Map: {title}", plot.map_figure(trace.estimate, truth=truth, title=title)),
+        "errors": (f"Errors: {title}", plot.errors_figure(estimate, truth, title=title)),
+        "map": (f"Map: {title}", plot.map_figure(estimate, truth=truth, title=title)),
     }
     return {
         "report.html": page.page(

@@ -1,5 +1,6 @@
 """What one run shows: its map with ellipses, and its errors within what the filter claims."""
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -78,7 +79,7 @@ def errors_figure(
 ) -> Figure:
     """Errors of x, y and heading over the steps, within ±n σ of the filter's own covariance."""
     error = np.asarray(truth.pose) - np.asarray(estimate.pose)
-    error[:, 2] = np.asarray(wrap(error[:, 2]))
+    error[:, 2] = np.asarray(jax.jit(wrap)(error[:, 2]))
     cov = np.asarray(estimate.pose_cov)
     sigma = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))
     figure, panels = panels_of(7.0, 6.0, 3)
