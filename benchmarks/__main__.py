@@ -72,7 +72,7 @@ def main() -> int:
     metrics += plain_particles.measure(8 if options.quick else 20)
     metrics += scaling.measure()
     metrics += seif.measure(4 if options.quick else 10)
-    metrics += comparison.measure(8 if options.quick else 40)
+    metrics += comparison.measure(8 if options.quick else 16)
     metrics += monte_carlo_localization.measure(4 if options.quick else 12)
     print()
     return report(metrics)

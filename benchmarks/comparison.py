@@ -17,7 +17,7 @@ from jaxslam.scenarios import SCENARIOS
 FIGURE = Path(__file__).parent / "figures" / "comparison.png"
 
 
-def measure(runs: int = 40, name: str = "cloister", out: Path | None = None) -> list[Metric]:
+def measure(runs: int = 16, name: str = "cloister", out: Path | None = None) -> list[Metric]:
     world = SCENARIOS[name]()
     filters = {each: make(world) for each, make in family.ALL.items()}
     campaign = monte_carlo(world, filters, runs, jax.random.key(0), workers=1)

@@ -149,20 +149,20 @@ def weigh(
         factor = settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
         pivots = jnp.diagonal(factor).reshape(m, size_z)
         # Measurements that are regular one by one can still be singular together.
-        regular = (pivots > 0).all(axis=1) if m > 1 else definite
+        regular = definite if m == 1 else (pivots > 0).all(axis=1)
         # A row without a pivot says nothing, and costs no mask of what it would say.
         factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
-        if m > 1:
-            v, whitened = apart(_solved, factor, hp, nu.reshape(-1))
-        else:
+        if m == 1:  # it has been factored already, alone
             whiten = jnp.where((fuse & regular)[:, None, None], own, 0.0)
             v, whitened = apart(_whitened, whiten, hp, nu)
             pivots = jnp.diagonal(own, axis1=1, axis2=2)
+        else:
+            v, whitened = apart(_solved, factor, hp, nu.reshape(-1))
         xi = linalg.gram(v, whitened[:, None])[:, 0]
         if iteration == 0:
             positive = positive & regular
             log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
-            log_det = log_det if m > 1 else -log_det  # of L⁻¹
+            log_det = -log_det if m == 1 else log_det  # of L⁻¹, of L
             nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
         if iteration + 1 < iterations:
             xi_l = xi[3:width].reshape(capacity, size_l)[slot]

@@ -398,15 +398,16 @@ def test_vmap_is_a_loop_and_one_trace_serves_all_logs(logs, single):
     assert single[1]() == 1
 
 
-def test_capacity_8_is_capacity_13(logs, single):
-    roomy = jax.device_get(jax.jit(runner(13))(take(logs[1], 0)))
+@pytest.mark.parametrize("capacity", [13, 70])  # P is passed over in another way beyond 128 rows
+def test_capacity_8_is_a_larger_one(logs, single, capacity):
+    roomy = jax.device_get(jax.jit(runner(capacity))(take(logs[1], 0)))
     tight = single[0](take(logs[1], 0))
     assert tight.estimate.alive[-1].sum() >= 4
     cut = [part[:, :8] for part in roomy.estimate[2:]]
     assert_same([*roomy.estimate[:2], *cut], list(tight.estimate), 1e-12)
     assert_same(roomy.info, tight.info, 1e-11)
     assert_same(roomy.probe.cov[:, :19, :19], tight.probe.cov, 1e-12)
-    np.testing.assert_array_equal(roomy.final.cov[19:], np.eye(29)[19:])
+    np.testing.assert_array_equal(roomy.final.cov[19:], np.eye(3 + 2 * capacity)[19:])
 
 
 def test_jit_is_no_jit():
