@@ -228,18 +228,32 @@ def mahalanobis_squared(
     better given one scale: a variance that is rounding next to its neighbour's then counts as none.
     Regular means that each Cholesky pivot exceeds 100 n·eps, i.e. no direction is known exactly.
     """
-    n = cov.shape[-1]
+    return mahalanobis_leading(error, cov, (cov.shape[-1],), scale)[0]
+
+
+def mahalanobis_leading(
+    error: jax.Array, cov: jax.Array, sizes: Iterable[int], scale: jax.Array | None = None
+) -> list[tuple[jax.Array, jax.Array]]:
+    """`mahalanobis_squared` of leading blocks of P (n, n), of k×k for each k of sizes.
+
+    error: (n, …); each result is of shape (…). One factor serves all blocks and errors.
+    """
     if scale is None:  # the square root's slope at a zero variance is infinite, hence the 1.0
         variance = jnp.diagonal(cov)
         scale = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
     spread = scale > 0
     unit = jnp.where(spread, 1.0 / jnp.where(spread, scale, 1.0), 0.0)
-    factor, positive = cholesky(cov * unit[:, None] * unit[None, :])
+    factor = cholesky(cov * unit[:, None] * unit[None, :])[0]
     pivots = jnp.diagonal(factor) ** 2
-    regular = positive & jnp.all(pivots > 100 * n * jnp.finfo(cov.dtype).eps)
-    regular = regular & jnp.all(jnp.isfinite(error))
-    whitened = solve_lower(factor, jnp.where(regular, error, 0.0) * unit)
-    return jnp.where(regular, jnp.sum(whitened**2), 0.0), regular
+    known = jnp.isfinite(error)
+    in_units = jnp.where(known, error, 0.0) * unit.reshape(-1, *(1,) * (error.ndim - 1))
+    squares = solve_lower(factor, in_units) ** 2
+    out = []
+    for k in sizes:
+        regular = jnp.all(pivots[:k] > 100 * k * jnp.finfo(cov.dtype).eps)
+        regular = regular & jnp.all(known[:k], axis=0)
+        out.append((jnp.where(regular, jnp.sum(squares[:k], axis=0), 0.0), regular))
+    return out
 
 
 def is_positive_definite(matrix: jax.Array) -> jax.Array:

@@ -9,6 +9,8 @@ import pytest
 from test_family import three_parameters
 
 from jaxslam import cli, family, store
+from jaxslam.cli import asking
+from jaxslam.consistency import Measure
 from jaxslam.monte_carlo import Interrupted
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
@@ -33,6 +35,33 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
     assert (found["runs"], found["steps"], found["seed"]) == (3, 8, 4)
     assert list(found["filters"]) == ["ekf", "ideal"]
     assert found["command"].startswith("jaxslam consistency --scenario circle")
+
+
+def test_on_a_terminal_a_line_tells_of_each_filter_as_soon_as_it_can(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with asking.Progress("circle") as progress:
+        progress.glimpse("ekf", 64, Measure(5.814, 4.414, 7.214))
+        progress.glimpse("one", 1, Measure(2.0, -np.inf, np.inf))
+        progress.glimpse("none", 64, None)
+        progress(64, 100)
+    shown = capsys.readouterr().err
+    lines = [line.rpartition("\x1b[K")[2] for line in shown.split("\n")]
+    assert lines[:2] == [
+        "ekf: pose NEES 5.81 ± 1.4 in the first 64 runs; honest is 3",
+        "one: pose NEES 2 in the first run; honest is 3",
+    ]
+    assert "64/100 runs" in shown
+    assert "none" not in shown
+
+
+def test_a_first_result_does_not_wait_for_what_draws():
+    found = subprocess.run(
+        [sys.executable, "-c", "import sys, jaxslam.cli; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert {"matplotlib", "scipy.stats"}.isdisjoint(found.stdout.split())
 
 
 @pytest.mark.parametrize(

@@ -50,18 +50,18 @@ def synthetic(rng, runs, claimed=1.0, singular=0):
 
 
 @jax.jit
-def _scores(trace, truth, limit):
-    return jax.vmap(lambda a, b: consistency.score(a, b, SENSOR, limit))(trace, truth)
+def _scores(trace, truth):
+    return jax.vmap(lambda a, b: consistency.score(a, b, SENSOR))(trace, truth)
 
 
 def summed(trace, truth, limit=1e9):
-    each = _scores(*jax.tree.map(jnp.asarray, (trace, truth)), jnp.asarray(limit))
+    each = _scores(*jax.tree.map(jnp.asarray, (trace, truth)))
     tally = consistency.Tally()
     # In two parts, as blocks come.
     for first, part in ((2, slice(2, None)), (0, slice(0, 2))):
         scores = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[part], each)
         if len(scores.finite) > 0:
-            tally.add(first, len(scores.finite), consistency.condense(scores, first))
+            tally.add(first, len(scores.finite), consistency.condense(scores, first, limit))
     return tally
 
 

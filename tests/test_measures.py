@@ -140,7 +140,7 @@ def test_landmark_nees_and_own_coordinates():
         def one(trace, truth):
             sensor = worlds.ring().sensor
             error = consistency.own_error_of(charts.right_invariant(), sensor, trace, truth)
-            return consistency.score(trace, truth, sensor, 1e9, error)
+            return consistency.score(trace, truth, sensor, error)
 
         return jax.vmap(one)(trace, truth)
 

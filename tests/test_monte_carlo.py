@@ -13,7 +13,7 @@ import worlds
 from jaxslam import family, filters, motion, run, sensors, simulate, store
 from jaxslam.monte_carlo import Interrupted, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
-from jaxslam.monte_carlo.programs import fitting_block
+from jaxslam.monte_carlo.programs import Programs, fitting_block
 
 SHORT = worlds.ring(steps=12)
 
@@ -141,11 +141,11 @@ def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_one_block):
     tried = []
     compile_programs = campaign_module.compile_programs
 
-    def little_memory(scenario, filters, key, block, devices, bound, pool):
-        tried.append(block)
-        if block > 2:
+    def little_memory(programs, *arguments):
+        tried.append(programs.wide)
+        if programs.wide > 2:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
-        return compile_programs(scenario, filters, key, block, devices, bound, pool)
+        compile_programs(programs, *arguments)
 
     monkeypatch.setattr(campaign_module, "compile_programs", little_memory)
     with pytest.warns(UserWarning, match="going on with block=") as warned:
@@ -170,6 +170,48 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
     monkeypatch.setattr(campaign_module, "compile_programs", broken)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
         campaign_of(block=4)
+
+
+def test_a_first_block_tells_of_each_filter_before_the_campaign_is_done(in_one_block):
+    told = []
+    campaign = campaign_of(
+        block=2,
+        workers=1,
+        glimpse=lambda *told_of: told.append(("glimpse", *told_of)),
+        progress=lambda *done: told.append(("progress", *done)),
+    )
+    identical(campaign.filters["ekf"], in_one_block.filters["ekf"])
+    names = list(campaign.filters)
+    assert [(what, name, runs) for what, name, runs, *_ in told[: len(names)]] == [
+        ("glimpse", name, 2) for name in names
+    ]
+    assert [what for what, *_ in told[len(names) :]] == ["progress"] * 5
+    for what, name, runs, nees in told[: len(names)]:
+        per_run = campaign.filters[name].per_run["nees_pose"][:runs]
+        assert nees.value == pytest.approx(per_run.mean(), rel=1e-12), what
+        assert nees.low < nees.value < nees.high
+
+
+def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it():
+    def broken(truth):
+        raise ValueError("no filter for this truth")
+
+    with pytest.raises(ValueError, match="no filter for this truth"):
+        monte_carlo(
+            SHORT,
+            {"ekf": worlds.ekf(SHORT), "broken": broken},
+            10,
+            worlds.key(),
+            block=1,
+            workers=2,
+        )
+
+
+def test_steps_are_timed_while_nothing_is_compiled():
+    programs = Programs(["a", "b"], worlds.key(), 2, 1, bound=False)
+    programs._spent["a"] += [(False, 8.0), (True, 1.0), (True, 3.0)]
+    programs._spent["b"] += [(False, 4.0)]
+    assert programs.run_seconds() == {"a": 1.0, "b": 2.0}
 
 
 def test_every_filter_gets_the_same_draws(in_one_block):

@@ -41,7 +41,6 @@ def scores(runs, rng):
 
     return Score(
         finite=rng.random(runs) > 0.1,
-        divergent=rng.random(runs) > 0.9,
         measures={"nees_pose": measure(), "square_position": measure()},
         snapshots=(
             rng.normal(size=(runs, 2, 3)),
@@ -59,7 +58,7 @@ def tallied(each, cuts, order):
     for i in order:
         first, end = edges[i], edges[i + 1]
         part = Score(*(_cut(field, first, end) for field in each))
-        tally.add(first, end - first, condense(part, first))
+        tally.add(first, end - first, condense(part, first, 1.0))
     return tally
 
 
@@ -84,6 +83,9 @@ def test_blocks_of_any_size_in_any_order_give_the_same_bits(cuts, order):
     for name, value in one.measures().items():
         np.testing.assert_array_equal(value, other.measures()[name])
         np.testing.assert_array_equal(np.isnan(value), ~each.measures[name][1])
+    far = np.linalg.norm(each.snapshots[0][:, -1, :2], axis=1) > 1
+    np.testing.assert_array_equal(other.flags("divergent"), far & each.finite)
+    assert 0 < (far & each.finite).sum() < far.sum()
     for a, b, leaf in zip(one.snapshots(), other.snapshots(), each.snapshots, strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, leaf[each.finite])
@@ -93,7 +95,7 @@ def test_merged_tallies_are_one():
     each = scores(20, np.random.default_rng(2))
     whole, parts = tallied(each, [12], [0, 1]), tallied(each, [12], [1])
     parts.merge(tallied(each, [12], [0]))
-    np.testing.assert_array_equal(parts.flags("divergent"), each.divergent)
+    np.testing.assert_array_equal(parts.flags("divergent"), whole.flags("divergent"))
     for name, value in whole.sums.items():
         assert value.tobytes() == parts.sums[name].tobytes()
 

@@ -135,7 +135,7 @@ def campaign(names, maps: int, runs: int, steps: int, seed: int, noise=1.0, bloc
             probe=lambda joint: joint.watch.information,
         )
         own = own_error_of(filter.chart, here.sensor, trace, truth)
-        scores = score(trace, truth, here.sensor, jnp.asarray(jnp.inf), own)
+        scores = score(trace, truth, here.sensor, own)
         kept = {
             m: jnp.where(scores.measures[m][1], scores.measures[m][0], jnp.nan) for m in MEASURES
         }

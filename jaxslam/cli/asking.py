@@ -5,6 +5,8 @@ import time
 from collections.abc import Mapping
 from typing import TypeVar
 
+from jaxslam.consistency import DOF, Measure
+
 _T = TypeVar("_T")
 
 INTERRUPTED = 130
@@ -40,6 +42,15 @@ class Progress:
         spent = time.perf_counter() - self._began
         bar = "█" * filled + "░" * (30 - filled)
         self._draw(f"{self._what}: {bar} {done:,}/{total:,} {self._unit}, {spent:.0f} s")
+
+    def glimpse(self, name: str, runs: int, nees: Measure | None) -> None:
+        """A line that stays: what the first block says of a filter, while others are compiled."""
+        if self._shown and nees is not None:
+            one = runs == 1
+            shown = f"{nees.value:.3g}" + ("" if one else f" ± {nees.high - nees.value:.2g}")
+            of = "run" if one else f"{runs} runs"
+            self._draw(f"{name}: pose NEES {shown} in the first {of}; honest is {DOF['pose']}\n")
+            self.say("compiling …")
 
     def __exit__(self, *_: object) -> None:
         self._draw("")

@@ -4,12 +4,13 @@ import argparse
 import shutil
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from jaxslam import page, plot, report, store
+from jaxslam import report, store
 from jaxslam.cli import devices
 from jaxslam.cli.asking import INTERRUPTED, Progress, pick
 from jaxslam.family import ALL
@@ -19,6 +20,7 @@ from jaxslam.protocols import Candidate, Filter
 from jaxslam.run import run
 from jaxslam.scenarios import SCENARIOS
 from jaxslam.simulate import Scenario, simulate
+from jaxslam.staging import compiled
 from jaxslam.types import Estimate, Truth
 
 BLOCKS = "blocks"
@@ -72,6 +74,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
                 bound=asked["bound"],
                 keep=keep,
                 progress=progress,
+                glimpse=progress.glimpse,
             )
     except Interrupted as stop:
         if stop.campaign is None:
@@ -125,6 +128,8 @@ def _campaign_files(
     campaign: Campaign, scenario: Scenario, seed: int, bound: bool, command: str
 ) -> dict[str, str | Callable[[Path], object]]:
     """The campaign, and pictures of its first run under its first filter."""
+    from jaxslam import page, plot  # matplotlib only once there is a result to draw
+
     name = next(iter(campaign.filters))
 
     def first_run(key: jax.Array) -> tuple[Truth, Estimate]:
@@ -137,7 +142,9 @@ def _campaign_files(
         return truth, trace.estimate
 
     # One program, and arrays of the host: what is computed piece by piece compiles piece by piece.
-    truth, estimate = jax.device_get(jax.jit(first_run)(jax.random.key(seed)))
+    key = jax.random.key(seed)
+    program = compiled(jax.jit(first_run).lower(key), jax.default_backend(), straight=True)
+    truth, estimate = jax.device_get(program(key))
     title = f"{scenario.name}, {name}, run 0 of seed {seed}"
     figures = {
         "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
@@ -152,6 +159,11 @@ def _campaign_files(
         "errors": (f"Errors: {title}", plot.errors_figure(estimate, truth, title=title)),
         "map": (f"Map: {title}", plot.map_figure(estimate, truth=truth, title=title)),
     }
+    draw = cache(plot.png)
+
+    def saved(figure: Any) -> Callable[[Path], object]:
+        return lambda path: path.write_bytes(draw(figure))
+
     return {
         "report.html": page.page(
             campaign,
@@ -160,10 +172,11 @@ def _campaign_files(
             seed,
             report.versions(),
             dict(figures.values()),
+            draw,
         ),
         "consistency.json": report.as_json(campaign, command, seed),
         "consistency.csv": report.as_csv(campaign),
-    } | {f"{name}.png": figure.savefig for name, (_, figure) in figures.items()}
+    } | {f"{name}.png": saved(figure) for name, (_, figure) in figures.items()}
 
 
 def _scenario(name: str, steps: int | None) -> Scenario:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import plot, report, se2
+from jaxslam import report, se2
 from jaxslam.cli.asking import Progress, pick
 from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS
@@ -66,6 +66,8 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         frame, summary["map RMSE after alignment [m]"] = align_map(last, data.landmarks)
         into_map = jax.vmap(se2.to_frame, (None, 0))
         surveyed = np.asarray(into_map(jnp.asarray(frame), jnp.asarray(data.landmarks)))
+    from jaxslam import plot  # matplotlib only once there is a result to draw
+
     figure = plot.map_figure(trace.estimate, true_points=surveyed, title=data.name)
     files: dict[str, str | Callable[[Path], object]] = {
         "trajectory.csv": report.trajectory_csv(data.time, trace.estimate),

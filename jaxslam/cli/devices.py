@@ -2,12 +2,13 @@
 
 import argparse
 import contextlib
-import os
 import socket
 import time
 
 import jax
 from jax.experimental import multihost_utils
+
+from jaxslam.monte_carlo.pieces import cores
 
 
 def prepare(options: argparse.Namespace) -> None:
@@ -23,12 +24,6 @@ def prepare(options: argparse.Namespace) -> None:
         jax.config.update("jax_compilation_cache_dir", str(options.cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-def cores() -> int:
-    """CPU cores this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 def join(options: argparse.Namespace) -> None:

@@ -6,6 +6,7 @@ anywhere here. While P is singular (a start with P0 = 0) there is no NEES: such 
 and counted, never filled with 0. (Bar-Shalom, Li, Kirubarajan 2001, 5.4; Bailey et al. 2006.)
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,8 +16,9 @@ import numpy as np
 from jaxslam import lapack, linalg
 from jaxslam.angles import wrap
 from jaxslam.consistency.associations import associations, identities
-from jaxslam.linalg import mahalanobis_squared
+from jaxslam.linalg import mahalanobis_leading, mahalanobis_squared
 from jaxslam.protocols import Chart, Sensor
+from jaxslam.staging import settle
 from jaxslam.stats import chi2_quantile
 from jaxslam.types import Status, Trace, Truth
 
@@ -57,8 +59,6 @@ class Score(NamedTuple):
 
     finite: Any
     """() bool: every number of the run is finite."""
-    divergent: Any
-    """() bool: finite, and ends too far from the truth."""
     measures: dict[str, tuple[Any, Any]]
     """the run's own averages, and whether there is one."""
     snapshots: tuple[Any, Any, Any]
@@ -76,79 +76,105 @@ def score(
     trace: Trace,
     truth: Truth,
     sensor: Sensor,
-    limit: jax.Array,
     own_error: jax.Array | None = None,
 ) -> Score:
     """Score one run.
 
-    limit () [m]: a final position error above is divergence. own_error (T, 3): the pose errors in
-    the filter's own coordinates (see `own_error_of`), by default those in (x, y, θ).
+    own_error (T, 3): the pose errors in the filter's own coordinates (see `own_error_of`), by
+    default those in (x, y, θ).
     """
     error = truth.pose - trace.estimate.pose
     error = jnp.concatenate([error[:, :2], wrap(error[:, 2:])], axis=1)
     cov = trace.estimate.pose_cov
-    sums: dict[str, jax.Array] = {}
-    measures: dict[str, tuple[jax.Array, jax.Array]] = {}
-    steps = jnp.asarray(error.shape[0])
-    scale = _scale(cov)
-    for block, at in (("pose", slice(0, 3)), ("position", slice(0, 2)), ("heading", slice(2, 3))):
-        nees, regular = jax.vmap(mahalanobis_squared)(error[:, at], cov[:, at, at], scale[:, at])
-        sums[f"nees_{block}"], sums[f"regular_{block}"] = nees, regular.astype(nees.dtype)
-        measures[f"nees_{block}"] = nees.sum(), regular.sum()
-        covered = _covered(nees, regular, DOF[block])
-        count = jnp.maximum(regular.sum(), 1)
-        sums[f"coverage_{block}"] = covered.sum(axis=0) / count
-        sums[f"coverage_runs_{block}"] = (regular.sum() > 0).astype(nees.dtype)
-        at_95 = covered[:, LEVELS.index(0.95)].sum()
-        measures[f"coverage_95_{block}"] = at_95.astype(nees.dtype), regular.sum()
-    own = error if own_error is None else own_error
-    nees, regular = jax.vmap(mahalanobis_squared)(own, cov, scale)
-    measures["nees_own"] = nees.sum(), regular.sum()
-
-    sums["square_position"] = (error[:, :2] ** 2).sum(axis=1)
-    sums["square_heading"] = error[:, 2] ** 2
+    nees = _nees(error, error if own_error is None else own_error, cov)
     fused = trace.info.status == Status.FUSED
-    sums["nis"] = jnp.where(fused, trace.info.nis, 0.0).sum(axis=1)
-    sums["nis_dof"] = trace.info.dof.sum(axis=1).astype(error.dtype)
-    measures["square_position"] = sums["square_position"].sum(), steps
-    measures["square_heading"] = sums["square_heading"].sum(), steps
-    measures["nis_per_dof"] = sums["nis"].sum(), sums["nis_dof"].sum()
     held = jnp.where(trace.estimate.alive, trace.estimate.tag, -1)
+    curves = {f"nees_{block}": nees[block][0] for block in DOF}
+    curves |= {f"regular_{block}": nees[block][1].astype(error.dtype) for block in DOF}
+    curves |= {
+        "square_position": (error[:, :2] ** 2).sum(axis=1),
+        "square_heading": error[:, 2] ** 2,
+        "nis": jnp.where(fused, trace.info.nis, 0.0).sum(axis=1),
+        "nis_dof": trace.info.dof.sum(axis=1).astype(error.dtype),
+    }
+    measures: dict[str, tuple[Any, Any]] = {}
+    sums: dict[str, jax.Array] = {}
     if not isinstance(truth.origin, tuple):
         held = identities(trace, truth.origin)
         measures |= associations(trace, truth.origin, held)
-    measures |= _landmarks(trace, truth, sensor, held)
-    measures["log_likelihood"] = trace.info.log_likelihood.sum(), jnp.asarray(1)
-    sums["autocorrelation"] = _autocorrelation(trace)
-    measures["autocorrelation"] = sums["autocorrelation"][0, 0], sums["autocorrelation"][0, 1]
     if getattr(trace.final, "watch", ()):
         gained, dimensions = _null_space(trace.probe, trace.final.watch)
-        sums["rotation_information"] = gained
-        measures["rotation_information"] = gained[-1], jnp.asarray(1)
-        measures["unobservable"] = dimensions.astype(error.dtype), jnp.asarray(1)
+        curves["rotation_information"] = gained
+        measures["rotation_information"] = gained[-1], 1
+        measures["unobservable"] = dimensions.astype(error.dtype), 1
+    of_landmarks, squares = _landmarks(trace, truth, sensor, held)
+    # One sum over time for all: each sum of its own is three kernels, and each kernel is compiled.
+    summed = curves | of_landmarks
+    summed |= {"nees_own": nees["own"][0], "regular_own": nees["own"][1].astype(error.dtype)}
+    summed |= {"log_likelihood": trace.info.log_likelihood}
+    added = settle(jnp.stack(list(summed.values())).sum(axis=1))
+    totals = dict(zip(summed, added, strict=True))
+    covered = _covered(*(jnp.stack([nees[block][i] for block in DOF]) for i in (0, 1)))
+    for at, block in enumerate(DOF):
+        count = totals[f"regular_{block}"]
+        sums[f"coverage_{block}"] = covered[at] / jnp.maximum(count, 1)
+        sums[f"coverage_runs_{block}"] = (count > 0).astype(error.dtype)
+        measures[f"coverage_95_{block}"] = covered[at, LEVELS.index(0.95)], count
+    for block in (*DOF, "own", "landmarks"):
+        measures[f"nees_{block}"] = totals[f"nees_{block}"], totals[f"regular_{block}"]
+    for name in ("square_position", "square_heading"):
+        measures[name] = totals[name], error.shape[0]
+    measures["square_landmarks"] = squares
+    measures["nis_per_dof"] = totals["nis"], totals["nis_dof"]
+    measures["log_likelihood"] = totals["log_likelihood"], 1
+    sums["autocorrelation"] = _autocorrelation(trace)
+    measures["autocorrelation"] = sums["autocorrelation"][0, 0], sums["autocorrelation"][0, 1]
 
-    sums |= {s.name.lower(): (trace.info.status == s).sum() for s in DROPS}
+    dropped = trace.info.status[:, :, None] == jnp.asarray(DROPS)[None, None]
+    sums |= {
+        reason.name.lower(): count
+        for reason, count in zip(DROPS, dropped.sum(axis=(0, 1)), strict=True)
+    }
     sums |= _events(trace)
-    sums |= {"missed": truth.missed.sum(), "singular_steps": (sums["regular_pose"] == 0).sum()}
-    finite = _all_finite((trace.estimate, trace.info, sums, measures))
-    far = jnp.sqrt(sums["square_position"][-1]) > limit
+    sums |= {"missed": truth.missed.sum()}
+    sums |= {"singular_steps": (error.shape[0] - totals["regular_pose"]).astype(int)}
+    finite = settle(_all_finite((trace.estimate, trace.info), (added, sums, measures)))
 
     def kept(value: jax.Array) -> jax.Array:
         return jnp.where(finite, value, jnp.zeros_like(value))
 
-    averages = {}
-    for name, (total, weight) in measures.items():
-        defined = finite & (weight > 0)
-        averages[name] = jnp.where(defined, total / jnp.where(weight > 0, weight, 1), 0.0), defined
+    tops, weights = (
+        jnp.stack([jnp.asarray(pair[i], error.dtype) for pair in measures.values()]) for i in (0, 1)
+    )
+    defined = finite & (weights > 0)
+    averages = jnp.where(defined, tops / jnp.where(weights > 0, weights, 1.0), 0.0)
     at_snapshots = snapshot_steps(error.shape[0])
-    shots = error[at_snapshots], cov[at_snapshots], sums["regular_pose"][at_snapshots] > 0
+    shots = error[at_snapshots], cov[at_snapshots], curves["regular_pose"][at_snapshots] > 0
     return Score(
         finite=finite,
-        divergent=finite & far,
-        measures=averages,
+        measures=dict(zip(measures, zip(averages, defined, strict=True), strict=True)),
         snapshots=jax.tree.map(kept, shots),
-        sums=jax.tree.map(kept, sums),
+        sums=jax.tree.map(kept, sums | curves),
     )
+
+
+def _nees(
+    error: jax.Array, own: jax.Array, cov: jax.Array
+) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """NEES (T,), and where there is one, of the blocks of `DOF` and of the own error."""
+
+    def one(
+        errors: jax.Array, cov: jax.Array, scale: jax.Array
+    ) -> dict[str, tuple[jax.Array, jax.Array]]:
+        position, pose = mahalanobis_leading(errors, cov, (2, 3), scale)
+        return {
+            "position": (position[0][0], position[1][0]),
+            "pose": (pose[0][0], pose[1][0]),
+            "own": (pose[0][1], pose[1][1]),
+            "heading": mahalanobis_squared(errors[2:, 0], cov[2:, 2:], scale[2:]),
+        }
+
+    return jax.vmap(one)(jnp.stack([error, own], axis=2), cov, _scale(cov))
 
 
 def _events(trace: Trace) -> dict[str, jax.Array]:
@@ -160,14 +186,17 @@ def _events(trace: Trace) -> dict[str, jax.Array]:
     return {name: value.sum() for name, value in there.items()}
 
 
-def _all_finite(tree: Any) -> jax.Array:
-    """Whether every number is; arrays of one shape together, which compiles faster."""
-    by_shape: dict[Any, list[jax.Array]] = {}
-    for leaf in map(jnp.asarray, jax.tree.leaves(tree)):
-        if jnp.issubdtype(leaf.dtype, jnp.floating):
-            by_shape.setdefault((leaf.shape, leaf.dtype), []).append(leaf)
-    each = [jnp.isfinite(jnp.stack(leaves)).all() for leaves in by_shape.values()]
-    return jnp.stack(each).all()
+def _all_finite(by_time: Any, others: Any) -> jax.Array:
+    """Whether every number is. by_time: arrays of leading T; a row each, then all at once."""
+
+    def good(tree: Any, axes: Callable[[int], Any]) -> list[jax.Array]:
+        leaves = map(jnp.asarray, jax.tree.leaves(tree))
+        there = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        return [jnp.isfinite(leaf).all(axis=axes(leaf.ndim)) for leaf in there]
+
+    rows = good(by_time, lambda ndim: tuple(range(1, ndim)))
+    every = good(others, lambda ndim: None)
+    return jnp.concatenate([jnp.stack(rows).all(axis=1), jnp.stack(every)]).all()
 
 
 def _scale(cov: jax.Array) -> jax.Array:
@@ -177,10 +206,14 @@ def _scale(cov: jax.Array) -> jax.Array:
     return jnp.where(spread > 0, jnp.sqrt(jnp.where(spread > 0, spread, 1.0)), 0.0)
 
 
-def _covered(nees: jax.Array, regular: jax.Array, dof: int) -> jax.Array:
-    """(T, LEVELS): whether the truth lies in the ellipsoid of that probability."""
-    radii = jnp.asarray([chi2_quantile(p, dof) for p in LEVELS], nees.dtype)
-    return (nees[:, None] <= radii[None, :]) & regular[:, None]
+def _covered(nees: jax.Array, regular: jax.Array) -> jax.Array:
+    """(3, LEVELS): at how many steps the truth lies in the ellipsoid of that probability.
+
+    nees, regular: (3, T), by the blocks of `DOF`.
+    """
+    radii = [[chi2_quantile(p, dof) for p in LEVELS] for dof in DOF.values()]
+    inside = nees[:, :, None] <= jnp.asarray(radii, nees.dtype)[:, None, :]
+    return (inside & regular[:, :, None]).sum(axis=1).astype(nees.dtype)
 
 
 def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> jax.Array:
@@ -199,8 +232,9 @@ def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> ja
 
 def _landmarks(
     trace: Trace, truth: Truth, sensor: Sensor, held: jax.Array
-) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """NEES of each landmark of the map at each step; |p̂ - p|² of the final map, unaligned.
+) -> tuple[dict[str, jax.Array], tuple[jax.Array, jax.Array]]:
+    """By step (T,), summed over the landmarks of the map: NEES, and how many have one; of the final
+    map, unaligned, |p̂ - p|² and how many landmarks that is.
 
     held: (T, N) which true landmark each slot holds, -1 for none.
     """
@@ -210,11 +244,12 @@ def _landmarks(
     off = true_points[jnp.maximum(held, 0)] - estimate.points
     nees, regular = jax.vmap(jax.vmap(mahalanobis_squared))(off, estimate.point_covs)
     counts = named & regular
-    square = jnp.where(named[-1], (off[-1] ** 2).sum(axis=-1), 0.0)
-    return {
-        "nees_landmarks": (jnp.where(counts, nees, 0.0).sum(), counts.sum()),
-        "square_landmarks": (square.sum(), named[-1].sum()),
+    by_step = {
+        "nees_landmarks": jnp.where(counts, nees, 0.0).sum(axis=1),
+        "regular_landmarks": counts.sum(axis=1).astype(nees.dtype),
     }
+    square = jnp.where(named[-1], (off[-1] ** 2).sum(axis=-1), 0.0)
+    return by_step, (square.sum(), named[-1].sum())
 
 
 def _autocorrelation(trace: Trace) -> jax.Array:

@@ -5,18 +5,16 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
 
 from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.score import DOF, DROPS, EVENTS
 from jaxslam.consistency.tally import Tally
-from jaxslam.stats import chi2_quantile, t_quantile
+from jaxslam.stats import chi2_quantile, chi2_quantiles, normal_quantile, t_quantile
 
 LEVEL = 0.95
 """of every band and interval."""
 
-NORMAL = float(scipy.stats.norm.ppf(0.5 + LEVEL / 2))
-
+NORMAL = normal_quantile(0.5 + LEVEL / 2)
 
 COUNTS = tuple(status.name.lower() for status in DROPS) + ("missed", "singular_steps") + EVENTS
 """The sums that are reported as counts."""
@@ -209,6 +207,6 @@ def _bands(count: np.ndarray, dof: int) -> tuple[np.ndarray, np.ndarray]:
     """Two-sided chi-square band of the mean of count χ²_dof variables, step by step."""
     tail = (1 - LEVEL) / 2
     safe = np.maximum(count, 1)
-    edges = [scipy.stats.chi2.ppf(p, dof * safe) / safe for p in (tail, 1 - tail)]
+    edges = [chi2_quantiles(p, dof * safe) / safe for p in (tail, 1 - tail)]
     low, high = (np.where(count > 0, edge, np.nan) for edge in edges)
     return low, high

@@ -46,10 +46,15 @@ def total(rows: np.ndarray) -> Sum:
     return Sum(parts.high[0], parts.low[0])
 
 
-def condense(scores: Score, first: int) -> dict[str, np.ndarray]:
-    """What a tally keeps of runs first, first + 1, … (leading axis), as named arrays."""
-    runs = len(scores.finite)
-    out = {"finite": np.asarray(scores.finite), "divergent": np.asarray(scores.divergent)}
+def condense(scores: Score, first: int, limit: float) -> dict[str, np.ndarray]:
+    """What a tally keeps of runs first, first + 1, … (leading axis), as named arrays.
+
+    limit [m]: a finite run is divergent when its final position error exceeds it.
+    """
+    runs, finite = len(scores.finite), np.asarray(scores.finite)
+    last = np.asarray(scores.snapshots[0])[:, -1, :2]
+    far = np.sqrt((last**2).sum(axis=1)) > limit
+    out = {"finite": finite, "divergent": finite & far}
     for name, (value, defined) in scores.measures.items():
         out[f"measure/{name}"], out[f"defined/{name}"] = np.asarray(value), np.asarray(defined)
     kept = max(min(runs, SHOTS - first), 0)

@@ -5,7 +5,6 @@ whatever block, on whatever device and in whatever process it runs. Only condens
 devices, so memory is that of the blocks in flight however many runs there are.
 """
 
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,8 +17,15 @@ import numpy as np
 
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.linalg import check_count
-from jaxslam.monte_carlo.pieces import missing
-from jaxslam.monte_carlo.programs import BOUND, check_fits, compile_programs, fitting_block
+from jaxslam.monte_carlo.pieces import cores, missing
+from jaxslam.monte_carlo.programs import (
+    BOUND,
+    Glimpse,
+    Programs,
+    check_fits,
+    compile_programs,
+    fitting_block,
+)
 from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
 from jaxslam.simulate import Scenario
@@ -77,6 +83,7 @@ def monte_carlo(
     bound: bool = False,
     keep: Keep | None = None,
     progress: Callable[[int, int], None] | None = None,
+    glimpse: Glimpse | None = None,
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
 
@@ -97,6 +104,9 @@ def monte_carlo(
         bound: also take the posterior Cramér-Rao bound of every run, at the price of one more EKF.
         keep: blocks are saved there as they finish, and those found there are not run again.
         progress: called with (runs done, runs) of this process after each block.
+        glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
+            block of each filter is scored, while the others may still be compiled. A campaign of no
+            more than `workers` blocks is compiled in full first: its steps are timed.
     Returns:
         Campaign.
     Raises:
@@ -118,8 +128,7 @@ def monte_carlo(
     began = time.perf_counter()
     runs = int(runs)
     if workers is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        workers = -(-(cores or 1) // len(devices)) if devices[0].platform == "cpu" else 1
+        workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 1
     names = (*filters, BOUND)
     tallies, own = ({name: Tally() for name in names} for _ in range(2))
     for first, count, arrays in keep.blocks() if keep is not None else ():
@@ -128,7 +137,7 @@ def monte_carlo(
     size = min(int(block), -(-runs // len(devices)))
     kept = tallies[names[0]].pieces()
     todo = share(missing(kept, runs, size * len(devices)))
-    work = _Work(scenario, filters, key, devices, bound, workers, keep, progress)
+    work = _Work(scenario, filters, key, devices, bound, workers, keep, progress, glimpse)
     interrupted = False
     while True:
         try:
@@ -190,6 +199,7 @@ class _Work:
     workers: int
     keep: Keep | None
     progress: Callable[[int, int], None] | None
+    glimpse: Glimpse | None
     compile_seconds: float = 0.0
     run_seconds: dict[str, float] = field(default_factory=dict)
 
@@ -197,34 +207,35 @@ class _Work:
         """Add those of the pieces that are not yet in the tallies, in blocks of size a device."""
         if not todo:
             return
+        programs = Programs(self.filters, self.key, size, len(self.devices), self.bound)
+        before = own[next(iter(own))].pieces()
+        queue = [
+            (first + at, count)
+            for first, runs in todo
+            for at, count in missing(_within(before, first, runs), runs, programs.wide)
+        ][::-1]
+        done = sum(count for _, count in before)
+        total = sum(count for _, count in todo)
+        early, glimpse = len(queue) > self.workers, self.glimpse
+        flight: dict[Future[Any], tuple[int, int]] = {}
+        stop: BaseException | None = None
         with ThreadPoolExecutor(self.workers) as pool:
-            began = time.perf_counter()
-            programs = compile_programs(
-                self.scenario, self.filters, self.key, size, self.devices, self.bound, pool
-            )
-            self.compile_seconds += time.perf_counter() - began
-            before = own[next(iter(own))].pieces()
-            queue = (
-                (first + at, count)
-                for first, runs in todo
-                for at, count in missing(_within(before, first, runs), runs, programs.wide)
-            )
-            done = sum(count for _, count in before)
-            total = sum(count for _, count in todo)
-            flight: dict[Future[Any], tuple[int, int]] = {}
-            stop: BaseException | None = None
-            while True:
+            try:
+                while queue and len(flight) <= self.workers:
+                    first, count = queue.pop()
+                    flight[pool.submit(programs.block, first, count, early, glimpse)] = first, count
+                    glimpse = None
+                began = time.perf_counter()
+                compile_programs(programs, self.scenario, self.filters, self.devices)
+                self.compile_seconds += time.perf_counter() - began
+            except BaseException as error:
+                stop = error
+                programs.give_up(error)
+            while flight:
                 try:
-                    while stop is None and len(flight) <= self.workers:
-                        piece = next(queue, None)
-                        if piece is None:
-                            break
-                        flight[pool.submit(programs.block, *piece)] = piece
-                    if not flight:
-                        break
                     for future in wait(flight, return_when=FIRST_COMPLETED).done:
                         first, count = flight.pop(future)
-                        if future.cancelled():
+                        if stop is not None and (future.cancelled() or future.exception()):
                             continue
                         found = future.result()
                         if self.keep is not None:
@@ -233,15 +244,18 @@ class _Work:
                         done += count
                         if self.progress is not None:
                             self.progress(done, total)
+                    while queue and stop is None and len(flight) <= self.workers:
+                        first, count = queue.pop()
+                        flight[pool.submit(programs.block, first, count, True, None)] = first, count
                 except BaseException as error:
                     if stop is not None:
                         raise
                     stop = error  # what is at work is finished, and kept
                     for future in flight:
                         future.cancel()
-            self.run_seconds = programs.run_seconds()
-            if stop is not None:
-                raise stop
+        self.run_seconds = programs.run_seconds()
+        if stop is not None:
+            raise stop
 
 
 def _within(pieces: Iterable[tuple[int, int]], first: int, runs: int) -> list[tuple[int, int]]:

@@ -1,5 +1,6 @@
-"""Which runs are still to do, and who does them."""
+"""Which runs are still to do, and with how many hands."""
 
+import os
 from collections.abc import Iterable
 
 
@@ -19,3 +20,9 @@ def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tupl
         for begin, end in gaps
         for first in range(begin, end, block)
     ]
+
+
+def cores() -> int:
+    """CPU cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1

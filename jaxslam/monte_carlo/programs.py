@@ -7,11 +7,11 @@ the devices with `shard_map`: no device ever waits for another.
 
 import hashlib
 import inspect
+import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,56 +21,105 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.consistency import Score, condense, own_error_of, posterior_bound, score
+from jaxslam.consistency import (
+    Measure,
+    Score,
+    condense,
+    interval,
+    own_error_of,
+    posterior_bound,
+    score,
+)
 from jaxslam.consistency.tally import condensed_sums
+from jaxslam.monte_carlo.pieces import cores
 from jaxslam.protocols import Candidate, Chart, Estimator, Filter
 from jaxslam.run import run
 from jaxslam.simulate import Scenario, simulate
+from jaxslam.staging import compiled
 from jaxslam.types import Estimate, Info, Log, Trace, Truth
 
 BOUND = "bound"
 """The name under which a block keeps the sums of the posterior bound, and the divergence limit."""
 
 
-@dataclass(frozen=True)
+Glimpse = Callable[[str, int, Measure | None], Any]
+"""(filter, runs, their mean pose NEES)."""
+
+
 class Programs:
-    """Compiled for blocks of `wide` runs; run i has key fold_in(key, i)."""
+    """Of blocks of `wide` runs; run i has key fold_in(key, i).
 
-    key: jax.Array
-    wide: int
-    draw: Callable[..., Any]
-    drives: dict[str, Callable[..., Any]]
-    scores: dict[str, Callable[..., Any]]
-    least: Callable[..., Any]
-    bound: bool
-    limit: jax.Array
-    """() [m] the divergence limit, from run 0"""
-    devices: int
-    spent: dict[str, list[float]]
-    """wall seconds of each block so far, by filter"""
+    `compile_programs` fills in one after the other. A block may be begun before: where it needs a
+    program that is not there yet, it waits.
+    """
 
-    def block(self, first: int, runs: int) -> dict[str, dict[str, np.ndarray]]:
-        """Condensed scores of runs first … first + runs - 1 (at most `wide`), by filter."""
+    def __init__(
+        self, names: Iterable[str], key: jax.Array, block: int, devices: int, bound: bool
+    ) -> None:
+        self.key, self.wide, self.devices, self.bound = key, block * devices, devices, bound
+        self.draw: Future[Callable[..., Any]] = Future()
+        self.drives: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
+        self.scores: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
+        self.least: Future[Callable[..., Any]] = Future()
+        self.limit: Future[jax.Array] = Future()
+        """() [m] the divergence limit, from run 0"""
+        self._quiet = threading.Event()
+        self._spent: dict[str, list[tuple[bool, float]]] = {name: [] for name in names}
+        """whether nothing was being compiled, and wall seconds; of each block so far"""
+
+    def block(
+        self, first: int, runs: int, early: bool, glimpse: Glimpse | None
+    ) -> dict[str, dict[str, np.ndarray]]:
+        """Condensed scores of runs first … first + runs - 1 (at most `wide`), by filter.
+
+        early: begin while other programs are being compiled, and do not time that. glimpse: told of
+        each filter as soon as it is scored.
+        """
+        if not early:
+            self.limit.result()
         which = first + jnp.arange(self.wide)
-        world = jax.block_until_ready(self.draw(self.key, which))
-        out = {}
-        for name, drive in self.drives.items():
-            began = time.perf_counter()
+        world = jax.block_until_ready(self.draw.result()(self.key, which))
+        scores = {}
+        for name, promised in self.drives.items():
+            drive = promised.result()
+            began, quiet = time.perf_counter(), self._quiet.is_set()
             driven = jax.block_until_ready(drive(self.key, which, world))
-            self.spent[name].append(time.perf_counter() - began)
-            scores = self.scores[name](self.limit, world[0], driven)
-            kept = jax.tree.map(lambda leaf: leaf[:runs], jax.device_get(scores))
-            out[name] = condense(kept, first)
-        out[BOUND] = {"limit": np.asarray(self.limit)}
+            self._spent[name].append((quiet, time.perf_counter() - began))
+            found = jax.device_get(self.scores[name].result()(world[0], driven))
+            scores[name] = jax.tree.map(lambda leaf: leaf[:runs], found)
+            if glimpse is not None:
+                nees, defined = scores[name].measures["nees_pose"]
+                glimpse(name, runs, interval(nees[defined]))
+        limit = self.limit.result()
+        out = {name: condense(each, first, float(limit)) for name, each in scores.items()}
+        out[BOUND] = {"limit": np.asarray(limit)}
         if self.bound:
-            least = jax.device_get(self.least(self.key, which, world))
+            least = jax.device_get(self.least.result()(self.key, which, world))
             out[BOUND] |= condensed_sums({name: rows[:runs] for name, rows in least.items()})
         return out
 
+    def promises(self) -> list[Future[Any]]:
+        """All that blocks may wait for."""
+        return [self.draw, *self.drives.values(), *self.scores.values(), self.least, self.limit]
+
+    def complete(self) -> None:
+        """Nothing is being compiled any more."""
+        self._quiet.set()
+
+    def give_up(self, error: BaseException) -> None:
+        """Whoever waits for a program that is not there gets the error."""
+        for promise in self.promises():
+            if not promise.done():
+                promise.set_exception(error)
+
     def run_seconds(self) -> dict[str, float]:
         """What one run took on one device, by filter: the median over blocks so far."""
-        each = self.devices / self.wide
-        return {name: each * float(np.median(all_)) for name, all_ in self.spent.items() if all_}
+        out = {}
+        for name, all_ in self._spent.items():
+            times = [seconds for quiet, seconds in all_ if quiet] or [s for _, s in all_]
+            if times:
+                out[name] = self.devices / self.wide * float(np.median(times))
+        return out
 
 
 class Driven(NamedTuple):
@@ -88,20 +137,20 @@ class _Final(NamedTuple):
 
 
 def compile_programs(
+    programs: Programs,
     scenario: Scenario,
     filters: Mapping[str, Candidate],
-    key: jax.Array,
-    block: int,
     devices: Sequence[jax.Device],
-    bound: bool,
-    pool: ThreadPoolExecutor,
-) -> Programs:
-    """Compile for blocks of `block` runs a device, all programs at once.
+) -> None:
+    """Fill in the programs, several compiled at once; back when all are there.
 
     Filters whose results have the same shapes share the program that scores them.
     """
     mesh = Mesh(np.asarray(devices), ("runs",))
-    wide = block * len(devices)
+    key, wide = programs.key, programs.wide
+    block = wide // len(devices)
+    # Compiling one program keeps nearly two cores busy; more at once only delay the first.
+    pool = ThreadPoolExecutor(max(cores() // 2, 1))
 
     def draw(key: jax.Array, which: jax.Array) -> tuple[Truth, Log]:
         return jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
@@ -119,10 +168,10 @@ def compile_programs(
         driven: Driven = jax.vmap(one)(which, *world)
         return driven
 
-    def judge(limit: jax.Array, truth: Truth, driven: Driven) -> Score:
+    def judge(truth: Truth, driven: Driven) -> Score:
         def one(truth: Truth, driven: Driven) -> Score:
             trace = Trace(driven.estimate, driven.info, _Final(driven.watch), driven.probe)
-            return score(trace, truth, scenario.sensor, limit, driven.own_error)
+            return score(trace, truth, scenario.sensor, driven.own_error)
 
         scores: Score = jax.vmap(one)(truth, driven)
         return scores
@@ -136,12 +185,15 @@ def compile_programs(
         return {"position": position, "heading": cov[:, :, 2, 2]}
 
     def program(
-        function: Callable[..., Any], by_runs: str, *arguments: Any, straight: bool = False
-    ) -> tuple[Future[Any], Any]:
-        """Compiling; and the shapes of its results.
+        promises: Iterable[Future[Any]],
+        function: Callable[..., Any],
+        by_runs: str,
+        *arguments: Any,
+        straight: bool = False,
+    ) -> Any:
+        """Have it compiled for those promises; the shapes of its results.
 
-        by_runs: "r" for an argument by runs. straight: its time goes into long passes over arrays,
-        not into a loop of small ones.
+        by_runs: "r" for an argument by runs. straight: see `staging.compiled`.
         """
         own = [
             _resized(x, block) if r == "r" else x for r, x in zip(by_runs, arguments, strict=True)
@@ -162,39 +214,47 @@ def compile_programs(
         )
         lowered = jax.jit(spread).lower(traced.consts, *arguments)
         # Tracing holds Python's lock, compiling does not: the next is traced meanwhile.
-        options = _QUICK if straight and devices[0].platform == "cpu" else {}
-        program = pool.submit(_compiled, lowered, tuple(devices), traced.consts, options)
-        return program, _resized(shapes, wide)
+        pool.submit(_compiled, lowered, tuple(devices), traced.consts, straight).add_done_callback(
+            lambda compiling: _keep(promises, compiling)
+        )
+        return _resized(shapes, wide)
 
     which = jnp.arange(wide)
-    draws, world = program(draw, "-r", key, which, straight=True)
-    dtype = world[0].pose.dtype
-    drives: dict[str, Future[Any]] = {}
-    scores: dict[Any, Future[Any]] = {}
-    kinds = {}
-    for name, candidate in filters.items():
-        drives[name], driven = program(partial(drive, candidate), "-rr", key, which, world)
-        leaves, structure = jax.tree.flatten(driven)
-        kinds[name] = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        if kinds[name] not in scores:
-            limit = jax.ShapeDtypeStruct((), dtype)
-            shapes = limit, world[0], driven
-            scores[kinds[name]] = program(judge, "-rr", *shapes, straight=True)[0]
-    bounds, _ = program(least, "-rr", key, which, world)
-    first = bounds.result()(key, which, draws.result()(key, which))
-    variance = float(first["position"][0, -1])
-    return Programs(
-        key=key,
-        wide=wide,
-        draw=draws.result(),
-        drives={name: program.result() for name, program in drives.items()},
-        scores={name: scores[kind].result() for name, kind in kinds.items()},
-        least=bounds.result(),
-        bound=bound,
-        limit=jnp.asarray(_divergence_limit(scenario, variance**0.5, dtype), dtype),
-        devices=len(devices),
-        spent={name: [] for name in filters},
-    )
+    try:
+        world = program([programs.draw], draw, "-r", key, which, straight=True)
+        alike: dict[Any, Future[Any]] = {}
+        for name, candidate in filters.items():
+            one = partial(drive, candidate)
+            driven = program([programs.drives[name]], one, "-rr", key, which, world)
+            leaves, structure = jax.tree.flatten(driven)
+            kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+            if kind in alike:
+                alike[kind].add_done_callback(partial(_keep, [programs.scores[name]]))
+            else:
+                alike[kind] = programs.scores[name]
+                program([alike[kind]], judge, "rr", world[0], driven, straight=True)
+        program([programs.least], least, "-rr", key, which, world)
+        found = programs.least.result()(key, which, programs.draw.result()(key, which))
+        spread = float(found["position"][0, -1]) ** 0.5
+        dtype = world[0].pose.dtype
+        for promise in (*programs.drives.values(), *programs.scores.values()):
+            promise.result()
+        programs.complete()
+        programs.limit.set_result(jnp.asarray(_divergence_limit(scenario, spread, dtype), dtype))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _keep(promises: Iterable[Future[Any]], compiling: Future[Any]) -> None:
+    """A promise is kept as the compilation turns out, unless it was given up."""
+    for promise in promises:
+        if promise.done() or compiling.cancelled():
+            continue
+        error = compiling.exception()
+        if error is None:
+            promise.set_result(compiling.result())
+        else:
+            promise.set_exception(error)
 
 
 def _resized(tree: Any, runs: int) -> Any:
@@ -207,16 +267,12 @@ def _resized(tree: Any, runs: int) -> Any:
 _KEPT: OrderedDict[Any, Any] = OrderedDict()
 _ROOM = 64
 
-# XLA's older emitters of CPU code: straight passes compile in under half the time and run as fast,
-# but the small kernels in a filter's loop run half as fast.
-_QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-
 
 def _compiled(
     lowered: jax.stages.Lowered,
     devices: tuple[jax.Device, ...],
     constants: list[Any],
-    options: dict[str, Any],
+    straight: bool,
 ) -> Callable[..., Any]:
     """The program with its constants, compiled unless the same has been, whatever its constants."""
     text = hashlib.sha256(lowered.as_text().encode()).digest()
@@ -224,12 +280,7 @@ def _compiled(
     which = (text, devices, lowered.in_tree, str(lowered.in_avals))
     kept = _KEPT.get(which)
     if kept is None:
-        try:
-            kept = lowered.compile(options)
-        except jax.errors.JaxRuntimeError as error:
-            if "No such compile option" not in str(error):
-                raise
-            kept = lowered.compile()
+        kept = compiled(lowered, devices[0].platform, straight=straight)
         _KEPT[which] = kept
         while len(_KEPT) > _ROOM:
             _KEPT.popitem(last=False)

@@ -4,7 +4,7 @@ Nothing in it is loaded from anywhere: figures are embedded, and the page forbid
 """
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 
 from jaxslam.consistency import DOF, LEVEL, Summary
@@ -51,6 +51,7 @@ def page(
     seed: int | None,
     versions: Mapping[str, str],
     figures: Mapping[str, Figure],
+    draw: Callable[[Figure], bytes] = png,
 ) -> str:
     """The whole campaign as the text of one HTML file.
 
@@ -61,12 +62,14 @@ def page(
         command, seed: how to run it again; None where there was no seed.
         versions: of what computed it, by name.
         figures: by caption, in order.
+        draw: makes a PNG file of a figure; one that remembers saves who needs the files as well.
     """
     names = list(campaign.filters)
     heading = f"{campaign.scenario}: consistency of {counted(len(names), 'filter')}"
     setup = f"{counted(campaign.runs, 'Monte-Carlo run')} of {counted(campaign.steps, 'step')}"
     shown = "\n".join(
-        _figure(i, caption, figure) for i, (caption, figure) in enumerate(figures.items(), 1)
+        _figure(i, caption, figure, draw(figure))
+        for i, (caption, figure) in enumerate(figures.items(), 1)
     )
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -254,9 +257,9 @@ def _parameters(
     return f'<dl class="parameters">{"".join(shown)}</dl>'
 
 
-def _figure(number: int, caption: str, figure: Figure) -> str:
+def _figure(number: int, caption: str, figure: Figure, drawn: bytes) -> str:
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
-    data = base64.b64encode(png(figure)).decode("ascii")
+    data = base64.b64encode(drawn).decode("ascii")
     return (
         f'<figure><img width="{width}" height="{height}" alt="{escape(describe(figure))}" '
         f'src="data:image/png;base64,{data}">'
