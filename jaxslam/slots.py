@@ -126,6 +126,11 @@ def allocate(alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]
     return jnp.argmax(match, axis=1).astype(jnp.int32), match.any(axis=1)
 
 
+def concerned(slot: jax.Array, on: jax.Array, count: int) -> jax.Array:
+    """Which of count slots the places slot (M,) name, where on (M,); (count,) bool."""
+    return jnp.zeros(count, bool).at[jnp.where(on, slot, count)].set(True, mode="drop")
+
+
 def gather(joint: Joint, slot: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The landmark (L,) in a slot () and its rows (L, D) of the covariance."""
     size = joint.landmarks.shape[1]

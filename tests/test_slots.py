@@ -185,6 +185,13 @@ def test_removing_a_dead_slot_is_the_identity():
             np.testing.assert_array_equal(a, b)
 
 
+def test_concerned_slots_are_those_that_a_place_names():
+    slot, on = np.array([2, 0, -1, 2, 4]), np.array([True, False, False, True, True])
+    found = jax.jit(slots.concerned, static_argnums=2)(slot, on, 6)
+    np.testing.assert_array_equal(found, [False, False, True, False, True, False])
+    assert not slots.concerned(slot[:0], on[:0], 6).any()
+
+
 def test_allocate_grants_the_lowest_free_slots_in_order_until_the_map_is_full():
     rng = np.random.default_rng(6)
     for _ in range(200):

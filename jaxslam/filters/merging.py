@@ -60,7 +60,7 @@ def told_apart(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Array:
 def _together(status: Array, slot: Array, capacity: int) -> Array:
     """(N, N) bool: both slots were corrected or born."""
     seen = (status == Status.FUSED) | (status == Status.BORN)
-    here = jnp.zeros(capacity, bool).at[jnp.where(seen, slot, capacity)].set(True, mode="drop")
+    here = slots.concerned(slot, seen, capacity)
     return here[:, None] & here[None, :]
 
 

@@ -34,8 +34,7 @@ def after_scan(
     given_up = jnp.zeros_like(own.alive)
     if life is not None and life.make_room is not None:
         needed = sight.is_new.sum() - (~own.alive).sum()
-        there = jnp.where(sight.used, sight.slot, own.alive.shape[0])
-        measured = jnp.zeros_like(own.alive).at[there].set(True, mode="drop")
+        measured = slots.concerned(sight.slot, sight.used, len(own.alive))
         given_up = life.make_room(_joint(own), needed, measured)
         own = _without(own, given_up)
     at, granted, deferred, repeated, new, new_covs = where_any(

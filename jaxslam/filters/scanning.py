@@ -102,7 +102,9 @@ def scan_update(
             if life is not None and life.make_room is not None:
                 needed = wanted.sum() - (~joint.alive).sum()
                 used = matched & done.inside & done.positive
-                given_up = life.make_room(joint, needed, _among(found.slot, used, joint.alive))
+                given_up = life.make_room(
+                    joint, needed, slots.concerned(found.slot, used, len(joint.alive))
+                )
                 joint = without(joint, given_up)
             taken = joint.alive if reserved is None else joint.alive | reserved
             slot, granted = slots.allocate(taken, wanted)
@@ -143,12 +145,6 @@ def scan_update(
         return joint, info, born.given_up
 
     return update_map
-
-
-def _among(slot: jax.Array, on: jax.Array, alive: jax.Array) -> jax.Array:
-    """Which slots (N,) the places slot (M,) name, where on (M,)."""
-    at = jnp.where(on, slot, alive.shape[0])
-    return jnp.zeros_like(alive).at[at].set(True, mode="drop")
 
 
 def part_updates(sensor: Sensor, size_l: int, **options: Any) -> list[tuple[int, ScanUpdate]]:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam import slots
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import canonical
 from jaxslam.filters.blankets import marginals, whole_marginals
@@ -64,8 +65,7 @@ def allotted(
     """
     order = jnp.argsort(first, stable=True)
     place = jnp.where(needs, order[jnp.clip(turn, 0, len(order) - 1)], jnp.argmax(match, axis=1))
-    into = jnp.where(needs, place, len(order))
-    return place, jnp.zeros(len(order), bool).at[into].set(True, mode="drop")
+    return place, slots.concerned(place, needs, len(order))
 
 
 def closed(

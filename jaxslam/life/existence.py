@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam import slots
 from jaxslam.linalg import check_count
 from jaxslam.protocols import Life
 from jaxslam.slots import Joint
@@ -92,8 +93,9 @@ def existence(
     def after(
         joint: Joint, info: Info, estimate: Callable[[], Estimate]
     ) -> tuple[Existence, Array]:
-        born = _slots_of(joint, info, Status.BORN)
-        hit = born | _slots_of(joint, info, Status.FUSED)
+        count = len(joint.alive)
+        born = slots.concerned(info.slot, info.status == Status.BORN, count)
+        hit = born | slots.concerned(info.slot, info.status == Status.FUSED, count)
         known: Existence = joint.life
         old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), known)
         should = joint.alive & ~hit & jax.vmap(visible, (None, 0))(joint.pose, joint.landmarks)
@@ -120,10 +122,3 @@ def existence(
         return given_up
 
     return Life("existence", init, after, make_room if replace else None)
-
-
-def _slots_of(joint: Joint, info: Info, status: Status) -> Array:
-    """Whether a measurement with that status concerned each slot, (N,)."""
-    capacity = joint.alive.shape[0]
-    slot = jnp.where(info.status == status, info.slot, capacity)
-    return jnp.zeros(capacity, bool).at[slot].set(True, mode="drop")

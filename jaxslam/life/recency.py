@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam import slots
 from jaxslam.linalg import check_count
 from jaxslam.protocols import Life
 from jaxslam.slots import Joint
@@ -46,14 +47,9 @@ def recency(patience: int | None = None) -> Life:
     def after(joint: Joint, info: Info, estimate: Callable[[], Estimate]) -> tuple[Recency, Array]:
         known: Recency = joint.life
         now = known.now + 1
-        count = joint.alive.shape[0]
-
-        def of(status: Status) -> Array:
-            slot = jnp.where(info.status == status, info.slot, count)
-            return jnp.zeros(count, bool).at[slot].set(True, mode="drop")
-
-        born = of(Status.BORN)
-        hit = born | of(Status.FUSED)
+        count = len(joint.alive)
+        born = slots.concerned(info.slot, info.status == Status.BORN, count)
+        hit = born | slots.concerned(info.slot, info.status == Status.FUSED, count)
         zero = jnp.zeros_like(known.last)
         memory = Recency(
             now,
