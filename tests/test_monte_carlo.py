@@ -13,7 +13,8 @@ import worlds
 from jaxslam import family, filters, motion, run, sensors, simulate, store
 from jaxslam.monte_carlo import Interrupted, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
-from jaxslam.monte_carlo.programs import Programs, fitting_block
+from jaxslam.monte_carlo.block import Programs
+from jaxslam.monte_carlo.candidates import fitting_block
 
 SHORT = worlds.ring(steps=12)
 

@@ -17,15 +17,10 @@ import numpy as np
 
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.linalg import check_count
+from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
+from jaxslam.monte_carlo.candidates import check_fits, fitting_block
 from jaxslam.monte_carlo.pieces import cores, missing
-from jaxslam.monte_carlo.programs import (
-    BOUND,
-    Glimpse,
-    Programs,
-    check_fits,
-    compile_programs,
-    fitting_block,
-)
+from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
 from jaxslam.simulate import Scenario
@@ -207,7 +202,7 @@ class _Work:
         """Add those of the pieces that are not yet in the tallies, in blocks of size a device."""
         if not todo:
             return
-        programs = Programs(self.filters, self.key, size, len(self.devices), self.bound)
+        programs = Programs(list(self.filters), self.key, size, len(self.devices), self.bound)
         before = own[next(iter(own))].pieces()
         queue = [
             (first + at, count)

@@ -1,0 +1,97 @@
+"""A block of runs: the programs it waits for, and what is condensed of its scores."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.consistency import Measure, condense, interval
+from jaxslam.consistency.tally import condensed_sums
+
+BOUND = "bound"
+"""The name under which a block keeps the sums of the posterior bound, and the divergence limit."""
+
+
+Glimpse = Callable[[str, int, Measure | None], Any]
+"""(filter, runs, their mean pose NEES)."""
+
+
+class Programs:
+    """Of blocks of `wide` runs; run i has key fold_in(key, i).
+
+    `compile_programs` fills in one after the other. A block may be begun before: where it needs a
+    program that is not there yet, it waits.
+    """
+
+    def __init__(
+        self, names: Sequence[str], key: jax.Array, block: int, devices: int, bound: bool
+    ) -> None:
+        self.key, self.wide, self.devices, self.bound = key, block * devices, devices, bound
+        self.draw: Future[Callable[..., Any]] = Future()
+        self.drives: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
+        self.scores: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
+        self.least: Future[Callable[..., Any]] = Future()
+        self.limit: Future[jax.Array] = Future()
+        """() [m] the divergence limit, from run 0"""
+        self._quiet = threading.Event()
+        self._spent: dict[str, list[tuple[bool, float]]] = {name: [] for name in names}
+        """whether nothing was being compiled, and wall seconds; of each block so far"""
+
+    def block(
+        self, first: int, runs: int, early: bool, glimpse: Glimpse | None
+    ) -> dict[str, dict[str, np.ndarray]]:
+        """Condensed scores of runs first … first + runs - 1 (at most `wide`), by filter.
+
+        early: begin while other programs are being compiled, and do not time that. glimpse: told of
+        each filter as soon as it is scored.
+        """
+        if not early:
+            self.limit.result()
+        which = first + jnp.arange(self.wide)
+        world = jax.block_until_ready(self.draw.result()(self.key, which))
+        scores = {}
+        for name, promised in self.drives.items():
+            drive = promised.result()
+            began, quiet = time.perf_counter(), self._quiet.is_set()
+            driven = jax.block_until_ready(drive(self.key, which, world))
+            self._spent[name].append((quiet, time.perf_counter() - began))
+            found = jax.device_get(self.scores[name].result()(world[0], driven))
+            scores[name] = jax.tree.map(lambda leaf: leaf[:runs], found)
+            if glimpse is not None:
+                nees, defined = scores[name].measures["nees_pose"]
+                glimpse(name, runs, interval(nees[defined]))
+        limit = self.limit.result()
+        out = {name: condense(each, first, float(limit)) for name, each in scores.items()}
+        out[BOUND] = {"limit": np.asarray(limit)}
+        if self.bound:
+            least = jax.device_get(self.least.result()(self.key, which, world))
+            out[BOUND] |= condensed_sums({name: rows[:runs] for name, rows in least.items()})
+        return out
+
+    def promises(self) -> list[Future[Any]]:
+        """All that blocks may wait for."""
+        return [self.draw, *self.drives.values(), *self.scores.values(), self.least, self.limit]
+
+    def complete(self) -> None:
+        """Nothing is being compiled any more."""
+        self._quiet.set()
+
+    def give_up(self, error: BaseException) -> None:
+        """Whoever waits for a program that is not there gets the error."""
+        for promise in self.promises():
+            if not promise.done():
+                promise.set_exception(error)
+
+    def run_seconds(self) -> dict[str, float]:
+        """What one run took on one device, by filter: the median over blocks so far."""
+        out = {}
+        for name, all_ in self._spent.items():
+            times = [seconds for quiet, seconds in all_ if quiet] or [s for _, s in all_]
+            if times:
+                out[name] = self.devices / self.wide * float(np.median(times))
+        return out

@@ -1,0 +1,78 @@
+"""What a campaign is given to run: whether it fits the scenario, and how many runs fit a device."""
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.protocols import Candidate, Chart, Estimator, Filter
+from jaxslam.run import run
+from jaxslam.simulate import Scenario, simulate
+from jaxslam.types import Log, Truth
+
+
+def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: jax.Device) -> int:
+    """Runs that are well computed together on a device: 32 on a CPU, whose caches they fit.
+
+    On an accelerator as many as take a quarter of its memory, counting a run's world and what the
+    first filter makes of it, which the scores read several times over: a power of two from 32 on,
+    4096 at most, and 1024 where the device does not tell its memory.
+    """
+    if device.platform == "cpu":
+        return 32
+    room = (device.memory_stats() or {}).get("bytes_limit")
+    if room is None:
+        return 1024
+
+    def one(key: jax.Array) -> Any:
+        truth, log = simulate(scenario, key)
+        method, _ = estimator_of(next(iter(filters.values())), truth, scenario)
+        trace = method(log, key)
+        return truth, log, trace.estimate, trace.info
+
+    shapes = jax.tree.leaves(jax.eval_shape(one, jax.random.key(0)))
+    each = sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
+    return int(np.clip(2 ** int(np.log2(max(room / 4 / each, 1.0))), 32, 4096))
+
+
+def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
+    """Raise ValueError unless a candidate takes what the scenario's log has."""
+    if not isinstance(candidate, Filter):
+        if not callable(candidate):
+            raise ValueError(f"monte_carlo: {name} is neither a filter nor a function of the truth")
+        try:
+            inspect.signature(candidate).bind(None)
+        except TypeError:
+            raise ValueError(
+                f"monte_carlo: {name} does not take the truth alone; an estimator of (log, key), "
+                "as of smoothing.smooth, is given as lambda truth: estimator"
+            ) from None
+        return
+    for what, has, needs in (
+        ("control", candidate.control_size, len(scenario.motion.controls)),
+        ("measurement", candidate.measurement_size, len(scenario.sensor.measurements)),
+    ):
+        if has != needs:
+            raise ValueError(
+                f"monte_carlo: filter {name} takes a {what} of size {has}, "
+                f"the scenario {scenario.name} gives {needs}"
+            )
+
+
+def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tuple[Estimator, Chart]:
+    """What runs, and the chart of its errors."""
+    method = candidate if isinstance(candidate, Filter) else candidate(truth)
+    if not isinstance(method, Filter):
+        return method, euclidean()
+
+    def learnt(state: Any) -> Any:
+        watch = getattr(state, "watch", ())
+        return watch.information if watch else ()
+
+    def drive(log: Log, key: jax.Array) -> Any:
+        return run(method, log, scenario.pose, scenario.pose_cov, key, probe=learnt)
+
+    return drive, method.chart
