@@ -7,14 +7,13 @@ share of steps whose average NEES over the runs lies in its 95 % band, of the po
 0.95 on average of an honest filter.
 """
 
-import argparse
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import family, monte_carlo, run, simulate
 from jaxslam.filters import mapping
 from jaxslam.linalg import mahalanobis_squared
@@ -65,15 +64,5 @@ def measure(runs=1000):
     return metrics
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.baselines")
-    parser.add_argument("--runs", type=int, default=1000)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.runs)
-    print()
-    return report(metrics)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(alone("baselines", measure, runs={"type": int, "default": 1000}))

@@ -19,14 +19,13 @@ runs and 30 % more, for the customary prior. (Jacobians at the truth make no ide
 naive one: its estimate starts metres off, where they are not those of its own innovations.)
 """
 
-import argparse
 import dataclasses
 from functools import partial
 
 import jax
 import numpy as np
 
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import monte_carlo, sensors
 from jaxslam.charts import right_invariant
 from jaxslam.filters import ekf_slam
@@ -91,15 +90,5 @@ def measure(runs=100):
     return metrics
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bearing")
-    parser.add_argument("--runs", type=int, default=100)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.runs)
-    print()
-    return report(metrics)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(alone("bearing", measure, runs={"type": int, "default": 100}))

@@ -5,20 +5,19 @@ step. `jaxslam consistency --scenario cloister --filters all` says the same, and
 figure of it, `figures/comparison.png`. Times are for comparison within one run.
 """
 
-import argparse
 from pathlib import Path
 
 import jax
 
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import family, monte_carlo, plot
 from jaxslam.scenarios import SCENARIOS
 
 FIGURE = Path(__file__).parent / "figures" / "comparison.png"
 
 
-def measure(runs: int = 16, name: str = "cloister", out: Path | None = None) -> list[Metric]:
-    world = SCENARIOS[name]()
+def measure(runs: int = 16, scenario: str = "cloister", out: Path | None = None) -> list[Metric]:
+    world = SCENARIOS[scenario]()
     filters = {each: make(world) for each, make in family.ALL.items()}
     campaign = monte_carlo(world, filters, runs, jax.random.key(0), workers=1)
     print(f"{world.name}, {runs} runs of {world.steps} steps")
@@ -44,17 +43,13 @@ def measure(runs: int = 16, name: str = "cloister", out: Path | None = None) -> 
     ]
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.comparison")
-    parser.add_argument("--runs", type=int, default=16)
-    parser.add_argument("--scenario", choices=list(SCENARIOS), default="cloister")
-    parser.add_argument("--out", type=Path, default=FIGURE)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.runs, options.scenario, options.out)
-    print()
-    return report(metrics)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(
+        alone(
+            "comparison",
+            measure,
+            runs={"type": int, "default": 16},
+            scenario={"choices": list(SCENARIOS), "default": "cloister"},
+            out={"type": Path, "default": FIGURE},
+        )
+    )

@@ -17,7 +17,6 @@ noise (`still`), and again with two bearings of nothing a step (`clutter`). A be
 landmark by the chi-square gate meets all others. There, false is farther than 1 m from any.
 """
 
-import argparse
 import dataclasses
 
 import jax
@@ -25,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import motion, sensors
 from jaxslam.angles import wrap
 from jaxslam.association import nearest
@@ -174,16 +173,12 @@ def measure(runs=100, every=3):
     return metrics
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.delayed")
-    parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--every", type=int, default=3)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.runs, options.every)
-    print()
-    return report(metrics)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(
+        alone(
+            "delayed",
+            measure,
+            runs={"type": int, "default": 100},
+            every={"type": int, "default": 3},
+        )
+    )

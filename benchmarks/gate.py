@@ -1,6 +1,11 @@
 """A benchmark's result and its gate: a measured number and the range it must lie in."""
 
+import argparse
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
+
+import jax
 
 
 @dataclass(frozen=True)
@@ -27,3 +32,18 @@ def report(metrics: list[Metric]) -> int:
     missed = [m.name for m in metrics if not m.passes]
     print(f"{len(metrics) - len(missed)} of {len(metrics)} gates met")
     return 1 if missed else 0
+
+
+def alone(name: str, measure: Callable[..., list[Metric]], **options: dict[str, Any]) -> int:
+    """The command `python -m benchmarks.NAME`: measure with its options, report; exit status.
+
+    options: arguments of measure, each with what `add_argument` is told of it.
+    """
+    parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}")
+    for option, told in options.items():
+        parser.add_argument(f"--{option}", **told)
+    asked = vars(parser.parse_args())
+    jax.config.update("jax_enable_x64", True)
+    metrics = measure(**asked)
+    print()
+    return report(metrics) if metrics else 0

@@ -14,7 +14,6 @@ one of ten at most, and fewer than a fifth of the particles are in use (median) 
 part. The EKF without a gate has none: as tags are known, what it measures may pull it back.
 """
 
-import argparse
 import dataclasses
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import run, sensors, simulate
 from jaxslam.filters import cloud, localization, particle_localization
 from jaxslam.scenarios import circle
@@ -164,17 +163,13 @@ def draw(traces, out):
     figure.savefig(out, dpi=170)
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.monte_carlo_localization")
-    parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--particles", type=int, default=5000)
-    parser.add_argument("--out", type=Path, default=FIGURE)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.runs, options.particles, options.out)
-    print()
-    return report(metrics)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(
+        alone(
+            "monte_carlo_localization",
+            measure,
+            runs={"type": int, "default": 20},
+            particles={"type": int, "default": 5000},
+            out={"type": Path, "default": FIGURE},
+        )
+    )

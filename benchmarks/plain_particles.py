@@ -8,13 +8,11 @@ FastSLAM samples the pose alone and keeps each landmark as a Gaussian given the 
 same number of particles, a robot on a circle inside N landmarks that it always sees.
 """
 
-import argparse
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import filters, linalg, motion, run, sensors
 from jaxslam.resampling import systematic
 from jaxslam.simulate import Scenario, simulate
@@ -110,16 +108,12 @@ def measure(runs: int = 20, particles: int = 500) -> list[Metric]:
     ]
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.plain_particles")
-    parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--particles", type=int, default=500)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.runs, options.particles)
-    print()
-    return report(metrics)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(
+        alone(
+            "plain_particles",
+            measure,
+            runs={"type": int, "default": 20},
+            particles={"type": int, "default": 500},
+        )
+    )

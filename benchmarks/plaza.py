@@ -12,7 +12,6 @@ of its ground truth, so dead reckoning is good already, and stands beside it. Gr
 in this file; the last row replaces one range in ten by anything from 0 to 80 m.
 """
 
-import argparse
 from pathlib import Path
 
 import gtsam
@@ -21,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import datasets, se2
 from jaxslam.filters import delayed_slam
 from jaxslam.types import Status
@@ -130,15 +129,7 @@ def draw(data, path, reckoned, points):
     figure.savefig(FIGURE, dpi=130)
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.plaza")
-    parser.add_argument("--figure", action="store_true", help=f"draw {FIGURE.name}")
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.figure)
-    print()
-    return report(metrics)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(
+        alone("plaza", measure, figure={"action": "store_true", "help": f"draw {FIGURE.name}"})
+    )

@@ -5,7 +5,6 @@ checkout, and left out where absent; Victoria Park comes with GTSAM. The map is 
 survey by the SE(2) motion that fits best. Seconds are of a second run, without compilation.
 """
 
-import argparse
 import os
 import time
 from collections.abc import Callable
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import datasets
 from jaxslam.consistency import align_map
 from jaxslam.datasets import Dataset
@@ -70,11 +69,5 @@ def measure() -> list[Metric]:
     return metrics
 
 
-def main() -> list[Metric]:
-    argparse.ArgumentParser(prog="python -m benchmarks.real_data").parse_args()
-    jax.config.update("jax_enable_x64", True)
-    return measure()
-
-
 if __name__ == "__main__":
-    raise SystemExit(report(main()))
+    raise SystemExit(alone("real_data", measure))

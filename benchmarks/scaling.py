@@ -10,7 +10,6 @@ are timed in a scan whose carry is donated, without estimates, which are O(N) by
 time is the least of some. Draws `figures/scaling.png`.
 """
 
-import argparse
 import time
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from jaxslam import filters, motion, sensors
 from jaxslam.types import Log, Scan
 
@@ -200,15 +199,5 @@ def draw(found, powers, out):
     figure.savefig(out, dpi=170)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling")
-    parser.add_argument("--out", type=Path, default=FIGURE)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.out)
-    print()
-    return report(metrics)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(alone("scaling", measure, out={"type": Path, "default": FIGURE}))

@@ -9,7 +9,6 @@ among the files. `theirs` is NIS/dof of the sightings alone. The folder is JAXSL
 ../shared/data beside the checkout.
 """
 
-import argparse
 import time
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import datasets, se2
 from jaxslam.consistency import align_map
@@ -136,16 +135,12 @@ def draw(data, runs, out):
     figure.savefig(out, dpi=110)
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.team")
-    parser.add_argument("--steps", type=int, help="the first rows alone")
-    parser.add_argument("--out", type=Path, default=FIGURE)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(options.steps, options.out)
-    print()
-    return report(metrics) if metrics else 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(
+        alone(
+            "team",
+            measure,
+            steps={"type": int, "help": "the first rows alone"},
+            out={"type": Path, "default": FIGURE},
+        )
+    )
