@@ -254,6 +254,11 @@ def test_joint_probabilities_of_nothing_and_of_everything():
     [
         (lambda: association.nearest(-1.0), "at least 0"),
         (lambda: association.nearest(np.nan), "at least 0"),
+        (lambda: association.nearest("9"), "nearest: expected a number as gate, got str$"),
+        (
+            lambda: associated(association.nearest, *problem(np.random.default_rng(1), 3, 5)),
+            r"expected a number .*: as associate, give nearest\(gate\), not nearest$",
+        ),
         (lambda: association.maximum_likelihood(9.0, 4.0), "new_gate >= gate"),
         (lambda: association.global_nearest(9.0, 4.0), "new_gate >= gate"),
         (lambda: association.nearest(9.0, ambiguous="guess"), "guess"),

@@ -1,10 +1,13 @@
 """Two gates: what is near enough to be a landmark's, and what is far enough to be a new one's."""
 
+from numbers import Real
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam.linalg import is_concrete
-from jaxslam.protocols import Pairs
+from jaxslam.protocols import Pairs, Prediction
 from jaxslam.types import Scan
 
 
@@ -12,8 +15,13 @@ def check_gates(name: str, gate: float, new_gate: float | None) -> float:
     """The gate for new landmarks, by default that for associations.
 
     Raises:
-        ValueError: on a gate below 0, or a new_gate below it.
+        ValueError: on a gate below 0 or that is no number, or a new_gate below it.
     """
+    for each in (gate, new_gate):
+        if each is not None and not isinstance(each, Real | np.ndarray | jax.Array):
+            called = isinstance(each, Prediction | Scan)
+            again = f": as associate, give {name}(gate), not {name}" if called else ""
+            raise ValueError(f"{name}: expected a number as gate, got {type(each).__name__}{again}")
     if is_concrete(gate) and not gate >= 0:
         raise ValueError(f"{name}: expected a gate of at least 0, got {gate}")
     if new_gate is None:
