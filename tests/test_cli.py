@@ -47,8 +47,8 @@ def test_on_a_terminal_a_line_tells_of_each_filter_as_soon_as_it_can(capsys, mon
     shown = capsys.readouterr().err
     lines = [line.rpartition("\x1b[K")[2] for line in shown.split("\n")]
     assert lines[:2] == [
-        "ekf: pose NEES 5.81 ± 1.4 in the first 64 runs; honest is 3",
-        "one: pose NEES 2 in the first run; honest is 3",
+        "ekf: pose NEES 5.81 ± 1.4 over a first block of 64 runs; honest is 3",
+        "one: pose NEES 2 over a first run; honest is 3",
     ]
     assert "64/100 runs" in shown
     assert "none" not in shown

@@ -48,8 +48,8 @@ class Progress:
         if self._shown and nees is not None:
             one = runs == 1
             shown = f"{nees.value:.3g}" + ("" if one else f" ± {nees.high - nees.value:.2g}")
-            of = "run" if one else f"{runs} runs"
-            self._draw(f"{name}: pose NEES {shown} in the first {of}; honest is {DOF['pose']}\n")
+            of = "run" if one else f"block of {runs} runs"
+            self._draw(f"{name}: pose NEES {shown} over a first {of}; honest is {DOF['pose']}\n")
             self.say("compiling …")
 
     def __exit__(self, *_: object) -> None:
