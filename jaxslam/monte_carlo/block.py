@@ -88,7 +88,8 @@ class Programs:
                 promise.set_exception(error)
 
     def run_seconds(self) -> dict[str, float]:
-        """What one run took on one device, by filter: the median over blocks so far."""
+        """What one run took on one device, by filter: the median over blocks so far,
+        those alone during which nothing was compiled, where there are such."""
         out = {}
         for name, all_ in self._spent.items():
             times = [seconds for quiet, seconds in all_ if quiet] or [s for _, s in all_]

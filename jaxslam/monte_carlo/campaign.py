@@ -45,7 +45,8 @@ class Campaign:
     compile_seconds: float
     step_seconds: dict[str, float]
     """Wall time of a step of one run on one device, by filter: the median over the blocks that this
-    process computed, several of which are at work at once; without filters of which it was none."""
+    process computed while nothing was being compiled (where there are none, over all), several of
+    which are at work at once; without filters of which it was none."""
 
 
 class Interrupted(KeyboardInterrupt):
