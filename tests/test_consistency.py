@@ -120,6 +120,20 @@ def test_a_singular_covariance_is_left_out_not_counted_as_zero():
     np.testing.assert_allclose(summary.measures["nees_pose"].value, nees.mean(), rtol=1e-9)
 
 
+def test_the_mean_pose_nees_alone_is_that_of_a_score():
+    trace, truth, error = synthetic(np.random.default_rng(5), runs=4, singular=4)
+    trace.estimate.pose[2, 5, 0] = np.nan
+    trace.estimate.pose_cov[3] = 0.0
+    mean, defined = jax.jit(jax.vmap(consistency.mean_pose_nees))(
+        *map(jnp.asarray, (truth.pose, trace.estimate.pose, trace.estimate.pose_cov))
+    )
+    np.testing.assert_array_equal(defined, [True, True, False, False])
+    nees = plain_nees(error[:2, 4:], trace.estimate.pose_cov[:2, 4:])
+    np.testing.assert_allclose(mean[:2], nees.mean(axis=1), rtol=1e-9)
+    scored = summed(trace, truth).measures()["nees_pose"]
+    np.testing.assert_allclose(scored, [*nees.mean(axis=1), np.nan, np.nan], rtol=1e-9)
+
+
 def test_a_run_that_is_not_finite_is_counted_and_leaves_the_others_alone():
     trace, truth, _ = synthetic(np.random.default_rng(3), runs=6)
     trace.estimate.pose[2, 5, 0] = np.nan

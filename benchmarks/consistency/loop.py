@@ -136,10 +136,12 @@ def campaign(names, maps: int, runs: int, steps: int, seed: int, noise=1.0, bloc
         )
         own = own_error_of(filter.chart, here.sensor, trace, truth)
         scores = score(trace, truth, here.sensor, own)
-        kept = {
-            m: jnp.where(scores.measures[m][1], scores.measures[m][0], jnp.nan) for m in MEASURES
-        }
-        return kept, truth.missed.sum()
+
+        def average(total: jax.Array, weight: jax.Array) -> jax.Array:
+            there = scores.finite & (weight > 0)
+            return jnp.where(there, total / jnp.where(there, weight, 1), jnp.nan)
+
+        return {m: average(*scores.measures[m]) for m in MEASURES}, truth.missed.sum()
 
     out = {}
     starts = range(0, maps * runs, block)

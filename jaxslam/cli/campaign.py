@@ -28,7 +28,7 @@ BLOCKS = "blocks"
 
 DEFAULTS: dict[str, Any] = {
     "scenario": "circle",
-    "filters": "ekf,dead_reckoning",
+    "filters": "dead_reckoning,ekf",
     "runs": 100,
     "steps": None,
     "seed": 0,
@@ -127,10 +127,11 @@ def _done(folder: Path) -> int:
 def _campaign_files(
     campaign: Campaign, scenario: Scenario, seed: int, bound: bool, command: str
 ) -> dict[str, str | Callable[[Path], object]]:
-    """The campaign, and pictures of its first run under its first filter."""
+    """The campaign, and pictures of its first run under the first filter that makes a map."""
     from jaxslam import page, plot  # matplotlib only once there is a result to draw
 
-    name = next(iter(campaign.filters))
+    mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
+    name = next(iter(mapping or campaign.filters))
 
     def first_run(key: jax.Array) -> tuple[Truth, Estimate]:
         key_world, key_filter = jax.random.split(jax.random.fold_in(key, 0))

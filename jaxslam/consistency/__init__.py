@@ -3,7 +3,8 @@
 from jaxslam.consistency.alignment import align_map
 from jaxslam.consistency.bound import posterior_bound
 from jaxslam.consistency.credibility import credibility
-from jaxslam.consistency.score import DOF, LAGS, LANDMARK_DOF, LEVELS, Score, own_error_of, score
+from jaxslam.consistency.nees import DOF, mean_pose_nees, own_error_of
+from jaxslam.consistency.score import LAGS, LANDMARK_DOF, LEVELS, Score, score
 from jaxslam.consistency.summary import LEVEL, Measure, Summary, interval, judge, summarize
 from jaxslam.consistency.tally import Tally, condense
 
@@ -22,6 +23,7 @@ __all__ = [
     "credibility",
     "interval",
     "judge",
+    "mean_pose_nees",
     "own_error_of",
     "posterior_bound",
     "score",

@@ -14,16 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import lapack, linalg
-from jaxslam.angles import wrap
 from jaxslam.consistency.associations import associations, identities
-from jaxslam.linalg import mahalanobis_leading, mahalanobis_squared
-from jaxslam.protocols import Chart, Sensor
+from jaxslam.consistency.nees import DOF, block_nees, pose_error
+from jaxslam.linalg import mahalanobis_squared
+from jaxslam.protocols import Sensor
 from jaxslam.staging import settle
 from jaxslam.stats import chi2_quantile
 from jaxslam.types import Status, Trace, Truth
-
-DOF = {"pose": 3, "position": 2, "heading": 1}
-"""Blocks of the pose error whose NEES is taken, and the mean of an honest one."""
 
 LANDMARK_DOF = 2
 """of the NEES of one landmark's position."""
@@ -55,12 +52,12 @@ SNAPSHOTS = 25
 
 
 class Score(NamedTuple):
-    """One run; with a leading axis, many. Everything is zero where the run is not finite."""
+    """One run; with a leading axis, many. Of a run that is not finite, the rest means nothing."""
 
     finite: Any
     """() bool: every number of the run is finite."""
     measures: dict[str, tuple[Any, Any]]
-    """the run's own averages, and whether there is one."""
+    """the run's own averages: what is averaged, and over how much; there is none over 0."""
     snapshots: tuple[Any, Any, Any]
     """pose error (K, 3), its covariance (K, 3, 3), whether that is regular (K,)."""
     sums: dict[str, Any]
@@ -83,10 +80,9 @@ def score(
     own_error (T, 3): the pose errors in the filter's own coordinates (see `own_error_of`), by
     default those in (x, y, θ).
     """
-    error = truth.pose - trace.estimate.pose
-    error = jnp.concatenate([error[:, :2], wrap(error[:, 2:])], axis=1)
+    error = pose_error(truth.pose, trace.estimate.pose)
     cov = trace.estimate.pose_cov
-    nees = _nees(error, error if own_error is None else own_error, cov)
+    nees = block_nees(error, error if own_error is None else own_error, cov)
     fused = trace.info.status == Status.FUSED
     held = jnp.where(trace.estimate.alive, trace.estimate.tag, -1)
     curves = {f"nees_{block}": nees[block][0] for block in DOF}
@@ -140,41 +136,17 @@ def score(
     sums |= {"singular_steps": (error.shape[0] - totals["regular_pose"]).astype(int)}
     finite = settle(_all_finite((trace.estimate, trace.info), (added, sums, measures)))
 
-    def kept(value: jax.Array) -> jax.Array:
-        return jnp.where(finite, value, jnp.zeros_like(value))
-
-    tops, weights = (
-        jnp.stack([jnp.asarray(pair[i], error.dtype) for pair in measures.values()]) for i in (0, 1)
-    )
-    defined = finite & (weights > 0)
-    averages = jnp.where(defined, tops / jnp.where(weights > 0, weights, 1.0), 0.0)
     at_snapshots = snapshot_steps(error.shape[0])
-    shots = error[at_snapshots], cov[at_snapshots], curves["regular_pose"][at_snapshots] > 0
     return Score(
         finite=finite,
-        measures=dict(zip(measures, zip(averages, defined, strict=True), strict=True)),
-        snapshots=jax.tree.map(kept, shots),
-        sums=jax.tree.map(kept, sums | curves),
+        measures=measures,
+        snapshots=(
+            error[at_snapshots],
+            cov[at_snapshots],
+            curves["regular_pose"][at_snapshots] > 0,
+        ),
+        sums=sums | curves,
     )
-
-
-def _nees(
-    error: jax.Array, own: jax.Array, cov: jax.Array
-) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """NEES (T,), and where there is one, of the blocks of `DOF` and of the own error."""
-
-    def one(
-        errors: jax.Array, cov: jax.Array, scale: jax.Array
-    ) -> dict[str, tuple[jax.Array, jax.Array]]:
-        position, pose = mahalanobis_leading(errors, cov, (2, 3), scale)
-        return {
-            "position": (position[0][0], position[1][0]),
-            "pose": (pose[0][0], pose[1][0]),
-            "own": (pose[0][1], pose[1][1]),
-            "heading": mahalanobis_squared(errors[2:, 0], cov[2:, 2:], scale[2:]),
-        }
-
-    return jax.vmap(one)(jnp.stack([error, own], axis=2), cov, _scale(cov))
 
 
 def _events(trace: Trace) -> dict[str, jax.Array]:
@@ -199,13 +171,6 @@ def _all_finite(by_time: Any, others: Any) -> jax.Array:
     return jnp.concatenate([jnp.stack(rows).all(axis=1), jnp.stack(every)]).all()
 
 
-def _scale(cov: jax.Array) -> jax.Array:
-    """Units (T, 3) in which a pose covariance is judged: x and y, both metres, have one."""
-    variance = jnp.maximum(jnp.diagonal(cov, axis1=1, axis2=2), 0.0)
-    spread = jnp.stack([variance[:, :2].max(axis=1)] * 2 + [variance[:, 2]], axis=1)
-    return jnp.where(spread > 0, jnp.sqrt(jnp.where(spread > 0, spread, 1.0)), 0.0)
-
-
 def _covered(nees: jax.Array, regular: jax.Array) -> jax.Array:
     """(3, LEVELS): at how many steps the truth lies in the ellipsoid of that probability.
 
@@ -214,20 +179,6 @@ def _covered(nees: jax.Array, regular: jax.Array) -> jax.Array:
     radii = [[chi2_quantile(p, dof) for p in LEVELS] for dof in DOF.values()]
     inside = nees[:, :, None] <= jnp.asarray(radii, nees.dtype)[:, None, :]
     return (inside & regular[:, :, None]).sum(axis=1).astype(nees.dtype)
-
-
-def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> jax.Array:
-    """The pose error in the filter's coordinates, brought to (x, y, θ) by its basis, (T, 3).
-
-    ξᵀ P_ξ⁻¹ ξ = (E ξ)ᵀ P⁻¹ (E ξ) with P = E P_ξ Eᵀ as the filter reports it.
-    """
-    ground = jnp.zeros(len(sensor.landmark), truth.pose.dtype)
-
-    def one(pose: jax.Array, true_pose: jax.Array) -> jax.Array:
-        dx, _ = chart.local(pose, ground, true_pose, ground)
-        return dx if chart.basis is None else chart.basis(pose, ground).pose @ dx
-
-    return jax.vmap(one)(trace.estimate.pose, truth.pose)
 
 
 def _landmarks(

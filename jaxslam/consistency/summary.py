@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxslam.consistency.credibility import credibility
-from jaxslam.consistency.score import DOF, DROPS, EVENTS
+from jaxslam.consistency.nees import DOF
+from jaxslam.consistency.score import DROPS, EVENTS
 from jaxslam.consistency.tally import Tally
 from jaxslam.stats import chi2_quantile, chi2_quantiles, normal_quantile, t_quantile
 

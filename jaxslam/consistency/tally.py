@@ -52,15 +52,22 @@ def condense(scores: Score, first: int, limit: float) -> dict[str, np.ndarray]:
     limit [m]: a finite run is divergent when its final position error exceeds it.
     """
     runs, finite = len(scores.finite), np.asarray(scores.finite)
-    last = np.asarray(scores.snapshots[0])[:, -1, :2]
-    far = np.sqrt((last**2).sum(axis=1)) > limit
+
+    def lost_left_out(rows: np.ndarray) -> np.ndarray:
+        rows = np.asarray(rows)
+        return np.where(finite.reshape(-1, *(1,) * (rows.ndim - 1)), rows, np.zeros_like(rows))
+
+    snapshots = [lost_left_out(leaf) for leaf in scores.snapshots]
+    far = np.sqrt((snapshots[0][:, -1, :2] ** 2).sum(axis=1)) > limit
     out = {"finite": finite, "divergent": finite & far}
-    for name, (value, defined) in scores.measures.items():
-        out[f"measure/{name}"], out[f"defined/{name}"] = np.asarray(value), np.asarray(defined)
+    for name, (whole, weight) in scores.measures.items():
+        whole, weight = lost_left_out(whole), lost_left_out(weight).astype(whole.dtype)
+        out[f"defined/{name}"] = weight > 0
+        out[f"measure/{name}"] = whole / np.where(weight > 0, weight, 1)
     kept = max(min(runs, SHOTS - first), 0)
-    for i, leaf in enumerate(scores.snapshots):
-        out[f"snapshot/{i}"] = np.asarray(leaf)[:kept]
-    return out | condensed_sums(scores.sums)
+    for i, leaf in enumerate(snapshots):
+        out[f"snapshot/{i}"] = leaf[:kept]
+    return out | condensed_sums({name: lost_left_out(rows) for name, rows in scores.sums.items()})
 
 
 def condensed_sums(per_run: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -95,9 +95,10 @@ def scan_update(
         def start(joint: Joint) -> tuple[Joint, Births]:
             repeated = is_new & seen_before(scan.tag, is_new)
             wanted = is_new & ~repeated
-            quota = wanted.shape[0] if births is None else births
-            deferred = wanted & (jnp.cumsum(wanted) > quota)
-            wanted = wanted & ~deferred
+            deferred = jnp.zeros_like(wanted)
+            if births is not None:
+                deferred = wanted & (jnp.cumsum(wanted) > births)
+                wanted = wanted & ~deferred
             given_up = jnp.zeros_like(joint.alive)
             if life is not None and life.make_room is not None:
                 needed = wanted.sum() - (~joint.alive).sum()

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.consistency import Measure, condense, interval
+from jaxslam.consistency import Measure, Score, condense, interval
 from jaxslam.consistency.tally import condensed_sums
 
 BOUND = "bound"
@@ -29,10 +29,19 @@ class Programs:
     """
 
     def __init__(
-        self, names: Sequence[str], key: jax.Array, block: int, devices: int, bound: bool
+        self,
+        names: Sequence[str],
+        key: jax.Array,
+        block: int,
+        devices: int,
+        bound: bool,
+        glimpse: Glimpse | None = None,
     ) -> None:
         self.key, self.wide, self.devices, self.bound = key, block * devices, devices, bound
+        self.glimpse = glimpse
         self.draw: Future[Callable[..., Any]] = Future()
+        self.peek: Future[Callable[..., Any]] = Future()
+        """the pose NEES of each run alone, which `glimpse` is told before all else is compiled"""
         self.drives: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
         self.scores: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
         self.least: Future[Callable[..., Any]] = Future()
@@ -43,28 +52,42 @@ class Programs:
         """whether nothing was being compiled, and wall seconds; of each block so far"""
 
     def block(
-        self, first: int, runs: int, early: bool, glimpse: Glimpse | None
+        self, first: int, runs: int, early: bool, tell: bool
     ) -> dict[str, dict[str, np.ndarray]]:
         """Condensed scores of runs first … first + runs - 1 (at most `wide`), by filter.
 
-        early: begin while other programs are being compiled, and do not time that. glimpse: told of
-        each filter as soon as it is scored.
+        early: begin while other programs are being compiled, and do not time that. tell: let
+        `glimpse` know of each filter as soon as it has run.
         """
         if not early:
             self.limit.result()
         which = first + jnp.arange(self.wide)
         world = jax.block_until_ready(self.draw.result()(self.key, which))
-        scores = {}
+        scores: dict[str, Score] = {}
+        held: list[tuple[str, Any]] = []
+
+        def judge() -> None:
+            name, driven = held.pop(0)
+            found = jax.device_get(self.scores[name].result()(world[0], driven))
+            scores[name] = jax.tree.map(lambda leaf: leaf[:runs], found)
+
         for name, promised in self.drives.items():
             drive = promised.result()
             began, quiet = time.perf_counter(), self._quiet.is_set()
             driven = jax.block_until_ready(drive(self.key, which, world))
             self._spent[name].append((quiet, time.perf_counter() - began))
-            found = jax.device_get(self.scores[name].result()(world[0], driven))
-            scores[name] = jax.tree.map(lambda leaf: leaf[:runs], found)
-            if glimpse is not None:
-                nees, defined = scores[name].measures["nees_pose"]
-                glimpse(name, runs, interval(nees[defined]))
+            if tell and self.glimpse is not None:
+                peek = self.peek.result()
+                estimate = driven.estimate
+                found = peek(world[0].pose, estimate.pose, estimate.pose_cov)
+                nees, defined = (leaf[:runs] for leaf in jax.device_get(found))
+                self.glimpse(name, runs, interval(nees[defined]))
+            held.append((name, driven))
+            # A filter is compiled before the score of the one before it.
+            while held and (len(held) > 1 or self.scores[held[0][0]].done()):
+                judge()
+        while held:
+            judge()
         limit = self.limit.result()
         out = {name: condense(each, first, float(limit)) for name, each in scores.items()}
         out[BOUND] = {"limit": np.asarray(limit)}
@@ -75,7 +98,14 @@ class Programs:
 
     def promises(self) -> list[Future[Any]]:
         """All that blocks may wait for."""
-        return [self.draw, *self.drives.values(), *self.scores.values(), self.least, self.limit]
+        return [
+            self.draw,
+            self.peek,
+            *self.drives.values(),
+            *self.scores.values(),
+            self.least,
+            self.limit,
+        ]
 
     def complete(self) -> None:
         """Nothing is being compiled any more."""

@@ -101,7 +101,7 @@ def monte_carlo(
         keep: blocks are saved there as they finish, and those found there are not run again.
         progress: called with (runs done, runs) of this process after each block.
         glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
-            block of each filter is scored, while the others may still be compiled. A campaign of no
+            block of each filter has run, while the others may still be compiled. A campaign of no
             more than `workers` blocks is compiled in full first: its steps are timed.
     Returns:
         Campaign.
@@ -203,7 +203,9 @@ class _Work:
         """Add those of the pieces that are not yet in the tallies, in blocks of size a device."""
         if not todo:
             return
-        programs = Programs(list(self.filters), self.key, size, len(self.devices), self.bound)
+        programs = Programs(
+            list(self.filters), self.key, size, len(self.devices), self.bound, self.glimpse
+        )
         before = own[next(iter(own))].pieces()
         queue = [
             (first + at, count)
@@ -212,15 +214,15 @@ class _Work:
         ][::-1]
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
-        early, glimpse = len(queue) > self.workers, self.glimpse
+        early, tell = len(queue) > self.workers, True
         flight: dict[Future[Any], tuple[int, int]] = {}
         stop: BaseException | None = None
         with ThreadPoolExecutor(self.workers) as pool:
             try:
                 while queue and len(flight) <= self.workers:
                     first, count = queue.pop()
-                    flight[pool.submit(programs.block, first, count, early, glimpse)] = first, count
-                    glimpse = None
+                    flight[pool.submit(programs.block, first, count, early, tell)] = first, count
+                    tell = False
                 began = time.perf_counter()
                 compile_programs(programs, self.scenario, self.filters, self.devices)
                 self.compile_seconds += time.perf_counter() - began
@@ -242,7 +244,10 @@ class _Work:
                             self.progress(done, total)
                     while queue and stop is None and len(flight) <= self.workers:
                         first, count = queue.pop()
-                        flight[pool.submit(programs.block, first, count, True, None)] = first, count
+                        flight[pool.submit(programs.block, first, count, True, False)] = (
+                            first,
+                            count,
+                        )
                 except BaseException as error:
                     if stop is not None:
                         raise

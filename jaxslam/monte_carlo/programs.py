@@ -10,14 +10,14 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxslam.consistency import Score, own_error_of, posterior_bound, score
+from jaxslam.consistency import Score, mean_pose_nees, own_error_of, posterior_bound, score
 from jaxslam.monte_carlo.block import Programs
 from jaxslam.monte_carlo.candidates import estimator_of
 from jaxslam.monte_carlo.pieces import cores
@@ -35,6 +35,10 @@ class Driven(NamedTuple):
     own_error: jax.Array
     watch: Any
     probe: Any
+
+
+_BY_TIME: Any = Driven(*cast(Any, (1, 1, 1, 0, 1)))
+"""Which axis of what a filter made goes over runs: that of time comes first, as its loop has it."""
 
 
 class _Final(NamedTuple):
@@ -70,7 +74,7 @@ def compile_programs(
             watch = getattr(trace.final, "watch", ())
             return Driven(trace.estimate, trace.info, own, watch, trace.probe)
 
-        driven: Driven = jax.vmap(one)(which, *world)
+        driven: Driven = jax.vmap(one, out_axes=_BY_TIME)(which, *world)
         return driven
 
     def judge(truth: Truth, driven: Driven) -> Score:
@@ -78,8 +82,12 @@ def compile_programs(
             trace = Trace(driven.estimate, driven.info, _Final(driven.watch), driven.probe)
             return score(trace, truth, scenario.sensor, driven.own_error)
 
-        scores: Score = jax.vmap(one)(truth, driven)
+        scores: Score = jax.vmap(one, in_axes=(0, _BY_TIME))(truth, driven)
         return scores
+
+    def peek(truth: jax.Array, pose: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found: tuple[jax.Array, jax.Array] = jax.vmap(mean_pose_nees, (0, 1, 1))(truth, pose, cov)
+        return found
 
     def least(key: jax.Array, which: jax.Array, world: tuple[Truth, Log]) -> dict[str, jax.Array]:
         def one(i: jax.Array, truth: Truth, log: Log) -> jax.Array:
@@ -92,29 +100,28 @@ def compile_programs(
     def program(
         promise: Future[Any],
         function: Callable[..., Any],
-        by_runs: str,
+        axes: Sequence[Any],
+        out: Any,
         *arguments: Any,
         straight: bool = False,
     ) -> Any:
         """Have the promise kept by it, compiled; the shapes of its results.
 
-        by_runs: "r" for an argument by runs. straight: see `staging.compiled`.
+        axes: of each argument the axis that goes over runs, or None; or a tree's prefix of such.
+        out: that of the results. straight: see `staging.compiled`.
         """
-        own = [
-            _resized(x, block) if r == "r" else x for r, x in zip(by_runs, arguments, strict=True)
-        ]
+        own = [_resized(x, block, axis) for x, axis in zip(arguments, axes, strict=True)]
         traced, shapes = jax.make_jaxpr(function, return_shape=True)(*own)
 
         def pure(constants: list[Any], *arguments: Any) -> Any:
             leaves = jax.core.eval_jaxpr(traced.jaxpr, constants, *jax.tree.leaves(arguments))
             return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
-        specs = tuple(PartitionSpec("runs") if each == "r" else PartitionSpec() for each in by_runs)
         spread = jax.shard_map(
             pure,
             mesh=mesh,
-            in_specs=(PartitionSpec(), *specs),
-            out_specs=PartitionSpec("runs"),
+            in_specs=(PartitionSpec(), *map(_spec, axes)),
+            out_specs=_spec(out),
             check_vma=False,
         )
         lowered = jax.jit(spread).lower(traced.consts, *arguments)
@@ -122,23 +129,41 @@ def compile_programs(
         pool.submit(_compiled, lowered, tuple(devices), traced.consts, straight).add_done_callback(
             partial(_keep, promise)
         )
-        return _resized(shapes, wide)
+        return _resized(shapes, wide, out)
 
     which = jnp.arange(wide)
     try:
-        world = program(programs.draw, draw, "-r", key, which, straight=True)
+        world = program(programs.draw, draw, (None, 0), 0, key, which, straight=True)
+        if programs.glimpse is not None:
+            pose = world[0].pose
+            steps, size = pose.shape[1:]
+            by_time, cov = (
+                jax.ShapeDtypeStruct((steps, wide, *shape), pose.dtype)
+                for shape in ((size,), (size, size))
+            )
+            program(programs.peek, peek, (0, 1, 1), 0, pose, by_time, cov, straight=True)
         alike: dict[Any, Future[Any]] = {}
-        for name, candidate in filters.items():
-            one = partial(drive, candidate)
-            driven = program(programs.drives[name], one, "-rr", key, which, world)
+
+        def scored(name: str, driven: Any) -> None:
             leaves, structure = jax.tree.flatten(driven)
             kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
             if kind in alike:
                 alike[kind].add_done_callback(partial(_keep, programs.scores[name]))
             else:
                 alike[kind] = programs.scores[name]
-                program(alike[kind], judge, "rr", world[0], driven, straight=True)
-        program(programs.least, least, "-rr", key, which, world)
+                program(alike[kind], judge, (0, _BY_TIME), 0, world[0], driven, straight=True)
+
+        # Each filter before the score of the one before it: `Programs.block` wants them so.
+        before: tuple[str, Any] | None = None
+        for name, candidate in filters.items():
+            one = partial(drive, candidate)
+            driven = program(programs.drives[name], one, (None, 0, 0), _BY_TIME, key, which, world)
+            if before is not None:
+                scored(*before)
+            before = name, driven
+        if before is not None:
+            scored(*before)
+        program(programs.least, least, (None, 0, 0), 0, key, which, world)
         found = programs.least.result()(key, which, programs.draw.result()(key, which))
         ideal = float(found["position"][0, -1]) ** 0.5
         dtype = world[0].pose.dtype
@@ -161,10 +186,28 @@ def _keep(promise: Future[Any], compiling: Future[Any]) -> None:
         promise.set_exception(error)
 
 
-def _resized(tree: Any, runs: int) -> Any:
-    """The shapes of arrays by runs, with so many of them."""
+def _resized(tree: Any, runs: int, axes: Any) -> Any:
+    """The shapes of arrays by runs, with so many of them. axes: see `program`."""
+
+    def resized(axis: int | None, part: Any) -> Any:
+        if axis is None:
+            return part
+        return jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct(
+                (*leaf.shape[:axis], runs, *leaf.shape[axis + 1 :]), leaf.dtype
+            ),
+            part,
+        )
+
+    return jax.tree.map(resized, axes, tree, is_leaf=lambda axis: axis is None)
+
+
+def _spec(axes: Any) -> Any:
+    """How arrays are divided over the devices. axes: see `program`."""
     return jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct((runs, *leaf.shape[1:]), leaf.dtype), tree
+        lambda axis: PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, "runs"),
+        axes,
+        is_leaf=lambda axis: axis is None,
     )
 
 
