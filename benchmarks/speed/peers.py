@@ -1,6 +1,10 @@
 """Peers that may be installed: what the same workload costs in another library."""
 
 import importlib.util
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -50,3 +54,27 @@ def dynamax_ekf(scenario, logs):
 
     program = jax.jit(jax.vmap(one)).lower(logs).compile()
     return lambda: jax.block_until_ready(program(logs))
+
+
+class Mrpt:
+    """MRPT's `CRangeBearingKFSLAM2D` on a workload like it: as many corrections of as large a map,
+    identities given. Compiled here, in double precision, which is all it has; `there` is False
+    without CMake or MRPT's headers (Debian's `libmrpt-dev`).
+    """
+
+    def __init__(self) -> None:
+        self.folder = tempfile.TemporaryDirectory()
+        self.there = shutil.which("cmake") is not None and self._build()
+
+    def _build(self) -> bool:
+        source, where = Path(__file__).with_name("mrpt"), self.folder.name
+        for command in (["cmake", "-S", str(source), "-B", where], ["cmake", "--build", where]):
+            if subprocess.run(command, capture_output=True).returncode != 0:
+                return False
+        return True
+
+    def run(self, runs: int) -> float:
+        """Seconds a run, by its own clock around the filter."""
+        command = [str(Path(self.folder.name) / "mrpt_slam"), str(runs)]
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        return float(done.stdout.split()[0])

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.speed import roofline
 from benchmarks.speed.area import compressed
 from benchmarks.speed.dense import dense_ekf
-from benchmarks.speed.peers import dynamax_ekf
+from benchmarks.speed.peers import Mrpt, dynamax_ekf
 from jaxslam.family import FILTERS
 from jaxslam.filters.ekf_slam import ekf_slam
 from jaxslam.run import run
@@ -73,6 +73,9 @@ def throughput(dtype):
     peer = dynamax_ekf(scenario, few)
     if peer is not None:
         actions["dynamax"] = peer
+    mrpt, mrpt_seconds = Mrpt(), []
+    if mrpt.there:
+        actions["MRPT"] = lambda: mrpt_seconds.append(mrpt.run(PEERS_RUNS))
     seconds = together(actions)
     each = seconds["batch"] / RUNS
     numpy_seconds = best(lambda: dense_ekf(numpy_log, scenario.pose, noise_u, noise_z), 1)
@@ -104,6 +107,8 @@ def throughput(dtype):
         }
     if peer is not None:
         out["dynamax / ours, a run"] = seconds["dynamax"] / PEERS_RUNS / each
+    if mrpt.there:
+        out["MRPT / ours, a run"] = min(mrpt_seconds) / each
     return out
 
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxslam import linalg, slots
 from jaxslam.protocols import Chart, Here, Linearizer, Sensor
 from jaxslam.slots import Joint
+from jaxslam.staging import settle
 
 
 def augment(
@@ -37,7 +38,7 @@ def augment(
                 by_pose, own = undo @ by_pose, undo @ own @ undo.T
         return landmark, by_pose, own
 
-    landmark, by_pose, own = jax.vmap(one)(z, tag)
+    landmark, by_pose, own = settle(jax.vmap(one)(z, tag))
     joint = slots.scatter(
         joint, slot, granted, landmark, by_pose, own, tag, square_root=square_root
     )

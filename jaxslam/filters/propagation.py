@@ -116,7 +116,8 @@ def moved_cov(cov: jax.Array, moved: Transition, noise: jax.Array | None) -> jax
         robot = linalg.matmul(moved.robot, cov[:3])
         own = linalg.matmul(robot[:, :3], moved.robot.T)
         own = linalg.symmetrize(own if noise is None else own + noise)
-        robot = jnp.concatenate([own, robot[:, 3:]], axis=1)
+        # Kept apart from P, which it is made of, so that P is written in place.
+        robot = settle(jnp.concatenate([own, robot[:, 3:]], axis=1))
         return cov.at[:3].set(robot).at[:, :3].set(robot.T)
     if moved.landmark is not None:
         cov = linalg.symmetrize(moved.turn(moved.turn(cov).T))

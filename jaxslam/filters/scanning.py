@@ -95,10 +95,9 @@ def scan_update(
         def start(joint: Joint) -> tuple[Joint, Births]:
             repeated = is_new & seen_before(scan.tag, is_new)
             wanted = is_new & ~repeated
-            deferred = jnp.zeros_like(wanted)
-            if births is not None:
-                deferred = wanted & (jnp.cumsum(wanted) > births)
-                wanted = wanted & ~deferred
+            rank = jnp.cumsum(wanted)
+            deferred = jnp.zeros_like(wanted) if births is None else wanted & (rank > births)
+            wanted = wanted & ~deferred
             given_up = jnp.zeros_like(joint.alive)
             if life is not None and life.make_room is not None:
                 needed = wanted.sum() - (~joint.alive).sum()
@@ -108,8 +107,16 @@ def scan_update(
                 )
                 joint = without(joint, given_up)
             taken = joint.alive if reserved is None else joint.alive | reserved
-            slot, granted = slots.allocate(taken, wanted)
-            joint = augment(joint, z, scan.tag, slot, granted)
+            if births is None or births >= len(wanted):
+                slot, granted = slots.allocate(taken, wanted)
+                joint = augment(joint, z, scan.tag, slot, granted)
+            else:  # no more places than may be granted
+                turn = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
+                place, there = slots.where_set(turn)
+                slot, granted = slots.allocate(taken, there)
+                joint = augment(joint, z[place], scan.tag[place], slot, granted)
+                mine = jnp.clip(rank - 1, 0, births - 1)
+                slot, granted = slot[mine], wanted & granted[mine]
             return joint, Births(slot, granted, deferred, repeated, given_up)
 
         def start_none(joint: Joint) -> tuple[Joint, Births]:
