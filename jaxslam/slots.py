@@ -124,11 +124,12 @@ def allocate(alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]
 
 
 def where_set(match: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The column in which each row (M, N) bool is set (the last), 0 where none, (M,) int32; and
-    whether there is one (M,). One maximum, where an `argmax` and an `any` cost three times as much.
+    """The last column in which each row (M, N) bool is set, 0 where none, (M,) int32; and whether
+    there is one (M,). In one pass, where an `argmax` and an `any` are two.
     """
-    at = jnp.where(match, jnp.arange(match.shape[1], dtype=jnp.int32), -1)
-    at = at.max(axis=1, initial=-1)
+    # Over the leading axis XLA takes maxima of whole rows.
+    at = jnp.where(match.T, jnp.arange(match.shape[1], dtype=jnp.int32)[:, None], -1)
+    at = at.max(axis=0, initial=-1)
     return jnp.maximum(at, 0), at >= 0
 
 
