@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 
 import jax
 
@@ -50,31 +51,47 @@ def command_seconds() -> list[Metric]:
     return metrics
 
 
+def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
+    """What is measured, by name, in order."""
+    return {
+        "commands": command_seconds,
+        "speed": lambda: gated(measure_speed(quick)),
+        "gradient": gradient.measure,
+        "circle": lambda: circle.measure(200 if quick else 1000)[1],
+        "victoria_park": victoria_park.measure,
+        "real_data": real_data.measure,
+        "association": lambda: measure_association(quick),
+        "baselines": lambda: baselines.measure(100 if quick else 1000),
+        "bearing": lambda: bearing.measure(20 if quick else 100),
+        "team": team.measure,
+        "delayed": lambda: delayed.measure(20 if quick else 100),
+        "plaza": plaza.measure,
+        "smoothing": lambda: smoothing.measure(10 if quick else 100),
+        "fastslam": lambda: fastslam.measure(4 if quick else 20, (10, 100)),
+        "plain_particles": lambda: plain_particles.measure(8 if quick else 20),
+        "scaling": scaling.measure,
+        "seif": lambda: seif.measure(4 if quick else 10),
+        "comparison": lambda: comparison.measure(8 if quick else 16),
+        "monte_carlo_localization": lambda: monte_carlo_localization.measure(4 if quick else 12),
+    }
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
-    parser.add_argument("--quick", action="store_true", help="circle with 200 runs, not 1000")
+    parser.add_argument("--quick", action="store_true", help="fewer runs of everything")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    metrics = command_seconds()
-    metrics += gated(measure_speed(options.quick))
-    metrics += gradient.measure()
-    metrics += circle.measure(200 if options.quick else 1000)[1]
-    metrics += victoria_park.measure()
-    metrics += real_data.measure()
-    metrics += measure_association(options.quick)
-    metrics += baselines.measure(100 if options.quick else 1000)
-    metrics += bearing.measure(20 if options.quick else 100)
-    metrics += team.measure()
-    metrics += delayed.measure(20 if options.quick else 100)
-    metrics += plaza.measure()
-    metrics += smoothing.measure(10 if options.quick else 100)
-    metrics += fastslam.measure(4 if options.quick else 20, (10, 100))
-    metrics += plain_particles.measure(8 if options.quick else 20)
-    metrics += scaling.measure()
-    metrics += seif.measure(4 if options.quick else 10)
-    metrics += comparison.measure(8 if options.quick else 16)
-    metrics += monte_carlo_localization.measure(4 if options.quick else 12)
-    print()
+    metrics: list[Metric] = []
+    for name, measure in parts(options.quick).items():
+        print(f"\n{name}", flush=True)
+        began = time.perf_counter()
+        found = measure()
+        # What was measured stays on the screen, whatever becomes of the parts after it.
+        if found:
+            report(found)
+        print(f"{name}: {time.perf_counter() - began:.0f} s", flush=True)
+        metrics += found
+    print("\nall")
     return report(metrics)
 
 

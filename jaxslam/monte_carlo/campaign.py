@@ -214,15 +214,15 @@ class _Work:
         ][::-1]
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
-        early, tell = len(queue) > self.workers, True
+        early = len(queue) > self.workers
         flight: dict[Future[Any], tuple[int, int]] = {}
         stop: BaseException | None = None
         with ThreadPoolExecutor(self.workers) as pool:
             try:
                 while queue and len(flight) <= self.workers:
                     first, count = queue.pop()
-                    flight[pool.submit(programs.block, first, count, early, tell)] = first, count
-                    tell = False
+                    block = pool.submit(programs.block, first, count, early, not flight)
+                    flight[block] = first, count
                 began = time.perf_counter()
                 compile_programs(programs, self.scenario, self.filters, self.devices)
                 self.compile_seconds += time.perf_counter() - began
@@ -244,10 +244,8 @@ class _Work:
                             self.progress(done, total)
                     while queue and stop is None and len(flight) <= self.workers:
                         first, count = queue.pop()
-                        flight[pool.submit(programs.block, first, count, True, False)] = (
-                            first,
-                            count,
-                        )
+                        block = pool.submit(programs.block, first, count, True, False)
+                        flight[block] = first, count
                 except BaseException as error:
                     if stop is not None:
                         raise

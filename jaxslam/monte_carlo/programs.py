@@ -72,7 +72,7 @@ def compile_programs(
             trace = method(log, _keys(key, i)[1])
             own = own_error_of(chart, scenario.sensor, trace, truth)
             watch = getattr(trace.final, "watch", ())
-            return Driven(trace.estimate, trace.info, own, watch, trace.probe)
+            return Driven(trace.estimate, trace.info, own, watch, trace.probe if watch else ())
 
         driven: Driven = jax.vmap(one, out_axes=_BY_TIME)(which, *world)
         return driven
