@@ -78,7 +78,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
-    parser.add_argument("--quick", action="store_true", help="fewer runs of everything")
+    parser.add_argument("--quick", action="store_true", help="fewer runs, no campaigns of cloister")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     metrics: list[Metric] = []

@@ -87,7 +87,6 @@ int main(int argc, char** argv) {
     }
     poses::CPosePDFGaussian found;
     filter.getCurrentRobotPose(found);
-
     error += std::hypot(found.mean.x() - x, found.mean.y() - (y + 2));  // its origin is the start
   }
   std::printf("%.6f %.4f\n", seconds / runs, error / runs);
