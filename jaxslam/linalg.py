@@ -39,8 +39,21 @@ def total(terms: Iterable[jax.Array]) -> jax.Array:
 def gram(a: jax.Array, b: jax.Array) -> jax.Array:
     """Aᵀ B of A (k, D), B (k, E), for small k."""
     if a.shape[0] > _OUTER_PRODUCTS or a.shape[0] == 0:
-        return a.T @ b
+        # Not a.T @ b, of which a gradient would keep a transposed copy of A.
+        return jax.lax.dot_general(a, b, (((0,), (0,)), ((), ())))
     return total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
+
+
+@jax.custom_jvp
+def square(a: jax.Array) -> jax.Array:
+    """Aᵀ A of A (k, D), k of any size; one product in a gradient, where `gram` takes two."""
+    return gram(a, a)
+
+
+@square.defjvp
+def _square_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    half = gram(tangents[0], primals[0])
+    return square(*primals), half + half.T
 
 
 def matmul(a: jax.Array, b: jax.Array) -> jax.Array:

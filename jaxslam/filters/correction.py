@@ -83,7 +83,7 @@ def correct(
         hx = found.hx.reshape(m * size_z, -1)
         cov = joint.cov - linalg.gram(v, settle(linalg.solve_lower(root, hx)))
     else:
-        cov = joint.cov - linalg.gram(v, v)
+        cov = joint.cov - linalg.square(v)
     xi, last = found.xi, joint.last
     if last:
         seen_last = along(*found.slopes, *split(last.cov.T, joint.landmarks.shape[0]), slot)

@@ -204,7 +204,8 @@ def _seen_rows(
 
 
 def _solved(factor: jax.Array, hp: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return linalg.solve_lower(factor, hp), linalg.solve_lower(factor, nu)
+    both = linalg.solve_lower(factor, jnp.concatenate([hp, nu[:, None]], axis=1))
+    return both[:, :-1], both[:, -1]
 
 
 def _whitened(whiten: jax.Array, hp: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
