@@ -50,7 +50,10 @@ def _quick(platform: str) -> dict[str, Any] | None:
     """What tells XLA to compile quickly; None where there is nothing to tell."""
     if platform != "cpu":
         return None
-    quick: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+    quick: dict[str, Any] = {
+        "xla_cpu_use_fusion_emitters": False,
+        "xla_backend_optimization_level": 1,
+    }
     try:
         jax.jit(lambda: 0).lower().compile(quick)
     except jax.errors.JaxRuntimeError as error:
