@@ -355,3 +355,15 @@ def test_no_batch_reaches_the_librarys_kernels_on_a_cpu():
         assert not batched
     alone = jax.jit(everything).lower(a[0], b[0]).compile().as_text()
     assert "lapack_dpotrf" in alone and "lapack_dtrsm" in alone
+
+
+@pytest.mark.parametrize("rows", [0, 2, 40])
+def test_a_square_and_its_slopes_are_those_of_the_product(rows):
+    rng = np.random.default_rng(rows)
+    a, by_a = rng.normal(size=(2, rows, 5))
+    weight = rng.normal(size=(5, 5))
+    np.testing.assert_allclose(linalg.square(a), a.T @ a, atol=1e-12)
+    _, slope = jax.jvp(linalg.square, (a,), (by_a,))
+    np.testing.assert_allclose(slope, by_a.T @ a + a.T @ by_a, atol=1e-12)
+    back = jax.grad(lambda a: jnp.sum(weight * linalg.square(a)))(a)
+    np.testing.assert_allclose(back, a @ (weight + weight.T), atol=1e-12)
