@@ -130,7 +130,7 @@ def monte_carlo(
     for first, count, arrays in keep.blocks() if keep is not None else ():
         _add(tallies, first, count, _by_filter(arrays, names))
     block = block or fitting_block(scenario, filters, devices[0])
-    size = min(int(block), -(-runs // len(devices)))
+    size = int(block)
     kept = tallies[names[0]].pieces()
     todo = share(missing(kept, runs, size * len(devices)))
     work = _Work(scenario, filters, key, devices, bound, workers, keep, progress, glimpse)
@@ -208,9 +208,9 @@ class _Work:
         )
         before = own[next(iter(own))].pieces()
         queue = [
-            (first + at, count)
-            for first, runs in todo
-            for at, count in missing(_within(before, first, runs), runs, programs.wide)
+            piece
+            for first, count in todo
+            for piece in missing([(0, first), *before], first + count, programs.wide)
         ][::-1]
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
@@ -255,11 +255,6 @@ class _Work:
         self.run_seconds = programs.run_seconds()
         if stop is not None:
             raise stop
-
-
-def _within(pieces: Iterable[tuple[int, int]], first: int, runs: int) -> list[tuple[int, int]]:
-    """The pieces within runs first … first + runs - 1, counted from there."""
-    return [(at - first, count) for at, count in pieces if first <= at < first + runs]
 
 
 def _add(
