@@ -36,7 +36,9 @@ class Programs:
         devices: int,
         bound: bool,
         glimpse: Glimpse | None = None,
+        dtype: Any = None,
     ) -> None:
+        self.dtype = dtype
         self.key, self.wide, self.devices, self.bound = key, block * devices, devices, bound
         self.glimpse = glimpse
         self.draw: Future[Callable[..., Any]] = Future()

@@ -19,6 +19,7 @@ def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tupl
     return [
         (max(first, begin), min(first + block, end) - max(first, begin))
         for begin, end in gaps
+        if begin < end
         for first in range(begin // block * block, end, block)
     ]
 

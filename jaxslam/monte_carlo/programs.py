@@ -19,7 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxslam import programs
 from jaxslam.consistency import Score, mean_pose_nees, own_error_of, posterior_bound, score
 from jaxslam.monte_carlo.block import Programs
-from jaxslam.monte_carlo.candidates import estimator_of
+from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.monte_carlo.pieces import cores
 from jaxslam.protocols import Candidate
 from jaxslam.simulate import Scenario, simulate
@@ -72,7 +72,8 @@ def compile_programs(
     pool = ThreadPoolExecutor(max(cores() // 2, 1))
 
     def draw(key: jax.Array, which: jax.Array) -> tuple[Truth, Log]:
-        return jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
+        world: tuple[Truth, Log] = jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
+        return rounded(world, promised.dtype)
 
     def drive(
         candidate: Candidate, key: jax.Array, which: jax.Array, world: tuple[Truth, Log]
@@ -148,7 +149,7 @@ def compile_programs(
 
         leaves, tree = jax.tree.flatten(arguments)
         shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        known = name, *map(programs.Same, objects)
+        known = name, promised.dtype, *map(programs.Same, objects)
         where = wide, tuple(devices), programs.context()
         key = (known, tree, shapes, where)
         made = _MADE.get(key, make)
