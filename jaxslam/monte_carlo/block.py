@@ -12,6 +12,8 @@ import numpy as np
 
 from jaxslam.consistency import Measure, Score, condense, interval
 from jaxslam.consistency.tally import condensed_sums
+from jaxslam.monte_carlo.blockwise import Library
+from jaxslam.types import Estimate, Truth
 
 BOUND = "bound"
 """The name under which a block keeps the sums of the posterior bound, and the divergence limit."""
@@ -19,6 +21,11 @@ BOUND = "bound"
 
 Glimpse = Callable[[str, int, Measure | None], Any]
 """(filter, runs, their mean pose NEES)."""
+
+
+def numbers(first: int, runs: int) -> np.ndarray:
+    """(runs,) the numbers of runs from the first on, as programs take them."""
+    return np.arange(first, first + runs, dtype=jnp.result_type(int))
 
 
 class Programs:
@@ -37,8 +44,9 @@ class Programs:
         bound: bool,
         glimpse: Glimpse | None = None,
         dtype: Any = None,
+        library: Library | None = None,
     ) -> None:
-        self.dtype = dtype
+        self.dtype, self.library = dtype, library
         self.key, self.wide, self.devices, self.bound = key, block * devices, devices, bound
         self.glimpse = glimpse
         self.draw: Future[Callable[..., Any]] = Future()
@@ -47,6 +55,8 @@ class Programs:
         self.drives: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
         self.scores: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
         self.least: Future[Callable[..., Any]] = Future()
+        self.first: dict[str, tuple[Truth, Estimate]] = {}
+        """run 0 of each filter, once its block has run"""
         self.limit: Future[jax.Array] = Future()
         """() [m] the divergence limit, from run 0"""
         self._quiet = threading.Event()
@@ -66,7 +76,7 @@ class Programs:
         # A run has its place in the block by its number, in whatever piece: the same bits.
         base = first // self.wide * self.wide
         mine = slice(first - base, first - base + runs)
-        which = base + jnp.arange(self.wide)
+        which = numbers(base, self.wide)
         world = jax.block_until_ready(self.draw.result()(self.key, which))
         scores: dict[str, Score] = {}
         held: list[tuple[str, Any]] = []
@@ -81,6 +91,10 @@ class Programs:
             began, quiet = time.perf_counter(), self._quiet.is_set()
             driven = jax.block_until_ready(drive(self.key, which, world))
             self._spent[name].append((quiet, time.perf_counter() - began))
+            if first == 0:
+                truth = jax.tree.map(lambda leaf: np.asarray(leaf)[0], world[0])
+                estimate = jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], driven.estimate)
+                self.first[name] = truth, estimate
             if tell and self.glimpse is not None:
                 peek = self.peek.result()
                 estimate = driven.estimate

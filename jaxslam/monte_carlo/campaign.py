@@ -18,12 +18,14 @@ import numpy as np
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.linalg import check_count
 from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
+from jaxslam.monte_carlo.blockwise import Library
 from jaxslam.monte_carlo.candidates import check_dtype, check_fits, fitting_block
 from jaxslam.monte_carlo.pieces import cores, missing
 from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
 from jaxslam.simulate import Scenario
+from jaxslam.types import Estimate, Truth
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Campaign:
     """Wall time of a step of one run on one device, by filter: the median over the blocks that this
     process computed while nothing was being compiled (where there are none, over all), several of
     which are at work at once; without filters of which it was none."""
+    first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict, repr=False)
+    """Run 0 by filter, host arrays; of those that this process did not run there is none."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -81,6 +85,7 @@ def monte_carlo(
     keep: Keep | None = None,
     progress: Callable[[int, int], None] | None = None,
     glimpse: Glimpse | None = None,
+    library: Library | None = None,
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
 
@@ -106,6 +111,8 @@ def monte_carlo(
         glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
             block of each filter has run, while the others may still be compiled. A campaign of no
             more than `workers` blocks is compiled in full first: its steps are timed.
+        library: compiled programs are taken from there, without a trace, and put there. The caller
+            answers for it: its programs are of this scenario and these filters, by name.
     Returns:
         Campaign.
     Raises:
@@ -137,7 +144,9 @@ def monte_carlo(
     size = int(block)
     kept = tallies[names[0]].pieces()
     todo = share(missing(kept, runs, size * len(devices)))
-    work = _Work(scenario, filters, key, devices, bound, workers, keep, progress, glimpse, dtype)
+    work = _Work(
+        scenario, filters, key, devices, bound, workers, keep, progress, glimpse, dtype, library
+    )
     interrupted = False
     while True:
         try:
@@ -181,6 +190,7 @@ def monte_carlo(
             step_seconds={
                 name: seconds / max(scenario.steps, 1) for name, seconds in work.run_seconds.items()
             },
+            first=work.first,
         )
     if interrupted or campaign is None:
         raise Interrupted(campaign, runs)
@@ -201,8 +211,10 @@ class _Work:
     progress: Callable[[int, int], None] | None
     glimpse: Glimpse | None
     dtype: Any
+    library: Library | None
     compile_seconds: float = 0.0
     run_seconds: dict[str, float] = field(default_factory=dict)
+    first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
 
     def go(self, own: dict[str, Tally], todo: Sequence[tuple[int, int]], size: int) -> None:
         """Add those of the pieces that are not yet in the tallies, in blocks of size a device."""
@@ -216,6 +228,7 @@ class _Work:
             self.bound,
             self.glimpse,
             self.dtype,
+            self.library,
         )
         before = own[next(iter(own))].pieces()
         queue = [
@@ -264,6 +277,7 @@ class _Work:
                     for future in flight:
                         future.cancel()
         self.run_seconds = programs.run_seconds()
+        self.first |= programs.first
         if stop is not None:
             raise stop
 

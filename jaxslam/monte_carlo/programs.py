@@ -6,24 +6,21 @@ values, in this campaign and the next. Runs are divided over the devices with `s
 ever waits for another.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from functools import partial
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxslam import programs
 from jaxslam.consistency import Score, mean_pose_nees, own_error_of, posterior_bound, score
-from jaxslam.monte_carlo.block import Programs
+from jaxslam.monte_carlo.block import Programs, numbers
+from jaxslam.monte_carlo.blockwise import Blockwise
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
-from jaxslam.monte_carlo.pieces import cores
 from jaxslam.protocols import Candidate
 from jaxslam.simulate import Scenario, simulate
-from jaxslam.staging import quick_options
 from jaxslam.types import Estimate, Info, Log, Trace, Truth
 
 
@@ -45,16 +42,6 @@ class _Final(NamedTuple):
     watch: Any
 
 
-class _Made(NamedTuple):
-    """A program that is compiled, or being compiled, and the shapes of its results."""
-
-    program: Future[Callable[..., Any]]
-    shapes: Any
-
-
-_MADE = programs.Kept(programs.ROOM)
-
-
 def compile_programs(
     promised: Programs,
     scenario: Scenario,
@@ -65,11 +52,8 @@ def compile_programs(
 
     Filters whose results have the same shapes share the program that scores them.
     """
-    mesh = Mesh(np.asarray(devices), ("runs",))
     key, wide = promised.key, promised.wide
-    block = wide // len(devices)
-    # Compiling one program keeps nearly two cores busy; more at once only delay the first.
-    pool = ThreadPoolExecutor(max(cores() // 2, 1))
+    maker = Blockwise(devices, wide, promised.library)
 
     def draw(key: jax.Array, which: jax.Array) -> tuple[Truth, Log]:
         world: tuple[Truth, Log] = jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
@@ -108,58 +92,14 @@ def compile_programs(
         position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)
         return {"position": position, "heading": cov[:, :, 2, 2]}
 
-    def program(
-        promise: Future[Any],
-        name: str,
-        objects: tuple[Any, ...],
-        function: Callable[..., Any],
-        axes: Sequence[Any],
-        out: Any,
-        *arguments: Any,
-        straight: bool = False,
-    ) -> Any:
-        """Have the promise kept by it, compiled; the shapes of its results.
-
-        name, objects: of the function and what it is made of, by which it is known again. axes: of
-        each argument the axis that goes over runs, or None; or a tree's prefix of such. out: that
-        of the results. straight: see `staging.quick_options`.
-        """
-
-        def make() -> _Made:
-            own = [_resized(x, block, axis) for x, axis in zip(arguments, axes, strict=True)]
-            traced = programs.trace(function, *own)
-            assert traced is not None
-
-            def pure(numbers: list[Any], *arguments: Any) -> Any:
-                leaves = traced.call(numbers, *jax.tree.leaves(arguments))
-                return jax.tree.unflatten(traced.out, leaves)
-
-            spread = jax.shard_map(
-                pure,
-                mesh=mesh,
-                in_specs=(PartitionSpec(), *map(_spec, axes)),
-                out_specs=_spec(out),
-                check_vma=False,
-            )
-            shapes = [jax.tree.map(_struct, x) for x in arguments]
-            lowered = jax.jit(spread).lower(traced.numbers, *shapes)
-            # Tracing holds Python's lock, compiling does not: the next is traced meanwhile.
-            finished = pool.submit(_compiled, lowered, mesh, traced.numbers, straight)
-            return _Made(finished, _resized(traced.shapes, wide, out))
-
-        leaves, tree = jax.tree.flatten(arguments)
-        shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        known = name, promised.dtype, *map(programs.Same, objects)
-        where = wide, tuple(devices), programs.context()
-        key = (known, tree, shapes, where)
-        made = _MADE.get(key, make)
-        if made.program.cancelled() or (made.program.done() and made.program.exception()):
-            _MADE.drop(key)
-            made = _MADE.get(key, make)
+    def program(promise: Future[Any], name: str, *what: Any, straight: bool = False) -> Any:
+        """Have the promise kept by `Blockwise.program`; the shapes of its results."""
+        label = name if promised.dtype is None else f"{name}, {promised.dtype}"
+        made = maker.program(label, *what, straight=straight)
         made.program.add_done_callback(partial(_keep, promise))
         return made.shapes
 
-    which = jnp.arange(wide)
+    which = numbers(0, wide)
     try:
         world = program(
             promised.draw, "draw", (scenario,), draw, (None, 0), 0, key, which, straight=True
@@ -185,7 +125,8 @@ def compile_programs(
         for name, candidate in filters.items():
             one = partial(drive, candidate)
             promise, of = promised.drives[name], (scenario, candidate)
-            driven = program(promise, "drive", of, one, (None, 0, 0), _BY_TIME, key, which, world)
+            about = f"drive {name}", of, one, (None, 0, 0), _BY_TIME
+            driven = program(promise, *about, key, which, world)
             if before is not None:
                 scored(*before)
             before = name, driven
@@ -200,7 +141,7 @@ def compile_programs(
         promised.complete()
         promised.limit.set_result(jnp.asarray(_divergence_limit(scenario, ideal, dtype), dtype))
     finally:
-        pool.shutdown(cancel_futures=True)
+        maker.close()
 
 
 def _keep(promise: Future[Any], compiling: Future[Any]) -> None:
@@ -212,45 +153,6 @@ def _keep(promise: Future[Any], compiling: Future[Any]) -> None:
         promise.set_result(compiling.result())
     else:
         promise.set_exception(error)
-
-
-def _resized(tree: Any, runs: int, axes: Any) -> Any:
-    """The shapes of arrays by runs, with so many of them. axes: see `program`."""
-
-    def resized(axis: int | None, part: Any) -> Any:
-        if axis is None:
-            return part
-        return jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct(
-                (*leaf.shape[:axis], runs, *leaf.shape[axis + 1 :]), leaf.dtype
-            ),
-            part,
-        )
-
-    return jax.tree.map(resized, axes, tree, is_leaf=lambda axis: axis is None)
-
-
-def _spec(axes: Any) -> Any:
-    """How arrays are divided over the devices. axes: see `program`."""
-    return jax.tree.map(
-        lambda axis: PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, "runs"),
-        axes,
-        is_leaf=lambda axis: axis is None,
-    )
-
-
-def _compiled(
-    lowered: jax.stages.Lowered, mesh: Mesh, numbers: list[Any], straight: bool
-) -> Callable[..., Any]:
-    """The program with its numbers, which are put on every device once."""
-    devices = tuple(mesh.devices.flat)
-    options = quick_options(devices[0].platform) if straight else None
-    run = programs.compiled(lowered, devices, options)
-    return partial(run, jax.device_put(numbers, NamedSharding(mesh, PartitionSpec())))
-
-
-def _struct(leaf: Any) -> Any:
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
 
 
 def _keys(key: jax.Array, i: jax.Array) -> jax.Array:
