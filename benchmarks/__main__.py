@@ -1,7 +1,7 @@
 """All benchmarks, one gate: `python -m benchmarks [--quick]`, or `make bench`.
 
 A table of every metric with the range it must lie in; the exit status is 1 if one is missed. Each
-part is also a program of its own: consistency, victoria_park, real_data, speed, gradient,
+part is also a program of its own: compile, consistency, victoria_park, real_data, speed, gradient,
 association, baselines, bearing, delayed, plaza, team, smoothing, fastslam, plain_particles,
 scaling, comparison, monte_carlo_localization, seif.
 """
@@ -19,6 +19,7 @@ from benchmarks import (
     baselines,
     bearing,
     comparison,
+    compile,
     delayed,
     fastslam,
     gradient,
@@ -55,6 +56,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
     """What is measured, by name, in order."""
     return {
         "commands": command_seconds,
+        "compile": compile.measure,
         "speed": lambda: gated(measure_speed(quick)),
         "gradient": gradient.measure,
         "circle": lambda: circle.measure(200 if quick else 1000)[1],

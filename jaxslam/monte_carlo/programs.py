@@ -134,7 +134,7 @@ def compile_programs(
             scored(*before)
         program(promised.least, "least", (scenario,), least, (None, 0, 0), 0, key, which, world)
         found = promised.least.result()(key, which, promised.draw.result()(key, which))
-        ideal = float(found["position"][0, -1]) ** 0.5
+        ideal = float(np.asarray(found["position"])[0, -1]) ** 0.5
         dtype = world[0].pose.dtype
         for promise in (*promised.drives.values(), *promised.scores.values()):
             promise.result()

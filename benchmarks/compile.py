@@ -1,0 +1,217 @@
+"""What a first run waits for: `python -m benchmarks.compile [--only NAMES] [--quick]`.
+
+Seconds of tracing, lowering and XLA's compilation of one `run` of every filter of the catalogue, of
+`delayed_slam`, `team_slam`, an EKF with `life` and merging, the smoother and the batch solution,
+and of gradients through runs of an EKF; how many programs XLA compiled when the same was run again
+with every noise, gate and map value changed (asked: none); and what a second call of `run` costs
+beyond its program. Compilation does not depend on the number of steps. Idle machine, please.
+"""
+
+import dataclasses
+import inspect
+import time
+from collections.abc import Callable
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.delayed import named
+from benchmarks.gate import Metric, alone
+from jaxslam import family, life, motion, programs, sensors, smoothing, team
+from jaxslam.filters import ekf_slam, team_slam
+from jaxslam.filters.merging import duplicates
+from jaxslam.protocols import Filter
+from jaxslam.run import run
+from jaxslam.scenarios import circle
+from jaxslam.sensors import Part, suite
+from jaxslam.simulate import Scenario, simulate
+
+GATE, DELAYED_GATE = 8.0, 10.0
+STEPS = 20
+OVERHEAD_MS = 2.0
+
+
+def world(scale: float) -> Scenario:
+    """`circle`, every number times the scale."""
+    there = circle(STEPS)
+    return dataclasses.replace(
+        there,
+        motion=motion.increment(np.diag([0.02, 0.01]) ** 2 * scale),
+        sensor=sensors.range_bearing(np.diag([0.3, 0.03]) ** 2 * scale),
+        landmarks=np.asarray(there.landmarks) * scale,
+        controls=np.asarray(there.controls)[:, :2] * scale,
+        filter_options={},
+    )
+
+
+def crew(scale: float) -> tuple[Scenario, Filter]:
+    eyes = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2 * scale)
+    sees = suite(Part(eyes, 4), Part(eyes, 1, every=2, sees="robots"))
+    moves = motion.increment(np.diag([0.01, 0.01]) ** 2 * scale)
+    second = (0.8, 0.6, 1.0), np.diag([0.05, 0.05, 0.05]) ** 2
+    robots = [team.Robot(moves, sees), team.Robot(moves, sees, second)]
+    points = 3.0 * scale * np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=1)
+    controls = np.tile([0.12, 0.1, 0.12, -0.1], (STEPS, 1))
+    return team.world(robots, points, controls), team_slam(robots, 8)
+
+
+def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
+    """By name: (scale) -> a scenario and a filter, or an estimator, with every number scaled."""
+
+    def of_family(name: str) -> Callable[[float], tuple[Scenario, Any]]:
+        def make(scale: float) -> tuple[Scenario, Any]:
+            there = world(scale)
+            return there, family.ALL[name](there, gate=9.21 * scale)
+
+        return make
+
+    def delayed(scale: float) -> tuple[Scenario, Any]:
+        there, filters = named(6)
+        controls = np.asarray(there.controls)[:STEPS] * scale
+        return dataclasses.replace(there, controls=controls), filters["delayed"]
+
+    def managed(scale: float) -> tuple[Scenario, Any]:
+        there = world(scale)
+        keeps = life.existence(there.visible, detected=0.9 * scale, patience=50)
+        count = len(there.landmarks)
+        return there, ekf_slam(
+            there.motion,
+            there.sensor,
+            count,
+            update="joint",
+            life=keeps,
+            merge=duplicates(9.21 * scale),
+        )
+
+    def smoother(make: Callable[..., Any]) -> Callable[[float], tuple[Scenario, Any]]:
+        def of(scale: float) -> tuple[Scenario, Any]:
+            there = world(scale)
+            count = len(there.landmarks)
+            return there, make(there.motion, there.sensor, count, there.pose, there.pose_cov)
+
+        return of
+
+    return {name: of_family(name) for name in family.ALL} | {
+        "delayed_slam": delayed,
+        "team_slam": crew,
+        "life and merging": managed,
+        "smooth": smoother(smoothing.smooth),
+        "batch_map": smoother(smoothing.batch_map),
+    }
+
+
+def estimator(there: Scenario, method: Any, truth: Any) -> Callable[..., Any]:
+    """(log, key) -> trace."""
+    if not isinstance(method, Filter) and len(inspect.signature(method).parameters) == 1:
+        method = method(truth)
+    if not isinstance(method, Filter):
+        return cast(Callable[..., Any], method)
+    return lambda log, key: run(method, log, there.pose, there.pose_cov, key)
+
+
+def seconds(function: Callable[..., Any], *arguments: Any) -> tuple[float, float, float]:
+    """Of tracing, lowering and compiling a function, its numbers as arguments."""
+    began = time.perf_counter()
+    traced = programs.trace(function, *arguments)
+    assert traced is not None
+    at = time.perf_counter()
+    lowered = jax.jit(traced.call).lower(traced.numbers, *jax.tree.leaves(arguments))
+    then = time.perf_counter()
+    lowered.compile()
+    return at - began, then - at, time.perf_counter() - then
+
+
+def measure(only: str = "", quick: bool = False) -> list[Metric]:
+    wanted = [name for name in only.split(",") if name]
+    chosen = {name: make for name, make in cases().items() if not wanted or name in wanted}
+    count = [0]
+
+    def listen(event: str, *_: Any, **__: Any) -> None:
+        count[0] += event == "/jax/core/compile/backend_compile_duration"
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    metrics = []
+    key = jax.random.key(0)
+    print(f"{'':24} {'trace':>7} {'lower':>7} {'XLA':>7} {'sum [s]':>8}")
+    for name, make in chosen.items():
+        there, method = make(1.0)
+        truth, log = simulate(there, key)
+        taken = seconds(estimator(there, method, truth), log, key)
+        print(f"{name:24} " + " ".join(f"{x:7.2f}" for x in taken) + f" {sum(taken):8.2f}")
+        high = DELAYED_GATE if name == "delayed_slam" else GATE
+        metrics.append(Metric(f"{name}: first run [s]", sum(taken), high=high))
+        if quick:
+            continue
+        estimator(there, method, truth)(log, key)
+        there, method = make(1.07)
+        truth, log = simulate(there, key)
+        drive, before = estimator(there, method, truth), count[0]
+        drive(log, key)
+        metrics.append(Metric(f"{name}: compiled for other numbers", count[0] - before, high=0.0))
+        programs.clear()
+    if not wanted:
+        metrics += gradients(key) + overhead(key)
+    jax.monitoring.unregister_event_duration_listener(listen)
+    return metrics
+
+
+def gradients(key: jax.Array) -> list[Metric]:
+    """Compiling ∂ log-likelihood / ∂ (noise, mount) of runs."""
+    there = world(1.0)
+    _, log = simulate(there, key)
+    at = jnp.asarray([0.3, 0.03, 0.0, 0.0, 0.0])
+    metrics = []
+    for update in ("joint", "sequential"):
+
+        def cost(p: jax.Array, log: Any, update: str = update) -> jax.Array:
+            sensor = sensors.range_bearing(jnp.diag(p[:2]) ** 2, mount=p[2:])
+            ekf = ekf_slam(there.motion, sensor, len(there.landmarks), update=update)
+            trace = run(ekf, log, there.pose, there.pose_cov, key)
+            return trace.info.log_likelihood.sum()
+
+        taken = seconds(jax.value_and_grad(cost), at, log)
+        name = f"gradient, {update}"
+        print(f"{name:24} " + " ".join(f"{x:7.2f}" for x in taken) + f" {sum(taken):8.2f}")
+        metrics.append(Metric(f"{name}: first run [s]", sum(taken), high=GATE))
+    return metrics
+
+
+def overhead(key: jax.Array) -> list[Metric]:
+    """What `run` costs beyond its program, when it is called again with the same objects."""
+    there = world(1.0)
+    ekf = ekf_slam(there.motion, there.sensor, len(there.landmarks), update="joint")
+    _, log = simulate(there, key)
+    arguments = log, jnp.asarray(there.pose, float), jnp.asarray(there.pose_cov, float), key
+
+    def drive(log: Any, pose: Any, pose_cov: Any, key: jax.Array) -> Any:
+        return run(ekf, log, pose, pose_cov, key)
+
+    compiled = jax.jit(drive).lower(*arguments).compile()
+
+    def median(call: Callable[..., Any]) -> float:
+        taken = []
+        for _ in range(201):
+            began = time.perf_counter()
+            jax.block_until_ready(call(*arguments))
+            taken.append(time.perf_counter() - began)
+        return float(np.median(taken[1:])) * 1e3
+
+    beyond = median(drive) - median(compiled)
+    draw = median(lambda *_: simulate(there, key))
+    return [
+        Metric("run again, beyond its program [ms]", beyond, high=OVERHEAD_MS),
+        Metric("simulate again [ms]", draw, high=OVERHEAD_MS),
+    ]
+
+
+if __name__ == "__main__":
+    raise SystemExit(
+        alone(
+            "compile",
+            measure,
+            only={"default": "", "help": "comma-separated names; default all, and gradients"},
+            quick={"action": "store_true", "help": "without running anything a second time"},
+        )
+    )
