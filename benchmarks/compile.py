@@ -82,7 +82,7 @@ def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
             count,
             update="joint",
             life=keeps,
-            merge=duplicates(9.21 * scale),
+            merge=duplicates(0.5 * scale),
         )
 
     def smoother(make: Callable[..., Any]) -> Callable[[float], tuple[Scenario, Any]]:
