@@ -381,6 +381,10 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"filters": {}}, "at least one"),
         ({"filters": {"x": 3}}, "neither"),
         ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
+        ({"filters": {"x": filters.ekf_slam}}, "x is a factory that was not called"),
+        ({"filters": {"x": filters.dead_reckoning}}, "what it returns, x(motion, …)"),
+        ({"filters": family.FILTERS}, "ekf is a factory that was not called"),
+        ({"filters": {"fej": family.FILTERS["fej"]}}, "what it returns, fej(world, …)"),
         (
             {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), SHORT.sensor, 2)}},
             "size 3",
