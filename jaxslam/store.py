@@ -215,17 +215,7 @@ def resume(
             than are asked for, and on any difference of settings, naming all.
     """
     folder = _folder(folder)
-    path = folder / MANIFEST
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ValueError(f"{path} is not there: no campaign to resume") from error
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}, line {error.lineno}: {error.msg}") from error
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not JSON ({error})") from error
-    if not isinstance(manifest, dict) or "format" not in manifest:
-        raise ValueError(f"{path}: not the manifest of a campaign")
+    manifest, path = read_manifest(folder), folder / MANIFEST
     if manifest["format"] != FORMAT:
         raise ValueError(f"{path}: of format {manifest['format']}, expected {FORMAT}")
     own, campaign = manifest.get("settings"), manifest.get("campaign")
@@ -244,6 +234,25 @@ def resume(
         raise ValueError(f"{folder} has runs up to {end}: expected at least as many, got {runs}")
     _write_manifest(folder, own, campaign, runs)
     return replace(kept, runs=runs)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """What the manifest of a campaign's folder says, of whatever format.
+
+    Raises ValueError if there is none, or if the file is no manifest.
+    """
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ValueError(f"{path} is not there: no campaign to resume") from error
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}, line {error.lineno}: {error.msg}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not JSON ({error})") from error
+    if not isinstance(manifest, dict) or "format" not in manifest:
+        raise ValueError(f"{path}: not the manifest of a campaign")
+    return manifest
 
 
 def _folder(folder: Any) -> Path:

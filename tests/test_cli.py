@@ -329,7 +329,7 @@ def test_an_unfinished_campaign_is_not_overwritten_unasked(tmp_path, capsys, mon
     monkeypatch.undo()
     assert cli.main([*QUICK, "--out", str(out)]) == 2
     message = capsys.readouterr().err
-    assert "2 runs done" in message
+    assert "2 of 3 runs done" in message
     assert "--resume" in message
     assert "--overwrite" in message
     monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: 1 / 0)

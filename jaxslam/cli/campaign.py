@@ -127,6 +127,7 @@ def _make_room(options: argparse.Namespace, out: Path, settings: dict[str, Any],
         if (out / RESULT).exists() and not options.overwrite:
             raise ValueError(f"{out} holds the results of a campaign: --overwrite gives them up")
         return
+    store.read_manifest(folder)  # or it is not ours to remove
     if not options.overwrite:
         there = store.resume(folder)
         done, whole = there.done(), there.runs or 0
