@@ -19,6 +19,11 @@ OURS = {
 }
 
 
+def test_the_suite_writes_nothing_into_the_users_folder():
+    """Not in processes that tests start either; see conftest."""
+    assert os.environ.get("JAX_COMPILATION_CACHE_DIR")
+
+
 @pytest.fixture(autouse=True)
 def as_it_was(monkeypatch, tmp_path):
     """The test run may have a cache of its own; here JAX has been told of none."""

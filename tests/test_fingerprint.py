@@ -60,7 +60,7 @@ def folder(tmp_path_factory):
         ({"scenario": world(steps=13)}, {"steps", "controls", "world", "filter blind"}),
         ({"scenario": world(landmarks=ELSEWHERE)}, {"landmarks", "world"}),
         ({"scenario": world(name="circus")}, {"scenario"}),
-        ({"scenario": world(visible=lambda pose, l: l[0] > pose[0])}, {"world"}),
+        ({"scenario": world(visible=lambda pose, landmark: landmark[0] > pose[0])}, {"world"}),
         ({"name": "deaf"}, {"filters", "filter blind", "filter deaf"}),
         ({"make": drifting}, {"filter blind"}),
         ({"make": worlds.ekf}, {"filter blind"}),

@@ -201,7 +201,9 @@ def test_a_renamed_or_foreign_block_is_set_aside(made, tmp_path):
     assert len(made.set_aside) == 3
     nameless, foreign, renamed = made.set_aside
     assert "block-96.npz: names no runs, holds 96 to 128" in nameless
-    assert "block-00000000-00000032.npz: of another campaign, or made with other settings" in foreign
+    assert (
+        "block-00000000-00000032.npz: of another campaign, or made with other settings" in foreign
+    )
     assert "block-00000064-00000096.npz: names runs 64 to 96, holds 0 to 32" in renamed
     assert sum(name.endswith(".bad") for name in files(made)) == 3
     assert spans(made) == [(32, 32), (96, 32)] and len(made.set_aside) == 3

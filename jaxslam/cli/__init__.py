@@ -168,4 +168,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _versions() -> str:
-    return f"jaxslam {version('jaxslam')} (jax {jax.__version__}, Python {platform.python_version()})"
+    return (
+        f"jaxslam {version('jaxslam')} (jax {jax.__version__}, Python {platform.python_version()})"
+    )

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import jax
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
@@ -156,10 +156,17 @@ def _troubles_told(folder: Path) -> Iterator[None]:
     """What JAX warns of its cache becomes one line; what cannot be read, or written whole, goes."""
     once = threading.Lock()
 
-    def show(message: Any, category: Any, filename: str, lineno: int, *more: Any) -> None:
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
         match = _TROUBLE.match(str(message))
         if match is None:
-            plain(message, category, filename, lineno, *more)
+            plain(message, category, filename, lineno, file, line)
             return
         for path in folder.glob(f"{match[2]}-*-cache"):
             with contextlib.suppress(OSError):

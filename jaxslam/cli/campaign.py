@@ -46,6 +46,8 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
     if options.resume is not None:
         there = store.resume(options.resume / BLOCKS)
+        if "asked" not in there.settings:
+            raise ValueError(f"{options.resume} holds a campaign that no command began")
         asked = there.settings["asked"] | {"runs": there.runs} | asked
     asked = DEFAULTS | asked
     out = options.resume or options.out

@@ -63,11 +63,11 @@ class Spent:
             f"compiled ({made}{kept}), {self.seconds - compiling:.1f} s besides"
         )
 
-    def _took(self, event: str, duration: float, **_: Any) -> None:
+    def _took(self, event: str, duration_secs: float, **_: Any) -> None:
         if event in _PARTS:
             now = time.perf_counter()
             with self._lock:
-                self._spans.append((now - duration, now))
+                self._spans.append((now - duration_secs, now))
                 self.programs += event == _PARTS[-1]
 
     def _happened(self, event: str, **_: Any) -> None:

@@ -7,9 +7,9 @@ constant and literal, bit by bit. So a noise, a gate, a map, a chart or an edite
 seen wherever it is held, and a renamed or moved function, a comment and a memory address are not;
 the same campaign built anew, in another process or on another host, has the same fingerprint.
 
-Not seen: the inside of a host callback (`jax.pure_callback`), settings of JAX that no jaxpr shows
-(`jax_threefry_partitionable`, flags of XLA), the kind of processor among those of one platform, and
-how results are summed up on the host, but for the source of `jaxslam.consistency`.
+Not seen: the inside of a host callback (`jax.pure_callback`), settings that no jaxpr shows (flags
+of XLA), and the kind of processor among those of one platform. Of what scores and sums up the
+results, the source is taken, that of `jaxslam.consistency`.
 
 It takes a trace of each candidate's run, 0.1 to 0.5 s, and compiles nothing.
 """
@@ -26,7 +26,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import Jaxpr, Literal
 
 from jaxslam import consistency
 from jaxslam.consistency import own_error_of
@@ -127,7 +127,8 @@ class _Reader:
         for eqn in jaxpr.eqns:
             parameters = {k: v for k, v in eqn.params.items() if k not in _SKIPPED}
             line = f"{eqn.primitive.name} {self.value(parameters)} {read(eqn.invars)}"
-            lines.append(f"{line} -> {bound(eqn.outvars)}")
+            context = f"{eqn.ctx.threefry_partitionable} {eqn.ctx.compute_type}"
+            lines.append(f"{line} {context} -> {bound(eqn.outvars)}")
         lines.append(read(jaxpr.outvars))
         short = _short("\n".join(lines))
         self._known[id(jaxpr)] = jaxpr, short  # held, so that no other gets its id
@@ -135,7 +136,7 @@ class _Reader:
 
     def value(self, value: Any) -> str:
         """A constant, or a parameter of a primitive."""
-        if isinstance(value, ClosedJaxpr):
+        if hasattr(value, "jaxpr") and hasattr(value, "consts"):
             return f"{self.jaxpr(value.jaxpr)} of {self.value(list(value.consts))}"
         if isinstance(value, Jaxpr):
             return self.jaxpr(value)
