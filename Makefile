@@ -15,7 +15,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 
 ## The main job: is EKF-SLAM honest? 100 simulated runs; results in out/.
 consistency: $(VENV)/.run
-	$(BIN)/jaxslam consistency --cache $(VENV)/compiled $(ARGS)
+	$(BIN)/jaxslam consistency $(if $(filter --resume% --overwrite,$(ARGS)),,--again) $(ARGS)
 
 ## The test suite, on every core.
 test: $(VENV)/.dev

@@ -285,6 +285,20 @@ def check_count(name: str, value: Any) -> None:
         raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
 
 
+def check_key(name: str, key: Any) -> None:
+    """Raise ValueError unless key is one PRNG key: of `jax.random.key`, or the raw numbers of one.
+
+    A tracer of one will do.
+    """
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
+    if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        if shape != ():
+            raise ValueError(f"{name}: expected one PRNG key, got keys of shape {shape}")
+    elif dtype != np.uint32 or shape is None or len(shape) != 1:
+        shown = repr(key) if dtype is None else f"an array of {dtype} of shape {shape}"
+        raise ValueError(f"{name}: expected a PRNG key, as of jax.random.key(0), got {shown}")
+
+
 def check_gate(name: str, gate: Any) -> None:
     """Raise ValueError unless the gate is None, a tracer, or above 0."""
     if gate is not None and is_concrete(gate) and not gate > 0:

@@ -61,6 +61,10 @@ def table(campaign: Campaign) -> str:
         f"{campaign.divergence_limit:.3g} m, 5 σ of the ideal EKF.",
     ]
     notes += not_finite(campaign)
+    if campaign.dtype == "float32":
+        notes.append(
+            "In float32: the command's default is float64 (from Python, jax_enable_x64 first)."
+        )
     if campaign.published:
         notes.append(f"published: {campaign.source}")
     return "\n".join([title, "", text, "", *notes])
@@ -177,15 +181,20 @@ def versions() -> dict[str, str]:
 def check_writable(folder: Path) -> None:
     """Raise OSError now, before hours of work, if files cannot be written to the folder.
 
-    The folder is not made here; its nearest existing parent is tried.
+    The folder is not made here; its nearest existing parent is tried. The error names the folder as
+    it was given.
     """
-    there = folder.absolute()
-    while not there.exists():
-        there = there.parent
-    if not there.is_dir():
-        raise NotADirectoryError(f"{there} is not a folder")
-    with tempfile.TemporaryFile(dir=there):
-        pass
+    try:
+        there = folder.absolute()
+        while not there.exists():
+            there = there.parent
+        if not there.is_dir():
+            raise NotADirectoryError(f"{there} is not a folder")
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise type(error)(f"results cannot be written to {folder}: {reason}") from error
 
 
 def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], Any]]) -> list[Path]:

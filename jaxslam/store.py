@@ -2,7 +2,8 @@
 
 A block is one npz file that appears under its name only when all of it is on the disk, so whatever
 ends the program costs the block at work and no other. Each file carries a checksum over its arrays,
-the numbers of its runs and the campaign's settings; one that fails it is put aside, never counted.
+the numbers of its runs, the campaign's fingerprint and the caller's settings; one that fails it is
+put aside, never counted.
 """
 
 import contextlib
@@ -12,9 +13,10 @@ import json
 import operator
 import os
 import re
+import secrets
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,11 +24,12 @@ import numpy as np
 
 from jaxslam.monte_carlo.pieces import missing
 
-FORMAT = 1
+FORMAT = 2
 """Of the folder, as its manifest says; another number is refused."""
 
 MANIFEST = "manifest.json"
-"""The file that makes a folder a campaign's: the format, the settings and their digest."""
+"""The file that makes a folder a campaign's: the format, settings and fingerprint, their digest,
+and how many runs were asked for."""
 
 _ABOUT = "_block"  # the entry of an npz that says which runs it holds, of what, with the checksum
 _NAME = re.compile(r"block-(\d{8,})-(\d{8,})\.npz", re.ASCII)
@@ -52,7 +55,25 @@ class Store:
 
     folder: Path
     settings: dict[str, Any]
+    runs: int | None = None
+    """how many the campaign is to have, where that was said; it may be extended"""
+    campaign: dict[str, str] = field(default_factory=dict)
+    """the fingerprint of the campaign that claimed the folder; empty until one does"""
     set_aside: list[str] = field(default_factory=list)
+
+    def claim(self, fingerprint: Mapping[str, str]) -> None:
+        """Say whose runs these are: a new folder notes it, any other must hold that campaign.
+
+        Raises ValueError that names every difference, as "key: … there, … here".
+        """
+        mine = {str(name): str(value) for name, value in fingerprint.items()}
+        there = resume(self.folder)  # another process may have claimed it meanwhile
+        if not there.campaign:
+            _write_manifest(self.folder, there.settings, mine, there.runs)
+        elif differences := _differences(there.campaign, mine):
+            raise ValueError(f"{self.folder} holds another campaign: {'; '.join(differences)}")
+        self.campaign.clear()
+        self.campaign.update(mine)
 
     def save(self, first: int, arrays: Mapping[str, np.ndarray], runs: int) -> Path:
         """Write runs first … first + runs - 1 to a file of their own and return its path.
@@ -69,7 +90,7 @@ class Store:
                 raise ValueError(f"{name!r} cannot be the name of an array in a block")
             if array.dtype.kind not in _KINDS:
                 raise ValueError(f"array {name!r}: dtype {array.dtype} cannot be kept in a block")
-        about = {"first": first, "runs": runs, "settings": _digest(self.settings)}
+        about = {"first": first, "runs": runs, "settings": self._digest()}
         about["sha256"] = _checksum(about, whole)
         whole[_ABOUT] = np.frombuffer(_text(about).encode(), np.uint8)
         path = self.folder / f"block-{first:08d}-{first + runs:08d}.npz"
@@ -97,8 +118,8 @@ class Store:
             raise ValueError(f"{path}: an npz, but not a block of a campaign") from error
         if checksum != _checksum(about, arrays):
             raise ValueError(f"{path}: its content does not fit its checksum")
-        if settings != _digest(self.settings):
-            raise ValueError(f"{path}: made with other settings")
+        if settings != self._digest():
+            raise ValueError(f"{path}: of another campaign, or made with other settings")
         if (named := _named(path)) != (first, first + runs):
             names = f"names runs {named[0]} to {named[1]}" if named else "names no runs"
             raise ValueError(f"{path}: {names}, holds {first} to {first + runs}")
@@ -108,6 +129,12 @@ class Store:
         """(first, runs) of each block by its name alone; `blocks` looks into them."""
         named = (_named(path) for path in self.folder.glob("block-*.npz"))
         return sorted((first, last - first) for first, last in filter(None, named))
+
+    def done(self) -> int:
+        """How many runs there are, by the names of the blocks."""
+        spans = self.spans()
+        end = max((first + runs for first, runs in spans), default=0)
+        return end - sum(count for _, count in missing(spans, end, max(end, 1)))
 
     def blocks(self) -> Iterator[Block]:
         """The good blocks in order of their runs, read one at a time; no run comes twice.
@@ -133,6 +160,9 @@ class Store:
             yield block
             del block  # before the next is read
 
+    def _digest(self) -> str:
+        return _digest({"settings": self.settings, "campaign": self.campaign})
+
     def _put_aside(self, path: Path, reason: ValueError) -> None:
         name, number = f"{path.name}.bad", 1
         while (path.parent / name).exists():
@@ -142,33 +172,74 @@ class Store:
         self.set_aside.append(f"{reason}; not counted, kept as {name}")
 
 
-def create(folder: Path, settings: Mapping[str, Any]) -> Store:
+def create(
+    folder: str | os.PathLike[str],
+    settings: Mapping[str, Any] | None = None,
+    runs: int | None = None,
+) -> Store:
     """A store for a new campaign in a folder, which is made if need be.
 
-    settings, of JSON's types, are all that must agree for two blocks to belong together. Raises
-    ValueError if the folder holds a campaign.
+    `monte_carlo(keep=…)` notes in it what the campaign is; nothing need be said here.
+
+    Args:
+        folder: where.
+        settings: of JSON's types; what must agree besides, for two blocks to belong together.
+        runs: how many the campaign is to have, as a note for who resumes it.
+    Raises:
+        ValueError: if the folder holds a campaign.
     """
-    own = _plain(settings)
-    path = folder / MANIFEST
-    if path.exists():
-        spans = Store(folder, {}).spans()
-        end = max((first + runs for first, runs in spans), default=0)
-        done = end - sum(count for _, count in missing(spans, end, max(end, 1)))
+    folder, own = _folder(folder), _plain(settings or {})
+    if (folder / MANIFEST).exists():
         raise ValueError(
-            f"{folder} holds a campaign of which {done} runs are done: resume it, or name another "
-            "folder"
+            f"{folder} holds a campaign of which {Store(folder, {}).done()} runs are done: resume "
+            "it, or name another folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    manifest = {"format": FORMAT, "digest": _digest(own), "settings": own}
-    _write(path, (json.dumps(manifest, indent=2) + "\n").encode())
-    return Store(folder, own)
+    _write_manifest(folder, own, {}, runs)
+    return Store(folder, own, runs)
 
 
-def resume(folder: Path, settings: Mapping[str, Any] | None = None) -> Store:
+def resume(
+    folder: str | os.PathLike[str],
+    settings: Mapping[str, Any] | None = None,
+    runs: int | None = None,
+) -> Store:
     """The store of the campaign that a folder holds.
 
-    Raises ValueError if there is none, if its manifest cannot be read, and, where settings are
-    given, on any difference between them and the manifest's, naming all.
+    Args:
+        folder: where.
+        settings: where given, they must be those of the manifest.
+        runs: where given, how many the campaign is to have from now on; more than before extend it.
+    Raises:
+        ValueError: if there is no campaign, if its manifest cannot be read, if it has more runs
+            than are asked for, and on any difference of settings, naming all.
+    """
+    folder = _folder(folder)
+    manifest, path = read_manifest(folder), folder / MANIFEST
+    if manifest["format"] != FORMAT:
+        raise ValueError(f"{path}: of format {manifest['format']}, expected {FORMAT}")
+    own, campaign = manifest.get("settings"), manifest.get("campaign")
+    if (
+        not isinstance(own, dict)
+        or not isinstance(campaign, dict)
+        or manifest.get("digest") != _digest({"settings": own, "campaign": campaign})
+    ):
+        raise ValueError(f"{path}: it was changed since the campaign began")
+    if settings is not None and (differences := _differences(own, _plain(settings))):
+        raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
+    kept = Store(folder, own, manifest.get("runs"), campaign)
+    if runs is None or runs == kept.runs:
+        return kept
+    if (end := max((first + count for first, count in kept.spans()), default=0)) > runs:
+        raise ValueError(f"{folder} has runs up to {end}: expected at least as many, got {runs}")
+    _write_manifest(folder, own, campaign, runs)
+    return replace(kept, runs=runs)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """What the manifest of a campaign's folder says, of whatever format.
+
+    Raises ValueError if there is none, or if the file is no manifest.
     """
     path = folder / MANIFEST
     try:
@@ -181,14 +252,23 @@ def resume(folder: Path, settings: Mapping[str, Any] | None = None) -> Store:
         raise ValueError(f"{path}: not JSON ({error})") from error
     if not isinstance(manifest, dict) or "format" not in manifest:
         raise ValueError(f"{path}: not the manifest of a campaign")
-    if manifest["format"] != FORMAT:
-        raise ValueError(f"{path}: of format {manifest['format']}, expected {FORMAT}")
-    own = manifest.get("settings")
-    if not isinstance(own, dict) or manifest.get("digest") != _digest(own):
-        raise ValueError(f"{path}: its settings were changed since the campaign began")
-    if settings is not None and (differences := _differences(own, _plain(settings))):
-        raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
-    return Store(folder, own)
+    return manifest
+
+
+def _folder(folder: Any) -> Path:
+    try:
+        return Path(folder)
+    except TypeError:
+        raise ValueError(f"expected a folder, as a path or a string, got {folder!r}") from None
+
+
+def _write_manifest(
+    folder: Path, settings: Mapping[str, Any], campaign: Mapping[str, str], runs: int | None
+) -> None:
+    own = {"settings": settings, "campaign": campaign}
+    manifest = {"format": FORMAT, "digest": _digest(own), "runs": runs, **own}
+    text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
+    _write(folder / MANIFEST, text.encode())
 
 
 def _named(path: Path) -> tuple[int, int] | None:
@@ -214,7 +294,7 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 def _write(path: Path, content: bytes) -> None:
     """Whole or not at all, through a hidden file beside it that no other process writes."""
-    hidden = path.with_name(f".{path.name}-{os.getpid()}.tmp")
+    hidden = path.with_name(f".{path.name}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with open(hidden, "wb") as file:
             file.write(content)

@@ -4,11 +4,12 @@ import json
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from test_family import three_parameters
 
-from jaxslam import cli, family, store
+from jaxslam import cli, family, report, store
 from jaxslam.cli import asking
 from jaxslam.consistency import Measure
 from jaxslam.monte_carlo import Interrupted
@@ -22,6 +23,8 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "verdict" in printed
     assert "published" not in printed  # of 2500 steps, and these are 8
+    assert "until the last program was there" in printed
+    assert "while programs were traced and compiled" in printed.splitlines()[-1]
     names = {path.name for path in out.iterdir()}
     assert names == {
         "blocks",
@@ -52,6 +55,29 @@ def test_on_a_terminal_a_line_tells_of_each_filter_as_soon_as_it_can(capsys, mon
     ]
     assert "64/100 runs" in shown
     assert "none" not in shown
+
+
+def test_a_bar_tells_how_fast_it_goes_and_how_long_that_takes(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    clock = iter([100.0, 130.0, 131.0, 132.0, 150.0])
+    monkeypatch.setattr(asking.time, "perf_counter", lambda: next(clock))
+    with asking.Progress("circle") as progress:
+        for done in (64, 64, 128, 140):
+            progress(done, 10_000)
+    first, same, second, third = (
+        line for line in capsys.readouterr().err.split("\x1b[K") if "/10,000" in line
+    )
+    assert first.endswith("64/10,000 runs, 30 s\r")
+    assert same.endswith("64/10,000 runs, 31 s\r")  # no rate of nothing
+    assert second.endswith("128/10,000 runs, 32 s, 32 a second, 5 min 8 s left\r")
+    assert third.endswith("140/10,000 runs, 50 s, 3.8 a second, 43 min 15 s left\r")
+    assert asking._duration(59.6) == "1 min 0 s"
+    assert asking._duration(7322) == "2 h 2 min"
+
+
+def test_the_version_is_told(capsys):
+    assert cli.main(["--version"]) == 0
+    assert f"(jax {jax.__version__}, Python 3." in capsys.readouterr().out
 
 
 def test_a_first_result_does_not_wait_for_what_draws():
@@ -128,8 +154,21 @@ def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, capsys
 def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: pytest.fail("work was begun"))
     (tmp_path / "file").write_text("")
-    assert cli.main([*QUICK, "--out", str(tmp_path / "file")]) == 2
-    assert "not a folder" in capsys.readouterr().err
+    out = tmp_path / "file" / "deeper" / "out"
+    assert cli.main([*QUICK, "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert message == (
+        f"jaxslam: results cannot be written to {out}: {tmp_path / 'file'} is not a folder\n"
+    )
+
+    def read_only(dir):
+        raise PermissionError(13, "Permission denied", f"{dir}/tmpxyz")
+
+    monkeypatch.setattr(report.tempfile, "TemporaryFile", read_only)
+    out = tmp_path / "not" / "there"
+    assert cli.main([*QUICK, "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert message == f"jaxslam: results cannot be written to {out}: Permission denied\n"
 
 
 def test_an_interrupt_exits_with_130_and_writes_nothing(tmp_path, capsys, monkeypatch):
@@ -154,6 +193,7 @@ def test_the_module_runs_as_a_program_in_float32(tmp_path):
         [sys.executable, "-m", "jaxslam", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    assert "In float32: the command's default is float64" in done.stdout
     assert json.loads((tmp_path / "consistency.json").read_text())["dtype"] == "float32"
 
 
@@ -222,7 +262,16 @@ def results(out):
 
 def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys):
     out, again = tmp_path / "out", ["consistency", "--resume", str(tmp_path / "out")]
-    asked = [*QUICK, "--filters", "ekf,fej", "--no-bound", "--block", "1", "--devices", "1"]
+    asked = [
+        *QUICK,
+        "--filters",
+        "ekf,dead_reckoning",
+        "--no-bound",
+        "--block",
+        "1",
+        "--devices",
+        "1",
+    ]
     assert cli.main([*asked, "--out", str(out)]) == 0
     whole, csv = results(out), (out / "consistency.csv").read_text()
     assert len(kept(out)) == 4
@@ -244,9 +293,21 @@ def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys):
     assert cli.main([*again, "--seed", "3", "--filters", "ekf"]) == 2
     message = capsys.readouterr().err
     assert "asked.seed: 0 there, 3 here" in message
-    assert "asked.filters: ekf,fej there, ekf here" in message
+    assert "asked.filters: ekf,dead_reckoning there, ekf here" in message
     assert cli.main(["consistency", "--resume", str(tmp_path)]) == 2
     assert "no campaign to resume" in capsys.readouterr().err
+
+    # More runs extend it, to what a campaign of as many gives; fewer than there are do not.
+    assert cli.main([*again, "--runs", "5", "--block", "1", "--devices", "1"]) == 0
+    extended = results(out)
+    assert extended["runs"] == 5
+    fresh = tmp_path / "fresh"
+    assert cli.main([*asked, "--runs", "5", "--out", str(fresh)]) == 0
+    assert extended == results(fresh)
+    capsys.readouterr()
+    assert cli.main([*again, "--runs", "4"]) == 2
+    assert "has runs up to 5: expected at least as many, got 4" in capsys.readouterr().err
+    assert store.resume(out / "blocks").runs == 5
 
 
 def test_an_unfinished_campaign_is_not_overwritten_unasked(tmp_path, capsys, monkeypatch):
@@ -262,13 +323,56 @@ def test_an_unfinished_campaign_is_not_overwritten_unasked(tmp_path, capsys, mon
     monkeypatch.undo()
     assert cli.main([*QUICK, "--out", str(out)]) == 2
     message = capsys.readouterr().err
-    assert "2 runs done" in message
+    assert "2 of 3 runs done" in message
     assert "--resume" in message
     assert "--overwrite" in message
     monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cli.main([*QUICK, "--out", str(out), "--overwrite"])
     assert store.resume(out / "blocks").spans() == []
+
+
+def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+    begun = []
+
+    def finished(*arguments, keep, **options):
+        if keep.spans() == []:
+            keep.save(0, {"x": np.zeros(2)}, 3)
+        begun.append(keep.spans())
+        raise Interrupted(None, 3)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", finished)
+    asked = [*QUICK, "--out", str(out)]
+    assert cli.main(asked) == 130
+    mine = out / "blocks" / "mine"
+    mine.write_text("of this campaign")
+    capsys.readouterr()
+    for refused in (asked, [*asked, "--runs", "4", "--again"], [*asked, "--seed", "1", "--again"]):
+        assert cli.main(refused) == 2
+        message = capsys.readouterr().err
+        assert f"{out} holds a finished campaign of 3 runs: --overwrite gives it up" in message
+        assert f"--resume {out}" in message
+        assert "--out" in message
+    assert mine.exists() and len(begun) == 1
+    for accepted in ("--again", "--overwrite"):
+        mine.write_text("of this campaign")
+        assert cli.main([*asked, accepted]) == 130
+        assert not mine.exists()
+    # Results without their blocks are results all the same.
+    cli.campaign.shutil.rmtree(out / "blocks")
+    (out / "consistency.json").write_text("{}")
+    assert cli.main([*asked, "--again"]) == 2
+    assert f"{out} holds the results of a campaign: --overwrite" in capsys.readouterr().err
+    assert cli.main([*asked, "--overwrite"]) == 130
+    assert cli.main([*asked, "--overwrite", "--resume", str(out)]) == 2
+    assert "not allowed with" in capsys.readouterr().err
+
+
+def test_a_campaign_begun_from_python_is_not_the_commands_to_resume(tmp_path, capsys):
+    store.create(tmp_path / "blocks")
+    assert cli.main(["consistency", "--resume", str(tmp_path)]) == 2
+    assert "a campaign that no command began" in capsys.readouterr().err
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Campaigns: blocks, workers and loops agree; draws are shared; wrong filters are found out."""
 
 import dataclasses
+import re
 from functools import partial
 from types import SimpleNamespace
 
@@ -98,6 +99,9 @@ class Spy:
 
     def __init__(self, store, fails=()):
         self.store, self.saved, self.fails = store, [], list(fails)
+
+    def claim(self, fingerprint):
+        self.store.claim(fingerprint)
 
     def save(self, first, arrays, runs):
         if self.fails and self.fails.pop(0):
@@ -365,9 +369,14 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"block": 0}, "block"),
         ({"workers": 0}, "workers"),
         ({"devices": []}, "device"),
+        ({"key": 0}, "monte_carlo: expected a PRNG key, as of jax.random.key(0), got 0"),
         ({"filters": {}}, "at least one"),
         ({"filters": {"x": 3}}, "neither"),
         ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
+        ({"filters": {"x": filters.ekf_slam}}, "x is a factory that was not called"),
+        ({"filters": {"x": filters.dead_reckoning}}, "what it returns, x(motion, …)"),
+        ({"filters": family.FILTERS}, "ekf is a factory that was not called"),
+        ({"filters": {"fej": family.FILTERS["fej"]}}, "what it returns, fej(world, …)"),
         (
             {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), SHORT.sensor, 2)}},
             "size 3",
@@ -375,6 +384,6 @@ def test_wrong_filters_are_found_out(lineup, name):
     ],
 )
 def test_bad_arguments_are_refused(change, message):
-    arguments = {"filters": {"ekf": worlds.ekf(SHORT)}, "runs": 2} | change
-    with pytest.raises(ValueError, match=message):
-        monte_carlo(SHORT, key=worlds.key(), **arguments)
+    arguments = {"filters": {"ekf": worlds.ekf(SHORT)}, "runs": 2, "key": worlds.key()} | change
+    with pytest.raises(ValueError, match=re.escape(message)):
+        monte_carlo(SHORT, **arguments)

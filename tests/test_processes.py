@@ -14,26 +14,21 @@ import pytest
 RUNS = 24
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("compiled")
-
-
-def command(out, cache, *more, runs=RUNS):
+def command(out, *more, runs=RUNS):
     asked = ["--scenario", "circle", "--filters", "ekf", "--steps", "60", "--no-bound"]
     asked += ["--runs", str(runs)]
-    shape = ["--devices", "1", "--block", "2", "--cache", str(cache), "--out", str(out)]
+    shape = ["--devices", "1", "--block", "2", "--out", str(out)]
     return [sys.executable, "-m", "jaxslam", "consistency", *asked, *shape, *more]
 
 
-def together(out, cache, count, *more, **options):
+def together(out, count, *more, **options):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     where = ["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--timeout", "60"]
     return [
         subprocess.Popen(
-            command(out, cache, *where, "--process-id", str(i), *more, **options),
+            command(out, *where, "--process-id", str(i), *more, **options),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -50,24 +45,24 @@ def results(out):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory, cache):
+def alone(tmp_path_factory):
     out = tmp_path_factory.mktemp("alone")
-    subprocess.run(command(out, cache), check=True, capture_output=True)
+    subprocess.run(command(out), check=True, capture_output=True)
     return results(out)
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_processes_together_are_one_alone(tmp_path, cache, alone, count):
-    processes = together(tmp_path, cache, count)
+def test_processes_together_are_one_alone(tmp_path, alone, count):
+    processes = together(tmp_path, count)
     said = [process.communicate(timeout=300)[0] for process in processes]
     assert [process.returncode for process in processes] == [0] * count, said
     assert ["verdict" in text for text in said] == [i == 0 for i in range(count)]
     assert results(tmp_path) == alone
 
 
-def test_a_killed_process_loses_no_finished_run(tmp_path, cache):
+def test_a_killed_process_loses_no_finished_run(tmp_path):
     many = 4000  # so many that they are not done before one is killed
-    processes = together(tmp_path, cache, 2, runs=many)
+    processes = together(tmp_path, 2, runs=many)
     blocks = tmp_path / "blocks"
     deadline = time.monotonic() + 200
     while len(list(blocks.glob("*.npz"))) < 6 and time.monotonic() < deadline:
@@ -80,7 +75,7 @@ def test_a_killed_process_loses_no_finished_run(tmp_path, cache):
     assert len(done) >= 6
 
     stale = sorted(done)[-1]
-    again = command(tmp_path, cache, runs=many)
+    again = command(tmp_path, runs=many)
     again = [
         *again[: again.index("--out")],
         "--resume",

@@ -201,7 +201,9 @@ def test_a_renamed_or_foreign_block_is_set_aside(made, tmp_path):
     assert len(made.set_aside) == 3
     nameless, foreign, renamed = made.set_aside
     assert "block-96.npz: names no runs, holds 96 to 128" in nameless
-    assert "block-00000000-00000032.npz: made with other settings" in foreign
+    assert (
+        "block-00000000-00000032.npz: of another campaign, or made with other settings" in foreign
+    )
     assert "block-00000064-00000096.npz: names runs 64 to 96, holds 0 to 32" in renamed
     assert sum(name.endswith(".bad") for name in files(made)) == 3
     assert spans(made) == [(32, 32), (96, 32)] and len(made.set_aside) == 3
@@ -253,8 +255,9 @@ def test_a_manifest_is_whole_or_refused(made, tmp_path):
         ('{\n"format": 1,\n"settings": {]}', "manifest.json, line 3: "),
         ("[]", "manifest.json: not the manifest"),
         ("\udcff", "manifest.json: not JSON"),
-        (text.replace('"format": 1', '"format": 2'), "manifest.json: of format 2, expected 1"),
-        (text.replace('"seed": 3', '"seed": 4'), "manifest.json: its settings were changed"),
+        (text.replace('"format": 2', '"format": 1'), "manifest.json: of format 1, expected 2"),
+        (text.replace('"seed": 3', '"seed": 4'), "manifest.json: it was changed since"),
+        (text.replace('"campaign": {}', '"campaign": []'), "manifest.json: it was changed since"),
     ):
         manifest.write_text(content, encoding="utf-8", errors="surrogateescape")
         with pytest.raises(ValueError, match=message):
@@ -274,6 +277,53 @@ def test_a_campaign_is_not_begun_twice(made):
     fill(made, 80, runs=32)
     with pytest.raises(ValueError, match="holds a campaign of which 80 runs are done: resume it"):
         store.create(made.folder, SETTINGS)
+
+
+def test_a_campaign_claims_its_folder_and_no_other_gets_it(made):
+    mine = {"key": "fry 0:1", "filter σ": "abc"}
+    fill(made, 0)  # of nobody knows what
+    made.claim(mine)
+    made.claim(dict(reversed(mine.items())))
+    fill(made, 32)
+    again = store.resume(made.folder, SETTINGS)
+    assert again.campaign == mine
+    assert spans(again) == [(32, 32)]
+    assert "of another campaign" in again.set_aside[0]
+    with pytest.raises(ValueError, match="holds another campaign: ") as caught:
+        again.claim({"key": "fry 0:2", "steps": "5"})
+    assert str(caught.value).split("another campaign: ")[1].split("; ") == [
+        "key: fry 0:1 there, fry 0:2 here",
+        "filter σ: abc there, absent here",
+        "steps: absent there, 5 here",
+    ]
+    assert store.resume(made.folder).campaign == mine
+    # Of two that were opened before either claimed it, the second to claim finds the first.
+    first = store.create(made.folder / "new", SETTINGS)
+    second = store.resume(first.folder, SETTINGS)
+    first.claim(mine)
+    with pytest.raises(ValueError, match="key: fry 0:1 there"):
+        second.claim(mine | {"key": "fry 0:2"})
+
+
+def test_the_number_of_runs_may_grow_but_not_below_what_is_there(tmp_path):
+    made = store.create(tmp_path, runs=64)
+    fill(made, 32)
+    assert store.resume(tmp_path).runs == 64
+    assert store.resume(tmp_path, runs=100).runs == 100
+    assert store.resume(tmp_path, {}).runs == 100
+    assert store.resume(tmp_path, runs=64).runs == 64
+    with pytest.raises(ValueError, match="has runs up to 64: expected at least as many, got 63"):
+        store.resume(tmp_path, runs=63)
+    assert store.resume(tmp_path).runs == 64
+    assert spans(store.resume(tmp_path)) == [(32, 32)]
+
+
+def test_a_folder_may_be_a_string_and_nothing_else_is_taken_for_one(tmp_path):
+    made = store.create(str(tmp_path / "a"), SETTINGS)
+    assert store.resume(str(tmp_path / "a"), SETTINGS).folder == made.folder == tmp_path / "a"
+    for function in (store.create, store.resume):
+        with pytest.raises(ValueError, match="expected a folder, as a path or a string, got 3"):
+            function(3)
 
 
 def test_every_difference_of_settings_is_named(made):

@@ -1,18 +1,21 @@
 """The command `jaxslam`: the only place that parses arguments or configures JAX."""
 
 import argparse
+import platform
 import shlex
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
 
-from jaxslam.cli import devices
+from jaxslam.cli import cache, devices
 from jaxslam.cli.asking import INTERRUPTED
 from jaxslam.cli.campaign import DEFAULTS, consistency
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
+from jaxslam.cli.spent import Spent
 from jaxslam.datasets import READERS
 from jaxslam.family import ALL
 from jaxslam.scenarios import SCENARIOS
@@ -34,7 +37,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             devices.prepare(options)
         else:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
-        return int(options.command(options, shlex.join(["jaxslam", *arguments])))
+        with Spent() as spent, cache.programs(options.cache, options.no_cache):
+            status = int(options.command(options, shlex.join(["jaxslam", *arguments])))
+            if status != INTERRUPTED and jax.process_index() == 0:
+                print(spent)
+        return status
     except (ValueError, OSError) as error:
         print(f"jaxslam: {error}", file=sys.stderr)
         return USAGE_ERROR
@@ -45,6 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="jaxslam", description="2-D landmark SLAM in JAX.")
+    parser.add_argument("--version", action="version", version=_versions())
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     judge = commands.add_parser(
@@ -82,23 +90,31 @@ def _parser() -> argparse.ArgumentParser:
     judge.add_argument(
         "--out", type=Path, default=Path("out"), help="folder for results (default: out)"
     )
-    judge.add_argument(
-        "--resume", type=Path, metavar="DIR", help="go on with the campaign in a folder of results"
+    there = judge.add_mutually_exclusive_group()
+    there.add_argument(
+        "--resume",
+        type=Path,
+        metavar="DIR",
+        help="go on with the campaign in a folder of results; with a larger --runs, extend it",
     )
-    judge.add_argument(
-        "--overwrite", action="store_true", help="give up an unfinished campaign in the folder"
+    there.add_argument(
+        "--overwrite", action="store_true", help="give up the campaign that is in the folder"
+    )
+    there.add_argument(
+        "--again",
+        action="store_true",
+        help="give it up where it is finished and was asked for by the same options",
     )
     judge.add_argument(
         "--block",
         type=int,
-        help="runs computed together on a device; sets memory (default: 32 on a CPU)",
+        help="runs computed together on each device, of which a CPU has one a core; sets memory "
+        "(default: 32 on a CPU, on an accelerator by its memory)",
     )
     judge.add_argument(
         "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'
     )
-    judge.add_argument(
-        "--cache", type=Path, metavar="DIR", help="keep compiled programs there for the next time"
-    )
+    cache.add_options(judge)
     others = judge.add_argument_group(
         "several processes", "the same command on each, but for the id"
     )
@@ -144,6 +160,14 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
     check.set_defaults(command=verify_models, dtype="float64")
 
+    for command in (drive, check):
+        cache.add_options(command)
     drive.add_argument("--dtype", default="float64", choices=["float32", "float64"])
     drive.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
     return parser
+
+
+def _versions() -> str:
+    return (
+        f"jaxslam {version('jaxslam')} (jax {jax.__version__}, Python {platform.python_version()})"
+    )

@@ -27,6 +27,7 @@ class Progress:
         self._what, self._unit = what, unit
         self._began = time.perf_counter()
         self._shown = sys.stderr.isatty()
+        self._first: tuple[float, int] | None = None
 
     def __enter__(self) -> "Progress":
         self.say("compiling …")
@@ -37,11 +38,20 @@ class Progress:
         self._draw(f"{self._what}: {what}")
 
     def __call__(self, done: int, total: int) -> None:
-        """Show how much is done."""
+        """Show how much is done; from the second call on also how fast, and how long it will take.
+
+        The rate is that since the first call, before which programs were compiled.
+        """
+        now = time.perf_counter()
         filled = round(30 * done / total)
-        spent = time.perf_counter() - self._began
         bar = "█" * filled + "░" * (30 - filled)
-        self._draw(f"{self._what}: {bar} {done:,}/{total:,} {self._unit}, {spent:.0f} s")
+        line = f"{self._what}: {bar} {done:,}/{total:,} {self._unit}, {now - self._began:.0f} s"
+        if self._first is None:
+            self._first = now, done
+        elif done > self._first[1] and now > self._first[0]:
+            rate = (done - self._first[1]) / (now - self._first[0])
+            line += f", {_rate(rate)} a second, {_duration((total - done) / rate)} left"
+        self._draw(line)
 
     def glimpse(self, name: str, runs: int, nees: Measure | None) -> None:
         """A line that stays: what the first block says of a filter, while others are compiled."""
@@ -58,3 +68,17 @@ class Progress:
     def _draw(self, line: str) -> None:
         if self._shown:
             print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+
+
+def _rate(rate: float) -> str:
+    return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+
+
+def _duration(seconds: float) -> str:
+    """As 42 s, 3 min 5 s or 2 h 10 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600:,} h {whole % 3600 // 60} min"

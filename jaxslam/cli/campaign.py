@@ -26,6 +26,9 @@ from jaxslam.types import Estimate, Truth
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
 
+RESULT = "consistency.json"
+"""The file of results that tells of a campaign."""
+
 DEFAULTS: dict[str, Any] = {
     "scenario": "circle",
     "filters": "dead_reckoning,ekf",
@@ -42,7 +45,10 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     """Run the campaign that was asked for, print its table, write its files; exit status."""
     asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
     if options.resume is not None:
-        asked = store.resume(options.resume / BLOCKS).settings["asked"] | asked
+        there = store.resume(options.resume / BLOCKS)
+        if "asked" not in there.settings:
+            raise ValueError(f"{options.resume} holds a campaign that no command began")
+        asked = there.settings["asked"] | {"runs": there.runs} | asked
     asked = DEFAULTS | asked
     out = options.resume or options.out
     jax.config.update("jax_enable_x64", asked["dtype"] == "float64")
@@ -61,7 +67,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         check_count("block", options.block)
     report.check_writable(out)
     here = devices.chosen(options.devices)
-    keep = _keep(options, out, {"asked": asked, "versions": report.versions()})
+    keep = _keep(options, out, asked)
     try:
         with Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress:
             campaign = monte_carlo(
@@ -91,37 +97,55 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     print(report.table(campaign))
     files = _campaign_files(campaign, scenario, asked["seed"], asked["bound"], command)
     written = report.write_files(out, files)
-    print(f"\ncampaign {campaign.seconds:.1f} s; wrote " + ", ".join(str(path) for path in written))
+    compiling = campaign.compile_seconds
+    print(
+        f"\ncampaign {campaign.seconds:.1f} s: {compiling:.1f} s until the last program was there, "
+        f"{campaign.seconds - compiling:.1f} s besides; wrote "
+        + ", ".join(str(path) for path in written)
+    )
     return 0
 
 
-def _keep(options: argparse.Namespace, out: Path, settings: dict[str, Any]) -> store.Store:
+def _keep(options: argparse.Namespace, out: Path, asked: dict[str, Any]) -> store.Store:
     """Where this campaign's blocks are kept: a new folder, or that of the campaign resumed."""
-    folder = out / BLOCKS
-    if options.resume is None and jax.process_index() == 0:
-        done = _done(folder)
-        if done and not options.overwrite:
-            raise ValueError(
-                f"{out} holds an unfinished campaign, with {done} runs done: --resume {out} goes "
-                "on with it, --overwrite gives it up"
-            )
-        if (folder / store.MANIFEST).exists():
-            shutil.rmtree(folder)
-        elif folder.exists() and any(folder.iterdir()):
-            raise ValueError(f"{folder} holds files that are no campaign's; choose another --out")
-        store.create(folder, settings)
+    folder, runs = out / BLOCKS, asked["runs"]
+    settings = {"asked": {name: value for name, value in asked.items() if name != "runs"}}
+    if jax.process_index() == 0:
+        if options.resume is None:
+            _make_room(options, out, settings, runs)
+            store.create(folder, settings, runs)
+        else:
+            store.resume(folder, settings, runs)  # which extends it
     devices.wait_for_all("campaign folder")
     return store.resume(folder, settings)
 
 
-def _done(folder: Path) -> int:
-    """How many runs an unfinished campaign in a folder has; 0 where there is none."""
+def _make_room(options: argparse.Namespace, out: Path, settings: dict[str, Any], runs: int) -> None:
+    """Remove the blocks of a campaign that is to be given up; ValueError where it is not to be."""
+    folder = out / BLOCKS
     if not (folder / store.MANIFEST).exists():
-        return 0
-    kept = store.resume(folder)
-    runs = kept.settings["asked"]["runs"]
-    left = sum(count for _, count in missing(kept.spans(), runs, runs))
-    return int(runs - left) if left else 0
+        if folder.exists() and any(folder.iterdir()):
+            raise ValueError(f"{folder} holds files that are no campaign's; choose another --out")
+        if (out / RESULT).exists() and not options.overwrite:
+            raise ValueError(f"{out} holds the results of a campaign: --overwrite gives them up")
+        return
+    store.read_manifest(folder)  # or it is not ours to remove
+    if not options.overwrite:
+        there = store.resume(folder)
+        done, whole = there.done(), there.runs or 0
+        left = bool(missing(there.spans(), whole, max(whole, 1)))
+        if left and done:
+            raise ValueError(
+                f"{out} holds an unfinished campaign, with {done} of {whole} runs done: --resume "
+                f"{out} goes on with it, --overwrite gives it up; or choose another --out"
+            )
+        same = options.again and (there.settings, whole) == (settings, runs)
+        if done and not same:
+            raise ValueError(
+                f"{out} holds a finished campaign of {done} runs: --overwrite gives it up, "
+                f"--resume {out} prints it, or extends it to more --runs; or choose another --out"
+            )
+    shutil.rmtree(folder)
 
 
 def _campaign_files(
@@ -174,7 +198,7 @@ def _campaign_files(
             dict(figures.values()),
             draw,
         ),
-        "consistency.json": report.as_json(campaign, command, seed),
+        RESULT: report.as_json(campaign, command, seed),
         "consistency.csv": report.as_csv(campaign),
     } | {f"{name}.png": saved(figure) for name, (_, figure) in figures.items()}
 

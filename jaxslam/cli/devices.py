@@ -20,10 +20,6 @@ def prepare(options: argparse.Namespace) -> None:
     if count is not None:
         with contextlib.suppress(RuntimeError):  # JAX has been used before, as in a notebook
             jax.config.update("jax_num_cpu_devices", count)
-    if options.cache is not None:
-        jax.config.update("jax_compilation_cache_dir", str(options.cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def join(options: argparse.Namespace) -> None:

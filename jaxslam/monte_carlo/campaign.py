@@ -16,10 +16,11 @@ import jax
 import numpy as np
 
 from jaxslam.consistency import Summary, Tally, summarize
-from jaxslam.linalg import check_count
+from jaxslam.linalg import check_count, check_key
 from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
 from jaxslam.monte_carlo.blockwise import Library
 from jaxslam.monte_carlo.candidates import check_dtype, check_fits, fitting_block
+from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.pieces import cores, missing
 from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.together import gathered, share
@@ -62,7 +63,10 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Keep(Protocol):
-    """Where finished blocks are kept: `store.Store`, for one."""
+    """Where finished blocks are kept: `store.Store`, for one. Claimed before it is read."""
+
+    def claim(self, fingerprint: Mapping[str, str]) -> None:
+        """Note what campaign this is, once; ValueError where it is another that was noted."""
 
     def save(self, first: int, arrays: Mapping[str, np.ndarray], runs: int) -> Any:
         """Keep runs first … first + runs - 1."""
@@ -86,6 +90,7 @@ def monte_carlo(
     progress: Callable[[int, int], None] | None = None,
     glimpse: Glimpse | None = None,
     library: Library | None = None,
+    identity: Mapping[str, str] | None = None,
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
 
@@ -106,24 +111,30 @@ def monte_carlo(
         bound: also take the posterior Cramér-Rao bound of every run, at the price of one more EKF.
         dtype: float32 or float64, of the worlds and so of the filters. With `jax_enable_x64` worlds
             are drawn in float64 and then rounded: both see the same. Default what JAX is set to.
-        keep: blocks are saved there as they finish, and those found there are not run again.
+        keep: blocks are saved there as they finish, and those found there are not run again. It
+            holds one campaign: what must agree (key, scenario, models, filters, precision,
+            versions) is told by `fingerprint`. More runs than it has extend it.
         progress: called with (runs done, runs) of this process after each block.
         glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
             block of each filter has run, while the others may still be compiled. A campaign of no
             more than `workers` blocks is compiled in full first: its steps are timed.
         library: compiled programs are taken from there, without a trace, and put there. The caller
             answers for it: its programs are of this scenario and these filters, by name.
+        identity: what `keep` is told instead of the fingerprint, where the caller knows without a
+            trace what the campaign is, as from names and the source that they stand for.
     Returns:
         Campaign.
     Raises:
-        ValueError: on runs, block or workers below 1, no devices, no filters, or a filter that does
-            not fit the scenario; before anything is traced.
+        ValueError: on runs, block or workers below 1, no PRNG key, no devices, no filters, or a
+            filter that does not fit the scenario, before anything is traced; where `keep` holds
+            another campaign, by every difference, or runs beyond those asked for.
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
         if value is not None:
             check_count(f"monte_carlo: {name}", value)
+    check_key("monte_carlo", key)
     if not isinstance(filters, Mapping) or not filters:
         raise ValueError("monte_carlo: expected filters by name, at least one")
     for name, candidate in filters.items():
@@ -138,8 +149,17 @@ def monte_carlo(
         workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 1
     names = (*filters, BOUND)
     tallies, own = ({name: Tally() for name in names} for _ in range(2))
-    for first, count, arrays in keep.blocks() if keep is not None else ():
-        _add(tallies, first, count, _by_filter(arrays, names))
+    if keep is not None:
+        keep.claim(
+            identity or fingerprint(scenario, filters, key, devices[0].platform, bound, dtype)
+        )
+        for first, count, arrays in keep.blocks():
+            if first + count > runs:  # sums over a block cannot be taken apart
+                raise ValueError(
+                    f"monte_carlo: runs up to {first + count} are kept: expected at least as many "
+                    f"runs, got {runs}"
+                )
+            _add(tallies, first, count, _by_filter(arrays, names))
     block = block or fitting_block(scenario, filters, devices[0])
     size = int(block)
     kept = tallies[names[0]].pieces()

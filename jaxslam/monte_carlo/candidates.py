@@ -1,7 +1,7 @@
 """What a campaign is given to run: whether it fits the scenario, and how many runs fit a device."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.protocols import Candidate, Chart, Estimator, Filter
+from jaxslam.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.run import run
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.types import Log, Truth
@@ -68,6 +68,7 @@ def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
     if not isinstance(candidate, Filter):
         if not callable(candidate):
             raise ValueError(f"monte_carlo: {name} is neither a filter nor a function of the truth")
+        check_called(name, candidate)
         try:
             inspect.signature(candidate).bind(None)
         except TypeError:
@@ -85,6 +86,20 @@ def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
                 f"monte_carlo: filter {name} takes a {what} of size {has}, "
                 f"the scenario {scenario.name} gives {needs}"
             )
+
+
+def check_called(name: str, candidate: Callable[..., Any]) -> None:
+    """Raise ValueError if a candidate is a factory of filters instead of what one returns."""
+    first = next(iter(inspect.signature(candidate).parameters.values()), None)
+    if first is None:
+        return
+    ours = getattr(candidate, "__module__", "").startswith("jaxslam.")
+    named = first.name in ("motion", "sensor", "robots", "scenario", "world")
+    if (ours and named) or first.annotation in (Motion, Sensor, Scenario):
+        raise ValueError(
+            f"monte_carlo: {name} is a factory that was not called: expected what it returns, "
+            f"{name}({first.name}, …)"
+        )
 
 
 def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tuple[Estimator, Chart]:

@@ -1,0 +1,156 @@
+"""A campaign is known by what it computes: whatever changes a result changes its fingerprint."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import filters, sensors, store
+from jaxslam.monte_carlo import fingerprint as module
+from jaxslam.monte_carlo import monte_carlo
+from jaxslam.monte_carlo.fingerprint import digest, fingerprint
+
+
+def world(steps=12, sigma=0.05, **changes):
+    sensor = sensors.range_bearing(np.diag([sigma, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
+    return dataclasses.replace(worlds.ring(steps), sensor=sensor, **changes)
+
+
+def blind(scenario):
+    return filters.dead_reckoning(scenario.motion, scenario.sensor)
+
+
+def campaign(scenario=None, name="blind", make=blind, key=0):
+    scenario = scenario or world()
+    return {"scenario": scenario, "filters": {name: make(scenario)}, "key": jax.random.key(key)}
+
+
+def drifting(scenario):
+    """The same filter by another line of code."""
+    filter = blind(scenario)
+
+    def predict(state, u, key):
+        return filter.predict(state, 1.0001 * u, key)
+
+    return dataclasses.replace(filter, predict=predict)
+
+
+ELSEWHERE = np.asarray(worlds.ring(12).landmarks) + [1e-15, 0.0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    kept = store.create(tmp_path_factory.mktemp("claimed"))
+    kept.claim(fingerprint(**campaign(), platform="cpu"))
+    return kept.folder
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"key": 1}, {"key"}),
+        ({"scenario": world(sigma=0.06)}, {"sensor noise", "world"}),
+        ({"scenario": world(steps=13)}, {"steps", "controls", "world", "filter blind"}),
+        ({"scenario": world(landmarks=ELSEWHERE)}, {"landmarks", "world"}),
+        ({"scenario": world(name="circus")}, {"scenario"}),
+        ({"scenario": world(visible=lambda pose, landmark: landmark[0] > pose[0])}, {"world"}),
+        ({"name": "deaf"}, {"filters", "filter blind", "filter deaf"}),
+        ({"make": drifting}, {"filter blind"}),
+        ({"make": worlds.ekf}, {"filter blind"}),
+    ],
+)
+def test_a_changed_campaign_is_refused_by_what_changed(folder, changed, named):
+    changed = campaign(**changed)
+    with pytest.raises(ValueError, match="holds another campaign: ") as caught:
+        monte_carlo(runs=2, keep=store.resume(folder), **changed)
+    differences = str(caught.value).split("another campaign: ")[1].split("; ")
+    assert {difference.split(": ")[0] for difference in differences} == named
+    assert all(" there, " in each and each.endswith(" here") for each in differences)
+
+
+def test_another_precision_platform_version_or_bound_is_another_campaign(folder, monkeypatch):
+    there = store.resume(folder).campaign
+    asked = campaign()
+
+    def changed(platform="cpu", **options):
+        found = fingerprint(**asked, platform=platform, **options)
+        assert found.keys() == there.keys()
+        return {name for name in found if found[name] != there[name]}
+
+    assert changed() == set()
+    assert changed(platform="gpu") == {"platform"}
+    assert changed(bound=True) == {"bound"}
+    with jax.enable_x64(False):
+        assert "dtype" in changed()
+    monkeypatch.setattr(module, "version", lambda name: {"jax": "0.1"}.get(name, there[name]))
+    assert changed() == {"jax"}
+
+
+def test_a_gate_that_a_filter_closes_over_is_seen():
+    scenario = world()
+    ekfs = [
+        fingerprint(
+            scenario, {"it": worlds.ekf(scenario, gate=gate)}, jax.random.key(0), platform="cpu"
+        )["filter it"]
+        for gate in (9.0, 9.0, 9.0 + 1e-12)
+    ]
+    assert ekfs[0] == ekfs[1] != ekfs[2]
+
+
+ALONE = """
+import json, jax, test_fingerprint as t
+jax.config.update("jax_enable_x64", True)
+found = t.fingerprint(**t.campaign(make=t.worlds.ekf), platform="cpu")
+print(json.dumps(found))
+"""
+
+
+def test_the_same_campaign_in_another_process_has_the_same_fingerprint():
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONHASHSEED": "7"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert json.loads(done.stdout) == fingerprint(**campaign(make=worlds.ekf), platform="cpu")
+
+
+def test_a_digest_is_of_numbers_and_structure_not_of_names_and_addresses():
+    def scaled(by, table):
+        @jax.custom_jvp
+        def inner(x):
+            return (x * by + table).astype(x.dtype)
+
+        inner.defjvp(lambda primals, tangents: (inner(*primals), tangents[0]))
+        return lambda x: jax.lax.fori_loop(0, 3, lambda _, x: inner(x), x)
+
+    x, table = jnp.zeros(3), np.arange(3.0)
+    one = digest(scaled(2.0, table), x)
+    assert one == digest(scaled(2.0, table.copy()), x)
+    others = [
+        digest(scaled(np.nextafter(2.0, 3.0), table), x),
+        digest(scaled(2.0, np.nextafter(table, 9)), x),
+        digest(scaled(2.0, table), x.astype(np.float32)),
+        digest(lambda x: (scaled(2.0, table)(x),), x),
+    ]
+    assert len({one, *others}) == 5
+
+    # An inner function that is traced once, or once a call: JAX keeps some and drops some.
+    @jax.jit
+    def shared(x):
+        return x + 1.0
+
+    assert digest(lambda x: shared(shared(x)), x) == digest(
+        lambda x: jax.jit(lambda x: x + 1.0)(jax.jit(lambda x: x + 1.0)(x)), x
+    )
+    keys = [jax.random.key(seed) for seed in (0, 0, 1)]
+    drawn = [digest(lambda x, key=key: jax.random.normal(key, x.shape), x) for key in keys]
+    assert drawn[0] == drawn[1] != drawn[2]
