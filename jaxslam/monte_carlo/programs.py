@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxslam.consistency import Score, mean_pose_nees, own_error_of, posterior_bound, score
+from jaxslam.consistency import Score, conditional_bound, mean_pose_nees, own_error_of, score
 from jaxslam.monte_carlo.block import Programs
 from jaxslam.monte_carlo.candidates import estimator_of
 from jaxslam.monte_carlo.pieces import cores
@@ -91,7 +91,7 @@ def compile_programs(
 
     def least(key: jax.Array, which: jax.Array, world: tuple[Truth, Log]) -> dict[str, jax.Array]:
         def one(i: jax.Array, truth: Truth, log: Log) -> jax.Array:
-            return posterior_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov
+            return conditional_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov
 
         cov = jax.vmap(one)(which, *world)
         position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)
