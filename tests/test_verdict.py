@@ -1,14 +1,21 @@
 """The verdict: its false alarms and its power on an exactly linear problem, and what it says."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.stats
 
 from benchmarks.verdict import averages, problem, rejected, verdicts
-from jaxslam import stats
+from jaxslam import motion, sensors, stats
 from jaxslam.consistency import judge, lopsided, positive_interval, power_of
 from jaxslam.consistency.intervals import Measure, spread
+from jaxslam.monte_carlo import monte_carlo
+from jaxslam.monte_carlo.candidates import check_noise
+from jaxslam.simulate import Scenario
+
+SENSOR = sensors.range_bearing(np.eye(2))
 
 COUNTS = {"runs": 20, "not_finite": 0, "divergent": 0}
 
@@ -167,6 +174,37 @@ def test_doubts_are_said():
     assert two.word == "consistent"
     assert two.doubts[0].startswith("unobservable directions 2, where 3 are")
     assert not judge(each | {"unobservable": np.full(20, 3.0)}, COUNTS).doubts
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sensor": sensors.range_bearing(lambda z: -0.1 * jnp.eye(2))}, "range_bearing.*negative"),
+        ({"sensor": sensors.compass(lambda z: jnp.array([[jnp.nan]]))}, "compass.*NaN"),
+        ({"motion": motion.increment(lambda pose, u: jnp.array([[1.0, 3], [3, 1]]))}, "increment"),
+    ],
+)
+def test_a_noise_that_is_no_covariance_is_refused_before_anything_runs(change, message):
+    fields = {"name": "bad", "motion": motion.increment(np.eye(2)), "sensor": SENSOR}
+    fields |= change
+    size = len(fields["sensor"].landmark)
+    world = Scenario(**fields, landmarks=np.ones((2, size)), controls=np.ones((3, 2)))
+    with pytest.raises(ValueError, match=f"monte_carlo: noise_cov of {message}") as refused:
+        monte_carlo(world, {"any": lambda truth: None}, 2, jax.random.key(0))
+    assert "\n" not in str(refused.value)
+
+
+def test_a_noise_that_zero_has_none_of_is_taken_where_it_is():
+    """σ ∝ 1/range, and a σ² that is negative at z = 0."""
+    for noise in (lambda z: jnp.eye(2) / z[0], lambda z: jnp.eye(2) * (z[0] - 0.5)):
+        world = Scenario(
+            name="odd",
+            motion=motion.increment(np.eye(2)),
+            sensor=sensors.range_bearing(noise),
+            landmarks=np.ones((2, 2)),
+            controls=np.ones((3, 2)),
+        )
+        check_noise(world)
 
 
 def test_lopsided_is_what_plus_minus_would_hide():

@@ -14,7 +14,7 @@ from jaxslam.consistency import Measure, Score, condense, interval
 from jaxslam.consistency.tally import condensed_sums
 
 BOUND = "bound"
-"""The name under which a block keeps the sums of the posterior bound, and the divergence limit."""
+"""Under this name a block keeps the sums of the conditional bound, and the divergence limit."""
 
 
 Glimpse = Callable[[str, int, Measure | None], Any]

@@ -18,7 +18,7 @@ import numpy as np
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.linalg import check_count
 from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
-from jaxslam.monte_carlo.candidates import check_fits, fitting_block
+from jaxslam.monte_carlo.candidates import check_fits, check_noise, fitting_block
 from jaxslam.monte_carlo.pieces import cores, missing
 from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.together import gathered, share
@@ -97,7 +97,8 @@ def monte_carlo(
         devices: of this process; default all of `jax.local_devices()`.
         workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
             accelerator).
-        bound: also take the posterior Cramér-Rao bound of every run, at the price of one more EKF.
+        bound: also take the conditional Cramér-Rao bound of every run (`conditional_bound`), at
+            the price of one more EKF.
         keep: blocks are saved there as they finish, and those found there are not run again.
         progress: called with (runs done, runs) of this process after each block.
         glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
@@ -106,8 +107,8 @@ def monte_carlo(
     Returns:
         Campaign.
     Raises:
-        ValueError: on runs, block or workers below 1, no devices, no filters, or a filter that does
-            not fit the scenario; before anything is traced.
+        ValueError: on runs, block or workers below 1, no devices, no filters, a filter that does
+            not fit the scenario, or a noise that is no covariance; before anything is traced.
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """
@@ -118,6 +119,7 @@ def monte_carlo(
         raise ValueError("monte_carlo: expected filters by name, at least one")
     for name, candidate in filters.items():
         check_fits(name, candidate, scenario)
+    check_noise(scenario)
     devices = jax.local_devices() if devices is None else list(devices)
     if not devices:
         raise ValueError("monte_carlo: expected at least one device")

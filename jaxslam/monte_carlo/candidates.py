@@ -1,15 +1,19 @@
 """What a campaign is given to run: whether it fits the scenario, and how many runs fit a device."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.charts.euclidean import euclidean
+from jaxslam.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Candidate, Chart, Estimator, Filter
 from jaxslam.run import run
+from jaxslam.sensors.suite import Suite
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.types import Log, Truth
 
@@ -36,6 +40,43 @@ def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: 
     shapes = jax.tree.leaves(jax.eval_shape(one, jax.random.key(0)))
     each = sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
     return int(np.clip(2 ** int(np.log2(max(room / 4 / each, 1.0))), 32, 4096))
+
+
+def check_noise(scenario: Scenario) -> None:
+    """Raise ValueError where a model of the scenario states a noise that is no covariance.
+
+    A `noise_cov` that is a function can only be looked at where it is called. That of the motion is
+    called for the start and the first control, that of a sensor, or of each part of a suite, for
+    z = 0 and, where it is no covariance there, for the first landmark as seen from the start.
+    """
+    if not is_concrete(scenario.controls, scenario.pose, scenario.landmarks):
+        return
+    dtype = jnp.result_type(float)
+    pose, control, landmark = (
+        jnp.asarray(np.asarray(value, dtype))
+        for value in (scenario.pose, _first(scenario.controls), _first(scenario.landmarks))
+    )
+    motion, sensor = scenario.motion, scenario.sensor
+    _check_stated(motion.name, len(motion.noises), lambda: motion.noise_cov(pose, control))
+    for model in [part.sensor for part in sensor.parts] if isinstance(sensor, Suite) else [sensor]:
+        size, seen = len(model.measurements), landmark[: len(model.landmark)]
+        try:
+            _check_stated(model.name, size, partial(model.noise_cov, jnp.zeros(size, dtype)))
+        except ValueError:
+            z = model.observe(pose, seen)
+            _check_stated(model.name, size, partial(model.noise_cov, z))
+
+
+def _first(rows: Any) -> np.ndarray:
+    return np.asarray(np.asarray(rows)[0])
+
+
+def _check_stated(name: str, size: int, noise_cov: Callable[[], Any]) -> None:
+    try:
+        check_covariance(name, noise_cov(), size)
+    except ValueError as error:
+        said = str(error).removeprefix(f"{name}: ")
+        raise ValueError(f"monte_carlo: noise_cov of {name}: {said}") from None
 
 
 def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
