@@ -57,8 +57,25 @@ def chi2_band(dof: float, runs: int, level: float = 0.95) -> tuple[float, float]
     return chi2_quantile(tail, total) / runs, chi2_quantile(1 - tail, total) / runs
 
 
-def t_quantile(p: float, dof: int) -> float:
-    """Student's t quantile, for the interval of a mean whose variance the runs estimate."""
+def truncated_chi2_mean(share: float, dof: float) -> float:
+    """The mean of χ²_dof below the gate that a share of it exceeds, over dof; 1 where none does.
+
+    F_{dof+2}(g)/F_dof(g) with F_dof(g) = 1 - share: what an honest filter's NIS averages after its
+    gate has dropped that share. Raises ValueError unless 0 <= share < 1 and dof > 0.
+    """
+    if not 0 <= share < 1:
+        raise ValueError(f"expected a share in [0, 1), got {share}")
+    if share == 0:
+        return 1.0
+    gate = chi2_quantile(1 - share, dof)
+    return float(scipy.special.gammainc(dof / 2 + 1, gate / 2)) / (1 - share)
+
+
+def t_quantile(p: float, dof: float) -> float:
+    """Student's t quantile, for the interval of a mean whose variance the runs estimate.
+
+    dof > 0, not necessarily whole.
+    """
     return float(scipy.special.stdtrit(dof, p))
 
 

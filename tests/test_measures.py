@@ -1,7 +1,6 @@
 """The consistency measures beyond NEES and NIS: each against a definition or a known answer."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from test_consistency import STEPS, plain_nees, summed, synthetic
 
 from jaxslam import charts, consistency, motion, sensors
 from jaxslam.simulate import simulate
-from jaxslam.types import Estimate, Info, Status, Trace, Truth
+from jaxslam.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 
 
 def test_coverage_is_the_share_of_truth_inside_the_ellipsoids():
@@ -61,6 +60,16 @@ def test_credibility_leaves_out_what_it_must():
     alone = consistency.credibility(errors[kept, 1:], covs[kept, 1:], regular[kept, 1:])
     np.testing.assert_allclose(inclination[kept], alone[1])
     assert consistency.credibility(errors[:6], covs[:6], regular[:6]) is None
+
+
+def test_credibility_of_what_is_not_positive_definite_is_left_out():
+    """eᵀ P⁻¹ e below zero has no logarithm, and no warning either."""
+    rng = np.random.default_rng(3)
+    errors, covs = rng.normal(size=(20, 2, 3)), np.broadcast_to(np.eye(3), (20, 2, 3, 3)).copy()
+    covs[7, 0] *= -1
+    errors[8, 0] = 0
+    index, _ = consistency.credibility(errors, covs, np.ones((20, 2), bool))
+    assert np.isfinite(index).all()
 
 
 def correlated(rng, rho, runs=30, steps=200, slots=3):
@@ -158,8 +167,11 @@ def test_landmark_nees_and_own_coordinates():
         np.testing.assert_allclose(found[run], total / STEPS, rtol=1e-7)
 
 
-def test_the_bound_obeys_tichavskys_recursion():
-    """Against the information form, in NumPy, where it exists: Q and P0 regular, all in view."""
+def test_the_bounds_obey_tichavskys_recursion():
+    """Against the information form, in NumPy, where it exists: Q and P0 regular, all in view.
+
+    Of one world the posterior bound is the conditional one; over many it is less (Jensen).
+    """
     q, r = np.diag([0.05, 0.04, 0.02]) ** 2, 0.1**2 * np.eye(2)
     base = worlds.ring(steps=15)
     world = dataclasses.replace(
@@ -170,10 +182,21 @@ def test_the_bound_obeys_tichavskys_recursion():
         pose_cov=np.diag([0.1, 0.2, 0.05]) ** 2,
         filter_options={"gate": 9.0, "births": 1},
     )
-    truth, log = jax.jit(partial(simulate, world))(jax.random.key(2))
-    bound = jax.jit(
-        lambda truth, log: consistency.posterior_bound(world, truth, log, jax.random.key(0))
-    )(truth, log)
+
+    @jax.jit
+    @jax.vmap
+    def draw(key):
+        truth, log = simulate(world, key)
+        return truth, log, consistency.conditional_bound(world, truth, log, key).pose_cov
+
+    worlds_drawn = draw(jax.random.split(jax.random.key(2), 4))
+    truths, logs, bounds = jax.tree.map(np.asarray, worlds_drawn)
+    steps, least = consistency.posterior_bound(world, truths, logs)
+    assert (np.linalg.eigvalsh(bounds[:, steps].mean(axis=0) - least)[1:] > 0).all()
+    alone = jax.tree.map(lambda leaf: leaf[:1], (truths, logs))
+    steps, own = consistency.posterior_bound(world, *alone, steps=[0, 7, 14])
+    np.testing.assert_allclose(own, bounds[0, steps], rtol=1e-7, atol=1e-12)
+    truth, bound = jax.tree.map(lambda leaf: leaf[0], truths), bounds[0]
     n = 3 + 12
     j = np.zeros((n, n))  # the map is unknown beforehand: no information
     j[:3, :3] = np.linalg.inv(world.pose_cov)
@@ -197,10 +220,40 @@ def test_the_bound_obeys_tichavskys_recursion():
             h = np.zeros((2, n))
             h[:, :3], h[:, 3 + 2 * i : 5 + 2 * i] = by_pose, by_landmark
             j = j + h.T @ np.linalg.solve(r, h)
-        np.testing.assert_allclose(
-            bound.pose_cov[t], np.linalg.inv(j)[:3, :3], rtol=1e-6, atol=1e-12
-        )
+        np.testing.assert_allclose(bound[t], np.linalg.inv(j)[:3, :3], rtol=1e-6, atol=1e-12)
         old = pose
+
+
+def test_what_is_called_a_bound_bounds():
+    """x ~ N(0, 1), z = x³ + v: the posterior mean beats the conditional bound by far."""
+    sigma = 0.01
+    x = np.random.default_rng(4).normal(size=200_000)
+    slope, jacobian = np.ones((len(x), 1, 1)), 3 * x[:, None, None] ** 2
+    noise, prior = np.array([[sigma**2]]), np.eye(1)
+    given = np.sqrt(np.mean(1 / (1 + jacobian**2 / sigma**2)))
+    proper = np.sqrt(consistency.van_trees(slope, jacobian, noise, prior)[0, 0])
+    np.testing.assert_allclose(proper, 1 / np.sqrt(1 + 27 / sigma**2), rtol=0.02)
+    # The posterior mean by quadrature, of fewer draws.
+    grid = np.linspace(-5, 5, 20_001)
+    draws = x[:400]
+    z = draws**3 + sigma * np.random.default_rng(5).normal(size=400)
+    log_density = -0.5 * grid**2 - 0.5 * ((z[:, None] - grid**3) / sigma) ** 2
+    density = np.exp(log_density - log_density.max(axis=1, keepdims=True))
+    mean = (density @ grid) / density.sum(axis=1)
+    rmse = np.sqrt(np.mean((mean - draws) ** 2))
+    np.testing.assert_allclose([proper, rmse, given], [0.0019, 0.066, 0.236], rtol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"draw": lambda scenario, key: None}, "one robot"), ({}, "leading axis")],
+)
+def test_a_posterior_bound_of_what_it_cannot_take_is_refused(change, message):
+    world = dataclasses.replace(worlds.ring(steps=2), **change)
+    truth = Truth(np.zeros((2, 3)), np.zeros((6, 2)), np.zeros(2, int), np.zeros(3))
+    log = Log(np.zeros((2, 2)), Scan(np.zeros((2, 6, 2)), np.zeros((2, 6), int), np.ones((2, 6))))
+    with pytest.raises(ValueError, match=f"posterior_bound: .*{message}"):
+        consistency.posterior_bound(world, truth, log)
 
 
 def test_runs_that_are_not_finite_are_named():

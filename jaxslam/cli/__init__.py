@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
         "--bound",
         action=argparse.BooleanOptionalAction,
         default=argparse.SUPPRESS,
-        help="also the posterior Cramér-Rao bound (default: yes)",
+        help="also the Cramér-Rao bound given each true trajectory (default: yes)",
     )
     asked.add_argument(
         "--dtype",

@@ -1,12 +1,14 @@
 """Is a filter honest? Scores of runs, their averages with bands and intervals, and a verdict."""
 
 from jaxslam.consistency.alignment import align_map
-from jaxslam.consistency.bound import posterior_bound
+from jaxslam.consistency.bound import conditional_bound, posterior_bound, van_trees
 from jaxslam.consistency.credibility import credibility
+from jaxslam.consistency.intervals import LEVEL, Measure, interval, lopsided, positive_interval
 from jaxslam.consistency.nees import DOF, mean_pose_nees, own_error_of
 from jaxslam.consistency.score import LAGS, LANDMARK_DOF, LEVELS, Score, score
-from jaxslam.consistency.summary import LEVEL, Measure, Summary, interval, judge, summarize
+from jaxslam.consistency.summary import Summary, summarize
 from jaxslam.consistency.tally import Tally, condense
+from jaxslam.consistency.verdict import Verdict, judge, power_of
 
 __all__ = [
     "DOF",
@@ -18,14 +20,20 @@ __all__ = [
     "Score",
     "Summary",
     "Tally",
+    "Verdict",
     "align_map",
     "condense",
+    "conditional_bound",
     "credibility",
     "interval",
     "judge",
+    "lopsided",
     "mean_pose_nees",
     "own_error_of",
+    "positive_interval",
     "posterior_bound",
+    "power_of",
     "score",
     "summarize",
+    "van_trees",
 ]

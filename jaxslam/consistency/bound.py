@@ -1,25 +1,41 @@
-"""The posterior Cramér-Rao bound: what no filter can be better than."""
+"""Cramér-Rao bounds: one of estimators that are unbiased given the truth, one of all estimators."""
 
-from typing import Any
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
+from jaxslam import derivatives
+from jaxslam.consistency.score import snapshot_steps
 from jaxslam.filters.ekf_slam import ekf_slam
+from jaxslam.linalg import root_psd
 from jaxslam.linearize.at_truth import at_truth
+from jaxslam.linearize.first_order import turned
 from jaxslam.run import run
+from jaxslam.sensors.suite import Suite
 from jaxslam.simulate import Scenario
 from jaxslam.types import Estimate, Log, Truth
 
 
-def posterior_bound(scenario: Scenario, truth: Truth, log: Log, key: jax.Array) -> Estimate:
-    """The bound on the covariance of any estimate, along a true trajectory; as `Estimate`s, (T,).
+def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: jax.Array) -> Estimate:
+    """The Cramér-Rao bound given a true trajectory; as `Estimate`s, (T,), of which the covariances
+    mean something.
+
+    It bounds the covariance of estimators that are unbiased *given that trajectory and map*; the
+    average over runs of such estimators' mean square errors lies above the average of the bounds. A
+    Bayesian estimator is biased given the truth, towards its prior, and may lie below: by Jensen's
+    inequality this average of inverses lies above the inverse of the average, which is the
+    `posterior_bound`. The two agree where the information hardly varies between the runs.
 
     Tichavský, Muravchik & Nehorai (IEEE Trans. Signal Processing 46(5), 1998) give the recursion
-    J_{k+1} = D22 - D21 (J_k + D11)⁻¹ D12, D11 = FᵀQ⁻¹F, D12 = -FᵀQ⁻¹, D22 = Q⁻¹ + HᵀR⁻¹H, with
-    Jacobians at the truth. Its inverse is the covariance of the Kalman filter of that linear
-    system, which also exists for a singular Q or P0; so this runs the ideal EKF without gate and
-    with every birth allowed, and only its covariances mean something. Averaged over runs it bounds
-    mean square errors. The noise of a measurement is what the sensor states for what it measured.
+    J_{k+1} = D22 - D21 (J_k + D11)⁻¹ D12, D11 = FᵀQ⁻¹F, D12 = -FᵀQ⁻¹, D22 = Q⁻¹ + HᵀR⁻¹H, here with
+    the Jacobians of one trajectory in place of their means. Its inverse is the covariance of the
+    Kalman filter of that linear system, which also exists for a singular Q or P0; so this runs the
+    ideal EKF without gate and with every birth allowed. The noise of a measurement is what the
+    sensor states for what it measured.
     """
     options: dict[str, Any] = scenario.filter_options | {"gate": None, "births": None}
     capacity = truth.landmarks.shape[0]
@@ -27,3 +43,162 @@ def posterior_bound(scenario: Scenario, truth: Truth, log: Log, key: jax.Array) 
         scenario.motion, scenario.sensor, capacity, **options, linearize=at_truth(truth)
     )
     return run(ideal, log, scenario.pose, scenario.pose_cov, key).estimate
+
+
+def posterior_bound(
+    scenario: Scenario, truth: Truth, log: Log, steps: Sequence[int] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (K,), and at each the bound (3, 3) on the mean square pose error of all estimators.
+
+    The posterior (van Trees) bound: information is averaged over the worlds and then inverted. The
+    recursion over states needs Q⁻¹, which the noise of a robot seldom has; so the bound is taken
+    over what is random, p = (ξ, ω_1 … ω_t, landmarks) with ξ, ω ~ N(0, 1), x_0 = pose + √P0 ξ and
+    x_t = f(x_{t-1}, u_t, √Q ω_t):
+
+        J_t = diag(1, …, 1, 0, …, 0) + E Σ_{s<=t} (∂h_s/∂p)ᵀ R⁻¹ (∂h_s/∂p),
+        E (x̂_t - x_t)(x̂_t - x_t)ᵀ >= A J_t⁻¹ Aᵀ,     A = E ∂x_t/∂p,
+
+    E over the worlds given, whose number should be large enough for an average. The landmarks are
+    the same unknowns in every run, without a prior: the bound is for estimators that do not know
+    the map beforehand and are unbiased in it (a hybrid bound: Rockah & Schultheiss, IEEE Trans.
+    ASSP 35(3), 1987; van Trees, "Detection, Estimation, and Modulation Theory I", 1968, 2.4.3).
+    Jacobians by the noise are taken at ω = 0, and Q and R are what the models state at the truth
+    and for what was measured; what could be learnt of the state from their dependence on it, or
+    from which landmarks are in view, is not counted. The time is that of the eigenvalues of K
+    matrices of size 3 + W T + L N.
+
+    Args:
+        truth, log: of `simulate`, with a leading axis over runs; identities known.
+        steps: counted from 0, default those of the snapshots.
+    Raises:
+        ValueError: on a world of spurious data or of several robots, arrays without runs, or a
+            measurement noise that is singular.
+    """
+    if scenario.draw is not None or scenario.spurious is not None:
+        raise ValueError("posterior_bound: expected the world of one robot, nothing spurious")
+    if np.ndim(truth.pose) != 3 or np.shape(log.control)[:2] != np.shape(truth.pose)[:2]:
+        raise ValueError("posterior_bound: expected truth and log with a leading axis over runs")
+    count, total = truth.pose.shape[:2]
+    at = snapshot_steps(total) if steps is None else np.asarray(steps, int)
+    if at.size == 0 or at.min() < 0 or at.max() >= total:
+        raise ValueError(f"posterior_bound: expected steps within 0 and {total - 1}, got {steps}")
+    found = jax.device_get(jax.jit(jax.vmap(partial(_jacobians, scenario)))(truth, log))
+    start = np.asarray(jax.jit(root_psd)(jnp.asarray(scenario.pose_cov, truth.pose.dtype)))
+    slopes: Any = 0.0
+    information: Any = 0.0
+    for i in range(count):
+        rows = list(_by_parameters(jax.tree.map(lambda leaf, i=i: leaf[i], found), start, at))
+        slopes = slopes + np.stack([slope for slope, _ in rows]) / count
+        information = information + np.stack([gained for _, gained in rows]) / count
+    random = 3 + total * found.by_noise.shape[3]
+    prior = np.diag((np.arange(information.shape[1]) < random).astype(float))
+    return at, np.stack([_inverted(a, prior + j) for a, j in zip(slopes, information, strict=True)])
+
+
+def van_trees(
+    slopes: np.ndarray, jacobians: np.ndarray, noise_covs: np.ndarray, prior: np.ndarray
+) -> np.ndarray:
+    """The posterior Cramér-Rao bound (K, K) on the mean square error of g(p) ∈ Rᴷ, z = h(p) + v.
+
+    E ∂g/∂p (prior + E (∂h/∂p)ᵀ R⁻¹ (∂h/∂p))⁻¹ (E ∂g/∂p)ᵀ, E over draws of p (van Trees 1968, 2.4).
+
+    Args:
+        slopes: ∂g/∂p (draws, K, P); jacobians: ∂h/∂p (draws, M, P).
+        noise_covs: R (M, M), or (draws, M, M).
+        prior: information on p (P, P): P0⁻¹ of a normal prior, 0 of what has none. A direction that
+            nothing tells is left out, and must not matter to g.
+    """
+    weighed = np.linalg.solve(noise_covs, jacobians)
+    gained = (np.swapaxes(jacobians, 1, 2) @ weighed).mean(axis=0)
+    return _inverted(np.mean(slopes, axis=0), prior + gained)
+
+
+class _Jacobians(NamedTuple):
+    """Of one run; rows of measurements are whitened, and zero where nothing was measured."""
+
+    by_pose: Any
+    """(T, 3, 3) of the motion"""
+    by_noise: Any
+    """(T, 3, W) times √Q"""
+    measured: list[tuple[Any, Any, Any]]
+    """by sensor: by the pose (T, M, Z, 3), by the landmark (T, M, Z, L), which one (T, M)"""
+    landmarks: Any
+    """(N, L)"""
+
+
+def _jacobians(scenario: Scenario, truth: Truth, log: Log) -> _Jacobians:
+    motion, dtype = scenario.motion, truth.pose.dtype
+    old = jnp.concatenate([truth.start[None], truth.pose[:-1]])
+    still = jnp.zeros(len(motion.noises), dtype)
+
+    def moved(old: jax.Array, new: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        by_pose, by_noise = derivatives.motion_jacobians(motion, old, u)
+        ahead = motion.step(old, u, still)
+        root = root_psd(motion.noise_cov(old, u))
+        return turned(by_pose, new[:2] - ahead[:2]), by_noise @ root
+
+    by_pose, by_noise = jax.vmap(moved)(old, truth.pose, log.control)
+    sensor = scenario.sensor
+    parts = (
+        [(p.sensor, p.places) for p in sensor.parts]
+        if isinstance(sensor, Suite)
+        else [(sensor, log.scan.tag.shape[1])]
+    )
+    measured, first = [], 0
+    for model, places in parts:
+        size = len(model.measurements)
+
+        def seen(
+            pose: jax.Array, z: jax.Array, tag: jax.Array, valid: jax.Array, model: Any = model
+        ) -> tuple[jax.Array, jax.Array]:
+            landmark = truth.landmarks[tag][: len(model.landmark)]
+            found = derivatives.observe_jacobians(model, pose, landmark)
+            factor = jnp.linalg.cholesky(model.noise_cov(z))
+            white = [jax.scipy.linalg.solve_triangular(factor, by, lower=True) for by in found]
+            return jnp.where(valid, white[0], 0.0), jnp.where(valid, white[1], 0.0)
+
+        z, tag, valid = (leaf[:, first : first + places] for leaf in log.scan)
+        tag = jnp.maximum(tag, 0)
+        by = jax.vmap(jax.vmap(seen, (None, 0, 0, 0)))(truth.pose, z[:, :, :size], tag, valid)
+        measured.append((*by, tag))
+        first += places
+    return _Jacobians(by_pose, by_noise, measured, truth.landmarks)
+
+
+def _by_parameters(
+    found: _Jacobians, start: np.ndarray, at: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """∂x_t/∂p (3, P), and what was gained until then (P, P), at each step of at."""
+    steps, _, width = found.by_noise.shape
+    count, size = found.landmarks.shape
+    map_at = 3 + steps * width
+    slope = np.zeros((3, map_at + count * size))
+    slope[:, :3] = start
+    gained = np.zeros((slope.shape[1],) * 2)
+    kept = {}
+    for t in range(steps):
+        slope = found.by_pose[t] @ slope
+        slope[:, 3 + t * width : 3 + (t + 1) * width] = found.by_noise[t]
+        for by_pose, by_landmark, tag in found.measured:
+            rows = by_pose[t] @ slope
+            for i, place in enumerate(tag[t]):
+                begin = map_at + int(place) * size
+                rows[i, :, begin : begin + by_landmark.shape[3]] += by_landmark[t, i]
+            rows = rows.reshape(-1, slope.shape[1])
+            gained += rows.T @ rows
+        if t in at:
+            kept[t] = slope.copy(), gained.copy()
+    if not np.isfinite(gained).all():
+        raise ValueError("posterior_bound: a measurement noise is not positive definite")
+    return iter([kept[t] for t in at])
+
+
+def _inverted(slope: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """A J⁺ Aᵀ (K, K), J scaled to a unit diagonal, a direction of no information left out."""
+    size = np.sqrt(np.diagonal(information))
+    unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
+    there = values > len(values) * np.finfo(float).eps * values[-1]
+    root = (slope * unit) @ vectors[:, there] / np.sqrt(values[there])
+    bound: np.ndarray = root @ root.T
+    return bound

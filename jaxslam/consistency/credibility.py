@@ -16,7 +16,8 @@ def credibility(
     Args:
         errors: (runs, K, n).
         covs: (runs, K, n, n) as claimed.
-        regular: (runs, K) whether that has an inverse; the others are left out.
+        regular: (runs, K) whether that has an inverse; the others are left out, and so is one
+            that is not positive definite for all that, or an error of 0.
     Returns:
         None unless some step has at least 2n + 2 runs: Σ is made of them.
     """
@@ -32,9 +33,8 @@ def credibility(
             continue
         claimed = np.einsum("ri,ri->r", e, np.linalg.solve(covs[runs, step], e[:, :, None])[..., 0])
         fair = np.einsum("ri,ri->r", e, np.linalg.solve(actual, e.T).T)
-        with np.errstate(divide="ignore"):
-            decibels = 10 * np.log10(claimed / fair)
-        runs, decibels = runs[np.isfinite(decibels)], decibels[np.isfinite(decibels)]
+        there = (claimed > 0) & (fair > 0) & np.isfinite(claimed) & np.isfinite(fair)
+        runs, decibels = runs[there], 10 * np.log10(claimed[there] / fair[there])
         total[:, runs] += [np.abs(decibels), decibels]
         count[runs] += 1
     if not count.any():

@@ -11,6 +11,9 @@ from jaxslam.types import Trace, Truth
 DOF = {"pose": 3, "position": 2, "heading": 1}
 """Blocks of the pose error whose NEES is taken, and the mean of an honest one."""
 
+ROUNDING = 32
+"""A claimed deviation of at most so many ulp of its coordinate is taken for zero."""
+
 
 def pose_error(truth: jax.Array, pose: jax.Array) -> jax.Array:
     """truth - estimate (T, 3), heading wrapped."""
@@ -19,9 +22,18 @@ def pose_error(truth: jax.Array, pose: jax.Array) -> jax.Array:
 
 
 def block_nees(
-    error: jax.Array, own: jax.Array, cov: jax.Array
+    pose: jax.Array, error: jax.Array, own: jax.Array, cov: jax.Array
 ) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """NEES (T,), and where there is one, of the blocks of `DOF` and of the own error."""
+    """NEES (T,), and where there is one, of the blocks of `DOF` and of the own error.
+
+    There is none where the claimed covariance is singular, and none where a claimed deviation is
+    what rounding makes of zero: at most `ROUNDING` ulp of the coordinate, that is of π for the
+    heading and of max(|x|, |y|) for the position. So particles that are copies of one, whose sample
+    covariance is zero but for rounding, have no NEES, instead of one of 1e27.
+
+    Args:
+        pose: (T, 3) as estimated; error, own: (T, 3); cov: (T, 3, 3) as claimed.
+    """
 
     def one(
         errors: jax.Array, cov: jax.Array, scale: jax.Array
@@ -34,7 +46,7 @@ def block_nees(
             "heading": mahalanobis_squared(errors[2:, 0], cov[2:, 2:], scale[2:]),
         }
 
-    return jax.vmap(one)(jnp.stack([error, own], axis=2), cov, _scale(cov))
+    return jax.vmap(one)(jnp.stack([error, own], axis=2), cov, _scale(pose, cov))
 
 
 def mean_pose_nees(
@@ -51,7 +63,7 @@ def mean_pose_nees(
     def one(error: jax.Array, cov: jax.Array, scale: jax.Array) -> tuple[jax.Array, jax.Array]:
         return mahalanobis_leading(error, cov, (DOF["pose"],), scale)[0]
 
-    nees, regular = jax.vmap(one)(pose_error(truth, pose), cov, _scale(cov))
+    nees, regular = jax.vmap(one)(pose_error(truth, pose), cov, _scale(pose, cov))
     count = regular.sum()
     finite = jnp.isfinite(pose).all() & jnp.isfinite(cov).all()
     return nees.sum() / jnp.maximum(count, 1), finite & (count > 0)
@@ -71,8 +83,12 @@ def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> ja
     return jax.vmap(one)(trace.estimate.pose, truth.pose)
 
 
-def _scale(cov: jax.Array) -> jax.Array:
-    """Units (T, 3) in which a pose covariance is judged: x and y, both metres, have one."""
+def _scale(pose: jax.Array, cov: jax.Array) -> jax.Array:
+    """Units (T, 3) in which a pose covariance is judged: x and y, both metres, have one; 0 where
+    it is rounding."""
     variance = jnp.maximum(jnp.diagonal(cov, axis1=1, axis2=2), 0.0)
     spread = jnp.stack([variance[:, :2].max(axis=1)] * 2 + [variance[:, 2]], axis=1)
-    return jnp.where(spread > 0, jnp.sqrt(jnp.where(spread > 0, spread, 1.0)), 0.0)
+    reach = jnp.abs(pose[:, :2]).max(axis=1)
+    size = jnp.stack([reach, reach, jnp.full_like(reach, jnp.pi)], axis=1)
+    there = spread > (ROUNDING * float(jnp.finfo(cov.dtype).eps) * size) ** 2
+    return jnp.where(there, jnp.sqrt(jnp.where(there, spread, 1.0)), 0.0)

@@ -2,8 +2,9 @@
 
 A run's error is compared with the covariance the filter claims for it. With e = truth - estimate,
 heading wrapped, NEES = eᵀ P⁻¹ e has mean dof for an honest filter; it is *not* divided by dof
-anywhere here. While P is singular (a start with P0 = 0) there is no NEES: such steps are left out,
-and counted, never filled with 0. (Bar-Shalom, Li, Kirubarajan 2001, 5.4; Bailey et al. 2006.)
+anywhere here. While P is singular (a start with P0 = 0, or a deviation that is rounding; see
+`block_nees`) there is no NEES: such steps are left out, and counted, never filled with 0.
+(Bar-Shalom, Li, Kirubarajan 2001, 5.4; Bailey et al. 2006.)
 """
 
 from collections.abc import Callable
@@ -24,6 +25,9 @@ from jaxslam.types import Status, Trace, Truth
 
 LANDMARK_DOF = 2
 """of the NEES of one landmark's position."""
+
+KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
+"""What a measurement does for the map; each is counted."""
 
 DROPS = (
     Status.REJECTED,
@@ -82,7 +86,8 @@ def score(
     """
     error = pose_error(truth.pose, trace.estimate.pose)
     cov = trace.estimate.pose_cov
-    nees = block_nees(error, error if own_error is None else own_error, cov)
+    pose = trace.estimate.pose
+    nees = block_nees(pose, error, error if own_error is None else own_error, cov)
     fused = trace.info.status == Status.FUSED
     held = jnp.where(trace.estimate.alive, trace.estimate.tag, -1)
     curves = {f"nees_{block}": nees[block][0] for block in DOF}
@@ -126,10 +131,10 @@ def score(
     sums["autocorrelation"] = _autocorrelation(trace)
     measures["autocorrelation"] = sums["autocorrelation"][0, 0], sums["autocorrelation"][0, 1]
 
-    dropped = trace.info.status[:, :, None] == jnp.asarray(DROPS)[None, None]
+    became = trace.info.status[:, :, None] == jnp.asarray(KEPT + DROPS)[None, None]
     sums |= {
-        reason.name.lower(): count
-        for reason, count in zip(DROPS, dropped.sum(axis=(0, 1)), strict=True)
+        status.name.lower(): count
+        for status, count in zip(KEPT + DROPS, became.sum(axis=(0, 1)), strict=True)
     }
     sums |= _events(trace)
     sums |= {"missed": truth.missed.sum()}

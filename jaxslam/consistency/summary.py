@@ -1,32 +1,29 @@
-"""A campaign's verdict on a filter: averages, bands, intervals, from the scores of its runs."""
+"""What a campaign says of a filter: averages, bands and intervals from the scores of its runs."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from jaxslam.consistency.credibility import credibility
+from jaxslam.consistency.intervals import LEVEL, Measure, interval, positive_interval
 from jaxslam.consistency.nees import DOF
-from jaxslam.consistency.score import DROPS, EVENTS
+from jaxslam.consistency.score import DROPS, EVENTS, KEPT
 from jaxslam.consistency.tally import Tally
-from jaxslam.stats import chi2_quantile, chi2_quantiles, normal_quantile, t_quantile
-
-LEVEL = 0.95
-"""of every band and interval."""
+from jaxslam.consistency.verdict import judge
+from jaxslam.stats import chi2_quantile, chi2_quantiles, normal_quantile
 
 NORMAL = normal_quantile(0.5 + LEVEL / 2)
 
-COUNTS = tuple(status.name.lower() for status in DROPS) + ("missed", "singular_steps") + EVENTS
+COUNTS = tuple(status.name.lower() for status in (*KEPT, *DROPS)) + (
+    *("missed", "singular_steps"),
+    *EVENTS,
+)
 """The sums that are reported as counts."""
 
-
-class Measure(NamedTuple):
-    """A figure over all runs, with its 95 % interval from the spread between runs."""
-
-    value: float
-    low: float
-    high: float
+POSITIVE = ("nees", "nis", "square", "noncredibility")
+"""How the names of measures begin that cannot be negative."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +31,7 @@ class Summary:
     """What a campaign says of one filter."""
 
     verdict: str
-    """consistent, optimistic, pessimistic, diverged or undecided; see `judge`."""
+    """consistent, optimistic, pessimistic, diverged, incomplete or undecided; see `judge`."""
     measures: dict[str, Measure]
     """Each with its interval over the runs; names without a number (nothing to average) are absent.
 
@@ -43,11 +40,11 @@ class Summary:
     landmarks and steps. nis_per_dof (1). coverage_95_pose, _position, _heading: share of steps with
     the truth in the 95 % ellipsoid. noncredibility and inclination [dB] (0). autocorrelation of
     innovations at lag 1 (0). rmse_position [m], rmse_heading_deg [°], rmse_landmarks [m] (final
-    map, unaligned); bound_ratio_position and _heading: those over the posterior Cramér-Rao bound
-    (at least 1). unobservable (3) and rotation_information [1/rad²] (0): the dimension of the
-    filter's unobservable subspace, and what it has learnt of a turn of the whole frame.
-    log_likelihood (mean a run). In a world with spurious data: precision and recall of
-    associations, and false_landmarks; see `associations`.
+    map, unaligned); bound_ratio_position and _heading: those over the conditional Cramér-Rao bound
+    (about 1 at best; see `conditional_bound`). unobservable (3) and rotation_information [1/rad²]
+    (0): the dimension of the filter's unobservable subspace, and what it has learnt of a turn of
+    the whole frame. log_likelihood (mean a run). In a world with spurious data: precision and
+    recall of associations, and false_landmarks; see `associations`.
     """
     nis_band: tuple[float, float] | None
     """95 % band of nis_per_dof from the summed degrees of freedom; None without a measurement."""
@@ -70,12 +67,19 @@ class Summary:
     """(runs,) each run's own average of each measure, NaN where it has none: squares, radians."""
     not_finite_runs: list[int]
     """the numbers of the runs that are not finite; run i has key fold_in(key, i)."""
+    by: tuple[str, ...] = ()
+    """the measures that spoke against the filter, nees_pose and nis_per_dof, if any did"""
+    noticed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """by measure, the averages (at most, at least) that such a campaign notices nine times in ten:
+    what "consistent" says, which means not rejected"""
+    doubts: tuple[str, ...] = ()
+    """sentences that qualify the verdict: most measurements dropped, directions lost"""
 
 
 def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Summary:
     """Averages, bands and verdict from the scores of a campaign (host numbers, float64).
 
-    bound: position [m²] and heading [rad²], (T,) each, the mean bound over the runs.
+    bound: position [m²] and heading [rad²], (T,) each, the mean conditional bound over the runs.
     """
     sums, finite = tally.sums, tally.flags("finite")
     runs = int(finite.sum())
@@ -106,7 +110,9 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
         per_run |= {"noncredibility": shot[0], "inclination": shot[1]}
     measures: dict[str, Measure] = {}
     for name, values in per_run.items():
-        measure = interval(values)
+        bounded = name.startswith(POSITIVE)
+        skewed = name != "nis_per_dof"
+        measure = positive_interval(values, skewed=skewed) if bounded else interval(values)
         if measure is not None:
             measures |= _as_reported(name, measure)
     for name, key, one in (
@@ -122,8 +128,9 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
     nis_band = None
     if total_dof > 0:
         share = float(np.sum(sums["nis"])) / total_dof
-        half = measures["nis_per_dof"].high - measures["nis_per_dof"].value
-        measures["nis_per_dof"] = Measure(share, share - half, share + half)
+        by_runs = measures["nis_per_dof"]
+        scale = share / by_runs.value if by_runs.value > 0 else 1.0
+        measures["nis_per_dof"] = Measure(share, scale * by_runs.low, scale * by_runs.high)
         tail = (1 - LEVEL) / 2
         nis_band = (
             chi2_quantile(tail, total_dof) / total_dof,
@@ -135,8 +142,12 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
         "divergent": int(tally.flags("divergent").sum()),
     }
     counts |= {name: int(value) for name, value in sums.items() if name in COUNTS}
+    verdict = judge(per_run, counts, total_dof)
     return Summary(
-        verdict=judge(measures, counts),
+        verdict=verdict.word,
+        by=verdict.by,
+        noticed=verdict.noticed,
+        doubts=verdict.doubts,
         measures=measures,
         nis_band=nis_band,
         inside=inside,
@@ -150,53 +161,14 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
     )
 
 
-def judge(measures: dict[str, Measure], counts: dict[str, int]) -> str:
-    """The verdict, from the time-averaged NEES of the pose; errors in (x, y, θ), dof 3.
-
-    Each run gives one time average, and runs are independent, so their mean has a t interval
-    although NEES is correlated in time. consistent: 3 lies in the 95 % interval; optimistic: the
-    interval lies above 3; pessimistic: below. diverged: over half of the runs are not finite or
-    divergent. undecided: under two runs have a NEES, or 3 lies in an interval whose half-width
-    exceeds 3, which a few enormous runs make as wide as any.
-    """
-    lost = counts["not_finite"] + counts["divergent"]
-    if lost > 0.5 * (counts["runs"] + counts["not_finite"]):
-        return "diverged"
-    nees = measures.get("nees_pose")
-    if nees is None or not np.isfinite(nees.low):
-        return "undecided"
-    if nees.low > DOF["pose"]:
-        return "optimistic"
-    if nees.high < DOF["pose"]:
-        return "pessimistic"
-    return "consistent" if nees.high - nees.low <= 2 * DOF["pose"] else "undecided"
-
-
-def interval(values: np.ndarray | Sequence[float]) -> Measure | None:
-    """Mean of independent runs with its t interval, NaN left out; None where nothing is left."""
-    there = np.asarray(values, np.float64)
-    there = there[np.isfinite(there)]
-    if there.size == 0:
-        return None
-    mean = float(there.mean())
-    if there.size < 2:
-        return Measure(mean, -np.inf, np.inf)
-    half = t_quantile(0.5 + LEVEL / 2, there.size - 1) * there.std(ddof=1) / np.sqrt(there.size)
-    return Measure(mean, mean - float(half), mean + float(half))
-
-
 def _as_reported(name: str, measure: Measure) -> dict[str, Measure]:
-    """Mean squares become their roots, radians degrees; intervals go by the slope of the root."""
+    """Mean squares become roots, as do the ends of their intervals; radians become degrees."""
     kind, _, what = name.partition("_")
     if kind != "square":
         return {name: measure}
     unit = np.rad2deg(1.0) if what == "heading" else 1.0
-    root = unit * float(np.sqrt(measure.value))
-    half = 0.0
-    if root > 0:
-        half = unit**2 * (measure.high - measure.value) / (2 * root)
     name = "rmse_heading_deg" if what == "heading" else f"rmse_{what}"
-    return {name: Measure(root, root - half, root + half)}
+    return {name: Measure(*(unit * float(np.sqrt(value)) for value in measure))}
 
 
 def _ratio(total: Any, count: np.ndarray) -> np.ndarray:

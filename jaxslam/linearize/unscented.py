@@ -30,9 +30,12 @@ def unscented(alpha: float | None = None) -> Linearizer:
     With n variables and P = L Lᵀ, points at 0 and ±α√n L_j, weights 1/(2α²n) and, for the centre,
     1 - 1/α² for means and that + 3 - α² for covariances (UKF-M: Brossard, Barrau, Bonnabel, "A Code
     for Unscented Kalman Filtering on Manifolds", ICRA 2020). The fit's slope takes the place of the
-    Jacobian, and what it leaves unexplained counts as noise; so the correction is that of a UKF on
-    the whole map, of which sigma points touch only robot and landmark, and P may be singular.
-    As there, a predicted pose and a new landmark are those of the centre. In the charts
+    Jacobian, and what it leaves unexplained counts as noise; so the correction
+    by one measurement is that of a UKF on the whole map, of which sigma points touch only robot and
+    landmark, and P may be singular. A joint update takes the unexplained parts of different
+    measurements for uncorrelated, which in a UKF of the whole scan they are not. The unexplained
+    covariance counts here, as in UKF-M; the authors' own program for SLAM (JUKF) drops it. As
+    there, a predicted pose and a new landmark are those of the centre. In the charts
     `right_invariant` and `left_invariant` this is their UKF on SE_{1+N}(2).
 
     Args:

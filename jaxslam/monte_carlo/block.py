@@ -16,7 +16,7 @@ from jaxslam.monte_carlo.blockwise import Library
 from jaxslam.types import Estimate, Truth
 
 BOUND = "bound"
-"""The name under which a block keeps the sums of the posterior bound, and the divergence limit."""
+"""Under this name a block keeps the sums of the conditional bound, and the divergence limit."""
 
 
 Glimpse = Callable[[str, int, Measure | None], Any]

@@ -19,7 +19,7 @@ from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.linalg import check_count, check_key
 from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
 from jaxslam.monte_carlo.blockwise import Library
-from jaxslam.monte_carlo.candidates import check_dtype, check_fits, fitting_block
+from jaxslam.monte_carlo.candidates import check_dtype, check_fits, check_noise, fitting_block
 from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.pieces import cores, missing
 from jaxslam.monte_carlo.programs import compile_programs
@@ -108,7 +108,8 @@ def monte_carlo(
         devices: of this process; default all of `jax.local_devices()`.
         workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
             accelerator).
-        bound: also take the posterior Cramér-Rao bound of every run, at the price of one more EKF.
+        bound: also take the conditional Cramér-Rao bound of every run (`conditional_bound`), at
+            the price of one more EKF.
         dtype: float32 or float64, of the worlds and so of the filters. With `jax_enable_x64` worlds
             are drawn in float64 and then rounded: both see the same. Default what JAX is set to.
         keep: blocks are saved there as they finish, and those found there are not run again. It
@@ -125,9 +126,10 @@ def monte_carlo(
     Returns:
         Campaign.
     Raises:
-        ValueError: on runs, block or workers below 1, no PRNG key, no devices, no filters, or a
-            filter that does not fit the scenario, before anything is traced; where `keep` holds
-            another campaign, by every difference, or runs beyond those asked for.
+        ValueError: on runs, block or workers below 1, no PRNG key, no devices, no filters, a filter
+            that does not fit the scenario, or a noise that is no covariance, before anything is
+            traced; where `keep` holds another campaign, by every difference, or runs beyond those
+            asked for.
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """
@@ -139,6 +141,7 @@ def monte_carlo(
         raise ValueError("monte_carlo: expected filters by name, at least one")
     for name, candidate in filters.items():
         check_fits(name, candidate, scenario)
+    check_noise(scenario)
     devices = jax.local_devices() if devices is None else list(devices)
     if not devices:
         raise ValueError("monte_carlo: expected at least one device")

@@ -2,15 +2,19 @@
 
 import inspect
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam import programs
 from jaxslam.charts.euclidean import euclidean
+from jaxslam.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.run import run
+from jaxslam.sensors.suite import Suite
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.types import Log, Truth
 
@@ -61,6 +65,47 @@ def rounded(tree: _T, dtype: Any) -> _T:
         lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree
     )
     return out
+
+
+def check_noise(scenario: Scenario) -> None:
+    """Raise ValueError where a model of the scenario states a noise that is no covariance.
+
+    A `noise_cov` that is a function can only be looked at where it is called. That of the motion is
+    called for the start and the first control, that of a sensor, or of each part of a suite, for
+    z = 0 and, where it is no covariance there, for the first landmark as seen from the start.
+    """
+    if not is_concrete(scenario.controls, scenario.pose, scenario.landmarks):
+        return
+    dtype = jnp.result_type(float)
+    pose, control, landmark = (
+        np.asarray(value, dtype)
+        for value in (scenario.pose, _first(scenario.controls), _first(scenario.landmarks))
+    )
+    motion, sensor = scenario.motion, scenario.sensor
+    _check_stated(
+        motion.name, len(motion.noises), partial(programs.call, motion.noise_cov, (), pose, control)
+    )
+    for model in [part.sensor for part in sensor.parts] if isinstance(sensor, Suite) else [sensor]:
+        size, seen = len(model.measurements), landmark[: len(model.landmark)]
+        try:
+            _check_stated(
+                model.name, size, partial(programs.call, model.noise_cov, (), np.zeros(size, dtype))
+            )
+        except ValueError:
+            z = programs.call(model.observe, (), pose, seen)
+            _check_stated(model.name, size, model.noise_cov, z)
+
+
+def _first(rows: Any) -> np.ndarray:
+    return np.asarray(np.asarray(rows)[0])
+
+
+def _check_stated(name: str, size: int, noise_cov: Callable[..., Any], *at: Any) -> None:
+    try:
+        check_covariance(name, programs.call(noise_cov, (), *at), size)
+    except ValueError as error:
+        said = str(error).removeprefix(f"{name}: ")
+        raise ValueError(f"monte_carlo: noise_cov of {name}: {said}") from None
 
 
 def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:

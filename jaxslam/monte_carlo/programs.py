@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.consistency import Score, mean_pose_nees, own_error_of, posterior_bound, score
+from jaxslam.consistency import Score, conditional_bound, mean_pose_nees, own_error_of, score
 from jaxslam.monte_carlo.block import Programs, numbers
 from jaxslam.monte_carlo.blockwise import Blockwise
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
@@ -86,7 +86,7 @@ def compile_programs(
 
     def least(key: jax.Array, which: jax.Array, world: tuple[Truth, Log]) -> dict[str, jax.Array]:
         def one(i: jax.Array, truth: Truth, log: Log) -> jax.Array:
-            return posterior_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov
+            return conditional_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov
 
         cov = jax.vmap(one)(which, *world)
         position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)

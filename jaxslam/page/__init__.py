@@ -7,7 +7,8 @@ import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 
-from jaxslam.consistency import DOF, LEVEL, Summary
+from jaxslam.consistency import DOF, LEVEL, Summary, power_of
+from jaxslam.consistency.verdict import TESTS
 from jaxslam.monte_carlo import Campaign
 from jaxslam.page.style import CSS, POLICY
 from jaxslam.page.text import (
@@ -24,13 +25,14 @@ from jaxslam.plot import Figure, describe, png
 __all__ = ["VERDICTS", "page"]
 
 VERDICTS = {
-    "consistent": ("✓", f"{DOF['pose']} lies in the interval of the mean pose NEES"),
-    "optimistic": ("▲", "the interval lies above: covariances are claimed too small"),
-    "pessimistic": ("▼", "the interval lies below: covariances are claimed too large"),
+    "consistent": ("✓", "neither interval excludes honesty, which is no proof of it"),
+    "optimistic": ("▲", "an interval lies above: covariances are claimed too small"),
+    "pessimistic": ("▼", "an interval lies below: covariances are claimed too large"),
     "diverged": ("✕", "over half of the runs are not finite or divergent"),
+    "incomplete": ("–", "not rejected, but over half of the measurements were dropped"),
     "undecided": (
         "?",
-        "fewer than two runs have a NEES, or the interval holds 3 but is wider than ± 3",
+        "fewer than two runs have a NEES, or not even twice the honest one would be rejected",
     ),
 }
 """Each verdict with its sign and its meaning."""
@@ -116,23 +118,34 @@ def page(
 
 
 def _verdicts(campaign: Campaign) -> str:
-    """One line a filter: name, badge, and the pose NEES it was judged by."""
+    """One line a filter: name, badge, what it was judged by, and what qualifies it."""
     out = []
     for name, summary in campaign.filters.items():
-        nees = summary.measures.get("nees_pose")
-        said = f"pose NEES {cell(nees)}" if nees else "no pose NEES"
+        there = [key for key in TESTS if key in summary.measures]
+        said = [f"{TESTS[key]} {cell(summary.measures[key])}" for key in there]
+        power = power_of(summary.noticed)
+        if power and summary.verdict in ("consistent", "incomplete", "undecided"):
+            said.append(f"not rejected; {power}")
+        said += summary.doubts
+        lines = "".join(f'<span class="why">{line}</span>' for line in said or ["no pose NEES"])
         out.append(
-            f'<li><span class="name">{breakable(name)}</span>{_badge(summary.verdict)}'
-            f'<span class="why">{said}</span></li>'
+            f'<li><span class="name">{breakable(name)}</span>{_badge(summary.verdict, summary)}'
+            f"{lines}</li>"
         )
     return "\n".join(out)
 
 
-def _badge(verdict: str) -> str:
+def _badge(verdict: str, summary: Summary | None = None) -> str:
+    """The verdict, and of a summary which tests spoke; grey and with an asterisk in doubt."""
     sign, meaning = VERDICTS.get(verdict, ("·", ""))
+    doubts = summary.doubts if summary is not None else ()
     kind = verdict if verdict in VERDICTS else "undecided"
+    if doubts and verdict == "consistent":
+        sign, kind = "✓*", "undecided"
+    spoke = ", ".join(TESTS[test] for test in (summary.by if summary is not None else ()))
+    title = "; ".join([meaning, *doubts, *[f"by {spoke}"] * bool(spoke)])
     return (
-        f'<span class="badge {kind}" title="{escape(meaning)}"><span aria-hidden="true">{sign}'
+        f'<span class="badge {kind}" title="{escape(title)}"><span aria-hidden="true">{sign}'
         f"</span> {escape(verdict)}</span>"
     )
 
@@ -141,7 +154,7 @@ def _measures(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
     """Measures × filters; published figures under our own."""
     summaries = campaign.filters
     head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in summaries)
-    verdicts = "".join(f"<td>{_badge(s.verdict)}</td>" for s in summaries.values())
+    verdicts = "".join(f"<td>{_badge(s.verdict, s)}</td>" for s in summaries.values())
     body = [_row("verdict", "consistent", verdicts)]
     for key, label, honest in table:
         published = [campaign.published.get(name, {}).get(key) for name in summaries]
@@ -225,12 +238,15 @@ def _conventions(campaign: Campaign) -> str:
     return f"""<p><strong>NEES</strong> = eᵀP⁻¹e is <em>not</em> divided by its degrees of freedom,
 which are the honest value: {DOF["pose"]} for the pose, {DOF["position"]} for the position,
 {DOF["heading"]} for the heading. Steps with a singular P have none, and are counted.
-<strong>±</strong> is half the {percentage(LEVEL)} interval of the mean over independent runs
-(Student’s t); hold the pointer over a number for its ends. <strong>Honest</strong> is what a filter
-shows whose covariances are right. A run is <strong>divergent</strong> when its final position
-error exceeds {campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth.</p>
-<p>The <strong>verdict</strong> goes by the pose NEES averaged over time, one number a run, and its
-{percentage(LEVEL)} interval over the runs:</p>
+<strong>±</strong> is half the {percentage(LEVEL)} interval of the mean over independent runs; hold
+the pointer over a number for its ends, which stand in brackets where it is lopsided.
+<strong>Honest</strong> is what a filter shows whose covariances are right. A run is
+<strong>divergent</strong> when its final position error exceeds
+{campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth.</p>
+<p>The <strong>verdict</strong> goes by the pose NEES and by NIS / dof, averaged over time, one
+number a run each, and their intervals over the runs, so wide that an honest filter is rejected in
+{percentage(1 - LEVEL)} of campaigns. <em>Noticed</em> is what nine such campaigns in ten would
+reject. An asterisk marks a verdict with a reservation:</p>
 <dl class="meanings">
 {meanings}
 </dl>

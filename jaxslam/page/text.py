@@ -4,16 +4,19 @@ from html import escape
 
 import numpy as np
 
-from jaxslam.consistency import LEVEL, Measure
+from jaxslam.consistency import LEVEL, Measure, lopsided
 
 
 def cell(measure: Measure | None) -> str:
-    """value ± half-width, to two digits of the half-width."""
+    """value ± half-width, to two digits of that, or [low, high] where the interval is lopsided."""
     if measure is None:
         return "–"
     half = (measure.high - measure.low) / 2
-    if not np.isfinite(half):
+    if not np.isfinite(measure.high) and measure.low <= 0:
         return number(measure.value, 4)
+    if lopsided(measure):
+        ends = (number(end, 3) if np.isfinite(end) else "∞" for end in measure[1:])
+        return f"{number(measure.value, 4)} [{', '.join(ends)}]"
     if half == 0:
         return f"{number(measure.value, 4)} ± 0"
     size = max(abs(measure.value), half)
@@ -34,7 +37,7 @@ def number(value: float, digits: int) -> str:
 
 def interval_title(measure: Measure | None) -> str:
     """The attribute that shows a measure's interval under the pointer."""
-    if measure is None or not np.isfinite(measure.low):
+    if measure is None or not np.isfinite(measure.high):
         return ""
     return f' title="{percentage(LEVEL)} interval {measure.low:.5g} to {measure.high:.5g}"'
 

@@ -48,8 +48,8 @@ def nees_figure(campaign: Campaign, *, blocks: Sequence[str] = tuple(DOF)) -> Fi
 
 
 def bound_figure(campaign: Campaign) -> Figure:
-    """RMSE of position and heading over the steps for every filter, above the posterior Cramér-Rao
-    bound where the campaign has one.
+    """RMSE of position and heading over the steps for every filter, above the conditional
+    Cramér-Rao bound where the campaign has one.
 
     Logarithmic where one filter's largest error is over ten times another's.
     """

@@ -1,0 +1,126 @@
+"""A figure averaged over independent runs, with its interval."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.stats import t_quantile
+
+LEVEL = 0.95
+"""of every band and interval."""
+
+SKEW = 1.5
+"""The spread of a run's average NEES is known as badly as that of so many times fewer normals."""
+
+
+class Measure(NamedTuple):
+    """A figure over all runs, with its 95 % interval from the spread between runs."""
+
+    value: float
+    low: float
+    high: float
+
+
+def lopsided(measure: Measure) -> bool:
+    """Whether one side of the interval is over a quarter longer than the other, so that ± would
+    mislead."""
+    sides = sorted((measure.value - measure.low, measure.high - measure.value))
+    return not sides[1] <= 1.25 * sides[0]
+
+
+class Spread(NamedTuple):
+    """The mean m of n positive numbers, and how far from the expectation μ it may lie.
+
+    The statistic is that of Student's t test with the standard error under the hypothesis: when a
+    covariance is claimed c times too small, the NEES of every run, their mean and their deviation s
+    all grow by c, so the deviation that belongs to μ is s μ/m. With u = s/(m √n),
+
+        m/μ - 1 + u²/2 lies within ± q u,     q = t_{1 - (1 - level)/2} with (n - 1)/f dof,
+
+    hence μ between m/(1 + q u - u²/2) and m/(1 - q u - u²/2): never negative, longer above than
+    below, as the average of a skewed quantity is. u²/2 centres the statistic where the skewness is
+    three times s/m, which that of a run's average NEES is about (the χ² of the common factor of its
+    steps has 2, a sum of a constant and such a χ² more). f = `SKEW` accounts for the spread of s of
+    skewed numbers, and 1 is for numbers whose spread is small. Calibrated by simulation:
+    `python -m benchmarks.verdict`.
+    """
+
+    mean: float
+    error: float
+    """u, the relative standard error of the mean; infinite for a single number"""
+    reach: float
+    """q u"""
+
+    @property
+    def above(self) -> float:
+        """m/μ at the lower end of the interval."""
+        return max(1 + self.reach - self.error**2 / 2, 1.0)
+
+    @property
+    def below(self) -> float:
+        """m/μ at its upper end; 0 where it has none."""
+        return max(1 - self.reach - self.error**2 / 2, 0.0)
+
+    @property
+    def low(self) -> float:
+        """The lower end."""
+        return self.mean / self.above
+
+    @property
+    def high(self) -> float:
+        """The upper end; infinite where so few numbers do not bound the mean."""
+        return self.mean / self.below if self.below > 0 else np.inf
+
+
+def spread(
+    values: np.ndarray | Sequence[float], level: float = LEVEL, skewed: bool = True
+) -> Spread | None:
+    """The mean of positive numbers, one an independent run, NaN left out; None without any.
+
+    skewed: f = `SKEW`, else 1; see `Spread`.
+    """
+    there = _numbers(values)
+    if there.size == 0:
+        return None
+    mean = float(there.mean())
+    if there.size < 2:
+        return Spread(mean, np.inf, np.inf)
+    error = float(there.std(ddof=1) / mean / np.sqrt(there.size)) if mean > 0 else 0.0
+    dof = (there.size - 1) / (SKEW if skewed else 1.0)
+    return Spread(mean, error, t_quantile(0.5 + level / 2, dof) * error)
+
+
+def positive_interval(
+    values: np.ndarray | Sequence[float], level: float = LEVEL, skewed: bool = True
+) -> Measure | None:
+    """The mean of positive numbers with the interval of `Spread`; None where there are none.
+
+    Of a single number the interval is all that is positive, (0, ∞).
+    """
+    found = spread(values, level, skewed)
+    if found is None:
+        return None
+    if not np.isfinite(found.error):
+        return Measure(found.mean, 0.0, np.inf)
+    return Measure(found.mean, found.low, found.high)
+
+
+def interval(values: np.ndarray | Sequence[float]) -> Measure | None:
+    """Mean of independent runs with its t interval, NaN left out; None where nothing is left.
+
+    For what may be of either sign; what cannot be negative has `positive_interval`.
+    """
+    there = _numbers(values)
+    if there.size == 0:
+        return None
+    mean = float(there.mean())
+    if there.size < 2:
+        return Measure(mean, -np.inf, np.inf)
+    half = t_quantile(0.5 + LEVEL / 2, there.size - 1) * there.std(ddof=1) / np.sqrt(there.size)
+    return Measure(mean, mean - float(half), mean + float(half))
+
+
+def _numbers(values: np.ndarray | Sequence[float]) -> np.ndarray:
+    there = np.asarray(values, np.float64)
+    return there[np.isfinite(there)]

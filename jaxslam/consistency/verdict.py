@@ -1,0 +1,160 @@
+"""The verdict on a filter: two tests over the runs of a campaign, and their power.
+
+Pose NEES and NIS say different things. The NEES holds the claimed covariance of the pose against
+its error, and answers to everything; but within a run it is correlated in time, so that a run is
+worth a few numbers. The NIS holds innovations against S, is nearly white, so that a run is worth as
+many numbers as it has measurements, and is by far the sharper test of R.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.consistency.intervals import LEVEL, Spread, spread
+from jaxslam.consistency.nees import DOF
+from jaxslam.consistency.score import DROPS, KEPT
+from jaxslam.stats import normal_quantile, truncated_chi2_mean
+from jaxslam.types import Status
+
+TESTS = {"nees_pose": "pose NEES", "nis_per_dof": "NIS / dof"}
+"""The measures that are tested, and how they are called."""
+
+TOLERANCE = 0.01
+"""What an interval does not reach beyond, relative to the honest value, counts as that value."""
+
+POWER = 0.9
+"""How often what is called noticed is noticed."""
+
+
+class Verdict(NamedTuple):
+    """What `judge` says."""
+
+    word: str
+    """consistent, optimistic, pessimistic, diverged, incomplete or undecided"""
+    by: tuple[str, ...] = ()
+    """which tests rejected, by the names of `TESTS`"""
+    noticed: Mapping[str, tuple[float, float]] = {}
+    """by test, (low, high): this campaign would have noticed an average of at most low (0: none)
+    and of at least high (∞: none), with probability `POWER` or more"""
+    doubts: tuple[str, ...] = ()
+    """sentences that qualify the word"""
+
+
+def judge(
+    per_run: Mapping[str, np.ndarray], counts: Mapping[str, int], nis_dof: float = 0.0
+) -> Verdict:
+    """The verdict on a filter from each run's own averages and the counts of the campaign.
+
+    Each run gives one average of the pose NEES over time and one of NIS/dof, and runs are
+    independent. Each average over the runs has an interval (`Spread`) of such a level, √0.95 with
+    two tests and 0.95 with one, that an honest filter of a linear Gaussian problem is rejected in
+    5 % of campaigns. Honest is 3 for the NEES and 1 for the NIS; a gate drops the largest
+    innovations, so if a share ρ failed it, all from `truncated_chi2_mean`(ρ) to 1 is honest.
+
+    optimistic: an interval lies above, covariances are claimed too small; pessimistic: below. If
+    the tests disagree, the NEES decides. consistent: neither rejects, which is no proof: `noticed`
+    says what would have been. undecided: under two runs have a NEES, or neither rejects, but an
+    average NEES of twice the honest one would not have been rejected either. incomplete: neither
+    rejects, but over half of the measurements that arrived were dropped. diverged: over half of the
+    runs are not finite or divergent.
+
+    An interval that lies within 1 % (`TOLERANCE`) of the honest value rejects nothing: a nonlinear
+    filter is never exactly honest, and enough runs would reject any. It changes nothing where the
+    interval is wider than that, as the NIS's is below some 400,000 degrees of freedom.
+
+    Args:
+        per_run: (runs,) nees_pose, nis_per_dof and unobservable, those that there are; NaN for a
+            run without.
+        counts: runs, not_finite, divergent, and measurements by what became of them, as in
+            `Summary.counts`; what is absent counts as 0.
+        nis_dof: the degrees of freedom of all NIS together.
+    """
+    doubts = _doubts(per_run, counts)
+    lost = counts["not_finite"] + counts["divergent"]
+    if lost > 0.5 * (counts["runs"] + counts["not_finite"]):
+        return Verdict("diverged", doubts=doubts)
+    there = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
+    level = LEVEL ** (1 / max(len(there), 1))
+    signs: dict[str, int] = {}
+    noticed: dict[str, tuple[float, float]] = {}
+    wide = True
+    for name, values in there.items():
+        of_nees = name == "nees_pose"
+        found = spread(values, level, skewed=of_nees)
+        assert found is not None
+        honest = (DOF["pose"],) * 2 if of_nees else (_after_gate(counts, nis_dof), 1.0)
+        signs[name], noticed[name] = _side(found, *honest), _noticed(found, *honest)
+        wide = wide and not (of_nees and found.above <= 2)
+    by = tuple(name for name, sign in signs.items() if sign)
+    if by:
+        return Verdict("optimistic" if signs[by[0]] > 0 else "pessimistic", by, noticed, doubts)
+    if wide:
+        return Verdict("undecided", by, noticed, doubts)
+    return Verdict("incomplete" if _starved(counts) else "consistent", by, noticed, doubts)
+
+
+def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
+    """In words what a campaign that rejects nothing would have noticed; "" where it is nothing."""
+    parts = []
+    for name, (low, high) in noticed.items():
+        ends = [f"of {high:.3g} on"] * (high < np.inf) + [f"below {low:.3g}"] * (low > 0)
+        if ends:
+            parts.append(f"a {TESTS[name]} {' or '.join(ends)}")
+    return f"would have been noticed from {', from '.join(parts)}" if parts else ""
+
+
+def _side(found: Spread, low: float, high: float) -> int:
+    """1 where the interval lies above what is honest, -1 below, 0 elsewhere."""
+    if found.low > high and found.high > high * (1 + TOLERANCE):
+        return 1
+    return -1 if found.high < low and found.low < low / (1 + TOLERANCE) else 0
+
+
+def _noticed(found: Spread, low: float, high: float) -> tuple[float, float]:
+    """Averages that are noticed with probability `POWER`, of a relative spread as found.
+
+    An average m is rejected beyond high·(m/μ at the lower end); the mean of which a share `POWER`
+    lies beyond that is z standard errors farther.
+    """
+    margin = normal_quantile(POWER) * found.error
+    least, most = low * found.below, high * max(found.above, 1 + TOLERANCE)
+    return least / (1 + margin), most / (1 - margin) if margin < 1 else np.inf
+
+
+def _after_gate(counts: Mapping[str, int], nis_dof: float) -> float:
+    """The NIS/dof that is honest when all that failed the gate did so by its size."""
+    fused, rejected = counts.get("fused", 0), counts.get("rejected", 0)
+    if not (fused and rejected and nis_dof > 0):
+        return 1.0
+    return truncated_chi2_mean(rejected / (fused + rejected), nis_dof / fused)
+
+
+def _starved(counts: Mapping[str, int]) -> bool:
+    """Whether over half of the measurements were dropped, by a filter that takes measurements."""
+    drops = {name: counts.get(name, 0) for name in map(_name, DROPS)}
+    used, dropped = sum(counts.get(name, 0) for name in map(_name, KEPT)), sum(drops.values())
+    takes_none = not used and dropped == drops["unmatched"]  # dead reckoning
+    return dropped > used and not takes_none
+
+
+def _doubts(per_run: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> tuple[str, ...]:
+    out = []
+    if _starved(counts):
+        drops = {name: counts.get(name, 0) for name in map(_name, DROPS)}
+        dropped = sum(drops.values())
+        every = dropped + sum(counts.get(name, 0) for name in map(_name, KEPT))
+        reasons = ", ".join(f"{count:,} {name}" for name, count in drops.items() if count)
+        out.append(f"{dropped:,} of {every:,} measurements were dropped: {reasons}")
+    free = np.asarray(per_run.get("unobservable", ()), np.float64)
+    free = free[np.isfinite(free)]
+    if free.size and free.mean() < 3:
+        out.append(
+            f"unobservable directions {free.mean():.3g}, where 3 are unless a sensor measures the "
+            "pose in the frame of the map: the filter takes for known what nothing has told it"
+        )
+    return tuple(out)
+
+
+def _name(status: Status) -> str:
+    return status.name.lower()
