@@ -15,8 +15,6 @@ from jaxslam.protocols import Pairs, Prediction
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 EUCLIDEAN = charts.euclidean()
 OPTIONS = {"window": 20, "cluster": 6, "least": 4}
 

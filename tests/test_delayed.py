@@ -303,7 +303,7 @@ def driven(filter, log, **options):
 
 
 @pytest.fixture(scope="module", params=list(KINDS))
-def drive(request, quick_compilation):
+def drive(request):
     scenario = world(request.param)
     truth, log = jaxslam.simulate(scenario, jax.random.key(2))
     return scenario, truth, log, driven(filter_of(scenario), log)
@@ -345,7 +345,7 @@ def test_the_covariance_stays_positive(drive):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_filter_is_honest(kind, quick_compilation):
+def test_the_filter_is_honest(kind):
     scenario = world(kind)
     campaign = monte_carlo(scenario, {"delayed": filter_of(scenario)}, 40, jax.random.key(5))
     found = campaign.filters["delayed"]
@@ -367,7 +367,7 @@ def small(kind, **options):
     return scenario, delayed_slam(scenario.motion, scenario.sensor, capacity, **options)
 
 
-def test_a_full_map_refuses_and_says_so(quick_compilation):
+def test_a_full_map_refuses_and_says_so():
     scenario, filter = small("rays", capacity=1)
     _, log = jaxslam.simulate(scenario, jax.random.key(0))
     trace = driven(filter, log)
@@ -377,7 +377,7 @@ def test_a_full_map_refuses_and_says_so(quick_compilation):
     assert trace.final.counts.promoted == 1
 
 
-def test_spurious_bearings_move_no_robot_and_empty_scans_neither(quick_compilation):
+def test_spurious_bearings_move_no_robot_and_empty_scans_neither():
     """Random bearings make no landmark, so all is as without them, to the bit."""
     scenario, filter = small("rays")
     _, log = jaxslam.simulate(scenario, jax.random.key(0))
@@ -407,7 +407,7 @@ def test_spurious_bearings_move_no_robot_and_empty_scans_neither(quick_compilati
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_float32_finds_the_landmarks(kind, quick_compilation):
+def test_float32_finds_the_landmarks(kind):
     scenario, filter = small(kind)
     truth, log = jaxslam.simulate(scenario, jax.random.key(1))
     narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, log)
@@ -421,7 +421,7 @@ def test_float32_finds_the_landmarks(kind, quick_compilation):
     np.testing.assert_allclose(trace.estimate.pose, truth.pose, atol=0.2)
 
 
-def test_gradients_reach_the_noise_and_are_finite(quick_compilation):
+def test_gradients_reach_the_noise_and_are_finite():
     scenario, _ = small("circles")
     _, log = jaxslam.simulate(scenario, jax.random.key(1))
 
@@ -437,7 +437,7 @@ def test_gradients_reach_the_noise_and_are_finite(quick_compilation):
     np.testing.assert_allclose(both(at)[1], by_differences, rtol=1e-4)
 
 
-def test_without_names_intersections_find_the_landmarks(quick_compilation):
+def test_without_names_intersections_find_the_landmarks():
     """Every bearing may be of any landmark; the names in the log are not looked at."""
     scenario = world("rays")
     gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)

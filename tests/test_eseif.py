@@ -17,8 +17,6 @@ from jaxslam.scenarios.view import between_ranges
 from jaxslam.simulate import simulate
 from jaxslam.types import Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(0)
 P0 = np.diag([0.01, 0.01, 0.005]) ** 2
 COUNT, STEPS, RUNS = 36, 60, 12

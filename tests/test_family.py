@@ -70,7 +70,7 @@ def test_what_draws_instead_of_linearizing_fits_scenarios(scenario):
 
 
 @pytest.fixture(scope="module", params=CURES + VICTIMS)
-def watched(request, quick_compilation):
+def watched(request):
     """A filter of the family, 80 steps of the loop, and its watch after each."""
     trace = drive(drawn(loop, 80), request.param, watch=True, probe=lambda s: s.watch)
     return request.param, trace
@@ -94,7 +94,7 @@ def test_cures_keep_three_directions_unobservable_and_the_others_two(watched):
 
 
 @pytest.fixture(scope="module")
-def still(quick_compilation):
+def still():
     """Standard deviation of the heading (T,) on `stationary`, by filter."""
     out = {}
     for name in family.FILTERS:
@@ -169,7 +169,7 @@ def test_all_variants_have_the_process_noise_of_the_standard_filter():
 
 
 @pytest.mark.parametrize("name", ["oc", "robocentric", "ukf_right", "square_root"])
-def test_gradients_are_finite_from_a_start_that_is_known_exactly(name, quick_compilation):
+def test_gradients_are_finite_from_a_start_that_is_known_exactly(name):
     """By both noises, through predictions, corrections and births, P0 = 0."""
     world = worlds.ring(steps=3)
     world = dataclasses.replace(world, landmarks=world.landmarks[:2])
@@ -240,7 +240,7 @@ def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
 # --- canonical form -----------------------------------------------------------------------------
 
 
-def test_information_filters_stand_beside_the_family(quick_compilation):
+def test_information_filters_stand_beside_the_family():
     """All active, they are the EKF by other numbers; what they do not know of is left out."""
     world = worlds.ring(steps=12)
     world = dataclasses.replace(world, pose_cov=np.diag([0.01, 0.02, 0.003]))

@@ -16,7 +16,6 @@ from jaxslam.run import run
 from jaxslam.simulate import simulate
 from jaxslam.types import Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(5)
 MOUNT = np.array([0.1, -0.05, 0.3])  # of worlds.ring
 R = np.diag([0.05, 0.02]) ** 2

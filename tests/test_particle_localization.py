@@ -15,7 +15,6 @@ from jaxslam.filters import cloud, fastslam, localization, particle_localization
 from jaxslam.sensors import Part, suite
 from jaxslam.types import Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(5)
 WORLD = worlds.ring(100)
 MOUNT = (0.1, -0.05, 0.3)
@@ -144,7 +143,7 @@ def test_absolute_sensors_of_a_suite_weigh_too():
 
 
 @pytest.fixture(scope="module")
-def carried(quick_compilation):
+def carried():
     """A robot anywhere, put down elsewhere after 40 steps: error [m] (runs, T), both filters."""
     first, second = (
         history(40, pose, seed) for pose, seed in (((0.5, 1.0, 2.0), 1), ((1.5, 2.5, -2.0), 2))

@@ -16,8 +16,6 @@ from jaxslam.linearize import unscented
 from jaxslam.protocols import Basis
 from jaxslam.types import Log, Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 MOTION = motion.increment(np.diag([0.02, 0.02]) ** 2)
 NOISE = np.array([[0.01**2]])
 POINTS = np.array([[4.0, 2.0], [3.0, -3.0], [7.0, 4.0]])

@@ -18,8 +18,6 @@ from jaxslam.scenarios import (
 )
 from jaxslam.simulate import simulate
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def draw(world, seed=0):
     return jax.jit(partial(simulate, world))(jax.random.key(seed))

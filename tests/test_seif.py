@@ -17,8 +17,6 @@ from jaxslam.scenarios.view import between_ranges
 from jaxslam.simulate import simulate
 from jaxslam.types import Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(0)
 P0 = np.diag([0.1, 0.1, 0.05]) ** 2
 COUNT = 36

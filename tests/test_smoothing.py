@@ -18,8 +18,6 @@ from jaxslam.smoothing.batch_map import Ending
 from jaxslam.stats import chi2_band
 from jaxslam.types import Log, Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(0)
 
 

@@ -17,8 +17,6 @@ from jaxslam.simulate import Scenario, simulate
 from jaxslam.spurious import Spurious
 from jaxslam.types import Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 EYES = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
 LASER = sensors.relative_position(np.diag([0.04, 0.06]) ** 2, mount=(-0.2, 0.0, 3.0))
 COMPASS = sensors.compass([[0.03**2]])

@@ -18,8 +18,6 @@ from jaxslam.sensors import Part, suite
 from jaxslam.simulate import simulate
 from jaxslam.types import Log, Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 Q = np.diag([0.01, 0.01]) ** 2
 R1, R2 = np.diag([0.05, 0.02]) ** 2, np.diag([0.08, 0.03]) ** 2
 MOUNT = (0.1, -0.05, 0.3)

@@ -14,8 +14,6 @@ from jaxslam.linearize.unscented import by_variables, regress
 from jaxslam.run import run
 from jaxslam.simulate import simulate
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def curved(xi):
     return jnp.stack([xi[0] ** 2 + xi[1], jnp.sin(xi[1]) * jnp.exp(xi[0]) - 0.3 * xi[0] * xi[2]])

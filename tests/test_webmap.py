@@ -14,8 +14,6 @@ from jaxslam.motion.substeps import substeps
 from jaxslam.scenarios.webmap import webmap
 from jaxslam.simulate import simulate
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 Q = np.array([[0.04, 0.003], [0.003, 0.01]])
 COUNT = 3
 # name: the model, and (n, U) controls of it
@@ -143,7 +141,7 @@ def test_a_bad_count_is_refused(count):
 
 
 @pytest.fixture(scope="module")
-def scenario(quick_compilation):
+def scenario():
     return webmap()
 
 

@@ -4,15 +4,12 @@ from functools import partial
 
 import jax
 import numpy as np
-import pytest
 from reference.robocentric import Robocentric
 
 from jaxslam.family import FILTERS
 from jaxslam.run import run
 from jaxslam.scenarios import loop
 from jaxslam.simulate import simulate
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def test_a_run_is_that_of_the_plain_filter():
