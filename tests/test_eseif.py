@@ -43,7 +43,7 @@ def logs():
         pose_cov=1e-30 * np.eye(3),
     )
     keys = jax.random.split(jax.random.key(2), RUNS)
-    first = jax.jit(functools.partial(simulate, silent))(keys[0])
+    first = simulate(silent, keys[0])
     rest = jax.jit(jax.vmap(functools.partial(simulate, scene)))(keys)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
 

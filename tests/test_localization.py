@@ -32,7 +32,7 @@ def here(**options):
 
 
 def driven(filter, log):
-    return jax.jit(lambda log: run(filter, log, jnp.asarray(START), jnp.asarray(SPREAD), KEY))(log)
+    return run(filter, log, jnp.asarray(START), jnp.asarray(SPREAD), KEY)
 
 
 def slam_in_a_known_map(scenario, log, chart_name, options):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import association, motion, resampling, run, sensors, simulate
+from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.filters import cloud, fastslam, localization, particle_localization
 from jaxslam.sensors import Part, suite
 from jaxslam.types import Scan, Status
@@ -28,15 +27,17 @@ def of(count, sensor=WORLD.sensor, move=WORLD.motion, **options):
 
 def drive(filter, log, pose=(0.0, 0.0, 0.0), cov=None):
     cov = np.zeros((3, 3)) if cov is None else cov
-    return jax.jit(lambda log, key: run(filter, log, pose, cov, key))(log, KEY)
+    return jax.device_get(run(filter, log, pose, cov, KEY))
 
 
 def history(steps, pose=(0.0, 0.0, 0.0), seed=1, sensor=WORLD.sensor):
-    """Truth and log of so many steps of the ring from a pose."""
+    """Truth and log of so many steps of the ring from a pose; one program draws them all."""
     world = dataclasses.replace(
-        WORLD, controls=np.asarray(WORLD.controls)[:steps], pose=pose, sensor=sensor
+        WORLD, controls=np.asarray(WORLD.controls)[:40], pose=pose, sensor=sensor
     )
-    return jax.jit(partial(simulate, world))(jax.random.key(seed))
+    truth, log = worlds.draw(world, seed)
+    path = truth._replace(pose=truth.pose[:steps])
+    return path, jax.tree.map(lambda leaf: leaf[:steps], log)
 
 
 # --- the right posterior ------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def world(steps=40):
     scene = dataclasses.replace(
         cloister(steps), visible=between_ranges(0.0, 2.2), places=8, pose_cov=P0
     )
-    return scene, jax.jit(functools.partial(simulate, scene))(jax.random.key(1))[1]
+    return scene, simulate(scene, jax.random.key(1))[1]
 
 
 @functools.cache
@@ -180,7 +180,7 @@ def test_with_all_active_it_is_the_eif():
     scene, log = world()
     eif = filters.eif_slam(scene.motion, scene.sensor, COUNT)
     sparse = filters.seif(scene.motion, scene.sensor, COUNT, active=99, links=COUNT - 1)
-    a, b = (jax.jit(lambda log, f=f: run(f, log, scene.pose, P0, KEY))(log) for f in (eif, sparse))
+    a, b = (run(f, log, scene.pose, P0, KEY) for f in (eif, sparse))
     np.testing.assert_allclose(a.estimate.pose, b.estimate.pose, atol=1e-8)
     np.testing.assert_allclose(a.estimate.pose_cov, b.estimate.pose_cov, atol=1e-8)
     np.testing.assert_allclose(a.info.nis, b.info.nis, rtol=1e-6, atol=1e-8)

@@ -202,7 +202,7 @@ def steady_ring(steps=12):
 @cache
 def drawn(make, steps, seed=4):
     world = make(steps)
-    truth, log = jax.device_get(jax.jit(partial(simulate, world))(jax.random.key(seed)))
+    truth, log = jax.device_get(simulate(world, jax.random.key(seed)))
     return world, truth, log
 
 
@@ -277,7 +277,7 @@ def test_it_ends_where_the_filter_ends(make, options):
     """The last pose and the map, with all covariances: births, gates and priors as the filter has
     them; and no pose is known worse than before the rest of the log came."""
     world = make()
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(6))
+    _, log = simulate(world, jax.random.key(6))
     size = len(world.landmarks)
     ekf = filters.ekf_slam(world.motion, world.sensor, size, update="joint", **options)
 

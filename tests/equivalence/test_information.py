@@ -1,6 +1,7 @@
 """The canonical form is the same filter: EIF-SLAM against the EKF, number by number."""
 
 import dataclasses
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -24,21 +25,30 @@ def world(steps=60, **changes):
     return dataclasses.replace(cloister(steps), **changes)
 
 
-def driven(filter, scene, log, dtype=None):
-    if dtype is not None:
-        log = jax.tree.map(
-            lambda leaf: leaf.astype(dtype) if leaf.dtype == jnp.float64 else leaf, log
-        )
-    return jax.jit(lambda log: run(filter, log, scene.pose, scene.pose_cov, KEY))(log)
+@cache
+def drawn(steps=60):
+    """A log of the world, for all tests that change no model."""
+    return jax.device_get(simulate(world(steps), jax.random.key(1)))[1]
+
+
+@cache
+def pair(gate=None):
+    """The two filters of 36 landmarks, for all tests; the floor is of a singular start alone."""
+    scene = world()
+    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint", gate=gate)
+    return ekf, filters.eif_slam(scene.motion, scene.sensor, 36, gate=gate, floor=1e-3)
+
+
+def driven(filter, scene, log, dtype=np.float64, pose_cov=None):
+    cov = scene.pose_cov if pose_cov is None else pose_cov
+    inputs = jax.tree.map(np.asarray, (log, scene.pose, cov))
+    inputs = jax.tree.map(lambda x: x.astype(dtype) if x.dtype == np.float64 else x, inputs)
+    return run(filter, *inputs, KEY)
 
 
 @pytest.mark.parametrize("gate", [None, 6.0])
 def test_eif_is_the_ekf(gate):
-    scene = world()
-    _, log = simulate(scene, jax.random.key(1))
-    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint", gate=gate)
-    eif = filters.eif_slam(scene.motion, scene.sensor, 36, gate=gate)
-    a, b = driven(ekf, scene, log), driven(eif, scene, log)
+    a, b = (driven(filter, world(), drawn()) for filter in pair(gate))
     for name in ("pose", "pose_cov", "points", "point_covs", "alive", "tag"):
         np.testing.assert_allclose(
             getattr(b.estimate, name), getattr(a.estimate, name), rtol=0, atol=1e-8, err_msg=name
@@ -61,12 +71,9 @@ def test_eif_is_the_ekf(gate):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_certain_start_gets_the_floor(dtype):
     """P0 = 0 has no inverse: the filter is the EKF that starts with floor² I."""
-    scene = world(20, pose_cov=np.zeros((3, 3)))
-    _, log = simulate(scene, jax.random.key(1))
-    eif = filters.eif_slam(scene.motion, scene.sensor, 36, floor=1e-3)
-    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint")
-    softer = dataclasses.replace(scene, pose_cov=1e-6 * np.eye(3))
-    a, b = driven(ekf, softer, log), driven(eif, scene, log, dtype)
+    ekf, eif = pair()
+    a = driven(ekf, world(), drawn(), pose_cov=1e-6 * np.eye(3))
+    b = driven(eif, world(), drawn(), dtype, pose_cov=np.zeros((3, 3)))
     assert b.estimate.pose.dtype == dtype
     atol = 1e-8 if dtype == jnp.float64 else 1e-3
     np.testing.assert_allclose(b.estimate.pose, a.estimate.pose, atol=atol)
@@ -75,8 +82,7 @@ def test_a_certain_start_gets_the_floor(dtype):
 
 
 def test_full_maps_unknown_tags_and_empty_scans():
-    scene = world(15)
-    _, log = simulate(scene, jax.random.key(1))
+    scene, log = world(15), drawn(15)
     tag = np.array(log.scan.tag)
     tag[:, 0] = -1
     valid = np.array(log.scan.valid)
@@ -102,13 +108,12 @@ def test_other_models():
 
 
 def test_a_lost_definiteness_is_refused_counted_and_recovered():
-    scene = world(6)
-    _, log = simulate(scene, jax.random.key(1))
-    eif = filters.eif_slam(scene.motion, scene.sensor, 36)
-    state = driven(eif, scene, log).final
+    log, eif = drawn(), pair()[1]
+    update = jax.jit(eif.update)
+    state = driven(eif, world(), log).final
     bad = state._replace(omega=state.omega.at[0, 0].set(-1.0))
     scan = jax.tree.map(lambda leaf: leaf[-1], log.scan)
-    after, info = jax.jit(eif.update)(bad, scan, KEY)
+    after, info = update(bad, scan, KEY)
     assert int(after.broken) == 1
     np.testing.assert_array_equal(after.pose, bad.pose)
     assert np.all(np.asarray(info.status)[np.asarray(scan.valid)] == Status.SINGULAR)
@@ -119,16 +124,15 @@ def test_a_lost_definiteness_is_refused_counted_and_recovered():
     slip = size[0] + 1e-12 * size[-1]
     omega[np.ix_(part, part)] -= slip * np.outer(axes[:, 0], axes[:, 0])
     bad = state._replace(omega=jnp.asarray(omega))
-    after, _ = jax.jit(eif.update)(bad, scan, KEY)
+    after, _ = update(bad, scan, KEY)
     assert int(after.broken) == 1
-    after, info = jax.jit(eif.update)(after, scan, KEY)
+    after, info = update(after, scan, KEY)
     assert int(after.broken) == 1
     assert (np.asarray(info.status) == Status.FUSED).any()
 
 
 def test_gradients_and_batches():
-    scene = world(6)
-    _, log = simulate(scene, jax.random.key(1))
+    scene, log = world(6), drawn(6)
 
     def loss(sigma, z):
         sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
@@ -136,13 +140,15 @@ def test_gradients_and_batches():
         changed = log._replace(scan=log.scan._replace(z=z))
         return run(eif, changed, scene.pose, P0, KEY).estimate.pose[-1, :2].sum()
 
-    slope = jax.jit(jax.grad(loss, argnums=(0, 1)))(0.1, log.scan.z)
+    value, slope = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(0.1, log.scan.z)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
     step = 1e-5
-    rise = (loss(0.1 + step, log.scan.z) - loss(0.1 - step, log.scan.z)) / (2 * step)
-    np.testing.assert_allclose(slope[0], rise, rtol=1e-4)
-    both = jax.vmap(loss, (None, 0))(0.1, jnp.stack([log.scan.z, log.scan.z + 0.01]))
-    np.testing.assert_allclose(both[0], loss(0.1, log.scan.z), rtol=1e-10)
+    sigma = np.array([0.1, 0.1 + step, 0.1 - step, 0.1])
+    z = np.stack([log.scan.z] * 3 + [log.scan.z + 0.01])
+    batch = jax.jit(jax.vmap(loss))(sigma, z)
+    np.testing.assert_allclose(slope[0], (batch[1] - batch[2]) / (2 * step), rtol=1e-4)
+    np.testing.assert_allclose(batch[0], value, rtol=1e-10)
+    assert batch[3] != batch[0]
 
 
 @pytest.mark.parametrize(

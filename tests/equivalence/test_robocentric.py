@@ -1,7 +1,5 @@
 """The chart `robocentric` is the filter of Castellanos et al. 2007."""
 
-from functools import partial
-
 import jax
 import numpy as np
 from reference.robocentric import Robocentric
@@ -14,7 +12,7 @@ from jaxslam.simulate import simulate
 
 def test_a_run_is_that_of_the_plain_filter():
     world = loop(steps=60)
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(3))
+    _, log = simulate(world, jax.random.key(3))
     filter = FILTERS["robocentric"](world)
     trace = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, jax.random.key(0)))(
         log
