@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxslam import linalg
+from jaxslam import linalg, programs
 from jaxslam.linalg import check_count
 from jaxslam.types import Info, Status
 
@@ -88,10 +88,10 @@ def calibrate(
         w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
         return w, (w, jnp.where(fused, found.dof, 0).sum())
 
-    step = jax.jit(jax.jacfwd(white, has_aux=True))
+    step = jax.jacfwd(white, has_aux=True)
     path, misfit, dofs, converged = [p], [], [], False
     for _ in range(iterations):
-        slope, (w, dof) = jax.device_get(step(jnp.asarray(p)))
+        slope, (w, dof) = jax.device_get(programs.call(step, (), jnp.asarray(p)))
         slope, w, dof = np.asarray(slope, np.float64), np.asarray(w, np.float64), int(dof)
         if not dof:
             raise ValueError(f"calibrate: no measurement is fused at {p}")

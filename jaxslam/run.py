@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam import programs
 from jaxslam.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Status, Trace, check_log
@@ -25,9 +26,11 @@ def run(
 ) -> Trace:
     """Drive a filter along a log: per row predict with the control, then update with the scan.
 
-    Traceable: wrap it in `jax.jit`, `jax.vmap` over logs and keys, or `jax.grad`. The arithmetic
-    runs in the wider dtype of the log's controls and measurements. A valid measurement that is not
-    finite is refused where its value is concrete, and dropped as `Status.REJECTED` under a trace.
+    Traceable: wrap it in `jax.jit`, `jax.vmap` over logs and keys, or `jax.grad`. Called outside a
+    trace it is compiled once for a structure: another call, with other values or a filter that its
+    factory made anew with other noises, runs the same program (`programs`). The arithmetic runs in
+    the wider dtype of the log's controls and measurements. A valid measurement that is not finite
+    is refused where its value is concrete, and dropped as `Status.REJECTED` under a trace.
 
     Args:
         filter: made by a factory of `jaxslam.filters`.
@@ -46,6 +49,12 @@ def run(
         ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN in controls
             or valid measurements, tags repeated within a scan, or a bad pose_cov.
     """
+    check_run(filter, log, pose, pose_cov)
+    return programs.call(_drive, (filter, probe, checkpoint), log, pose, pose_cov, key)
+
+
+def check_run(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
+    """Raise ValueError unless a log and a start are what `run` takes."""
     check_log(
         log,
         control_size=filter.control_size,
@@ -57,6 +66,18 @@ def run(
     if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
         raise ValueError("run: the initial pose is not finite")
     check_covariance("run: pose_cov", pose_cov, 3)
+
+
+def _drive(
+    filter: Filter,
+    probe: Callable[[Any], Any] | None,
+    checkpoint: bool,
+    log: Log,
+    pose: jax.Array,
+    pose_cov: jax.Array,
+    key: jax.Array,
+) -> Trace:
+    """The steps of `run`."""
     log = jax.tree.map(jnp.asarray, log)
     dtype = jnp.result_type(log.control, log.scan.z)
     log = Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))

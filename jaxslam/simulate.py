@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam import programs
 from jaxslam.angles import wrap
 from jaxslam.linalg import check_covariance, is_concrete, root_psd
 from jaxslam.protocols import Motion, Sensor
@@ -89,9 +90,14 @@ class Scenario:
 def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
     """Draw one world history: true poses and the log of noisy controls or motion, and noisy scans.
 
-    Traceable, so `jax.vmap(partial(simulate, scenario))(keys)` draws a batch. The filters of a
-    campaign all get the same draws.
+    Traceable, so `jax.vmap(partial(simulate, scenario))(keys)` draws a batch. Called outside a
+    trace it is compiled once for a structure, as `run` is. The filters of a campaign all get the
+    same draws.
     """
+    return programs.call(_simulate, (scenario,), key)
+
+
+def _simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
     if scenario.draw is not None:
         return scenario.draw(scenario, key)
     dtype = jnp.result_type(float)

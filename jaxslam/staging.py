@@ -29,38 +29,19 @@ def apart(function: Callable[..., _T], *arguments: Any) -> _T:
         return cast(_T, jax.jit(whole)(*arguments))
 
 
-def compiled(lowered: jax.stages.Lowered, platform: str, *, straight: bool) -> jax.stages.Compiled:
-    """The program, compiled in less time where it is straight; see `straight_jit`."""
-    return lowered.compile(_quick(platform) if straight else None)
+def quick_options(platform: str) -> dict[str, Any] | None:
+    """Options with which XLA compiles a straight program in less time; None where there are none.
 
-
-def straight_jit(function: Callable[..., _T]) -> Callable[..., _T]:
-    """jax.jit(function), compiled in less time: for a straight program, one that spends its own in
-    long passes over arrays, not in a loop of small ones, or runs but once.
-
-    XLA's older emitters of CPU code compile in under half the time. Straight passes run as fast,
-    but the small kernels in a filter's loop half as fast.
+    A straight program spends its time in long passes over arrays, not in a loop of small ones, or
+    runs but once. On a CPU it is compiled without most of LLVM's optimizations.
     """
-    options = _quick(jax.default_backend())
+    return {"xla_backend_optimization_level": 1} if platform == "cpu" else None
+
+
+def quick_jit(function: Callable[..., _T]) -> Callable[..., _T]:
+    """jax.jit(function) for a program that runs but once; see `quick_options`."""
+    options = quick_options(jax.default_backend())
     return cast(Callable[..., _T], jax.jit(function, compiler_options=options))
-
-
-@functools.cache
-def _quick(platform: str) -> dict[str, Any] | None:
-    """What tells XLA to compile quickly; None where there is nothing to tell."""
-    if platform != "cpu":
-        return None
-    quick: dict[str, Any] = {
-        "xla_cpu_use_fusion_emitters": False,
-        "xla_backend_optimization_level": 1,
-    }
-    try:
-        jax.jit(lambda: 0).lower().compile(quick)
-    except jax.errors.JaxRuntimeError as error:
-        if "No such compile option" not in str(error):
-            raise
-        return None
-    return quick
 
 
 def settle(values: _T) -> _T:

@@ -14,7 +14,7 @@ import jaxslam
 PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
-    "angles se2 frames lapack linalg assignment staging stats",
+    "angles se2 frames lapack linalg assignment hoisting programs staging stats",
     "types protocols slots noise derivatives",
     "motion sensors charts linearize association resampling life",
     "filters smoothing run simulate spurious team",

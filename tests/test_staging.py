@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.staging import anywhere, apart, settle, straight_jit, where_any
+from jaxslam.staging import anywhere, apart, quick_jit, settle, where_any
 
 
 def test_settle_is_the_identity_under_every_transformation():
@@ -35,14 +35,14 @@ def test_apart_is_the_function_under_every_transformation():
 
 
 @pytest.mark.parametrize("platform", ["cpu", "gpu"])
-def test_a_straight_program_is_the_function(monkeypatch, platform):
+def test_a_quick_program_is_the_function(monkeypatch, platform):
     """Told how to compile on a CPU, and nothing elsewhere."""
     monkeypatch.setattr(jax, "default_backend", lambda: platform)
     told = []
     jit = jax.jit
     monkeypatch.setattr(jax, "jit", lambda f, **options: told.append(options) or jit(f, **options))
     x = np.array([0.3, 2.0])
-    np.testing.assert_allclose(straight_jit(jax.vmap(jnp.sin))(x), np.sin(x))
+    np.testing.assert_allclose(quick_jit(jax.vmap(jnp.sin))(x), np.sin(x))
     assert bool(told[-1]["compiler_options"]) == (platform == "cpu")
 
 

@@ -20,7 +20,7 @@ from jaxslam.protocols import Candidate, Filter
 from jaxslam.run import run
 from jaxslam.scenarios import SCENARIOS
 from jaxslam.simulate import Scenario, simulate
-from jaxslam.staging import compiled
+from jaxslam.staging import quick_jit
 from jaxslam.types import Estimate, Truth
 
 BLOCKS = "blocks"
@@ -144,8 +144,7 @@ def _campaign_files(
 
     # One program, and arrays of the host: what is computed piece by piece compiles piece by piece.
     key = jax.random.key(seed)
-    program = compiled(jax.jit(first_run).lower(key), jax.default_backend(), straight=True)
-    truth, estimate = jax.device_get(program(key))
+    truth, estimate = jax.device_get(quick_jit(first_run)(key))
     title = f"{scenario.name}, {name}, run 0 of seed {seed}"
     figures = {
         "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),

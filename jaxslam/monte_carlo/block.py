@@ -36,7 +36,9 @@ class Programs:
         devices: int,
         bound: bool,
         glimpse: Glimpse | None = None,
+        dtype: Any = None,
     ) -> None:
+        self.dtype = dtype
         self.key, self.wide, self.devices, self.bound = key, block * devices, devices, bound
         self.glimpse = glimpse
         self.draw: Future[Callable[..., Any]] = Future()
@@ -54,14 +56,17 @@ class Programs:
     def block(
         self, first: int, runs: int, early: bool, tell: bool
     ) -> dict[str, dict[str, np.ndarray]]:
-        """Condensed scores of runs first … first + runs - 1 (at most `wide`), by filter.
+        """Condensed scores of runs first … first + runs - 1 by filter, all within a block.
 
         early: begin while other programs are being compiled, and do not time that. tell: let
         `glimpse` know of each filter as soon as it has run.
         """
         if not early:
             self.limit.result()
-        which = first + jnp.arange(self.wide)
+        # A run has its place in the block by its number, in whatever piece: the same bits.
+        base = first // self.wide * self.wide
+        mine = slice(first - base, first - base + runs)
+        which = base + jnp.arange(self.wide)
         world = jax.block_until_ready(self.draw.result()(self.key, which))
         scores: dict[str, Score] = {}
         held: list[tuple[str, Any]] = []
@@ -69,7 +74,7 @@ class Programs:
         def judge() -> None:
             name, driven = held.pop(0)
             found = jax.device_get(self.scores[name].result()(world[0], driven))
-            scores[name] = jax.tree.map(lambda leaf: leaf[:runs], found)
+            scores[name] = jax.tree.map(lambda leaf: leaf[mine], found)
 
         for name, promised in self.drives.items():
             drive = promised.result()
@@ -80,7 +85,7 @@ class Programs:
                 peek = self.peek.result()
                 estimate = driven.estimate
                 found = peek(world[0].pose, estimate.pose, estimate.pose_cov)
-                nees, defined = (leaf[:runs] for leaf in jax.device_get(found))
+                nees, defined = (leaf[mine] for leaf in jax.device_get(found))
                 self.glimpse(name, runs, interval(nees[defined]))
             held.append((name, driven))
             # A filter is compiled before the score of the one before it.
@@ -93,7 +98,7 @@ class Programs:
         out[BOUND] = {"limit": np.asarray(limit)}
         if self.bound:
             least = jax.device_get(self.least.result()(self.key, which, world))
-            out[BOUND] |= condensed_sums({name: rows[:runs] for name, rows in least.items()})
+            out[BOUND] |= condensed_sums({name: rows[mine] for name, rows in least.items()})
         return out
 
     def promises(self) -> list[Future[Any]]:

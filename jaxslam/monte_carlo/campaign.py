@@ -18,7 +18,7 @@ import numpy as np
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.linalg import check_count
 from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
-from jaxslam.monte_carlo.candidates import check_fits, fitting_block
+from jaxslam.monte_carlo.candidates import check_dtype, check_fits, fitting_block
 from jaxslam.monte_carlo.pieces import cores, missing
 from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.together import gathered, share
@@ -77,6 +77,7 @@ def monte_carlo(
     devices: Sequence[jax.Device] | None = None,
     workers: int | None = None,
     bound: bool = False,
+    dtype: Any = None,
     keep: Keep | None = None,
     progress: Callable[[int, int], None] | None = None,
     glimpse: Glimpse | None = None,
@@ -98,6 +99,8 @@ def monte_carlo(
         workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
             accelerator).
         bound: also take the posterior Cramér-Rao bound of every run, at the price of one more EKF.
+        dtype: float32 or float64, of the worlds and so of the filters. With `jax_enable_x64` worlds
+            are drawn in float64 and then rounded: both see the same. Default what JAX is set to.
         keep: blocks are saved there as they finish, and those found there are not run again.
         progress: called with (runs done, runs) of this process after each block.
         glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
@@ -121,6 +124,7 @@ def monte_carlo(
     devices = jax.local_devices() if devices is None else list(devices)
     if not devices:
         raise ValueError("monte_carlo: expected at least one device")
+    dtype = check_dtype(dtype)
     began = time.perf_counter()
     runs = int(runs)
     if workers is None:
@@ -130,10 +134,10 @@ def monte_carlo(
     for first, count, arrays in keep.blocks() if keep is not None else ():
         _add(tallies, first, count, _by_filter(arrays, names))
     block = block or fitting_block(scenario, filters, devices[0])
-    size = min(int(block), -(-runs // len(devices)))
+    size = int(block)
     kept = tallies[names[0]].pieces()
     todo = share(missing(kept, runs, size * len(devices)))
-    work = _Work(scenario, filters, key, devices, bound, workers, keep, progress, glimpse)
+    work = _Work(scenario, filters, key, devices, bound, workers, keep, progress, glimpse, dtype)
     interrupted = False
     while True:
         try:
@@ -196,6 +200,7 @@ class _Work:
     keep: Keep | None
     progress: Callable[[int, int], None] | None
     glimpse: Glimpse | None
+    dtype: Any
     compile_seconds: float = 0.0
     run_seconds: dict[str, float] = field(default_factory=dict)
 
@@ -204,13 +209,19 @@ class _Work:
         if not todo:
             return
         programs = Programs(
-            list(self.filters), self.key, size, len(self.devices), self.bound, self.glimpse
+            list(self.filters),
+            self.key,
+            size,
+            len(self.devices),
+            self.bound,
+            self.glimpse,
+            self.dtype,
         )
         before = own[next(iter(own))].pieces()
         queue = [
-            (first + at, count)
-            for first, runs in todo
-            for at, count in missing(_within(before, first, runs), runs, programs.wide)
+            piece
+            for first, count in todo
+            for piece in missing([(0, first), *before], first + count, programs.wide)
         ][::-1]
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
@@ -255,11 +266,6 @@ class _Work:
         self.run_seconds = programs.run_seconds()
         if stop is not None:
             raise stop
-
-
-def _within(pieces: Iterable[tuple[int, int]], first: int, runs: int) -> list[tuple[int, int]]:
-    """The pieces within runs first … first + runs - 1, counted from there."""
-    return [(at - first, count) for at, count in pieces if first <= at < first + runs]
 
 
 def _add(

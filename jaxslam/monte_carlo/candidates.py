@@ -2,9 +2,10 @@
 
 import inspect
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.charts.euclidean import euclidean
@@ -12,6 +13,8 @@ from jaxslam.protocols import Candidate, Chart, Estimator, Filter
 from jaxslam.run import run
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.types import Log, Truth
+
+_T = TypeVar("_T")
 
 
 def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: jax.Device) -> int:
@@ -36,6 +39,28 @@ def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: 
     shapes = jax.tree.leaves(jax.eval_shape(one, jax.random.key(0)))
     each = sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
     return int(np.clip(2 ** int(np.log2(max(room / 4 / each, 1.0))), 32, 4096))
+
+
+def check_dtype(dtype: Any) -> Any:
+    """The dtype of a campaign's worlds, or None; ValueError unless JAX is set to have it."""
+    if dtype is None:
+        return None
+    wanted = jnp.dtype(dtype)
+    if wanted not in (jnp.float32, jnp.float64):
+        raise ValueError(f"monte_carlo: expected a dtype float32 or float64, got {wanted}")
+    if wanted == jnp.float64 and jnp.result_type(float) != jnp.float64:
+        raise ValueError("monte_carlo: float64 needs jax.config.update('jax_enable_x64', True)")
+    return wanted
+
+
+def rounded(tree: _T, dtype: Any) -> _T:
+    """The same arrays, those of floating-point numbers in the dtype; None leaves them."""
+    if dtype is None:
+        return tree
+    out: _T = jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree
+    )
+    return out
 
 
 def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:

@@ -5,7 +5,8 @@ from collections.abc import Iterable
 
 
 def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
-    """(first, runs) of the pieces of runs 0 … runs-1 that are not done, none above block, in order.
+    """(first, runs) of the pieces of runs 0 … runs-1 that are not done, in order; each of them lies
+    within runs n block … (n + 1) block - 1 for some n.
 
     done: (first, runs) of what is, in any order; may overlap and reach beyond.
     """
@@ -16,9 +17,10 @@ def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tupl
         gaps.append((at, min(first, runs)))
         at = max(at, first + count)
     return [
-        (first, min(block, end - first))
+        (max(first, begin), min(first + block, end) - max(first, begin))
         for begin, end in gaps
-        for first in range(begin, end, block)
+        if begin < end
+        for first in range(begin // block * block, end, block)
     ]
 
 

@@ -1,12 +1,11 @@
 """The programs of a campaign: a block of runs, drawn, filtered and scored on every device.
 
-Each takes the campaign's key, the numbers of its runs, and every array that models, filters and map
-were made of: one compilation serves all blocks, seeds, noises and map values. Runs are divided over
-the devices with `shard_map`: no device ever waits for another.
+Each takes the campaign's key, the numbers of its runs, and every number that models, filters and
+map were made of (`jaxslam.programs`): one compilation serves all blocks, seeds, noises and map
+values, in this campaign and the next. Runs are divided over the devices with `shard_map`: no device
+ever waits for another.
 """
 
-import hashlib
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -15,15 +14,16 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxslam import programs
 from jaxslam.consistency import Score, mean_pose_nees, own_error_of, posterior_bound, score
 from jaxslam.monte_carlo.block import Programs
-from jaxslam.monte_carlo.candidates import estimator_of
+from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.monte_carlo.pieces import cores
 from jaxslam.protocols import Candidate
 from jaxslam.simulate import Scenario, simulate
-from jaxslam.staging import compiled
+from jaxslam.staging import quick_options
 from jaxslam.types import Estimate, Info, Log, Trace, Truth
 
 
@@ -45,8 +45,18 @@ class _Final(NamedTuple):
     watch: Any
 
 
+class _Made(NamedTuple):
+    """A program that is compiled, or being compiled, and the shapes of its results."""
+
+    program: Future[Callable[..., Any]]
+    shapes: Any
+
+
+_MADE = programs.Kept(programs.ROOM)
+
+
 def compile_programs(
-    programs: Programs,
+    promised: Programs,
     scenario: Scenario,
     filters: Mapping[str, Candidate],
     devices: Sequence[jax.Device],
@@ -56,13 +66,14 @@ def compile_programs(
     Filters whose results have the same shapes share the program that scores them.
     """
     mesh = Mesh(np.asarray(devices), ("runs",))
-    key, wide = programs.key, programs.wide
+    key, wide = promised.key, promised.wide
     block = wide // len(devices)
     # Compiling one program keeps nearly two cores busy; more at once only delay the first.
     pool = ThreadPoolExecutor(max(cores() // 2, 1))
 
     def draw(key: jax.Array, which: jax.Array) -> tuple[Truth, Log]:
-        return jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
+        world: tuple[Truth, Log] = jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
+        return rounded(world, promised.dtype)
 
     def drive(
         candidate: Candidate, key: jax.Array, which: jax.Array, world: tuple[Truth, Log]
@@ -99,6 +110,8 @@ def compile_programs(
 
     def program(
         promise: Future[Any],
+        name: str,
+        objects: tuple[Any, ...],
         function: Callable[..., Any],
         axes: Sequence[Any],
         out: Any,
@@ -107,70 +120,85 @@ def compile_programs(
     ) -> Any:
         """Have the promise kept by it, compiled; the shapes of its results.
 
-        axes: of each argument the axis that goes over runs, or None; or a tree's prefix of such.
-        out: that of the results. straight: see `staging.compiled`.
+        name, objects: of the function and what it is made of, by which it is known again. axes: of
+        each argument the axis that goes over runs, or None; or a tree's prefix of such. out: that
+        of the results. straight: see `staging.quick_options`.
         """
-        own = [_resized(x, block, axis) for x, axis in zip(arguments, axes, strict=True)]
-        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*own)
 
-        def pure(constants: list[Any], *arguments: Any) -> Any:
-            leaves = jax.core.eval_jaxpr(traced.jaxpr, constants, *jax.tree.leaves(arguments))
-            return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+        def make() -> _Made:
+            own = [_resized(x, block, axis) for x, axis in zip(arguments, axes, strict=True)]
+            traced = programs.trace(function, *own)
+            assert traced is not None
 
-        spread = jax.shard_map(
-            pure,
-            mesh=mesh,
-            in_specs=(PartitionSpec(), *map(_spec, axes)),
-            out_specs=_spec(out),
-            check_vma=False,
-        )
-        lowered = jax.jit(spread).lower(traced.consts, *arguments)
-        # Tracing holds Python's lock, compiling does not: the next is traced meanwhile.
-        pool.submit(_compiled, lowered, tuple(devices), traced.consts, straight).add_done_callback(
-            partial(_keep, promise)
-        )
-        return _resized(shapes, wide, out)
+            def pure(numbers: list[Any], *arguments: Any) -> Any:
+                leaves = traced.call(numbers, *jax.tree.leaves(arguments))
+                return jax.tree.unflatten(traced.out, leaves)
+
+            spread = jax.shard_map(
+                pure,
+                mesh=mesh,
+                in_specs=(PartitionSpec(), *map(_spec, axes)),
+                out_specs=_spec(out),
+                check_vma=False,
+            )
+            shapes = [jax.tree.map(_struct, x) for x in arguments]
+            lowered = jax.jit(spread).lower(traced.numbers, *shapes)
+            # Tracing holds Python's lock, compiling does not: the next is traced meanwhile.
+            finished = pool.submit(_compiled, lowered, mesh, traced.numbers, straight)
+            return _Made(finished, _resized(traced.shapes, wide, out))
+
+        leaves, tree = jax.tree.flatten(arguments)
+        shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        known = name, promised.dtype, *map(programs.Same, objects)
+        where = wide, tuple(devices), programs.context()
+        key = (known, tree, shapes, where)
+        made = _MADE.get(key, make)
+        if made.program.cancelled() or (made.program.done() and made.program.exception()):
+            _MADE.drop(key)
+            made = _MADE.get(key, make)
+        made.program.add_done_callback(partial(_keep, promise))
+        return made.shapes
 
     which = jnp.arange(wide)
     try:
-        world = program(programs.draw, draw, (None, 0), 0, key, which, straight=True)
-        if programs.glimpse is not None:
+        world = program(
+            promised.draw, "draw", (scenario,), draw, (None, 0), 0, key, which, straight=True
+        )
+        if promised.glimpse is not None:
             pose = world[0].pose
             steps, size = pose.shape[1:]
             by_time, cov = (
                 jax.ShapeDtypeStruct((steps, wide, *shape), pose.dtype)
                 for shape in ((size,), (size, size))
             )
-            program(programs.peek, peek, (0, 1, 1), 0, pose, by_time, cov, straight=True)
-        alike: dict[Any, Future[Any]] = {}
+            program(
+                promised.peek, "peek", (), peek, (0, 1, 1), 0, pose, by_time, cov, straight=True
+            )
 
         def scored(name: str, driven: Any) -> None:
-            leaves, structure = jax.tree.flatten(driven)
-            kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-            if kind in alike:
-                alike[kind].add_done_callback(partial(_keep, programs.scores[name]))
-            else:
-                alike[kind] = programs.scores[name]
-                program(alike[kind], judge, (0, _BY_TIME), 0, world[0], driven, straight=True)
+            promise = promised.scores[name]
+            axes, made = (0, _BY_TIME), (world[0], driven)
+            program(promise, "judge", (scenario,), judge, axes, 0, *made, straight=True)
 
         # Each filter before the score of the one before it: `Programs.block` wants them so.
         before: tuple[str, Any] | None = None
         for name, candidate in filters.items():
             one = partial(drive, candidate)
-            driven = program(programs.drives[name], one, (None, 0, 0), _BY_TIME, key, which, world)
+            promise, of = promised.drives[name], (scenario, candidate)
+            driven = program(promise, "drive", of, one, (None, 0, 0), _BY_TIME, key, which, world)
             if before is not None:
                 scored(*before)
             before = name, driven
         if before is not None:
             scored(*before)
-        program(programs.least, least, (None, 0, 0), 0, key, which, world)
-        found = programs.least.result()(key, which, programs.draw.result()(key, which))
+        program(promised.least, "least", (scenario,), least, (None, 0, 0), 0, key, which, world)
+        found = promised.least.result()(key, which, promised.draw.result()(key, which))
         ideal = float(found["position"][0, -1]) ** 0.5
         dtype = world[0].pose.dtype
-        for promise in (*programs.drives.values(), *programs.scores.values()):
+        for promise in (*promised.drives.values(), *promised.scores.values()):
             promise.result()
-        programs.complete()
-        programs.limit.set_result(jnp.asarray(_divergence_limit(scenario, ideal, dtype), dtype))
+        promised.complete()
+        promised.limit.set_result(jnp.asarray(_divergence_limit(scenario, ideal, dtype), dtype))
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -211,27 +239,18 @@ def _spec(axes: Any) -> Any:
     )
 
 
-_KEPT: OrderedDict[Any, Any] = OrderedDict()
-_ROOM = 64
-
-
 def _compiled(
-    lowered: jax.stages.Lowered,
-    devices: tuple[jax.Device, ...],
-    constants: list[Any],
-    straight: bool,
+    lowered: jax.stages.Lowered, mesh: Mesh, numbers: list[Any], straight: bool
 ) -> Callable[..., Any]:
-    """The program with its constants, compiled unless the same has been, whatever its constants."""
-    text = hashlib.sha256(lowered.as_text().encode()).digest()
-    # Arguments that nothing reads are not in the text.
-    which = (text, devices, lowered.in_tree, str(lowered.in_avals))
-    kept = _KEPT.get(which)
-    if kept is None:
-        kept = compiled(lowered, devices[0].platform, straight=straight)
-        _KEPT[which] = kept
-        while len(_KEPT) > _ROOM:
-            _KEPT.popitem(last=False)
-    return partial(kept, constants)
+    """The program with its numbers, which are put on every device once."""
+    devices = tuple(mesh.devices.flat)
+    options = quick_options(devices[0].platform) if straight else None
+    run = programs.compiled(lowered, devices, options)
+    return partial(run, jax.device_put(numbers, NamedSharding(mesh, PartitionSpec())))
+
+
+def _struct(leaf: Any) -> Any:
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
 
 
 def _keys(key: jax.Array, i: jax.Array) -> jax.Array:

@@ -140,7 +140,7 @@ def batch_map(
             f"{sensor.free.mean.shape[0]} of its parameters free"
         )
 
-    def estimator(log: Log, key: Array) -> Trace:
+    def solve(log: Log, key: Array) -> Trace:
         history = forward.filtered(filter, log, pose, pose_cov, key)
         log = in_one_width(log)
         kind = log.control.dtype
@@ -201,7 +201,7 @@ def batch_map(
             info = info._replace(exhausted=cut_short)
         return Trace(estimate, info, solved, ())
 
-    return estimator
+    return forward.compiled_once(filter, pose, pose_cov, solve)
 
 
 def _descend(

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from jaxslam import derivatives, linalg
+from jaxslam import derivatives, linalg, programs
 from jaxslam.angles import wrap
 from jaxslam.filters.ekf_slam import ekf_slam
-from jaxslam.protocols import Associate, Filter, Motion, Sensor
-from jaxslam.run import run
+from jaxslam.protocols import Associate, Estimator, Filter, Motion, Sensor
+from jaxslam.run import check_run, run
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.smoothing.chain import Chain, Start, Step
@@ -92,6 +92,18 @@ def filter_of(
     return dataclasses.replace(
         ekf, name=name, init=init, predict=predict, update=update, estimate=estimate
     )
+
+
+def compiled_once(
+    filter: Filter, pose: ArrayLike, pose_cov: ArrayLike, solve: Estimator
+) -> Estimator:
+    """The estimator that refuses what `run` refuses and calls `solve`, compiled as `run` is."""
+
+    def estimator(log: Log, key: Array) -> Trace:
+        check_run(filter, log, pose, pose_cov)
+        return programs.call(solve, (), log, key)
+
+    return estimator
 
 
 def filtered(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike, key: Array) -> History:

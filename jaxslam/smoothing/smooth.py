@@ -61,7 +61,7 @@ def smooth(
     a `Smoothed`.
 
         estimator = smooth(world.motion, world.sensor, 20, world.pose, world.pose_cov)
-        trace = jax.jit(estimator)(log, jax.random.key(0))
+        trace = estimator(log, jax.random.key(0))
 
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`.
@@ -77,7 +77,7 @@ def smooth(
         motion, sensor, capacity, name="smooth", associate=associate, gate=gate, births=births
     )
 
-    def estimator(log: Log, key: Array) -> Trace:
+    def solve(log: Log, key: Array) -> Trace:
         history = forward.filtered(filter, log, pose, pose_cov, key)
         log = in_one_width(log)
         root = jnp.asarray(pose_cov, log.control.dtype)
@@ -91,7 +91,7 @@ def smooth(
         smoothed = Smoothed(*solved, history.trace.estimate)
         return Trace(estimate, counted(history.trace.info, used), smoothed, ())
 
-    return estimator
+    return forward.compiled_once(filter, pose, pose_cov, solve)
 
 
 def solution(

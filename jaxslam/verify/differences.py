@@ -97,7 +97,7 @@ def quotients(
         best = np.where(better, np.take_along_axis(finer, pick, axis=0)[0], best)
         least = np.where(better, candidate, least)
         level = finer
-    return Quotient(*(np.swapaxes(part, 1, 2) for part in (best, least, kink)))
+    return Quotient(best.swapaxes(1, 2), least.swapaxes(1, 2), kink.swapaxes(1, 2))
 
 
 def on_circle(difference: Values, periods: Values) -> Values:

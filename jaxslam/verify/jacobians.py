@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxslam.staging import straight_jit
+from jaxslam.staging import quick_jit
 from jaxslam.verify.differences import Quotient, complex_step, quotients
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples
@@ -131,7 +131,7 @@ class _Evaluator:
     def values(self) -> Callable[..., Any]:
         """Batches of arguments -> values (B, m)."""
         if self.traceable:
-            return _in_chunks(straight_jit(jax.vmap(self.function.call)))
+            return _in_chunks(quick_jit(jax.vmap(self.function.call)))
         return _looped(self.function.call)
 
     @cached_property
@@ -142,7 +142,7 @@ class _Evaluator:
             forward = jax.jacfwd(self.function.call, argnums=self.over)(*arguments)
             return forward, jax.jacrev(self.function.call, argnums=self.over)(*arguments)
 
-        return straight_jit(jax.vmap(both))
+        return quick_jit(jax.vmap(both))
 
     def _autodiff(self, arguments: tuple[Any, ...]) -> dict[str, list[Values | None]]:
         if not self.traceable:
@@ -174,7 +174,7 @@ class _Evaluator:
             first = [jnp.asarray(a[0]) for a in self.arguments]
             try:
                 shaped = self._split(jax.eval_shape(hand, *first))
-                batch: Callable[..., Any] = straight_jit(jax.vmap(hand))
+                batch: Callable[..., Any] = quick_jit(jax.vmap(hand))
             except (jax.errors.JAXTypeError, TypeError) as error:
                 shaped = self._split(hand(*first))  # raises again if it is not about tracing
                 batch = _looped(hand)

@@ -79,7 +79,7 @@ def _compare(evaluation: Evaluation, tolerance: float, float32_tolerance: float)
     away, excess_away, lost = np.zeros_like(gap), np.zeros_like(gap), 0
     if evaluation.quotient is not None:
         value, error, kink = evaluation.quotient
-        away = np.max([np.abs(m - value) for m in evaluation.methods.values()], axis=0)
+        away = np.abs(np.stack(list(evaluation.methods.values())) - value).max(axis=0)
         own = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
         trusted = ((error <= _CONVERGED * own) | (error <= _NOTHING)) & ~kink
         away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaxslam.linalg import check_covariance
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.staging import straight_jit
+from jaxslam.staging import quick_jit
 from jaxslam.verify.jacobians import Evaluated
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples
@@ -51,7 +51,7 @@ def of_motion(motion: Motion, samples: Samples) -> Iterator[Check]:
     yield from _guarded("noise covariance", lambda: _covariances(motion.noise_cov, (pose, u)))
 
     def wrapped() -> str:
-        heading = np.asarray(straight_jit(jax.vmap(motion.step))(pose, u, w))[:, 2]
+        heading = np.asarray(quick_jit(jax.vmap(motion.step))(pose, u, w))[:, 2]
         worst = float(np.max(np.abs(heading)))
         return "" if worst <= np.pi else f"a heading of {worst:.6g} rad is returned"
 
@@ -66,7 +66,7 @@ def of_motion(motion: Motion, samples: Samples) -> Iterator[Check]:
             return there - motion.step(pose, u, w)
 
         return _on_circle(
-            straight_jit(jax.vmap(gap))(pose, u, w), np.array([np.inf, np.inf, 2 * np.pi])
+            quick_jit(jax.vmap(gap))(pose, u, w), np.array([np.inf, np.inf, 2 * np.pi])
         )
 
     yield from _guarded("step(pose, u, w) = step(pose, perturb(u, w), 0)", through_the_control)
@@ -75,9 +75,9 @@ def of_motion(motion: Motion, samples: Samples) -> Iterator[Check]:
 def of_sensor(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check]:
     """Of a sensor: noise, residual, and that `invert` and `observe` undo each other."""
     circle = periods(sensor.measurements)
-    z = np.asarray(straight_jit(jax.vmap(sensor.observe))(*seen.values), np.float64)
+    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*seen.values), np.float64)
     yield from _guarded("noise covariance", lambda: _covariances(sensor.noise_cov, (z,)))
-    residual = straight_jit(jax.vmap(sensor.residual))
+    residual = quick_jit(jax.vmap(sensor.residual))
     other = z[::-1] + np.random.default_rng(0).uniform(-1, 1, z.shape)
     yield from _guarded(
         "the residual is zero at equality",
@@ -103,7 +103,7 @@ def of_sensor(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check
         regular = np.array(["zero" not in label and "= 0" not in label for label in inverse.labels])
         few = tuple(a[regular] for a in inverse.values)
         size = 1 + np.abs(few[0]).max()
-        return _exactly(np.asarray(straight_jit(jax.vmap(again))(*few)) / size)
+        return _exactly(np.asarray(quick_jit(jax.vmap(again))(*few)) / size)
 
     yield from _guarded("observe undoes invert, whatever is free", forth)
     yield from _guarded(
@@ -139,7 +139,7 @@ def _inverted(sensor: Sensor, seen: Samples) -> str:
         gaps = jax.vmap(from_start)(jnp.asarray(mean, pose.dtype)[None] + offsets)
         return jnp.where(jnp.isfinite(gaps), gaps, jnp.inf).min()
 
-    gaps = np.asarray(straight_jit(jax.vmap(gap))(pose, point))
+    gaps = np.asarray(quick_jit(jax.vmap(gap))(pose, point))
     worst = int(np.argmax(gaps))
     if gaps[worst] <= _ROUNDING * (1 + np.abs(pose).max()):
         return ""
@@ -180,7 +180,7 @@ def _wrapped(
 
 
 def _covariances(noise_cov: Callable[..., Any], arguments: tuple[Values, ...]) -> str:
-    covs = np.asarray(straight_jit(jax.vmap(noise_cov))(*arguments))
+    covs = np.asarray(quick_jit(jax.vmap(noise_cov))(*arguments))
     for cov in covs:
         try:
             check_covariance("noise_cov", cov, covs.shape[-1])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxslam.protocols import Sensor
-from jaxslam.staging import straight_jit
+from jaxslam.staging import quick_jit
 from jaxslam.verify.subject import POSE, Argument
 
 Values = NDArray[np.float64]
@@ -76,8 +76,8 @@ def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
     the present one; every coordinate of theirs also takes its hard values.
     """
     rng = np.random.default_rng(seed)
-    embed = straight_jit(jax.vmap(sensor.embed))
-    place = straight_jit(jax.vmap(sensor.invert))
+    embed = quick_jit(jax.vmap(sensor.embed))
+    place = quick_jit(jax.vmap(sensor.invert))
 
     def at(poses: Values, points: Values) -> Values:
         return np.asarray(embed(poses, points), np.float64)
@@ -96,7 +96,7 @@ def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
     mean = np.asarray(sensor.free.mean, np.float64)
     root = np.linalg.cholesky(np.asarray(sensor.free.cov, np.float64)) if len(mean) else mean
     s = mean + rng.normal(size=(count, len(mean))) @ np.reshape(root, (len(mean), len(mean))).T
-    z = np.asarray(straight_jit(jax.vmap(sensor.observe))(pose, landmark), np.float64)
+    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(pose, landmark), np.float64)
     metres = np.array([name.endswith("[m]") for name in sensor.measurements])
     few = slice(0, 4)
     if sensor.landmark:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.linearity import motion_linearity, sensor_linearity
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.staging import straight_jit
+from jaxslam.staging import quick_jit
 from jaxslam.verify import properties, samples, subject
 from jaxslam.verify.jacobians import Evaluated, evaluate
 from jaxslam.verify.judge import judge
@@ -184,7 +184,7 @@ def _typical_linearity(model: Any, examined: Examined) -> float | None:
         return sensor_linearity(model, state[0], state[1], cov).hessian
 
     try:
-        return float(np.median(np.asarray(straight_jit(jax.vmap(index))(*states))))
+        return float(np.median(np.asarray(quick_jit(jax.vmap(index))(*states))))
     except (Exception, SystemExit):  # what is wrong with the model is in the checks
         return None
 

@@ -1,0 +1,265 @@
+"""Programs are compiled once for a structure: another number, object or key compiles nothing."""
+
+import dataclasses
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import family, filters, motion, programs, run, sensors, simulate, smoothing
+from jaxslam.monte_carlo import monte_carlo
+from jaxslam.types import Status
+
+
+@pytest.fixture
+def compilations():
+    """How many programs XLA has compiled so far, as a function."""
+    count = [0]
+
+    def listen(event, seconds, **kwargs):
+        count[0] += event == "/jax/core/compile/backend_compile_duration"
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield lambda: count[0]
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def world(scale):
+    """The ring with other noises, mount, map and start: every number times the scale."""
+    ring = worlds.ring(20)
+    return dataclasses.replace(
+        ring,
+        motion=motion.increment(np.diag([0.01, 0.01]) ** 2 * scale),
+        sensor=sensors.range_bearing(
+            np.diag([0.05, 0.02]) ** 2 * scale, mount=(0.1 * scale, -0.05, 0.3)
+        ),
+        landmarks=np.asarray(ring.landmarks) * scale,
+        controls=np.asarray(ring.controls) * scale,
+        pose=(0.1 * scale, 0.2, 0.3),
+        pose_cov=np.diag([0.1, 0.1, 0.01]) * scale,
+    )
+
+
+@pytest.mark.parametrize("name", family.ALL)
+def test_other_numbers_run_what_is_there(name, compilations):
+    def trace(scale, seed):
+        there = world(scale)
+        truth, log = simulate(there, jax.random.key(seed))
+        method = family.ALL[name](there, gate=9.0 * scale)
+        method = method(truth) if callable(method) else method
+        return run(method, log, there.pose, there.pose_cov, jax.random.key(seed))
+
+    first = trace(1.0, 0)
+    before = compilations()
+    second = trace(1.07, 1)
+    assert compilations() == before
+    assert np.isfinite(np.asarray(second.estimate.pose)).all()
+    assert not np.allclose(first.estimate.pose, second.estimate.pose)
+
+
+def test_a_program_gives_what_the_function_does():
+    """Hoisted numbers stand where they stood: the same trace as under `jax.jit`, to rounding."""
+    there = world(1.0)
+    ekf = worlds.ekf(there, gate=5.991, update="joint")
+    key = jax.random.key(0)
+    truth, log = simulate(there, key)
+    plain = jax.jit(lambda log: run(ekf, log, there.pose, there.pose_cov, key))(log)
+    ours = run(ekf, log, there.pose, there.pose_cov, key)
+    assert jax.tree.structure(plain) == jax.tree.structure(ours)
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(ours), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    drawn = jax.jit(lambda key: simulate(there, key))(key)
+    for a, b in zip(jax.tree.leaves(drawn), jax.tree.leaves((truth, log)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    none = run(worlds.ekf(there, gate=1e-6, update="joint"), log, there.pose, there.pose_cov, key)
+    assert int(none.info.tally(Status.REJECTED).sum()) > int(ours.info.tally(Status.REJECTED).sum())
+
+
+@pytest.mark.parametrize("make", [smoothing.smooth, smoothing.batch_map])
+def test_a_smoother_with_other_numbers(make, compilations):
+    def trace(scale):
+        there = world(scale)
+        _, log = simulate(there, jax.random.key(0))
+        estimator = make(there.motion, there.sensor, 6, there.pose, there.pose_cov)
+        return estimator(log, jax.random.key(0))
+
+    first = trace(1.0)
+    before = compilations()
+    assert not np.allclose(trace(1.07).estimate.pose, first.estimate.pose)
+    assert compilations() == before
+
+
+def test_a_campaign_with_another_key_noise_map_or_more_runs(compilations):
+    def campaign(there, runs, seed):
+        tried = {"ekf": worlds.ekf(there, gate=9.0), "ideal": family.ideal(there)}
+        return monte_carlo(there, tried, runs, jax.random.key(seed), block=4, bound=True)
+
+    same = world(1.0)
+    first = campaign(same, 3, 0)
+    before = compilations()
+    for there, runs, seed in ((same, 3, 1), (same, 40, 0), (world(1.07), 3, 0)):
+        other = campaign(there, runs, seed)
+        assert other.runs == runs
+        assert other.filters["ekf"].measures != first.filters["ekf"].measures
+    assert compilations() == before
+
+
+def test_the_same_objects_are_not_traced_again():
+    traced = []
+
+    def scaled(factor, x):
+        traced.append(factor)
+        return x * factor
+
+    factor, x = np.float64(3.7), jnp.arange(3.0)
+    for _ in range(2):
+        np.testing.assert_allclose(programs.call(scaled, (factor,), x), 3.7 * np.arange(3))
+    assert len(traced) == 1
+    programs.call(scaled, (factor,), x[:2])
+    programs.call(scaled, (np.float64(3.7),), x)
+    assert len(traced) == 3
+    programs.clear()
+    programs.call(scaled, (factor,), x)
+    assert len(traced) == 4
+
+
+def test_within_a_trace_it_is_the_function():
+    def cubed(x):
+        return x**3
+
+    x = jnp.asarray([1.0, 2.0])
+
+    def through(x):
+        return programs.call(cubed, (), x).sum()
+
+    np.testing.assert_allclose(jax.grad(through)(x), 3 * x**2)
+    np.testing.assert_allclose(jax.jit(jax.vmap(through))(x), x**3)
+
+    def of_noise(scale):
+        """The arguments are concrete; what the function closes over is not."""
+        return programs.call(lambda x: scale * x, (), x).sum()
+
+    assert jax.grad(of_noise)(2.0) == 3.0
+    with jax.disable_jit():
+        np.testing.assert_allclose(programs.call(cubed, (), x), x**3)
+
+
+def test_every_kind_of_number_becomes_an_input():
+    """Constants and literals in calls, loops, branches and rules: the same structure for all."""
+
+    def make(s):
+        rows, offset = np.array([[1.5, 0.3], [0.2, 1.3]]) * s, jnp.array([0.3, 0.4]) * s
+
+        @jax.jit
+        def inner(x):
+            return x @ rows * (0.7 * s) + offset[0]
+
+        @jax.custom_jvp
+        def curve(x):
+            return jnp.tanh(x * (0.9 * s))
+
+        curve.defjvp(lambda p, t: (curve(p[0]), t[0]))
+
+        @jax.custom_batching.custom_vmap
+        def batch(x):
+            return x + 0.11 * s
+
+        batch.def_vmap(lambda size, batched, x: (batch(x), batched[0]))
+
+        @jax.checkpoint
+        def body(x, row):
+            x = inner(x) * row
+            x = jax.lax.cond(
+                x[0] > 0.21 * s, lambda x: inner(x) - 0.31 * s, lambda x: x + offset * 0.41 * s, x
+            )
+            x = jax.lax.while_loop(
+                lambda x: x[0] > 1.23 * s, lambda x: x * jnp.array([0.51, 0.61]) * s, x
+            )
+            return batch(curve(x)), x.sum()
+
+        return lambda x: jax.lax.scan(body, x, jnp.array([1.7, 0.71, 1.3]) * s)
+
+    x = jnp.array([0.6, 0.8])
+    texts = set()
+    for s in (1.01, 0.97):
+        traced = programs.trace(make(s), x)
+        ours = jax.tree.unflatten(traced.out, jax.jit(traced.call)(traced.numbers, x))
+        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(make(s)(x)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-14)
+        texts.add(jax.jit(traced.call).lower(traced.numbers, x).as_text())
+    assert len(texts) == 1
+
+
+def test_what_says_how_large_something_is_stays():
+    texts = {
+        jax.jit(traced.call).lower(traced.numbers, 1.0).as_text()
+        for traced in (programs.trace(lambda x, n=n: jnp.zeros(n) + x, 1.0) for n in (2, 3))
+    }
+    assert len(texts) == 2
+
+
+def test_the_least_recently_used_is_dropped():
+    kept, made = programs.Kept(2), []
+
+    def get(key):
+        return kept.get(key, lambda: made.append(key) or key)
+
+    for key in (1, 2, 1, 3, 1):
+        assert get(key) == key
+    assert made == [1, 2, 3]
+    assert len(kept) == 2
+    get(2)
+    assert made == [1, 2, 3, 2]
+
+
+def test_who_comes_second_waits_and_an_error_is_not_kept():
+    kept, began, go = programs.Kept(2), threading.Event(), threading.Event()
+    made, found = [], []
+
+    def slow():
+        began.set()
+        go.wait(10)
+        made.append(1)
+        return "made"
+
+    threads = [threading.Thread(target=lambda: found.append(kept.get(0, slow))) for _ in range(3)]
+    threads[0].start()
+    began.wait(10)
+    for thread in threads[1:]:
+        thread.start()
+    go.set()
+    for thread in threads:
+        thread.join(10)
+    assert (made, found) == ([1], ["made"] * 3)
+
+    def bad():
+        raise ValueError("bad")
+
+    with pytest.raises(ValueError, match="bad"):
+        kept.get(1, bad)
+    assert kept.get(1, lambda: "good") == "good"
+
+
+def test_float32_and_float64_are_two_programs():
+    def double(x):
+        return x * 2.3
+
+    assert programs.call(double, (), jnp.ones(2, jnp.float32)).dtype == jnp.float32
+    assert programs.call(double, (), np.ones(2)).dtype == jnp.float64
+
+
+def test_an_error_of_the_function_comes_as_it_is():
+    ring = worlds.ring(3)
+    ekf = filters.ekf_slam(ring.motion, ring.sensor, 6)
+    _, log = simulate(ring, jax.random.key(0))
+    with pytest.raises(ValueError, match="expected shape"):
+        run(
+            ekf,
+            log._replace(control=log.control[:, :1]),
+            ring.pose,
+            ring.pose_cov,
+            jax.random.key(0),
+        )
