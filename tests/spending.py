@@ -4,6 +4,8 @@ At the end of a run it prints the worst files. Under pytest-xdist every worker c
 sends the counts to the controller.
 """
 
+import contextlib
+import ctypes
 import gc
 import resource
 import sys
@@ -13,13 +15,24 @@ from collections import defaultdict
 import jax
 import pytest
 
+from jaxslam import programs
+
 WORST = 10
 """How many files are printed."""
 
-ROOM = 900 * 2**20
-"""Resident memory [bytes] of a worker above which compiled programs are dropped after a file."""
+ROOM = 0.8, 1.3
+"""Resident memory [GB] of a worker above which compiled programs are dropped: after a file, and
+after a test."""
 
-HEAVY = ()
+HEAVY = tuple(
+    f"tests/{name}.py"
+    for name in (
+        *("test_monte_carlo", "test_delayed", "test_team", "test_family", "test_fastslam"),
+        *("test_programs", "test_cli", "equivalence/test_information", "test_gradients"),
+        *("test_suite", "test_seif", "test_eseif", "test_spurious", "test_wild", "test_reduction"),
+        *("equivalence/test_ekf", "test_particle_localization", "test_smoothing", "test_readme"),
+    )
+)
 """Files in the order in which they start; what is not here comes afterwards, as collected."""
 
 COLUMNS = ("compiled", "from cache", "compile s", "cpu s", "wall s")
@@ -58,7 +71,8 @@ class Spending:
             return (yield)
         finally:
             self.add(0, 0, 0, processor_seconds() - cpu, time.perf_counter() - wall)
-            if nextitem is None or nextitem.location[0] != self.current:
+            ended = nextitem is None or nextitem.location[0] != self.current
+            if resident() > ROOM[0 if ended else 1] * 2**30:
                 give_back()
 
     @pytest.hookimpl(tryfirst=True)
@@ -115,7 +129,9 @@ def resident():
 
 
 def give_back():
-    """Drop what JAX keeps of programs, where it has become much."""
-    if resident() > ROOM:
-        jax.clear_caches()
-        gc.collect()
+    """Drop the programs that JAX and the package keep, and return what they took."""
+    programs.clear()
+    jax.clear_caches()
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # glibc alone has it
+        ctypes.CDLL(None).malloc_trim(0)

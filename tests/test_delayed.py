@@ -23,6 +23,9 @@ BEACON = sensors.range_only([[0.05**2]])
 KINDS = {"rays": rays(CAMERA), "circles": circles(BEACON)}
 
 
+MISS = {kind: jax.jit(jax.vmap(meeting.miss)) for kind, meeting in KINDS.items()}
+
+
 # --- where two sightings meet -------------------------------------------------------------------
 
 
@@ -48,7 +51,7 @@ def test_perfect_sightings_meet_at_the_point(kind):
     np.testing.assert_array_equal(np.asarray(ok).all(axis=1), sine >= least)
     assert 100 < ok[:, 0].sum() < 200
     np.testing.assert_allclose(miss[sine >= least], 0, atol=1e-9)
-    wrong = jax.jit(jax.vmap(KINDS[kind].miss))(seen[:, 0], points)
+    wrong = MISS[kind](seen[:, 0], points)
     np.testing.assert_allclose(wrong, 0, atol=1e-12)
 
 
@@ -56,6 +59,14 @@ def test_two_circles_meet_in_mirrored_points():
     points, ok = KINDS["circles"].meet(jnp.asarray([0.0, 0, 5]), jnp.asarray([6.0, 0, 5]))
     assert ok.all()
     np.testing.assert_allclose(points, [[3, 4], [3, -4]], atol=1e-12)
+
+
+def with_slopes(meet):
+    """The points, whether they are, and their derivatives by both sightings."""
+    return jax.jit(lambda a, b: (*meet(a, b), jax.jacfwd(lambda *s: meet(*s)[0], (0, 1))(a, b)))
+
+
+MEET = {kind: with_slopes(meeting.meet) for kind, meeting in KINDS.items()}
 
 
 @pytest.mark.parametrize(
@@ -75,9 +86,8 @@ def test_two_circles_meet_in_mirrored_points():
 )
 def test_what_does_not_meet_is_not_ok_and_finite(kind, a, b):
     a, b = jnp.asarray(a, float), jnp.asarray(b, float)
-    points, ok = KINDS[kind].meet(a, b)
+    points, ok, slopes = MEET[kind](a, b)
     assert not ok.any()
-    slopes = jax.jacfwd(lambda a, b: KINDS[kind].meet(a, b)[0], argnums=(0, 1))(a, b)
     assert all(np.isfinite(x).all() for x in (points, *slopes))
 
 
@@ -105,6 +115,12 @@ def test_bad_meetings_are_refused():
 # --- hypotheses in the table --------------------------------------------------------------------
 
 LAYOUT = Layout(2, 2, 4)
+FORM = jax.jit(hypotheses.form, static_argnums=(1, 2))
+MISSES = jax.jit(hypotheses.misses, static_argnums=1)
+CONSTRAINTS = jax.jit(hypotheses.constraints)
+MOVE = jax.jit(hypotheses.move_hypotheses, static_argnums=1)
+FIT = jax.jit(placing.fit, static_argnums=1)
+ENTER = jax.jit(placing.enter)
 
 
 def table(kind, seed=0, scale=0.01):
@@ -134,7 +150,7 @@ def table(kind, seed=0, scale=0.01):
 
 def closest_point(kind, seen):
     """The number of the meeting point of two sightings that is near (1, 5)."""
-    points = np.asarray(KINDS[kind].meet(*map(jnp.asarray, seen))[0])
+    points = np.asarray(MEET[kind](*map(jnp.asarray, seen))[0])
     return int(np.argmin(np.linalg.norm(points - [1, 5], axis=1)))
 
 
@@ -142,7 +158,7 @@ def formed(kind, joint):
     which = closest_point(kind, joint.landmarks[4:6])
     born = jnp.asarray([True, False])
     parents, which = jnp.asarray([[4, 5], [4, 4]]), jnp.asarray([which, 0])
-    return hypotheses.form(joint, LAYOUT, KINDS[kind], born, parents, which, jnp.zeros(2, int))
+    return FORM(joint, LAYOUT, KINDS[kind], born, parents, which, jnp.zeros(2, int))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -179,7 +195,7 @@ def slope_rows(kind, joint, point, sightings, differences):
     """G by the whole state, and the differences g, of a point against sightings; numerically."""
 
     def miss(s, x):
-        return np.asarray(jax.vmap(KINDS[kind].miss)(s, x))
+        return np.asarray(MISS[kind](s, x))
 
     seen = np.asarray(joint.landmarks)[sightings]
     points = np.broadcast_to(point, (len(seen), 2))
@@ -195,7 +211,7 @@ def slope_rows(kind, joint, point, sightings, differences):
 def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     joint = formed(kind, table(kind))
     slots = jnp.asarray([2, 3])
-    found = hypotheses.misses(joint, KINDS[kind], slots, jnp.asarray([6, 7]))
+    found = MISSES(joint, KINDS[kind], slots, jnp.asarray([6, 7]))
     value, rows, by_point = slope_rows(
         kind, joint, np.asarray(joint.landmarks)[2, :2], [6], differences
     )
@@ -209,8 +225,8 @@ def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     gain[np.delete(np.arange(len(gain)), [9, 10])] = 0
     left = np.eye(len(cov)) - gain @ rows
     part = (found.value[:, 0], found.by_point[:, 0], found.by_sight[:, 0])
-    constraint = hypotheses.constraints(joint, slots, jnp.asarray([6, 6]), *part)
-    new = hypotheses.move_hypotheses(joint, LAYOUT, constraint, jnp.asarray([True, False]))
+    constraint = CONSTRAINTS(joint, slots, jnp.asarray([6, 6]), *part)
+    new = MOVE(joint, LAYOUT, constraint, jnp.asarray([True, False]))
     np.testing.assert_allclose(new.cov, left @ cov @ left.T, atol=1e-9 * cov.max())
     np.testing.assert_allclose(
         new.landmarks[2, :2], joint.landmarks[2, :2] - gain[9:11, 0] * value, atol=1e-8
@@ -226,8 +242,8 @@ def test_a_landmark_of_all_its_sightings_is_the_constrained_least_squares(kind, 
     sightings = jnp.asarray([4, 5, 6, 7, 4])
     use = jnp.asarray([True, True, True, True, False])
     start = jnp.asarray([1.1, 5.1])
-    fit = placing.fit(joint, KINDS[kind], start, sightings, use)
-    new = placing.enter(joint, fit, jnp.asarray(1), sightings)
+    fit = FIT(joint, KINDS[kind], start, sightings, use)
+    new = ENTER(joint, fit, jnp.asarray(1), sightings)
     # At the point where Gauss-Newton ends, the linear problem in plain NumPy.
     point = np.array([1.1, 5.1])
     for _ in range(20):

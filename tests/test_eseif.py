@@ -45,7 +45,8 @@ def logs():
     keys = jax.random.split(jax.random.key(2), RUNS)
     first = simulate(silent, keys[0])
     rest = jax.jit(jax.vmap(functools.partial(simulate, scene)))(keys)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+    first, rest = jax.device_get((first, rest))
+    return jax.tree.map(lambda a, b: np.concatenate([a[None], b]), first, rest)
 
 
 @functools.cache

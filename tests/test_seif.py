@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import draw
 
 from jaxslam import filters, sensors
 from jaxslam.filters import blankets, sparse_map, sparsification
@@ -14,7 +15,6 @@ from jaxslam.filters.recovery import relaxed
 from jaxslam.run import run
 from jaxslam.scenarios import cloister
 from jaxslam.scenarios.view import between_ranges
-from jaxslam.simulate import simulate
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)
@@ -28,7 +28,7 @@ def world(steps=40):
     scene = dataclasses.replace(
         cloister(steps), visible=between_ranges(0.0, 2.2), places=8, pose_cov=P0
     )
-    return scene, simulate(scene, jax.random.key(1))[1]
+    return scene, draw(scene)[1]
 
 
 @functools.cache
