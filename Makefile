@@ -1,7 +1,7 @@
 # Each target makes its own .venv and installs what it needs; only make and a Python >= 3.11 with
 # venv must be there. Choose one with `make PYTHON=python3.12 …`.
 
-PYTHON ?= $(shell for p in python3 python python3.13 python3.12 python3.11; do \
+PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
 	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -17,9 +17,9 @@ export OPENBLAS_NUM_THREADS ?= 1
 consistency: $(VENV)/.run
 	$(BIN)/jaxslam consistency $(if $(filter --resume% --overwrite,$(ARGS)),,--again) $(ARGS)
 
-## The test suite, on every core.
+## The test suite, on every core: heavy files first, compiled programs kept in .cache/ for the next run.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --dist loadscope $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder $(ARGS)
 
 ## Format, lint and types.
 check: $(VENV)/.dev

@@ -1,23 +1,51 @@
 """Strictness of the whole suite (never of the package), and the oracles that many tests share."""
 
+import importlib.metadata
 import os
+from pathlib import Path
 
-import jaxlib
 import numpy as np
 import pytest
 
-# A suite compiles much and runs little, and XLA's older emitters of CPU code compile in half the
-# time. Benchmarks run what users run. An unknown flag would abort, so only where it was tried.
-if tuple(map(int, jaxlib.__version__.split(".")[:2])) < (0, 11):
-    os.environ.setdefault(
-        "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
-    )
+# A suite compiles much and runs little: XLA optimizes as little as it can, in half the time, and a
+# program once compiled is kept in the checkout for all workers, for the processes that tests start
+# and for the next run. `full_optimization` is for what depends on the optimizer.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR",
+    str(Path(__file__).parents[1] / ".cache" / f"jax-{importlib.metadata.version('jax')}"),
+)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
+from spending import Spending
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 4)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+PROGRAMS = Path(__file__).parents[1] / ".cache"
+KEPT = 2**29
+"""Bytes of compiled programs that stay in the checkout after a run."""
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(Spending(config))
+
+
+def pytest_unconfigure(config):
+    """Those longest unused go first; once, not in each worker."""
+    if hasattr(config, "workerinput"):
+        return
+    files = [(path, path.stat()) for path in PROGRAMS.rglob("*") if path.is_file()]
+    files.sort(key=lambda item: -max(item[1].st_atime, item[1].st_mtime))
+    total = 0
+    for path, stat in files:
+        total += stat.st_size
+        if total > KEPT:
+            path.unlink(missing_ok=True)
+
 
 # Angles where something can go wrong: the seam, the series around zero turn and where they end
 # (0.5, and 1 for functions of the half angle).
@@ -80,10 +108,10 @@ def assert_jacobians(differences):
     return check
 
 
-@pytest.fixture(scope="module")
-def quick_compilation():
-    """For modules that compile much and run little: XLA optimizes less, and rounds a little
-    differently, while they run."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
+@pytest.fixture
+def full_optimization():
+    """For what depends on XLA's optimizer, or runs long enough to be worth its time."""
+    before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)

@@ -11,8 +11,6 @@ from jaxslam.filters import ekf_slam
 from jaxslam.life import recency
 from jaxslam.types import Info, Log, Scan
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(0)
 Q, R = np.diag([0.03, 0.02, 0.0]) ** 2, 0.1**2 * np.eye(2)
 

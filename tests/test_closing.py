@@ -1,5 +1,7 @@
 """Loops closed by the cluster of recent landmarks: what is merged, what is refused, and a whole run."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +16,6 @@ from jaxslam.life.recency import Recency
 from jaxslam.protocols import Pairs, Prediction
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 EUCLIDEAN = charts.euclidean()
 OPTIONS = {"window": 20, "cluster": 6, "least": 4}
@@ -51,8 +51,16 @@ def two_visits(seed=0, drift=4.0, shape=0.05, symmetric=False):
     return joint, of
 
 
-def look(joint, chart=EUCLIDEAN, **options):
-    return jax.jit(lambda joint: close_loop(joint, chart, **(OPTIONS | options)))(joint)
+@cache
+def looking(**options):
+    return jax.jit(lambda joint: close_loop(joint, EUCLIDEAN, **(OPTIONS | options)))
+
+
+def look(joint, **options):
+    return looking(**options)(joint)
+
+
+MERGE = jax.jit(lambda joint, k, m: merge(joint, EUCLIDEAN, k, m))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -63,7 +71,7 @@ def test_the_cluster_is_found_and_merged_exactly(seed):
     assert report.merged == report.explained == 5 and report.likely
     expected = joint
     for i, k in enumerate(of):
-        expected = merge(expected, EUCLIDEAN, jnp.asarray(k), jnp.asarray(8 + i))
+        expected = MERGE(expected, k, 8 + i)
     np.testing.assert_array_equal(closed.alive, np.arange(15) < 8)
     np.testing.assert_allclose(closed.landmarks, expected.landmarks, atol=1e-9)
     np.testing.assert_allclose(closed.cov, expected.cov, atol=1e-9)
@@ -104,14 +112,14 @@ def test_a_symmetric_old_map_is_ambiguous():
 def test_recency_remembers():
     model = motion.pose_increment(1e-4 * np.eye(3))
     filter = ekf_slam(model, sensors.relative_position(0.01 * np.eye(2)), 4, life=recency())
-    state = filter.init(jnp.zeros(3), jnp.zeros((3, 3)))
+    state, update = filter.init(jnp.zeros(3), jnp.zeros((3, 3))), jax.jit(filter.update)
     key = jax.random.key(0)
     for tags in ([0, -2], [0, 1], [1, -2]):
         valid = jnp.asarray(tags) >= 0
         scan = Scan(jnp.array([[2.0, 1.0], [3.0, -1.0]]), jnp.maximum(jnp.asarray(tags), -1), valid)
         if tags == [1, -2]:
             scan = scan._replace(z=scan.z[::-1])
-        state, info = filter.update(state, scan, key)
+        state, info = update(state, scan, key)
     life = state.life
     assert int(life.now) == 3
     np.testing.assert_array_equal(life.born, [1, 2, 0, 0])

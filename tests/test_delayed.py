@@ -1,14 +1,16 @@
 """Delayed initialization: meetings, hypotheses, what a landmark is made of, and the filter."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import draw, judged
 
 import jaxslam
-from jaxslam import Scenario, monte_carlo, motion, sensors
+from jaxslam import Scenario, motion, sensors
 from jaxslam.association import nearest
 from jaxslam.filters import delayed_slam, ekf_slam, hypotheses, placing
 from jaxslam.filters.meeting import circles, meeting_of, rays
@@ -19,6 +21,9 @@ from jaxslam.types import Status
 CAMERA = sensors.bearing_only([[0.01**2]])
 BEACON = sensors.range_only([[0.05**2]])
 KINDS = {"rays": rays(CAMERA), "circles": circles(BEACON)}
+
+
+MISS = {kind: jax.jit(jax.vmap(meeting.miss)) for kind, meeting in KINDS.items()}
 
 
 # --- where two sightings meet -------------------------------------------------------------------
@@ -36,7 +41,7 @@ def test_perfect_sightings_meet_at_the_point(kind):
     rng = np.random.default_rng(0)
     places, points = rng.uniform(-5, 5, (200, 2, 2)), rng.uniform(-5, 5, (200, 2))
     seen = np.stack([seen_by(kind, p, x) for p, x in zip(places, points, strict=True)])
-    met, ok = jax.vmap(KINDS[kind].meet)(seen[:, 0], seen[:, 1])
+    met, ok = jax.jit(jax.vmap(KINDS[kind].meet))(seen[:, 0], seen[:, 1])
     miss = np.linalg.norm(np.asarray(met) - points[:, None], axis=2).min(axis=1)
     # The angle at the point between the two directions to it decides whether the meeting is sharp.
     a, b = points - places[:, 0], points - places[:, 1]
@@ -46,7 +51,7 @@ def test_perfect_sightings_meet_at_the_point(kind):
     np.testing.assert_array_equal(np.asarray(ok).all(axis=1), sine >= least)
     assert 100 < ok[:, 0].sum() < 200
     np.testing.assert_allclose(miss[sine >= least], 0, atol=1e-9)
-    wrong = jax.vmap(KINDS[kind].miss)(seen[:, 0], points)
+    wrong = MISS[kind](seen[:, 0], points)
     np.testing.assert_allclose(wrong, 0, atol=1e-12)
 
 
@@ -54,6 +59,14 @@ def test_two_circles_meet_in_mirrored_points():
     points, ok = KINDS["circles"].meet(jnp.asarray([0.0, 0, 5]), jnp.asarray([6.0, 0, 5]))
     assert ok.all()
     np.testing.assert_allclose(points, [[3, 4], [3, -4]], atol=1e-12)
+
+
+def with_slopes(meet):
+    """The points, whether they are, and their derivatives by both sightings."""
+    return jax.jit(lambda a, b: (*meet(a, b), jax.jacfwd(lambda *s: meet(*s)[0], (0, 1))(a, b)))
+
+
+MEET = {kind: with_slopes(meeting.meet) for kind, meeting in KINDS.items()}
 
 
 @pytest.mark.parametrize(
@@ -73,9 +86,8 @@ def test_two_circles_meet_in_mirrored_points():
 )
 def test_what_does_not_meet_is_not_ok_and_finite(kind, a, b):
     a, b = jnp.asarray(a, float), jnp.asarray(b, float)
-    points, ok = KINDS[kind].meet(a, b)
+    points, ok, slopes = MEET[kind](a, b)
     assert not ok.any()
-    slopes = jax.jacfwd(lambda a, b: KINDS[kind].meet(a, b)[0], argnums=(0, 1))(a, b)
     assert all(np.isfinite(x).all() for x in (points, *slopes))
 
 
@@ -103,6 +115,12 @@ def test_bad_meetings_are_refused():
 # --- hypotheses in the table --------------------------------------------------------------------
 
 LAYOUT = Layout(2, 2, 4)
+FORM = jax.jit(hypotheses.form, static_argnums=(1, 2))
+MISSES = jax.jit(hypotheses.misses, static_argnums=1)
+CONSTRAINTS = jax.jit(hypotheses.constraints)
+MOVE = jax.jit(hypotheses.move_hypotheses, static_argnums=1)
+FIT = jax.jit(placing.fit, static_argnums=1)
+ENTER = jax.jit(placing.enter)
 
 
 def table(kind, seed=0, scale=0.01):
@@ -132,7 +150,7 @@ def table(kind, seed=0, scale=0.01):
 
 def closest_point(kind, seen):
     """The number of the meeting point of two sightings that is near (1, 5)."""
-    points = np.asarray(KINDS[kind].meet(*map(jnp.asarray, seen))[0])
+    points = np.asarray(MEET[kind](*map(jnp.asarray, seen))[0])
     return int(np.argmin(np.linalg.norm(points - [1, 5], axis=1)))
 
 
@@ -140,7 +158,7 @@ def formed(kind, joint):
     which = closest_point(kind, joint.landmarks[4:6])
     born = jnp.asarray([True, False])
     parents, which = jnp.asarray([[4, 5], [4, 4]]), jnp.asarray([which, 0])
-    return hypotheses.form(joint, LAYOUT, KINDS[kind], born, parents, which, jnp.zeros(2, int))
+    return FORM(joint, LAYOUT, KINDS[kind], born, parents, which, jnp.zeros(2, int))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -177,7 +195,7 @@ def slope_rows(kind, joint, point, sightings, differences):
     """G by the whole state, and the differences g, of a point against sightings; numerically."""
 
     def miss(s, x):
-        return np.asarray(jax.vmap(KINDS[kind].miss)(s, x))
+        return np.asarray(MISS[kind](s, x))
 
     seen = np.asarray(joint.landmarks)[sightings]
     points = np.broadcast_to(point, (len(seen), 2))
@@ -193,7 +211,7 @@ def slope_rows(kind, joint, point, sightings, differences):
 def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     joint = formed(kind, table(kind))
     slots = jnp.asarray([2, 3])
-    found = hypotheses.misses(joint, KINDS[kind], slots, jnp.asarray([6, 7]))
+    found = MISSES(joint, KINDS[kind], slots, jnp.asarray([6, 7]))
     value, rows, by_point = slope_rows(
         kind, joint, np.asarray(joint.landmarks)[2, :2], [6], differences
     )
@@ -207,8 +225,8 @@ def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     gain[np.delete(np.arange(len(gain)), [9, 10])] = 0
     left = np.eye(len(cov)) - gain @ rows
     part = (found.value[:, 0], found.by_point[:, 0], found.by_sight[:, 0])
-    constraint = hypotheses.constraints(joint, slots, jnp.asarray([6, 6]), *part)
-    new = hypotheses.move_hypotheses(joint, LAYOUT, constraint, jnp.asarray([True, False]))
+    constraint = CONSTRAINTS(joint, slots, jnp.asarray([6, 6]), *part)
+    new = MOVE(joint, LAYOUT, constraint, jnp.asarray([True, False]))
     np.testing.assert_allclose(new.cov, left @ cov @ left.T, atol=1e-9 * cov.max())
     np.testing.assert_allclose(
         new.landmarks[2, :2], joint.landmarks[2, :2] - gain[9:11, 0] * value, atol=1e-8
@@ -224,8 +242,8 @@ def test_a_landmark_of_all_its_sightings_is_the_constrained_least_squares(kind, 
     sightings = jnp.asarray([4, 5, 6, 7, 4])
     use = jnp.asarray([True, True, True, True, False])
     start = jnp.asarray([1.1, 5.1])
-    fit = placing.fit(joint, KINDS[kind], start, sightings, use)
-    new = placing.enter(joint, fit, jnp.asarray(1), sightings)
+    fit = FIT(joint, KINDS[kind], start, sightings, use)
+    new = ENTER(joint, fit, jnp.asarray(1), sightings)
     # At the point where Gauss-Newton ends, the linear problem in plain NumPy.
     point = np.array([1.1, 5.1])
     for _ in range(20):
@@ -295,22 +313,40 @@ def filter_of(scenario, capacity=5, **options):
     return delayed_slam(scenario.motion, scenario.sensor, capacity, **options)
 
 
-def driven(filter, log, **options):
-    def go(log):
-        return jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0), **options)
+def go(filter, log):
+    return jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
 
-    return jax.jit(go)(log)
+
+def driven(filter, log):
+    return jax.jit(partial(go, filter))(log)
+
+
+RUNS = 40
 
 
 @pytest.fixture(scope="module", params=list(KINDS))
-def drive(request, quick_compilation):
+def many(request):
+    """Of one kind, truths, logs and traces of all runs: one program for all tests."""
     scenario = world(request.param)
-    truth, log = jaxslam.simulate(scenario, jax.random.key(2))
-    return scenario, truth, log, driven(filter_of(scenario), log)
+    filter = filter_of(scenario)
+
+    @jax.jit
+    @jax.vmap
+    def one(key):
+        truth, log = jaxslam.simulate(scenario, key)
+        return truth, log, go(filter, log)
+
+    return jax.device_get(one(jax.random.split(jax.random.key(5), RUNS)))
+
+
+@pytest.fixture(scope="module")
+def drive(many):
+    """One of the runs."""
+    return jax.tree.map(lambda leaf: leaf[2], many)
 
 
 def test_every_landmark_is_found_where_it_is(drive):
-    scenario, truth, log, trace = drive
+    truth, log, trace = drive
     final = trace.estimate
     assert final.alive[-1].all()
     assert sorted(np.asarray(final.tag[-1])) == [0, 1, 2, 3, 4]
@@ -325,7 +361,7 @@ def test_every_landmark_is_found_where_it_is(drive):
 
 
 def test_every_measurement_is_accounted_for(drive):
-    scenario, truth, log, trace = drive
+    truth, log, trace = drive
     counts = {s.name: int(trace.info.tally(s).sum()) for s in Status}
     assert sum(counts.values()) == log.scan.valid.size
     assert counts["SIGHTED"] > 10
@@ -344,18 +380,16 @@ def test_the_covariance_stays_positive(drive):
     assert np.linalg.eigvalsh(cov)[0] > 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_filter_is_honest(kind, quick_compilation):
-    scenario = world(kind)
-    campaign = monte_carlo(scenario, {"delayed": filter_of(scenario)}, 40, jax.random.key(5))
-    found = campaign.filters["delayed"]
-    assert found.counts["not_finite"] == 0
-    assert found.measures["rmse_landmarks"].value < 0.2
+def test_the_filter_is_honest(many):
+    truth, _, trace = many
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(trace) if leaf.dtype == float)
+    found = judged(truth, trace.estimate, trace.info)
+    assert found["error_landmarks"][0] < 0.2
     for name, dof in (("nees_pose", 3), ("nees_landmarks", 2), ("nis_per_dof", 1)):
-        measure = found.measures[name]
-        assert measure.low < 1.15 * dof, name
-        assert measure.high > 0.85 * dof, name
-        assert measure.value < 1.5 * dof, name
+        mean, low, high = found[name]
+        assert low < 1.15 * dof, name
+        assert high > 0.85 * dof, name
+        assert mean < 1.5 * dof, name
 
 
 def small(kind, **options):
@@ -367,49 +401,50 @@ def small(kind, **options):
     return scenario, delayed_slam(scenario.motion, scenario.sensor, capacity, **options)
 
 
-def test_a_full_map_refuses_and_says_so(quick_compilation):
+@pytest.fixture(scope="module")
+def poor():
+    """With room for one landmark: the log as drawn, one of random bearings, one without a
+    measurement, one without names; as a batch."""
     scenario, filter = small("rays", capacity=1)
-    _, log = jaxslam.simulate(scenario, jax.random.key(0))
-    trace = driven(filter, log)
+    _, log = draw(scenario, 0)
+    z = jax.random.uniform(jax.random.key(3), log.scan.z.shape, float, -np.pi, np.pi)
+    spoiled = log._replace(scan=log.scan._replace(z=z))
+    empty = log._replace(scan=log.scan._replace(valid=jnp.zeros_like(log.scan.valid)))
+    nameless = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
+    logs = jax.tree.map(lambda *x: jnp.stack(x), log, spoiled, empty, nameless)
+    trace = jax.device_get(jax.jit(jax.vmap(partial(go, filter)))(logs))
+    return scenario, filter, empty, [jax.tree.map(lambda x, i=i: x[i], trace) for i in range(4)]
+
+
+def test_a_full_map_refuses_and_says_so(poor):
+    trace = poor[-1][0]
     assert trace.estimate.alive[-1].sum() == 1
     assert trace.info.tally(Status.BORN).sum() == 1
     assert trace.info.tally(Status.OVERFLOW).sum() > 0
     assert trace.final.counts.promoted == 1
 
 
-def test_spurious_bearings_move_no_robot_and_empty_scans_neither(quick_compilation):
-    """Random bearings make no landmark, so all is as without them, to the bit."""
-    scenario, filter = small("rays")
-    _, log = jaxslam.simulate(scenario, jax.random.key(0))
-    z = jax.random.uniform(jax.random.key(3), log.scan.z.shape, float, -np.pi, np.pi)
-    spoiled = log._replace(scan=log.scan._replace(z=z))
-    empty = log._replace(scan=log.scan._replace(valid=jnp.zeros_like(log.scan.valid)))
-    nameless = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
-    logs = jax.tree.map(lambda *x: jnp.stack(x), spoiled, empty, nameless)
+def test_spurious_bearings_move_no_robot_and_empty_scans_neither(poor):
+    """Random bearings make no landmark, so all is as without them."""
+    scenario, filter, empty, (_, *traces) = poor
+    alone = driven(ekf_slam(scenario.motion, scenario.sensor, 1), empty).estimate
+    for trace in traces:
+        assert not trace.estimate.alive.any()
+        np.testing.assert_allclose(trace.estimate.pose, alone.pose, atol=1e-12)
+        np.testing.assert_allclose(trace.estimate.pose_cov, alone.pose_cov, atol=1e-15)
+    spoiled, nothing, nameless = traces
+    assert spoiled.final.counts.vanished > 5
+    assert (nothing.info.status == Status.EMPTY).all()
+    assert (nameless.info.status == Status.UNMATCHED).all()  # no names, and none asked for
 
-    def go(log):
-        return jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
-
-    trace = jax.jit(jax.vmap(go))(logs)
-    plain = ekf_slam(scenario.motion, scenario.sensor, 3)
-    alone = driven(plain, empty).estimate
-    for i in range(3):
-        assert not trace.estimate.alive[i].any()
-        np.testing.assert_allclose(trace.estimate.pose[i], alone.pose, atol=1e-12)
-        np.testing.assert_allclose(trace.estimate.pose_cov[i], alone.pose_cov, atol=1e-15)
-    counts = jax.tree.map(np.asarray, trace.final.counts)
-    assert counts.vanished[0] > 5
-    assert (trace.info.status[1] == Status.EMPTY).all()
-    assert (trace.info.status[2] == Status.UNMATCHED).all()  # no names, and none asked for
-
-    none = log._replace(scan=jax.tree.map(lambda x: x[:, :0], log.scan))
+    none = empty._replace(scan=jax.tree.map(lambda x: x[:, :0], empty.scan))
     np.testing.assert_allclose(driven(filter, none).estimate.pose, alone.pose, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_float32_finds_the_landmarks(kind, quick_compilation):
+def test_float32_finds_the_landmarks(kind):
     scenario, filter = small(kind)
-    truth, log = jaxslam.simulate(scenario, jax.random.key(1))
+    truth, log = draw(scenario, 1)
     narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, log)
     trace = driven(filter, narrow)
     floats = [x for x in jax.tree.leaves(trace) if jnp.issubdtype(x.dtype, jnp.floating)]
@@ -421,9 +456,9 @@ def test_float32_finds_the_landmarks(kind, quick_compilation):
     np.testing.assert_allclose(trace.estimate.pose, truth.pose, atol=0.2)
 
 
-def test_gradients_reach_the_noise_and_are_finite(quick_compilation):
+def test_gradients_reach_the_noise_and_are_finite():
     scenario, _ = small("circles")
-    _, log = jaxslam.simulate(scenario, jax.random.key(1))
+    _, log = draw(scenario, 1)
 
     def likelihood(sigma):
         sensor = sensors.range_only(sigma[None, None] ** 2)
@@ -437,7 +472,7 @@ def test_gradients_reach_the_noise_and_are_finite(quick_compilation):
     np.testing.assert_allclose(both(at)[1], by_differences, rtol=1e-4)
 
 
-def test_without_names_intersections_find_the_landmarks(quick_compilation):
+def test_without_names_intersections_find_the_landmarks():
     """Every bearing may be of any landmark; the names in the log are not looked at."""
     scenario = world("rays")
     gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)
@@ -450,7 +485,7 @@ def test_without_names_intersections_find_the_landmarks(quick_compilation):
         decay=0.7,
         associate=nearest(*gates),
     )
-    truth, log = jaxslam.simulate(scenario, jax.random.key(4))
+    truth, log = draw(scenario, 4)
     log = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
     final = jax.tree.map(lambda x: np.asarray(x[-1]), driven(filter, log).estimate)
     off = np.linalg.norm(final.points[:, None] - np.asarray(truth.landmarks)[None], axis=2)

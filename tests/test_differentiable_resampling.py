@@ -12,8 +12,6 @@ import scipy.stats
 from jaxslam.resampling import kld, kld_bound, soft, stop_gradient, systematic
 from jaxslam.resampling.weights import normalized, survivors
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 # x' = a x + q ε, z = x + r η; x_0 ~ N(0, 1) before the first step
 A, Q, R = 0.7, 0.5, 0.4
 Z = np.array([0.5, 0.9, 1.2, 0.7, 1.1, 1.6, 1.3, 0.9])  # as of a larger a: the score is not zero
@@ -60,7 +58,7 @@ METHODS = {
 
 
 @pytest.fixture(scope="module")
-def slopes(quick_compilation):
+def slopes():
     """By method: mean over seeds of value and gradient, and their standard errors."""
     keys, seeds = jax.random.split(jax.random.key(11), 200), math.sqrt(200)
 

@@ -23,7 +23,7 @@ VICTIMS = ["ekf", "iterated", "left_invariant", "ukf", "ukf_left", "square_root"
 
 def draw(world):
     """A scenario with a truth and a log of it."""
-    return world, *jax.jit(partial(simulate, world))(jax.random.key(1))
+    return world, *worlds.draw(world)
 
 
 @cache
@@ -34,14 +34,9 @@ def drawn(make, steps):
 def drive(drawn, name, probe=None, **options):
     """One run of a variant: its trace."""
     world, truth, log = drawn
-
-    @jax.jit
-    def go(truth, log):
-        candidate = family.FILTERS[name](world, **options)
-        filter = candidate if isinstance(candidate, Filter) else candidate(truth)
-        return run(filter, log, world.pose, world.pose_cov, KEY, probe=probe)
-
-    return go(truth, log)
+    candidate = family.FILTERS[name](world, **options)
+    filter = candidate if isinstance(candidate, Filter) else candidate(truth)
+    return jax.device_get(run(filter, log, world.pose, world.pose_cov, KEY, probe=probe))
 
 
 def test_the_family_is_known_to_these_tests():
@@ -70,7 +65,7 @@ def test_what_draws_instead_of_linearizing_fits_scenarios(scenario):
 
 
 @pytest.fixture(scope="module", params=CURES + VICTIMS)
-def watched(request, quick_compilation):
+def watched(request):
     """A filter of the family, 80 steps of the loop, and its watch after each."""
     trace = drive(drawn(loop, 80), request.param, watch=True, probe=lambda s: s.watch)
     return request.param, trace
@@ -94,7 +89,7 @@ def test_cures_keep_three_directions_unobservable_and_the_others_two(watched):
 
 
 @pytest.fixture(scope="module")
-def still(quick_compilation):
+def still():
     """Standard deviation of the heading (T,) on `stationary`, by filter."""
     out = {}
     for name in family.FILTERS:
@@ -169,11 +164,11 @@ def test_all_variants_have_the_process_noise_of_the_standard_filter():
 
 
 @pytest.mark.parametrize("name", ["oc", "robocentric", "ukf_right", "square_root"])
-def test_gradients_are_finite_from_a_start_that_is_known_exactly(name, quick_compilation):
+def test_gradients_are_finite_from_a_start_that_is_known_exactly(name):
     """By both noises, through predictions, corrections and births, P0 = 0."""
     world = worlds.ring(steps=3)
     world = dataclasses.replace(world, landmarks=world.landmarks[:2])
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    _, log = simulate(world, jax.random.key(1))
 
     def cost(sigma):
         models = {
@@ -220,7 +215,7 @@ def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
     """Sharp measurements of a vague map: P loses its definiteness to rounding, X cannot."""
     sharp = sensors.range_bearing(np.diag([1e-4, 1e-4]) ** 2)
     world = dataclasses.replace(worlds.ring(steps=25), sensor=sharp, pose_cov=np.eye(3) * 4.0)
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    _, log = simulate(world, jax.random.key(1))
     single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, log)
     smallest = {}
     for square_root in (False, True):
@@ -240,16 +235,16 @@ def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
 # --- canonical form -----------------------------------------------------------------------------
 
 
-def test_information_filters_stand_beside_the_family(quick_compilation):
+def test_information_filters_stand_beside_the_family():
     """All active, they are the EKF by other numbers; what they do not know of is left out."""
     world = worlds.ring(steps=12)
     world = dataclasses.replace(world, pose_cov=np.diag([0.01, 0.02, 0.003]))
     plain = drive(draw(world), "ekf", update="joint")
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    _, log = simulate(world, jax.random.key(1))
     for name in ("eif_slam", "seif", "eseif"):
         filter = family.CANONICAL[name](world, update="joint", watch=True)
         assert filter.name == name
-        trace = jax.jit(lambda log, f=filter: run(f, log, world.pose, world.pose_cov, KEY))(log)
+        trace = run(filter, log, world.pose, world.pose_cov, KEY)
         np.testing.assert_allclose(trace.estimate.pose, plain.estimate.pose, atol=1e-8)
         np.testing.assert_allclose(trace.estimate.pose_cov, plain.estimate.pose_cov, atol=1e-8)
 

@@ -16,7 +16,6 @@ from jaxslam.run import run
 from jaxslam.simulate import simulate
 from jaxslam.types import Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(5)
 MOUNT = np.array([0.1, -0.05, 0.3])  # of worlds.ring
 R = np.diag([0.05, 0.02]) ** 2
@@ -27,9 +26,9 @@ def of(world, count, capacity=6, **options):
 
 
 def drive(world, filter, seed=1, probe=None):
-    truth, log = jax.jit(partial(simulate, world))(jax.random.key(seed))
-    go = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, KEY, probe=probe))
-    return go(log), truth, log
+    truth, log = worlds.draw(world, seed)
+    trace = run(filter, log, world.pose, world.pose_cov, KEY, probe=probe)
+    return jax.device_get(trace), truth, log
 
 
 def still(steps=4):
@@ -224,7 +223,7 @@ def test_unknown_identities_of_landmarks_far_apart_give_the_same_filter(method):
     known, _, log = drive(world, of(world, 20))
     blind = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
     filter = of(world, 20, associate=method)
-    unknown = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, KEY))(blind)
+    unknown = run(filter, blind, world.pose, world.pose_cov, KEY)
     assert np.all(unknown.estimate.alive.sum(axis=1)[-1] == 6)
     np.testing.assert_allclose(unknown.estimate.pose, known.estimate.pose, atol=1e-9)
     np.testing.assert_allclose(unknown.final.landmarks, known.final.landmarks, atol=1e-9)
@@ -325,11 +324,11 @@ def test_births_have_a_quota_and_a_tag_is_born_once():
 def test_negative_evidence_removes_a_landmark_from_every_map():
     """One that is measured once and then never again, though in view."""
     world = worlds.ring(6)
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    _, log = simulate(world, jax.random.key(1))
     gone = (log.scan.tag == 5) & (jnp.arange(6) > 0)[:, None]
     log = log._replace(scan=log.scan._replace(valid=log.scan.valid & ~gone))
     filter = of(world, 8, life=life.existence(lambda pose, landmark: jnp.asarray(True)))
-    trace = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, KEY))(log)
+    trace = run(filter, log, world.pose, world.pose_cov, KEY)
     assert trace.final.life.log_odds.shape == (8, 6)
     np.testing.assert_array_equal(np.sort(trace.final.tag), [[-1, 0, 1, 2, 3, 4]] * 8)
     # log(0.1/0.9) a miss: at the second the odds fall below 0.05/0.95
@@ -398,7 +397,7 @@ def test_float32_stays_float32_and_near(proposal):
     filter = of(world, 3, proposal=proposal)
     double, _, log = drive(world, filter)
     single = jax.tree.map(lambda x: x.astype("f4") if x.dtype == float else x, log)
-    trace = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, KEY))(single)
+    trace = run(filter, single, world.pose, world.pose_cov, KEY)
     for leaf in jax.tree.leaves((trace.estimate, trace.info, trace.final)):
         assert leaf.dtype != np.float64
         assert np.isfinite(np.asarray(leaf, np.float64)).all()
@@ -409,7 +408,7 @@ def test_float32_stays_float32_and_near(proposal):
 def test_gradients_are_finite_from_a_start_that_is_known_exactly(proposal):
     """By both noises, through predictions, resampling and births, P0 = 0."""
     world = worlds.ring(4)
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    _, log = simulate(world, jax.random.key(1))
 
     def cost(sigma):
         ours = dataclasses.replace(

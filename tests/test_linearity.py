@@ -9,7 +9,6 @@ import jaxslam
 from jaxslam import motion, sensors
 from jaxslam.linearity import motion_linearity, sensor_linearity
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 DTYPES = [np.float32, np.float64]
 
 

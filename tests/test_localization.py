@@ -15,8 +15,6 @@ from jaxslam.sensors import Part, suite
 from jaxslam.stats import chi2_quantile
 from jaxslam.types import Log, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(0)
 START, SPREAD = np.array([0.1, -0.05, 0.02]), np.diag([0.2, 0.1, 0.05]) ** 2
 GATE, NEW = chi2_quantile(0.999, 2), chi2_quantile(0.99999, 2)
@@ -34,7 +32,7 @@ def here(**options):
 
 
 def driven(filter, log):
-    return jax.jit(lambda log: run(filter, log, jnp.asarray(START), jnp.asarray(SPREAD), KEY))(log)
+    return run(filter, log, jnp.asarray(START), jnp.asarray(SPREAD), KEY)
 
 
 def slam_in_a_known_map(scenario, log, chart_name, options):

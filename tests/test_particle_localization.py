@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +9,11 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import association, motion, resampling, run, sensors, simulate
+from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.filters import cloud, fastslam, localization, particle_localization
 from jaxslam.sensors import Part, suite
 from jaxslam.types import Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(5)
 WORLD = worlds.ring(100)
 MOUNT = (0.1, -0.05, 0.3)
@@ -29,15 +27,17 @@ def of(count, sensor=WORLD.sensor, move=WORLD.motion, **options):
 
 def drive(filter, log, pose=(0.0, 0.0, 0.0), cov=None):
     cov = np.zeros((3, 3)) if cov is None else cov
-    return jax.jit(lambda log, key: run(filter, log, pose, cov, key))(log, KEY)
+    return jax.device_get(run(filter, log, pose, cov, KEY))
 
 
 def history(steps, pose=(0.0, 0.0, 0.0), seed=1, sensor=WORLD.sensor):
-    """Truth and log of so many steps of the ring from a pose."""
+    """Truth and log of so many steps of the ring from a pose; one program draws them all."""
     world = dataclasses.replace(
-        WORLD, controls=np.asarray(WORLD.controls)[:steps], pose=pose, sensor=sensor
+        WORLD, controls=np.asarray(WORLD.controls)[:40], pose=pose, sensor=sensor
     )
-    return jax.jit(partial(simulate, world))(jax.random.key(seed))
+    truth, log = worlds.draw(world, seed)
+    path = truth._replace(pose=truth.pose[:steps])
+    return path, jax.tree.map(lambda leaf: leaf[:steps], log)
 
 
 # --- the right posterior ------------------------------------------------------------------------
@@ -144,7 +144,7 @@ def test_absolute_sensors_of_a_suite_weigh_too():
 
 
 @pytest.fixture(scope="module")
-def carried(quick_compilation):
+def carried():
     """A robot anywhere, put down elsewhere after 40 steps: error [m] (runs, T), both filters."""
     first, second = (
         history(40, pose, seed) for pose, seed in (((0.5, 1.0, 2.0), 1), ((1.5, 2.5, -2.0), 2))

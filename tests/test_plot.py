@@ -45,7 +45,7 @@ def test_an_ellipse_of_no_covariance_is_refused(cov):
 
 
 @pytest.fixture(scope="module")
-def drive(quick_compilation):
+def drive():
     truth, log = simulate(WORLD, worlds.key())
     return truth, run(worlds.ekf(WORLD), log, WORLD.pose, WORLD.pose_cov, worlds.key())
 
@@ -82,7 +82,7 @@ def test_errors_are_drawn_within_their_claimed_bounds(drive):
 
 
 @pytest.fixture(scope="module")
-def campaign(quick_compilation):
+def campaign():
     """A filter and another like it; the first as if it had been watched."""
     found = monte_carlo(WORLD, {"a": worlds.ekf(WORLD)}, 4, worlds.key(), bound=True)
     a = found.filters["a"]

@@ -21,7 +21,7 @@ def reference():
 
 
 @pytest.mark.filterwarnings("default")
-def test_the_readme_runs(capsys, quick_compilation):
+def test_the_readme_runs(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(blocks) == 3
     code = "\n".join(blocks).replace("steps=500", "steps=12").replace("runs=100", "runs=3")

@@ -16,8 +16,6 @@ from jaxslam.linearize import unscented
 from jaxslam.protocols import Basis
 from jaxslam.types import Log, Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 MOTION = motion.increment(np.diag([0.02, 0.02]) ** 2)
 NOISE = np.array([[0.01**2]])
 POINTS = np.array([[4.0, 2.0], [3.0, -3.0], [7.0, 4.0]])
@@ -27,14 +25,19 @@ def camera(**options):
     return sensors.bearing_inverse_depth(NOISE, min_distance=1.0, **options)
 
 
+REDUCE = jax.jit(reduce, static_argnums=(2, 3))
+READY = jax.jit(ready, static_argnums=(1, 2))
+
+
 @cache
 def a_log(steps=40, seed=0, dtype=np.float64):
     """A robot on a bend that sees the direction of POINTS."""
     rng = np.random.default_rng(seed)
     sensor, pose, rows = sensors.bearing_only(NOISE, free=((1.0,), ((1.0,),))), np.zeros(3), []
+    move, see = jax.jit(MOTION.step), jax.jit(jax.vmap(sensor.observe, (None, 0)))
     for _ in range(steps):
-        pose = np.asarray(MOTION.step(pose, np.array([0.2, 0.05]), rng.normal(size=2) * 0.02))
-        z = np.asarray(jax.vmap(sensor.observe, (None, 0))(pose, POINTS))
+        pose = np.asarray(move(pose, np.array([0.2, 0.05]), rng.normal(size=2) * 0.02))
+        z = np.asarray(see(pose, POINTS))
         rows.append(z + 0.01 * rng.normal(size=z.shape))
     tag = np.tile(np.arange(3, dtype=np.int32), (steps, 1))
     control = np.tile([0.2, 0.05], (steps, 1)).astype(dtype)
@@ -44,7 +47,7 @@ def a_log(steps=40, seed=0, dtype=np.float64):
 def driven(filter, log):
     dtype = log.control.dtype
     start = jnp.zeros(3, dtype), jnp.zeros((3, 3), dtype), jax.random.key(0)
-    return jax.jit(lambda log: run(filter, log, *start))(log)
+    return run(filter, log, *start)
 
 
 CHARTS = {"euclidean": charts.euclidean, "right_invariant": lambda: right_invariant(rays=True)}
@@ -63,7 +66,7 @@ def test_the_covariance_goes_through_the_derivative_of_position(name, square_roo
     chart, sensor = CHARTS[name](), camera(to_point=0.1)
     joint = joint_of(name, square_root)
     which = jnp.array([True, False, True, False])
-    less = reduce(joint, which, sensor, square_root)
+    less = REDUCE(joint, which, sensor, square_root)
 
     # Brute force: retract by all errors, take positions, ask the chart of points for their errors.
     of_points = charts.REGISTRY[name]()
@@ -81,7 +84,7 @@ def test_the_covariance_goes_through_the_derivative_of_position(name, square_roo
         own = jnp.where(which[:, None], jnp.pad(dl, [(0, 0), (0, 2)]), rows)
         return jnp.concatenate([dx[0], own.reshape(-1)])
 
-    slope = np.asarray(jax.jacfwd(errors)(jnp.zeros(19)))
+    slope = np.asarray(jax.jit(jax.jacfwd(errors))(jnp.zeros(19)))
     full = np.asarray(joint.cov @ joint.cov.T if square_root else joint.cov)
     expected = slope @ full @ slope.T
     freed = [3 + 4 * slot + k for slot in (0, 2) for k in (2, 3)]
@@ -99,7 +102,7 @@ def test_the_covariance_goes_through_the_derivative_of_position(name, square_roo
 @pytest.mark.parametrize("square_root", [False, True])
 def test_nothing_to_reduce_changes_nothing(square_root):
     joint = joint_of("euclidean", square_root)
-    same = reduce(joint, jnp.zeros(4, bool), camera(to_point=0.1), square_root)
+    same = REDUCE(joint, jnp.zeros(4, bool), camera(to_point=0.1), square_root)
     for a, b in zip(jax.tree.leaves(joint), jax.tree.leaves(same), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -108,7 +111,7 @@ def test_nothing_to_reduce_changes_nothing(square_root):
 def test_a_reduced_map_is_filtered_as_one_of_points(options):
     """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
     log, sensor = a_log(), camera(to_point=0.1)
-    start = reduce(joint_of(), jnp.array([1, 1, 1, 0], bool), sensor, False)
+    start = REDUCE(joint_of(), jnp.array([1, 1, 1, 0], bool), sensor, False)
     # Without a watch, and never to be reduced again.
     start = start._replace(watch=())
     keep = np.r_[0:3, np.arange(3, 19).reshape(4, 4)[:, :2].reshape(-1)]
@@ -202,9 +205,9 @@ def test_rays_to_infinity_and_beyond_stay_rays():
 def test_dead_and_reduced_slots_are_not_ready():
     sensor = camera(to_point=1e6)
     joint = joint_of()
-    np.testing.assert_array_equal(ready(joint, sensor, False), [True, True, True, False])
-    less = reduce(joint, jnp.array([True, False, False, False]), sensor, False)
-    np.testing.assert_array_equal(ready(less, sensor, False), [False, True, True, False])
+    np.testing.assert_array_equal(READY(joint, sensor, False), [True, True, True, False])
+    less = REDUCE(joint, jnp.array([True, False, False, False]), sensor, False)
+    np.testing.assert_array_equal(READY(less, sensor, False), [False, True, True, False])
     gone = slots.remove(less, jnp.array([True, False, False, False]))
     assert not gone.reduced.any()
 

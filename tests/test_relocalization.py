@@ -16,8 +16,6 @@ from jaxslam.slots import Joint
 from jaxslam.stats import chi2_band, chi2_quantile
 from jaxslam.types import Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SENSOR = sensors.range_bearing(np.diag([0.05, 0.01]) ** 2, mount=(0.2, 0.1, 0.3))
 FIND = jax.jit(relocalize)
 

@@ -1,7 +1,6 @@
 """The scenarios of the consistency family: parameters as published, worlds as described."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import numpy as np
@@ -18,11 +17,9 @@ from jaxslam.scenarios import (
 )
 from jaxslam.simulate import simulate
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def draw(world, seed=0):
-    return jax.jit(partial(simulate, world))(jax.random.key(seed))
+    return simulate(world, jax.random.key(seed))
 
 
 def test_loop_has_the_parameters_of_huang_et_al():

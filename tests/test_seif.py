@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import draw
 
 from jaxslam import filters, sensors
 from jaxslam.filters import blankets, sparse_map, sparsification
@@ -14,10 +15,7 @@ from jaxslam.filters.recovery import relaxed
 from jaxslam.run import run
 from jaxslam.scenarios import cloister
 from jaxslam.scenarios.view import between_ranges
-from jaxslam.simulate import simulate
 from jaxslam.types import Status
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.1, 0.1, 0.05]) ** 2
@@ -30,7 +28,7 @@ def world(steps=40):
     scene = dataclasses.replace(
         cloister(steps), visible=between_ranges(0.0, 2.2), places=8, pose_cov=P0
     )
-    return scene, jax.jit(functools.partial(simulate, scene))(jax.random.key(1))[1]
+    return scene, draw(scene)[1]
 
 
 @functools.cache
@@ -182,7 +180,7 @@ def test_with_all_active_it_is_the_eif():
     scene, log = world()
     eif = filters.eif_slam(scene.motion, scene.sensor, COUNT)
     sparse = filters.seif(scene.motion, scene.sensor, COUNT, active=99, links=COUNT - 1)
-    a, b = (jax.jit(lambda log, f=f: run(f, log, scene.pose, P0, KEY))(log) for f in (eif, sparse))
+    a, b = (run(f, log, scene.pose, P0, KEY) for f in (eif, sparse))
     np.testing.assert_allclose(a.estimate.pose, b.estimate.pose, atol=1e-8)
     np.testing.assert_allclose(a.estimate.pose_cov, b.estimate.pose_cov, atol=1e-8)
     np.testing.assert_allclose(a.info.nis, b.info.nis, rtol=1e-6, atol=1e-8)

@@ -1,7 +1,7 @@
 """Spurious data: it is what it says, the truth knows of it, and associations are scored by it."""
 
 import dataclasses
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +74,7 @@ def test_false_measurements_are_of_points_within_reach():
 
 def test_nothing_wrong_leaves_the_scan_alone():
     world = dataclasses.replace(worlds.ring(steps=5), spurious=Spurious())
-    truth, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    truth, log = simulate(world, jax.random.key(1))
     np.testing.assert_array_equal(truth.origin, log.scan.tag)
     assert log.scan.valid.all()
 
@@ -115,20 +115,24 @@ def test_associations_are_counted_by_what_a_slot_was_born_of():
     assert float(found["false_landmarks"][0]) == 1
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        association.nearest(16.0, 36.0),
-        association.maximum_likelihood(16.0, 36.0),
-        association.global_nearest(16.0, 36.0),
-        association.joint(0.999, 36.0),
-    ],
-    ids=["nearest", "maximum_likelihood", "global_nearest", "joint"],
-)
-def test_where_landmarks_are_far_apart_every_method_finds_them_without_tags(method):
+METHODS = {
+    "nearest": association.nearest(16.0, 36.0),
+    "maximum_likelihood": association.maximum_likelihood(16.0, 36.0),
+    "global_nearest": association.global_nearest(16.0, 36.0),
+    "joint": association.joint(0.999, 36.0),
+}
+
+
+@pytest.fixture(scope="module")
+def campaign():
     world = dataclasses.replace(worlds.ring(steps=12), spurious=Spurious())
-    filter = worlds.ekf(world, associate=method)
-    summary = monte_carlo(world, {"it": filter}, 4, jax.random.key(0)).filters["it"]
+    filters = {name: worlds.ekf(world, associate=method) for name, method in METHODS.items()}
+    return monte_carlo(world, filters, 4, jax.random.key(0)).filters
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_where_landmarks_are_far_apart_every_method_finds_them_without_tags(campaign, name):
+    summary = campaign[name]
     assert summary.measures["precision"].value == 1.0
     assert summary.measures["recall"].value > 0.99
     assert summary.measures["false_landmarks"].value == 0

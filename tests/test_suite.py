@@ -6,18 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import ring
+from worlds import draw, ring
 
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.scenarios import between_ranges
 from jaxslam.sensors import Part, suite
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulate import Scenario
 from jaxslam.spurious import Spurious
 from jaxslam.types import Status
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 EYES = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
 LASER = sensors.relative_position(np.diag([0.04, 0.06]) ** 2, mount=(-0.2, 0.0, 3.0))
@@ -35,13 +33,13 @@ def world(steps=40, **changes):
 
 
 def drawn(scenario, seed=0):
-    return simulate(scenario, jax.random.key(seed))
+    return draw(scenario, seed)
 
 
 def go(scenario, log, **options):
     ekf = ekf_slam(scenario.motion, scenario.sensor, len(scenario.landmarks), **options)
     start = scenario.pose, scenario.pose_cov, jax.random.key(0)
-    return jax.jit(lambda log: jaxslam.run(ekf, log, *start))(log)
+    return jax.device_get(jaxslam.run(ekf, log, *start))
 
 
 def test_a_suite_of_one_is_the_sensor():

@@ -1,7 +1,5 @@
 """The unscented transform against its textbook sums, and the UKF's limits."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +11,6 @@ from jaxslam import charts, linearize
 from jaxslam.linearize.unscented import by_variables, regress
 from jaxslam.run import run
 from jaxslam.simulate import simulate
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def curved(xi):
@@ -77,14 +73,14 @@ def test_with_points_close_together_it_is_the_ekf_of_the_same_chart(chart):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_pose_known_exactly_and_both_dtypes(dtype):
     world = worlds.ring(steps=20)  # P0 = 0
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
+    _, log = simulate(world, jax.random.key(1))
     log = jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, log)
     filter = worlds.ekf(world, linearize=linearize.unscented(), update="joint")
     trace = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, jax.random.key(0)))(
         log
     )
     first = worlds.ekf(world, update="joint")
-    usual = jax.jit(lambda log: run(first, log, world.pose, world.pose_cov, jax.random.key(0)))(log)
+    usual = run(first, log, world.pose, world.pose_cov, jax.random.key(0))
     assert trace.estimate.pose.dtype == dtype
     assert np.isfinite(trace.estimate.pose_cov).all()
     np.testing.assert_allclose(trace.estimate.pose, usual.estimate.pose, atol=5e-3)

@@ -1,7 +1,6 @@
 """substeps is its model in a loop; webmap is the car it says, on a closed path of its own."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,6 @@ from jaxslam.filters import ekf_slam
 from jaxslam.motion.substeps import substeps
 from jaxslam.scenarios.webmap import webmap
 from jaxslam.simulate import simulate
-
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 Q = np.array([[0.04, 0.003], [0.003, 0.01]])
 COUNT = 3
@@ -143,13 +140,13 @@ def test_a_bad_count_is_refused(count):
 
 
 @pytest.fixture(scope="module")
-def scenario(quick_compilation):
+def scenario():
     return webmap()
 
 
 @pytest.fixture(scope="module")
 def drawn(scenario):
-    return jax.device_get(jax.jit(functools.partial(simulate, scenario))(jax.random.key(0)))
+    return jax.device_get(simulate(scenario, jax.random.key(0)))
 
 
 def fine_controls(scenario):
@@ -271,7 +268,7 @@ def test_ekf_slam_runs_on_it():
     scenario = webmap(20)
     landmarks = np.asarray(scenario.landmarks)
     ekf = ekf_slam(scenario.motion, scenario.sensor, len(landmarks), **scenario.filter_options)
-    truth, log = jax.jit(functools.partial(simulate, scenario))(jax.random.key(1))
+    truth, log = simulate(scenario, jax.random.key(1))
     go = jax.jit(lambda log: run(ekf, log, scenario.pose, scenario.pose_cov, jax.random.key(2)))
     trace = jax.device_get(go(log))
     for leaf in jax.tree.leaves((trace.estimate, trace.info)):

@@ -17,32 +17,44 @@ STEPS, PLACES = 1000, 4
 MOTION = motion.increment(np.diag([0.01, 0.01]) ** 2)
 SENSOR = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2)
 GATE, NEW = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
-METHODS = {
-    "nearest": lambda: association.nearest(GATE, NEW),
-    "maximum_likelihood": lambda: association.maximum_likelihood(GATE, NEW),
-    "global_nearest": lambda: association.global_nearest(GATE, NEW),
-    "joint": lambda: association.joint(0.99, NEW, budget=50),
-    "gates of 0 and ∞": lambda: association.nearest(0.0, np.inf),
-    "gates of ∞": lambda: association.nearest(np.inf, np.inf),
+MAKERS = {
+    "nearest": association.nearest,
+    "maximum_likelihood": association.maximum_likelihood,
+    "global_nearest": association.global_nearest,
+    "joint": lambda _, new: association.joint(0.99, new, budget=50),
+}
+METHODS = {name: (name, GATE, NEW) for name in MAKERS} | {
+    "gates of 0 and ∞": ("nearest", 0.0, np.inf),
+    "gates of ∞": ("nearest", np.inf, np.inf),
 }
 CASES = [(method, 6) for method in METHODS] + [("nearest", 1), ("joint", 1)]
 
 
 @cache
-def go(method, capacity):
+def program(maker, capacity):
+    """A run as a program of the log and the gates."""
     manager = life.existence(
         lambda pose, point: ((point - pose[:2]) ** 2).sum() < 25, patience=5, replace=True
     )
-    filter = ekf_slam(
-        MOTION,
-        SENSOR,
-        capacity,
-        associate=METHODS[method](),
-        life=manager,
-        merge=duplicates(0.3),
-    )
-    start = jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)
-    return jax.jit(lambda log: run(filter, log, *start))
+
+    def one(log, *gates):
+        filter = ekf_slam(
+            MOTION,
+            SENSOR,
+            capacity,
+            associate=MAKERS[maker](*gates),
+            life=manager,
+            merge=duplicates(0.3),
+        )
+        return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0))
+
+    return jax.jit(one)
+
+
+@cache
+def go(method, capacity, world):
+    maker, *gates = METHODS[method]
+    return jax.device_get(program(maker, capacity)(WORLDS[world], *gates))
 
 
 def log_of(z, valid):
@@ -87,7 +99,7 @@ WORLDS = worlds()
 @pytest.mark.parametrize(("method", "capacity"), CASES)
 def test_everything_stays_finite_and_nothing_is_lost_uncounted(method, capacity):
     for name, log in WORLDS.items():
-        trace = go(method, capacity)(log)
+        trace = go(method, capacity, name)
         for leaf in jax.tree.leaves(trace):
             assert np.isfinite(leaf).all() if leaf.dtype.kind == "f" else True, name
         # Every measurement has a status; every landmark of the map was born, and every one that
@@ -106,16 +118,16 @@ def test_everything_stays_finite_and_nothing_is_lost_uncounted(method, capacity)
 
 @pytest.mark.parametrize("method", ["nearest", "joint", "maximum_likelihood", "global_nearest"])
 def test_what_the_worlds_hold_is_found(method):
-    clean = go(method, 6)(WORLDS["four landmarks"])
+    clean = go(method, 6, "four landmarks")
     assert np.asarray(clean.final.alive).sum() == 4
     assert (np.asarray(clean.info.status)[1:] == Status.FUSED).mean() > 0.97
-    nothing = go(method, 6)(WORLDS["nothing seen"])
+    nothing = go(method, 6, "nothing seen")
     assert not np.asarray(nothing.final.alive).any()
     assert (np.asarray(nothing.estimate.pose_cov)[-1, :2, :2].trace()) > 0
 
 
 def test_clutter_alone_confirms_nothing_for_long():
-    trace = go("joint", 6)(WORLDS["nothing but clutter"])
+    trace = go("joint", 6, "nothing but clutter")
     removed = np.asarray(trace.info.removed).sum()
     assert removed > 50  # it comes and goes …
     confirmed = np.asarray(trace.final.life.confirmed) & np.asarray(trace.final.alive)

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import filters, linearize, motion, sensors
-from jaxslam.simulate import Scenario
+from jaxslam.simulate import Scenario, simulate
+from jaxslam.stats import t_quantile
+from jaxslam.types import Status
 
 
 def ring(steps: int = 100, seed: int = 3) -> Scenario:
@@ -95,3 +97,50 @@ WRONG = {
 
 def key(seed: int = 0):
     return jax.random.key(seed)
+
+
+def draw(scenario, seed=1):
+    """A truth and a log of the scenario, in NumPy."""
+    return jax.device_get(simulate(scenario, jax.random.key(seed)))
+
+
+def judged(truth, estimate, info):
+    """What a campaign says of many runs (runs, T, …): {measure: (mean, low, high)}, in NumPy.
+
+    NEES of the pose (3) and of a landmark (2), NIS by its degrees of freedom, and the position's
+    error; averaged over each run, with the 95 % interval of the mean over runs.
+    """
+    truth, estimate, info = jax.tree.map(np.asarray, (truth, estimate, info))
+    error = truth.pose - estimate.pose
+    error[..., 2] = np.angle(np.exp(1j * error[..., 2]))
+    own = np.take_along_axis(truth.landmarks[:, None], np.maximum(estimate.tag, 0)[..., None], 2)
+    square = nees(own[..., :2] - estimate.points, estimate.point_covs)
+    fused = info.status == Status.FUSED
+    each = {
+        "nees_pose": np.nanmean(nees(error, estimate.pose_cov), axis=1),
+        "nees_landmarks": np.where(estimate.alive, square, 0.0).sum(axis=(1, 2))
+        / estimate.alive.sum(axis=(1, 2)),
+        "nis_per_dof": np.where(fused, info.nis, 0.0).sum(axis=(1, 2)) / info.dof.sum(axis=(1, 2)),
+        "error_position": np.hypot(error[..., 0], error[..., 1]).mean(axis=1),
+        "error_landmarks": np.sqrt(
+            (
+                np.where(estimate.alive, ((own[..., :2] - estimate.points) ** 2).sum(-1), 0.0)[
+                    :, -1
+                ]
+            ).sum(-1)
+            / estimate.alive[:, -1].sum(-1)
+        ),
+    }
+    found = {}
+    for name, values in each.items():
+        half = t_quantile(0.975, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5
+        found[name] = values.mean(), values.mean() - half, values.mean() + half
+    return found
+
+
+def nees(error, cov):
+    """eᵀ P⁻¹ e over any leading axes; NaN where P is singular, as at a start with P0 = 0."""
+    regular = np.linalg.cond(cov) < 1e12
+    cov = np.where(regular[..., None, None], cov, np.eye(cov.shape[-1]))
+    square = (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(axis=-1)
+    return np.where(regular, square, np.nan)

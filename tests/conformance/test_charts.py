@@ -10,11 +10,10 @@ import pytest
 from jaxslam.charts import REGISTRY
 
 DTYPES = [np.float32, np.float64]
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 @pytest.fixture(scope="module", params=REGISTRY)
-def made(request, hard_angles, quick_compilation):
+def made(request, hard_angles):
     """A chart of the registry, cases (pose, l, dx, dl) with leading C, and one compiled call."""
     chart = REGISTRY[request.param]()
     rng = np.random.default_rng(0)

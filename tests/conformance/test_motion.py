@@ -10,7 +10,6 @@ import pytest
 from jaxslam.motion import REGISTRY
 
 DTYPES = [np.float32, np.float64]
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def random_covariance(rng, n):
@@ -39,7 +38,7 @@ def cases_of(model, hard_angles):
 
 
 @pytest.fixture(scope="module", params=REGISTRY)
-def made(request, hard_angles, quick_compilation):
+def made(request, hard_angles):
     """A model of the registry with a random noise covariance, its cases, and one compiled call."""
     factory = REGISTRY[request.param]
     width = len(factory(lambda pose, u: None).noises)

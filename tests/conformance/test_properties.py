@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from jaxslam import angles, charts, motion, se2, sensors
 from jaxslam.verify import build
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 law = settings(max_examples=60, deadline=None, derandomize=True)
 
 

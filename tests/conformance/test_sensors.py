@@ -11,7 +11,6 @@ from jaxslam.protocols import Free
 from jaxslam.sensors import REGISTRY
 
 DTYPES = [np.float32, np.float64]
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 MOUNT = np.array([0.4, -0.3, 0.9])
 NO_LANDMARK = "an absolute sensor has no landmark"
 
@@ -29,7 +28,7 @@ def random_covariance(rng, n):
 
 
 @pytest.fixture(scope="module", params=REGISTRY)
-def made(request, hard_angles, quick_compilation):
+def made(request, hard_angles):
     """A sensor of the registry, mounted off the robot's centre, and its compiled functions."""
     factory = REGISTRY[request.param]
     width = len(factory(lambda z: None).measurements)

@@ -16,8 +16,6 @@ from jaxslam.scenarios import cloister
 from jaxslam.simulate import simulate
 from jaxslam.types import Scan, Status
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(4)
 CAPACITY = 24
 STEPS, PLACES = 120, 6

@@ -1,18 +1,19 @@
 """The canonical form is the same filter: EIF-SLAM against the EKF, number by number."""
 
 import dataclasses
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import draw
 
 from jaxslam import filters, motion, sensors
 from jaxslam.run import run
 from jaxslam.scenarios import cloister
 from jaxslam.scenarios.view import between_ranges
-from jaxslam.simulate import simulate
-from jaxslam.types import Log, Scan, Status
+from jaxslam.types import Scan, Status
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.1, 0.1, 0.05]) ** 2
@@ -24,21 +25,30 @@ def world(steps=60, **changes):
     return dataclasses.replace(cloister(steps), **changes)
 
 
-def driven(filter, scene, log, dtype=None):
-    if dtype is not None:
-        log = jax.tree.map(
-            lambda leaf: leaf.astype(dtype) if leaf.dtype == jnp.float64 else leaf, log
-        )
-    return jax.jit(lambda log: run(filter, log, scene.pose, scene.pose_cov, KEY))(log)
+@cache
+def drawn(steps=60):
+    """A log of the world, for all tests that change no model."""
+    return draw(world(steps))[1]
+
+
+@cache
+def pair(gate=None):
+    """The two filters of 36 landmarks, for all tests; the floor is of a singular start alone."""
+    scene = world()
+    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint", gate=gate)
+    return ekf, filters.eif_slam(scene.motion, scene.sensor, 36, gate=gate, floor=1e-3)
+
+
+def driven(filter, scene, log, dtype=np.float64, pose_cov=None):
+    cov = scene.pose_cov if pose_cov is None else pose_cov
+    inputs = jax.tree.map(np.asarray, (log, scene.pose, cov))
+    inputs = jax.tree.map(lambda x: x.astype(dtype) if x.dtype == np.float64 else x, inputs)
+    return run(filter, *inputs, KEY)
 
 
 @pytest.mark.parametrize("gate", [None, 6.0])
 def test_eif_is_the_ekf(gate):
-    scene = world()
-    _, log = simulate(scene, jax.random.key(1))
-    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint", gate=gate)
-    eif = filters.eif_slam(scene.motion, scene.sensor, 36, gate=gate)
-    a, b = driven(ekf, scene, log), driven(eif, scene, log)
+    a, b = (driven(filter, world(), drawn()) for filter in pair(gate))
     for name in ("pose", "pose_cov", "points", "point_covs", "alive", "tag"):
         np.testing.assert_allclose(
             getattr(b.estimate, name), getattr(a.estimate, name), rtol=0, atol=1e-8, err_msg=name
@@ -61,12 +71,9 @@ def test_eif_is_the_ekf(gate):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_certain_start_gets_the_floor(dtype):
     """P0 = 0 has no inverse: the filter is the EKF that starts with floor² I."""
-    scene = world(20, pose_cov=np.zeros((3, 3)))
-    _, log = simulate(scene, jax.random.key(1))
-    eif = filters.eif_slam(scene.motion, scene.sensor, 36, floor=1e-3)
-    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint")
-    softer = dataclasses.replace(scene, pose_cov=1e-6 * np.eye(3))
-    a, b = driven(ekf, softer, log), driven(eif, scene, log, dtype)
+    ekf, eif = pair()
+    a = driven(ekf, world(), drawn(), pose_cov=1e-6 * np.eye(3))
+    b = driven(eif, world(), drawn(), dtype, pose_cov=np.zeros((3, 3)))
     assert b.estimate.pose.dtype == dtype
     atol = 1e-8 if dtype == jnp.float64 else 1e-3
     np.testing.assert_allclose(b.estimate.pose, a.estimate.pose, atol=atol)
@@ -74,41 +81,32 @@ def test_a_certain_start_gets_the_floor(dtype):
     assert int(b.final.broken) == 0
 
 
-def test_full_maps_unknown_tags_and_empty_scans():
-    scene = world(15)
-    _, log = simulate(scene, jax.random.key(1))
-    tag = np.array(log.scan.tag)
+def test_other_models_full_maps_unknown_tags_and_empty_scans():
+    """Landmarks of three parameters, in the canonical form as in the other, in too small a map."""
+    sensor = sensors.range_bearing_signature(np.diag([0.1, 0.02, 0.1]) ** 2)
+    points = np.concatenate([cloister().landmarks, np.arange(36)[:, None] * 0.3], axis=1)
+    scene = world(15, sensor=sensor, landmarks=points)
+    log = draw(scene, 3)[1]
+    tag, valid = log.scan.tag.copy(), log.scan.valid.copy()
     tag[:, 0] = -1
-    valid = np.array(log.scan.valid)
     valid[7] = False
-    log = log._replace(scan=log.scan._replace(tag=jnp.asarray(tag), valid=jnp.asarray(valid)))
+    log = log._replace(scan=log.scan._replace(tag=tag, valid=valid))
     a = driven(filters.ekf_slam(scene.motion, scene.sensor, 5, update="joint"), scene, log)
     b = driven(filters.eif_slam(scene.motion, scene.sensor, 5), scene, log)
     np.testing.assert_array_equal(a.info.status, b.info.status)
     assert b.info.tally(Status.OVERFLOW).sum() > 0
     assert b.info.tally(Status.UNMATCHED).sum() > 0
     np.testing.assert_allclose(b.estimate.pose, a.estimate.pose, atol=1e-8)
-
-
-def test_other_models():
-    """A landmark of three parameters, in the canonical form as in the other."""
-    sensor = sensors.range_bearing_signature(np.diag([0.1, 0.02, 0.1]) ** 2)
-    points = np.concatenate([cloister().landmarks, np.arange(36)[:, None] * 0.3], axis=1)
-    scene = world(15, sensor=sensor, landmarks=points)
-    _, log = simulate(scene, jax.random.key(3))
-    a = driven(filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint"), scene, log)
-    b = driven(filters.eif_slam(scene.motion, scene.sensor, 36), scene, log)
     np.testing.assert_allclose(b.final.landmarks, a.final.landmarks, atol=1e-8)
 
 
 def test_a_lost_definiteness_is_refused_counted_and_recovered():
-    scene = world(6)
-    _, log = simulate(scene, jax.random.key(1))
-    eif = filters.eif_slam(scene.motion, scene.sensor, 36)
-    state = driven(eif, scene, log).final
+    log, eif = drawn(), pair()[1]
+    update = jax.jit(eif.update)
+    state = driven(eif, world(), log).final
     bad = state._replace(omega=state.omega.at[0, 0].set(-1.0))
     scan = jax.tree.map(lambda leaf: leaf[-1], log.scan)
-    after, info = jax.jit(eif.update)(bad, scan, KEY)
+    after, info = update(bad, scan, KEY)
     assert int(after.broken) == 1
     np.testing.assert_array_equal(after.pose, bad.pose)
     assert np.all(np.asarray(info.status)[np.asarray(scan.valid)] == Status.SINGULAR)
@@ -119,16 +117,15 @@ def test_a_lost_definiteness_is_refused_counted_and_recovered():
     slip = size[0] + 1e-12 * size[-1]
     omega[np.ix_(part, part)] -= slip * np.outer(axes[:, 0], axes[:, 0])
     bad = state._replace(omega=jnp.asarray(omega))
-    after, _ = jax.jit(eif.update)(bad, scan, KEY)
+    after, _ = update(bad, scan, KEY)
     assert int(after.broken) == 1
-    after, info = jax.jit(eif.update)(after, scan, KEY)
+    after, info = update(after, scan, KEY)
     assert int(after.broken) == 1
     assert (np.asarray(info.status) == Status.FUSED).any()
 
 
 def test_gradients_and_batches():
-    scene = world(6)
-    _, log = simulate(scene, jax.random.key(1))
+    scene, log = world(6), drawn(6)
 
     def loss(sigma, z):
         sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
@@ -136,13 +133,15 @@ def test_gradients_and_batches():
         changed = log._replace(scan=log.scan._replace(z=z))
         return run(eif, changed, scene.pose, P0, KEY).estimate.pose[-1, :2].sum()
 
-    slope = jax.jit(jax.grad(loss, argnums=(0, 1)))(0.1, log.scan.z)
+    value, slope = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(0.1, log.scan.z)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
     step = 1e-5
-    rise = (loss(0.1 + step, log.scan.z) - loss(0.1 - step, log.scan.z)) / (2 * step)
-    np.testing.assert_allclose(slope[0], rise, rtol=1e-4)
-    both = jax.vmap(loss, (None, 0))(0.1, jnp.stack([log.scan.z, log.scan.z + 0.01]))
-    np.testing.assert_allclose(both[0], loss(0.1, log.scan.z), rtol=1e-10)
+    sigma = np.array([0.1, 0.1 + step, 0.1 - step, 0.1])
+    z = np.stack([log.scan.z] * 3 + [log.scan.z + 0.01])
+    batch = jax.jit(jax.vmap(loss))(sigma, z)
+    np.testing.assert_allclose(slope[0], (batch[1] - batch[2]) / (2 * step), rtol=1e-4)
+    np.testing.assert_allclose(batch[0], value, rtol=1e-10)
+    assert batch[3] != batch[0]
 
 
 @pytest.mark.parametrize(
@@ -177,14 +176,20 @@ def test_scans_without_places_and_measurements_beyond_all_numbers(name):
     make, options = FAMILY[name]
     scene = world(2, pose_cov=P0)
     filter = make(scene.motion, scene.sensor, 2, **options)
-    control = jnp.asarray(scene.controls[:3]) if len(scene.controls) > 2 else jnp.zeros((3, 2))
-    empty = Scan(jnp.zeros((3, 0, 2)), jnp.zeros((3, 0), jnp.int32), jnp.zeros((3, 0), bool))
-    none = driven(filter, scene, Log(control, empty))
-    assert np.isfinite(none.estimate.pose_cov).all()
-    z = jnp.array([[[2.0, 0.1]], [[1e200, 0.1]], [[2.0, 0.1]]])
-    scan = Scan(z, jnp.zeros((3, 1), jnp.int32), jnp.ones((3, 1), bool))
-    far = driven(filter, scene, Log(control, scan))
-    left = driven(filter, scene, Log(control, scan._replace(valid=scan.valid.at[1].set(False))))
-    assert far.info.status[1, 0] == Status.REJECTED
-    np.testing.assert_allclose(far.estimate.pose, left.estimate.pose, atol=1e-12)
-    np.testing.assert_allclose(far.estimate.pose_cov, left.estimate.pose_cov, atol=1e-12)
+    update, estimate = jax.jit(filter.update), jax.jit(filter.estimate)
+    start = filter.init(jnp.asarray(scene.pose), jnp.asarray(P0))
+    nothing = Scan(np.zeros((0, 2)), np.zeros(0, np.int32), np.zeros(0, bool))
+    none, _ = update(start, nothing, KEY)
+    np.testing.assert_allclose(estimate(none).pose_cov, P0, rtol=0, atol=1e-12)
+    states = []
+    for valid in (True, False):
+        state = start
+        for distance, there in ((2.0, True), (1e200, valid), (2.0, True)):
+            scan = Scan(np.array([[distance, 0.1]]), np.zeros(1, np.int32), np.array([there]))
+            state, info = update(state, scan, KEY)
+            if distance > 2.0 and valid:
+                assert info.status[0] == Status.REJECTED
+        states.append(estimate(state))
+    far, left = states
+    np.testing.assert_allclose(far.pose, left.pose, atol=1e-12)
+    np.testing.assert_allclose(far.pose_cov, left.pose_cov, atol=1e-12)

@@ -1,10 +1,7 @@
 """The chart `robocentric` is the filter of Castellanos et al. 2007."""
 
-from functools import partial
-
 import jax
 import numpy as np
-import pytest
 from reference.robocentric import Robocentric
 
 from jaxslam.family import FILTERS
@@ -12,12 +9,10 @@ from jaxslam.run import run
 from jaxslam.scenarios import loop
 from jaxslam.simulate import simulate
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def test_a_run_is_that_of_the_plain_filter():
     world = loop(steps=60)
-    _, log = jax.jit(partial(simulate, world))(jax.random.key(3))
+    _, log = simulate(world, jax.random.key(3))
     filter = FILTERS["robocentric"](world)
     trace = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, jax.random.key(0)))(
         log
