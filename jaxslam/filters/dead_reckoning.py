@@ -5,7 +5,7 @@ import dataclasses
 import jax
 
 from jaxslam.filters.ekf_slam import ekf_slam
-from jaxslam.filters.scanning import left_alone
+from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
@@ -26,7 +26,6 @@ def dead_reckoning(
     filter = ekf_slam(motion, sensor, 1, chart=chart, linearize=linearize)
 
     def update(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
-        joint, info, _ = left_alone(joint, scan)
-        return joint, info
+        return joint, nothing_of(scan)
 
     return dataclasses.replace(filter, name="dead_reckoning", update=update)

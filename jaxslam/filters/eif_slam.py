@@ -9,12 +9,12 @@ from jaxslam import linalg, slots
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import canonical
 from jaxslam.filters.moments import moments
-from jaxslam.filters.scanning import seen_before
+from jaxslam.filters.reporting import seen_before
 from jaxslam.linalg import check_count, check_gate
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Scan, Status
+from jaxslam.types import Estimate, Info, Scan
 
 
 class Canonical(NamedTuple):
@@ -116,13 +116,14 @@ def eif_slam(
             tag=state.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
             broken=state.broken + (scan.valid.any() & ~sound),
         )
-        info = canonical.with_births(
-            canonical.unless(sound, weighed.info),
+        info = canonical.reported(
+            canonical.judged(weighed, sound),
             scan,
             jnp.where(new, fresh, at),
-            new,
-            [repeated, granted, room, jnp.ones_like(new)],
-            [Status.REPEATED, Status.BORN, Status.SINGULAR, Status.OVERFLOW],
+            new=new,
+            repeated=repeated,
+            granted=granted,
+            singular=room,
         )
         return after, info
 

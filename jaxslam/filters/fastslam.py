@@ -19,6 +19,7 @@ from jaxslam.filters.particles import (
     moments,
     over_particles,
 )
+from jaxslam.filters.reporting import has_distance
 from jaxslam.linearize import first_order
 from jaxslam.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
 from jaxslam.resampling import weights
@@ -167,7 +168,7 @@ def fastslam(
         state, infos = jax.vmap(change_map, in_axes=(0, 0, None))(state, sight, scan)
         info: Info = jax.tree.map(lambda of_all: of_all[best], infos)
         info = info._replace(
-            nis=jnp.where(sight.matched[best], nis, 0.0),
+            nis=jnp.where(has_distance(info.status), nis, 0.0),
             log_likelihood=log_likelihood,
             exhausted=sight.exhausted.any(),
             ess=ess,

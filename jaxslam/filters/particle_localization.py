@@ -16,14 +16,14 @@ from jaxslam.filters import cloud, particle_checks, particle_fit
 from jaxslam.filters.cloud import Cloud
 from jaxslam.filters.localization import checked_map
 from jaxslam.filters.particles import finite, over_particles
-from jaxslam.filters.scanning import first_that_holds
+from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.protocols import Associate, Differentiable, Filter, Motion, Resample, Sensor
 from jaxslam.resampling.kld import bins_of, enough
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import effective_size, normalized, survivors
 from jaxslam.sensors.suite import Suite
 from jaxslam.stats import chi2_quantile
-from jaxslam.types import Estimate, Info, Scan, Status
+from jaxslam.types import Estimate, Info, Scan
 
 Array = jax.Array
 
@@ -212,21 +212,14 @@ def particle_localization(
         if inject:
             due = due | (lost > 0)
         own: particle_fit.Fit = jax.tree.map(lambda of_all: of_all[best], fit)
-        status = first_that_holds(
-            (own.matched & ~own.inside, Status.REJECTED),
-            (own.matched & ~own.used, Status.SINGULAR),
-            (own.matched, Status.FUSED),
-            (scan.valid, Status.UNMATCHED),
-        )
-        fused = status == Status.FUSED
-        nis = over_particles(fit.nis, fit.matched, weight)
-        info = Info(
-            nis=jnp.where(own.matched, nis, 0.0),
-            dof=jnp.where(fused, jnp.concatenate(_dof(parts, len(scan.tag))), 0),
+        info = info_of(
+            status_of(scan.valid, matched=own.matched, positive=own.positive, inside=own.inside),
+            own.matched,
+            size=jnp.concatenate(_dof(parts, len(scan.tag))),
+            slot=own.slot,
+            nis=over_particles(fit.nis, fit.matched, weight),
             innovation=own.innovation,
             innovation_cov=own.cov,
-            slot=jnp.where(fused, own.slot, -1),
-            status=status,
             log_likelihood=log_likelihood,
             exhausted=fit.exhausted.any(),
             ess=ess,

@@ -12,7 +12,7 @@ from jaxslam.filters import canonical
 from jaxslam.filters.blankets import marginals, whole_marginals
 from jaxslam.filters.eif_slam import check_models
 from jaxslam.filters.recovery import owed_of, owing
-from jaxslam.filters.scanning import seen_before
+from jaxslam.filters.reporting import seen_before
 from jaxslam.filters.sparse_map import Sparse, empty
 from jaxslam.linalg import check_count
 from jaxslam.protocols import Filter, Motion, Sensor
