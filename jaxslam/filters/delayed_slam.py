@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam import validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.correction import correct_in_turn
@@ -110,9 +111,11 @@ def delayed_slam(
     Raises:
         ValueError: on counts below 1, parameters out of range, or a sensor that does not fit.
     """
+    validation.check_models("delayed_slam", motion, sensor)
+    validation.check_parts("delayed_slam", associate=associate)
+    _check_sensor(sensor)
     tagged = associate is None
     associate = associate or known_association()
-    _check_sensor(sensor)
     meeting = meeting_of(sensor) if meet is None else meet
     gate = chi2_quantile(0.99, 1) if gate is None else gate
     if same is None:

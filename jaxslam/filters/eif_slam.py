@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg, slots
+from jaxslam import linalg, slots, validation
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import canonical
 from jaxslam.filters.moments import moments
@@ -68,7 +68,7 @@ def eif_slam(
         ValueError: on a capacity below 1, a gate or floor not above 0, a suite, or a sensor that
             has no landmarks or whose landmarks become points.
     """
-    check_models("eif_slam", sensor, capacity, gate, floor)
+    check_models("eif_slam", motion, sensor, capacity, gate, floor)
     size = len(sensor.landmark)
 
     def init(pose: jax.Array, pose_cov: jax.Array) -> Canonical:
@@ -145,9 +145,15 @@ def eif_slam(
 
 
 def check_models(
-    name: str, sensor: Sensor, capacity: int, gate: float | None, floor: float
+    name: str,
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    gate: float | None,
+    floor: float,
 ) -> None:
     """Raise ValueError on what no filter in canonical form takes."""
+    validation.check_models(name, motion, sensor)
     check_count(f"{name}: capacity", capacity)
     check_gate(name, gate)
     canonical.check_floor(name, floor)

@@ -77,6 +77,7 @@ def eseif(
     """
     check_sparse(
         "eseif",
+        motion,
         sensor,
         capacity,
         gate,

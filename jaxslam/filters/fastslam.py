@@ -6,7 +6,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
+from jaxslam import linalg, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import particle_map, particle_scan
@@ -95,6 +95,8 @@ def fastslam(
             gate not above 0, an unknown proposal, a life that is none, a resample that is no
             function, or a sensor that is a suite, absolute, or whose landmarks turn into points.
     """
+    validation.check_models("fastslam", motion, sensor)
+    validation.check_parts("fastslam", associate=associate)
     counts = {"capacity": capacity, "particles": particles, "births": births}
     _check(sensor, counts, threshold, gate, (proposal, resample, life))
     associate = associate or known_association()

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam import linalg
+from jaxslam import linalg, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import cloud, particle_checks, particle_fit
@@ -116,6 +116,8 @@ def particle_localization(
             a threshold outside [0, 1], a gate, bins, error or slack not above 0, a confidence not
             within (0, 1), or rates that do not fit.
     """
+    validation.check_models("particle_localization", motion, sensor)
+    validation.check_parts("particle_localization", associate=associate)
     points, names = checked_map("particle_localization", sensor, landmarks, tags)
     least = particle_checks.checked_least(particles, least)
     particle_checks.check_resample(resample)

@@ -72,6 +72,7 @@ def seif(
     """
     check_sparse(
         "seif",
+        motion,
         sensor,
         capacity,
         gate,

@@ -147,10 +147,16 @@ def sparse_filter(
 
 
 def check_sparse(
-    name: str, sensor: Sensor, capacity: int, gate: float | None, floor: float, **counts: Any
+    name: str,
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    gate: float | None,
+    floor: float,
+    **counts: Any,
 ) -> None:
     """Raise ValueError on what no filter of a `Sparse` map takes; counts are to be above 0."""
-    check_models(name, sensor, capacity, gate, floor)
+    check_models(name, motion, sensor, capacity, gate, floor)
     for what, value in counts.items():
         check_count(f"{name}: {what}", value)
     if len(sensor.landmark) != 2:

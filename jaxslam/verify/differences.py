@@ -1,5 +1,6 @@
 """Difference quotients with an error estimate: the Jacobian that sees only a function's values."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -79,7 +80,7 @@ def quotients(
     kink = turn > _KINK * np.abs(sides).max(axis=(1, 2, 3), initial=0.0)[:, None, None]
     kink &= turn > 100 * np.finfo(np.float64).eps * (1 + np.abs(values).max(axis=(1, 2)))
     eps = np.finfo(np.float64).eps
-    slope = np.fmax.reduce(np.abs(level), axis=0)
+    slope = functools.reduce(np.fmax, np.abs(level))
     size = np.abs(values).max(axis=(1, 2)) + slope * np.abs(x)[:, :, None]
     rounding = eps * size[None] / steps[:, None, None, None]
 
@@ -97,7 +98,7 @@ def quotients(
         best = np.where(better, np.take_along_axis(finer, pick, axis=0)[0], best)
         least = np.where(better, candidate, least)
         level = finer
-    return Quotient(*(np.swapaxes(part, 1, 2) for part in (best, least, kink)))
+    return Quotient(np.swapaxes(best, 1, 2), np.swapaxes(least, 1, 2), np.swapaxes(kink, 1, 2))
 
 
 def on_circle(difference: Values, periods: Values) -> Values:

@@ -76,10 +76,11 @@ class _Compared(NamedTuple):
 
 def _compare(evaluation: Evaluation, tolerance: float, float32_tolerance: float) -> _Compared:
     (gap, scale), (gap32, scale32) = _spread(evaluation.methods), _spread(evaluation.single)
-    away, excess_away, lost = np.zeros_like(gap), np.zeros_like(gap), 0
+    away: Values = np.zeros_like(gap)
+    excess_away, lost = np.zeros_like(gap), 0
     if evaluation.quotient is not None:
         value, error, kink = evaluation.quotient
-        away = np.max([np.abs(m - value) for m in evaluation.methods.values()], axis=0)
+        away = np.stack([np.abs(m - value) for m in evaluation.methods.values()]).max(axis=0)
         own = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
         trusted = ((error <= _CONVERGED * own) | (error <= _NOTHING)) & ~kink
         away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
@@ -160,12 +161,12 @@ def _finding(
         argument=argument.name,
         passed=not entries and len(samples.labels) > 0,
         methods=(*evaluation.methods, *(("differences",) if has_quotient else ())),
-        absolute=float(compared.gap.max(initial=0.0)),
-        relative=float(compared.relative.max(initial=0.0)),
+        absolute=float(np.max(compared.gap, initial=0.0)),
+        relative=float(np.max(compared.relative, initial=0.0)),
         tolerance=tolerance,
-        float32=float(compared.relative32.max(initial=0.0)) if evaluation.single else None,
+        float32=float(np.max(compared.relative32, initial=0.0)) if evaluation.single else None,
         float32_tolerance=float32_tolerance,
-        differences=float(compared.away.max(initial=0.0)) if has_quotient else None,
+        differences=float(np.max(compared.away, initial=0.0)) if has_quotient else None,
         differences_tolerance=DIFFERENCES_TOLERANCE,
         quotient=evaluation.how,
         samples=len(samples.labels),
