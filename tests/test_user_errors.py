@@ -63,7 +63,7 @@ def test_a_model_that_was_not_called_or_is_none_is_told(name):
 def test_mapping_and_teams_look_at_their_models_too():
     with pytest.raises(ValueError, match=r"^mapping: expected sensor to be a Sensor.*call it"):
         filters.mapping(sensors.range_bearing, 3)
-    wrong = dataclasses.replace(SEES, observe=lambda pose, l: pose)
+    wrong = dataclasses.replace(SEES, observe=lambda pose, at: pose)
     robot = team.Robot(MOVE, sensors.suite((wrong, 2)))
     with pytest.raises(ValueError, match=r"^team_slam: expected range_bearing.observe"):
         filters.team_slam([robot], 3)
@@ -105,11 +105,11 @@ def test_an_association_that_was_not_called_or_is_none_is_told(name):
 def own_sensor(**other):
     """A user's sensor of points, by hand."""
     functions = {
-        "observe": lambda pose, l: l - pose[:2],
+        "observe": lambda pose, at: at - pose[:2],
         "residual": lambda z, z_hat: z - z_hat,
         "noise_cov": lambda z: jnp.eye(2),
         "invert": lambda pose, z, s: pose[:2] + z,
-        "position": lambda l: l,
+        "position": lambda at: at,
         "embed": lambda pose, point: point,
     }
     free = Free(jnp.zeros(0), jnp.zeros((0, 0)))
@@ -120,13 +120,13 @@ def own_sensor(**other):
 @pytest.mark.parametrize(
     ("field", "wrong", "told"),
     [
-        ("observe", lambda pose, l: pose, r"own.observe\(pose \(3,\), l \(2,\)\) to return shape \(2,\), got shape \(3,\)"),
-        ("observe", lambda pose, l: (l, l), r"to return shape \(2,\), got a tuple"),
+        ("observe", lambda pose, at: pose, r"own.observe\(pose \(3,\), l \(2,\)\) to return shape \(2,\), got shape \(3,\)"),
+        ("observe", lambda pose, at: (at, at), r"to return shape \(2,\), got a tuple"),
         ("residual", lambda z: z, r"own.residual\(z \(2,\), z_hat \(2,\)\) fails: TypeError"),
         ("noise_cov", lambda z: jnp.ones(2), r"own.noise_cov\(z \(2,\)\) to return shape \(2, 2\)"),
         ("invert", lambda pose, z: z, r"own.invert\(pose \(3,\), z \(2,\), s \(0,\)\) fails: TypeError.* takes 2 positional"),
         ("invert", lambda pose, z, s: pose, r"own.invert.* to return shape \(2,\), got shape \(3,\)"),
-        ("position", lambda l: l[:1], r"own.position\(l \(2,\)\) to return shape \(2,\)"),
+        ("position", lambda at: at[:1], r"own.position\(l \(2,\)\) to return shape \(2,\)"),
         ("free", Free(jnp.zeros(1), jnp.zeros((2, 2))), r"own.free of shapes \(K,\) and \(K, K\)"),
     ],
 )  # fmt: skip
@@ -154,7 +154,7 @@ def test_a_motion_of_ones_own_is_evaluated_on_shapes(field, wrong, told):
 
 def test_what_has_been_found_sound_is_not_looked_at_again():
     asked = []
-    sensor = own_sensor(observe=lambda pose, l: asked.append(1) or l)
+    sensor = own_sensor(observe=lambda pose, at: asked.append(1) or at)
     check_models("mine", MOVE, sensor)
     check_models("mine", MOVE, sensor)
     assert len(asked) == 1
@@ -184,11 +184,13 @@ def test_names_are_tuples_of_strings():
 
 
 def test_charts_linearizers_and_filters_hold_functions():
-    with pytest.raises(ValueError, match="^Chart 'euclidean': expected retract to be a function"):
+    with pytest.raises(ValueError, match=r"^Chart 'euclidean': expected retract to be a function"):
         dataclasses.replace(charts.euclidean(), retract=None)
-    with pytest.raises(ValueError, match="^Linearizer 'at_estimate': expected born to be a functi"):
+    with pytest.raises(
+        ValueError, match=r"^Linearizer 'at_estimate': expected born to be a functi"
+    ):
         dataclasses.replace(linearize.at_estimate(), born=0)
-    with pytest.raises(ValueError, match="^Filter 'ekf_slam': expected predict to be a function"):
+    with pytest.raises(ValueError, match=r"^Filter 'ekf_slam': expected predict to be a function"):
         dataclasses.replace(FACTORIES["ekf_slam"](MOVE, SEES), predict="predict")
 
 
@@ -208,18 +210,18 @@ def test_an_update_that_returns_no_info_is_told():
 
 def test_localization_is_named_by_its_own_name():
     for wrong in ({"gate": 0.0}, {"iterations": 0}, {"update": "at once"}):
-        with pytest.raises(ValueError, match="^localization: "):
+        with pytest.raises(ValueError, match=r"^localization: "):
             filters.localization(MOVE, SEES, POINTS, **wrong)
 
 
 def test_a_compressed_filter_refuses_to_merge():
-    with pytest.raises(ValueError, match="^compressed_ekf_slam: does not take merge"):
+    with pytest.raises(ValueError, match=r"^compressed_ekf_slam: does not take merge"):
         FACTORIES["compressed_ekf_slam"](MOVE, SEES, merge=merging.duplicates(1.0))
 
 
 def test_closing_checks_its_options_when_it_is_made():
     ekf = filters.ekf_slam(MOVE, SEES, 3, life=life.recency())
-    with pytest.raises(ValueError, match="^closing: expected options of close_loop, got leest"):
+    with pytest.raises(ValueError, match=r"^closing: expected options of close_loop, got leest"):
         closing(ekf, leest=3)
     with pytest.raises(ValueError, match="least"):
         closing(ekf, least=2)
