@@ -16,7 +16,6 @@ from jaxslam.filters.weighing import Correction, view_of, weigh
 from jaxslam.linearize.first_order import turned
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint, Last
-from jaxslam.staging import apart
 
 Retract = Callable[[Chart, Joint, jax.Array], tuple[jax.Array, jax.Array]]
 
@@ -96,80 +95,56 @@ def whole(parted: Parted, chart: Chart) -> Joint:
     return rest._replace(pose=found.pose, cov=linalg.symmetrize(cov), watch=watch, last=last)
 
 
-def correct_group(
+def correct_one(
     parted: Parted,
-    places: tuple[jax.Array, jax.Array, jax.Array],
+    place: tuple[jax.Array, jax.Array, jax.Array],
     *,
     chart: Chart,
     retracted: Retract,
     **options: Any,
 ) -> tuple[Parted, Correction]:
-    """Correct by g measurements one after the other: z (g, Z), slot (g,), known (g,).
+    """Correct x and δ by one measurement: z (1, Z), slot (1,), known (1,).
 
-    As a group of `correction.correct_in_turn`: means and the rows of x_I and δ that the group sees
-    are corrected by each, all of P once.
+    It sees e of the robot and its landmark, E = [T g] of their rows of (x, δ). With P that of
+    (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V.
     """
-    rest, slot = parted.rest, places[1]
-    size_l, count = rest.landmarks.shape[1], rest.cov.shape[0]
-    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
-    at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1), count - 3 + jnp.arange(3)])
-    rows, seen = rest.cov[at], len(at) - 3
+    rest, (z, slot, known) = parted.rest, place
+    size_l, size = rest.landmarks.shape[1], rest.cov.shape[0] - 3
+    own = 3 + slot[0] * size_l + jnp.arange(size_l)
+    at = jnp.concatenate([jnp.arange(3), own, size + jnp.arange(3)])
     watch: Any = rest.watch
     if watch:
         watch = watch._replace(directions=watch.directions[at[:-3]])
-    # The local rows of P, and beside them the matrix that takes those of before to those of now.
     local = rest._replace(
         landmarks=rest.landmarks[slot],
-        cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
+        cov=rest.cov[at],
         alive=rest.alive[slot],
         tag=rest.tag[slot],
         watch=watch,
     )
-
-    def one(now: Parted, place: Any) -> tuple[Parted, Any]:
-        i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], place)
-        local, found = now.rest, compose(now, chart)
-        against = found.times(local.cov)
-        among = found.times(against[:, : seen + 3].T)
-        watch = local.watch
-        if watch:
-            watch = watch._replace(directions=found.moved.times(watch.directions))
-        here = local._replace(
-            pose=found.pose, cov=jnp.concatenate([among.T, against], axis=1), watch=watch
-        )
-        memory = rest._replace(pose=found.pose), slot
-        said = weigh(here, i, view_of(here, i), z, known, memory, chart=chart, **options)
-        v = said.v[:, seen:]
-        xi = linalg.gram(v[:, : seen + 3], said.whitened[:, None])[:, 0]
-        pose, landmarks = retracted(chart, local, xi[:seen])
-        watch = local.watch
-        if watch:
-            fused = said.fuse & said.correction.positive
-            told = informed(here, chart, *said.seen, i, said.own_noise, fused)
-            watch = told._replace(directions=watch.directions)
-        cov = local.cov - linalg.gram(v[:, : seen + 3], v)
-        moved = local._replace(pose=pose, landmarks=landmarks, cov=cov, watch=watch)
-        frame = now.frame + (pose[2] - local.pose[2])
-        done = jax.tree.map(lambda leaf: leaf[0], said.correction)
-        after = Parted(moved, frame, now.step + xi[seen:])
-        return after, (v[:, seen + 3 :], said.whitened, done)
-
-    each = jnp.arange(len(slot)), places
-    after, (reach, whitened, done) = jax.lax.scan(
-        one, parted._replace(rest=local), each, unroll=True
-    )
-    v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
-    xi = linalg.gram(v[:, : count - 3], whitened.reshape(-1, 1))[:, 0]
-    pose, landmarks = retracted(chart, rest, xi)
-    some = places[2].any()  # a move by zero would round
-    watch = rest.watch
+    found = compose(parted._replace(rest=local), chart)
+    against = found.times(local.cov)
+    among = found.times(against[:, at].T).T
     if watch:
-        watch = after.rest.watch._replace(directions=watch.directions)
+        watch = watch._replace(directions=found.moved.times(watch.directions))
+    cov = jnp.concatenate([among, against], axis=1)
+    here = local._replace(pose=found.pose, cov=cov, watch=watch)
+    first = jnp.zeros_like(slot)
+    memory = rest._replace(pose=found.pose), slot
+    said = weigh(here, first, view_of(here, first), z, known, memory, chart=chart, **options)
+    v = said.v[:, len(among) :]
+    xi = linalg.gram(v, said.whitened[:, None])[:, 0]
+    pose, landmarks = retracted(chart, rest, xi[:size])
+    pose = jnp.where(known[0], pose, rest.pose)  # a move by zero would round
+    if watch:
+        fused = said.fuse & said.correction.positive
+        watch = informed(here, chart, *said.seen, first, said.own_noise, fused)
+        watch = watch._replace(directions=rest.watch.directions)
     rest = rest._replace(
-        pose=jnp.where(some, pose, rest.pose),
-        landmarks=jnp.where(some, landmarks, rest.landmarks),
-        cov=rest.cov - linalg.gram(v[:, :count], v),
+        pose=pose,
+        landmarks=jnp.where(known[0], landmarks, rest.landmarks),
+        cov=rest.cov - linalg.gram(v, v),
         watch=watch,
     )
-    frame = parted.frame + jnp.where(some, pose[2] - parted.rest.pose[2], 0.0)
-    return Parted(rest, frame, after.step), done
+    frame = parted.frame + (pose[2] - parted.rest.pose[2])
+    return Parted(rest, frame, parted.step + xi[size:]), said.correction
