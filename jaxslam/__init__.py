@@ -10,6 +10,7 @@ from typing import Any
 
 from jaxslam import (
     association,
+    calibration,
     charts,
     consistency,
     family,
@@ -39,6 +40,7 @@ from jaxslam.verify import verify_jacobians
 __all__ = [
     "Scenario",
     "association",
+    "calibration",
     "charts",
     "consistency",
     "family",

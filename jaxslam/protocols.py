@@ -20,9 +20,38 @@ from jaxslam.types import Estimate, Info, Log, Scan, Trace, Truth
 Array = jax.Array
 
 
+def _check_fields(
+    record: Any,
+    functions: tuple[str, ...],
+    names: tuple[str, ...] = (),
+    optional: tuple[str, ...] = (),
+) -> None:
+    """Raise ValueError unless functions are functions, and names tuples of str."""
+    what = f"{type(record).__name__} {record.name!r}"
+    if not isinstance(record.name, str):
+        raise ValueError(f"{what}: expected a name, got {type(record.name).__name__}")
+    for field in names:
+        value = getattr(record, field)
+        if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value):
+            raise ValueError(
+                f'{what}: expected {field} to be a tuple of names as ("x [m]",), got {value!r}'
+            )
+    for field in (*functions, *optional):
+        value = getattr(record, field)
+        if not callable(value) and not (value is None and field in optional):
+            got, wanted = type(value).__name__, "a function"
+            if hasattr(value, "shape"):
+                got, wanted = f"an array of shape {value.shape}", "a function that returns one"
+            raise ValueError(f"{what}: expected {field} to be {wanted}, got {got}")
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How the robot moves. w = 0 is the nominal motion: one function for simulator and filters."""
+    """How the robot moves. w = 0 is the nominal motion: one function for simulator and filters.
+
+    This and the other records raise ValueError on a function that is none, or names that are no
+    tuple of strings.
+    """
 
     name: str
     controls: tuple[str, ...]
@@ -38,6 +67,9 @@ class Motion:
     kind; a world that disturbs the odometry instead of the robot needs it."""
     jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
     """(pose, u, w) -> by pose (3, 3), by u (3, U), by w (3, W); hand-derived, to verify against."""
+
+    def __post_init__(self) -> None:
+        _check_fields(self, ("step", "noise_cov"), ("controls", "noises"), ("perturb", "jacobians"))
 
 
 class Free(NamedTuple):
@@ -93,6 +125,16 @@ class Sensor:
     reduced: Reduced | None = None
     """the points that landmarks may turn into; None where they never do"""
 
+    def __post_init__(self) -> None:
+        functions = ("observe", "residual", "noise_cov", "invert", "position", "embed")
+        optional = ("observe_jacobians", "invert_jacobians")
+        _check_fields(self, functions, ("measurements", "landmark"), optional)
+        if not isinstance(self.free, Free):
+            raise ValueError(
+                f"Sensor {self.name!r}: expected free to be a Free(mean, cov), got "
+                f"{type(self.free).__name__}"
+            )
+
 
 class Basis(NamedTuple):
     """The derivative of a chart's `retract` at zero, block lower triangular."""
@@ -122,6 +164,9 @@ class Chart:
     motion_apart: bool = False
     """whether a correction splits off what it says of the last motion, and moves the robot by that
     in a world that stands still: the way of a map that is composed with the motion afterwards."""
+
+    def __post_init__(self) -> None:
+        _check_fields(self, ("retract", "local"), optional=("basis",))
 
 
 class Here(NamedTuple):
@@ -165,6 +210,9 @@ class Linearizer:
     """(joint, born (N,) bool) -> memory, after new landmarks entered the map."""
     euclidean: bool = False
     """whether it is meant for the Euclidean chart and landmarks that are points (x, y) alone."""
+
+    def __post_init__(self) -> None:
+        _check_fields(self, ("init", "motion", "observe", "invert", "born"))
 
 
 class Pairs(NamedTuple):
@@ -260,6 +308,9 @@ class Filter:
     """how many places of a scan each sensor has, in order; () where all are of one sensor."""
     square_root: bool = False
     """whether its state is a `slots.Joint` with a root of the covariance."""
+
+    def __post_init__(self) -> None:
+        _check_fields(self, ("init", "predict", "update", "estimate"))
 
 
 Estimator = Callable[[Log, Array], Trace]

@@ -16,7 +16,10 @@ from jaxslam.linalg import is_concrete
 
 
 class Status(IntEnum):
-    """What became of a measurement place; `Info.status` holds one a place."""
+    """What became of a measurement place; `Info.status` holds one a place.
+
+    `filters.reporting.status_of` has the table that decides.
+    """
 
     EMPTY = 0
     """No measurement there (padding)."""
@@ -34,7 +37,7 @@ class Status(IntEnum):
     REPEATED = 6
     """Its new tag occurs earlier in the same scan; dropped."""
     SINGULAR = 7
-    """Its innovation covariance is not positive definite; dropped."""
+    """Its innovation covariance is not positive definite, so that no gate can be asked; dropped."""
     UNMATCHED = 8
     """Association found it neither of a landmark nor new (between two gates, ambiguous, or of
     unknown identity where identities are asked for), or a robot it concerns has no place in the map

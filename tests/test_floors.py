@@ -16,7 +16,7 @@ PACKAGE = Path(jaxslam.__file__).parent
 FLOORS = [
     "angles se2 frames lapack linalg assignment hoisting programs staging stats",
     "types protocols slots noise derivatives",
-    "motion sensors charts linearize association resampling life",
+    "motion sensors charts linearize association resampling life validation",
     "filters smoothing run simulate spurious team",
     "consistency monte_carlo verify linearity scenarios family calibration",
     "datasets plot page report store userfile cli __main__",

@@ -109,7 +109,7 @@ def make_log(
     order = np.argsort(rows, kind="stable")
     rows = rows[order]
     place = np.arange(rows.size) - (np.cumsum(count) - count)[rows]
-    places = int(count.max())
+    places = int(np.max(count))
     # Any, because the fields of a Log are declared as what they become under jit.
     padded_z: Any = np.zeros((steps, places, values.shape[1]))
     padded_tag: Any = np.full((steps, places), -1, np.int32)

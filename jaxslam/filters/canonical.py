@@ -12,7 +12,7 @@ filters", IJRR 23(7-8), 2004; the Notes, with the corrections of ERRATA.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +20,10 @@ import jax.numpy as jnp
 from jaxslam import linalg
 from jaxslam.angles import wrap
 from jaxslam.derivatives import observe_jacobians
-from jaxslam.filters.scanning import first_that_holds
+from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.linearize import first_order
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.types import Info, Scan, Status
+from jaxslam.types import Info, Scan
 
 
 class Weighed(NamedTuple):
@@ -33,10 +33,22 @@ class Weighed(NamedTuple):
     """(M·Z, D) N⁻¹ H, R = N Nᵀ; zero for what is not fused"""
     innovation: jax.Array
     """(M·Z,) N⁻¹ ν of the same"""
+    known: jax.Array
+    """(M,) bool: of a landmark of the map, and compared with it"""
+    positive: jax.Array
+    """(M,) bool: S, R and Ω are positive definite"""
+    inside: jax.Array
+    """(M,) bool: within the gate"""
     fused: jax.Array
-    """(M,) bool"""
-    info: Info
-    """as a filter reports it, before births"""
+    """(M,) bool: known, positive and inside"""
+    nu: jax.Array
+    """(M, Z) innovations ν"""
+    s: jax.Array
+    """(M, Z, Z) S of each alone"""
+    nis: jax.Array
+    """(M,) of fused places given those before, of the others alone"""
+    log_likelihood: jax.Array
+    """(M,), 0 where not fused"""
 
 
 def started(pose_cov: jax.Array, floor: float) -> jax.Array:
@@ -117,7 +129,7 @@ def weigh(
     marginal = s[jnp.arange(m), :, jnp.arange(m)]
     distance, positive = jax.vmap(_squared)(nu, marginal)
     root, noisy = jax.vmap(linalg.cholesky)(noise)
-    inside = ~positive | (jnp.isfinite(distance) if gate is None else distance <= gate)
+    inside = jnp.isfinite(distance) if gate is None else distance <= gate
     positive = positive & noisy & sound
     fused = known & inside & positive
     both = fused[:, None, None, None] & fused[None, None, :, None]
@@ -134,24 +146,17 @@ def weigh(
         return linalg.solve_lower(root, values)
 
     rows = jax.vmap(whitened)(root, h.reshape(m, size_z, h.shape[1]))
-    status = first_that_holds(
-        (known & ~inside, Status.REJECTED),
-        (known & ~positive, Status.SINGULAR),
-        (known, Status.FUSED),
-    )
     return Weighed(
         rows=jnp.where(fused[:, None, None], rows, 0.0).reshape(h.shape),
         innovation=jax.vmap(whitened)(root, fused_nu).reshape(-1),
+        known=known,
+        positive=positive,
+        inside=inside,
         fused=fused,
-        info=Info(
-            nis=jnp.where(fused, nis, jnp.where(known, distance, 0.0)),
-            dof=jnp.where(fused, size_z, 0),
-            innovation=jnp.where(known[:, None], nu, 0.0),
-            innovation_cov=jnp.where(known[:, None, None], marginal, 0.0),
-            slot=jnp.full(m, -1, jnp.int32),
-            status=status,
-            log_likelihood=jnp.where(fused, likelihood, 0.0).sum(),
-        ),
+        nu=nu,
+        s=marginal,
+        nis=jnp.where(fused, nis, distance),
+        log_likelihood=jnp.where(fused, likelihood, 0.0),
     )
 
 
@@ -197,27 +202,45 @@ def born(
     return linalg.symmetrize(omega), landmark, granted
 
 
-def with_births(
-    info: Info, scan: Scan, slot: jax.Array, new: jax.Array, fate: list[Any], fates: list[Status]
+def judged(weighed: Weighed, sound: jax.Array) -> Weighed:
+    """What was weighed, where the scan could be solved for, sound (), or else all singular."""
+    return weighed._replace(
+        positive=weighed.positive & sound,
+        log_likelihood=jnp.where(sound, weighed.log_likelihood, 0.0),
+    )
+
+
+def reported(
+    weighed: Weighed,
+    scan: Scan,
+    slot: jax.Array,
+    *,
+    matched: jax.Array | None = None,
+    **fates: jax.Array,
 ) -> Info:
-    """The info of a scan with its slots (M,), and what became of its new landmarks (M,) bool.
+    """The info of a scan with its slots (M,).
 
-    fate: masks (M,) of `new` in the order in which they are asked, of the statuses `fates`.
+    matched: (M,) bool, those of landmarks of the map, where more than were weighed. fates: as
+    `reporting.status_of` has them.
     """
-    none = scan.valid & ~new & (info.status == Status.EMPTY)
-    status = jnp.select([*[new & mask for mask in fate], none], [*fates, Status.UNMATCHED], -1)
-    status = jnp.where(status < 0, info.status, status).astype(jnp.int32)
-    kept = (status == Status.FUSED) | (status == Status.BORN)
-    return info._replace(status=status, slot=jnp.where(kept, slot, -1).astype(jnp.int32))
-
-
-def unless(sound: jax.Array, info: Info) -> Info:
-    """The info where sound (), else with all that was fused `Status.SINGULAR`."""
-    lost = ~sound & (info.status == Status.FUSED)
-    return info._replace(
-        status=jnp.where(lost, Status.SINGULAR, info.status).astype(jnp.int32),
-        dof=jnp.where(lost, 0, info.dof),
-        log_likelihood=jnp.where(sound, info.log_likelihood, 0.0),
+    known = weighed.known
+    status = status_of(
+        scan.valid,
+        matched=known if matched is None else matched,
+        positive=weighed.positive,
+        inside=weighed.inside,
+        **fates,
+    )
+    return info_of(
+        status,
+        known,
+        size=scan.z.shape[1],
+        slot=slot,
+        born=slot,
+        nis=weighed.nis,
+        innovation=weighed.nu,
+        innovation_cov=weighed.s,
+        log_likelihood=weighed.log_likelihood.sum(),
     )
 
 

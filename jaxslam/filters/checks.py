@@ -10,19 +10,20 @@ from jaxslam.sensors.suite import Suite
 
 
 def check_numbers(
+    filter: str,
     capacity: int,
     update: str,
     gate: float | None,
     iterations: int,
     births: int | None,
 ) -> None:
-    """Counts are counts, the update is one of two, the gate positive."""
+    """Counts are counts, the update is one of two, the gate positive; errors name the filter."""
     for name, value in (("capacity", capacity), ("iterations", iterations), ("births", births)):
         if value is not None or name != "births":
-            check_count(f"ekf_slam: {name}", value)
+            check_count(f"{filter}: {name}", value)
     if update not in ("sequential", "joint"):
-        raise ValueError(f'ekf_slam: expected update "sequential" or "joint", got {update!r}')
-    check_gate("ekf_slam", gate)
+        raise ValueError(f'{filter}: expected update "sequential" or "joint", got {update!r}')
+    check_gate(filter, gate)
 
 
 def check_chart(sensor: Sensor, chart: Chart) -> None:

@@ -1,12 +1,13 @@
 """Loops closed at the scale of a map: recent landmarks, together, are found to be old ones."""
 
+import inspect
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import linalg
+from jaxslam import linalg, validation
 from jaxslam.filters.coordinates import cov_of_coordinates
 from jaxslam.filters.doubles import double, merged
 from jaxslam.filters.matching import Limits, Match, limits, match
@@ -148,6 +149,14 @@ def close_loop(
     return where_any(possible, look, lambda joint: (joint, _no_look()), joint)
 
 
+_OPTIONS: dict[str, Any] = {
+    name: parameter.default
+    for name, parameter in inspect.signature(close_loop).parameters.items()
+    if parameter.kind is parameter.KEYWORD_ONLY
+}
+"""What `close_loop` may be told, with what it does where it is not."""
+
+
 def closing(
     filter: Filter,
     *,
@@ -171,10 +180,16 @@ def closing(
         spread: [m]
         **options: of `close_loop`.
     Raises:
-        ValueError: on a square-root filter, on every below 1, a reach or spread not above 0, and as
-            `close_loop`.
+        ValueError: on a square-root filter, on every below 1, a reach or spread not above 0, an
+            option that `close_loop` does not have or refuses, and, when it starts, on a life that
+            is not recency.
     """
     check_count("closing: every", every)
+    unknown = sorted(set(options) - set(_OPTIONS))
+    if unknown:
+        raise ValueError(f"closing: expected options of close_loop, got {', '.join(unknown)}")
+    chosen = _OPTIONS | options
+    _checked(**chosen)
     if not (reach is None or reach > 0) or not spread > 0:
         raise ValueError(f"closing: expected a reach and a spread above 0, got {reach}, {spread}")
     if filter.square_root:
@@ -192,12 +207,13 @@ def closing(
         return state._replace(joint=filter.predict(state.joint, u, key))
 
     def update(state: Closed, scan: Scan, key: Array) -> tuple[Closed, Info]:
-        joint, info = filter.update(state.joint, scan, key)
+        found = filter.update(state.joint, scan, key)
+        joint, info = validation.state_and_info(f"closing: {filter.name}", found)
         before = joint.alive
         due = (joint.life.now % every == 0) & scan.valid.any()
 
         def look(joint: Joint) -> tuple[Joint, Closing]:
-            joint_after, report = close_loop(joint, chart, **options)
+            joint_after, report = close_loop(joint, chart, **chosen)
             # Of a batch, the runs that are not due look too, and keep what they had.
             both: tuple[Joint, Closing] = jax.tree.map(
                 lambda a, b: jnp.where(due, a, b), (joint_after, report), (joint, _no_look())
@@ -217,7 +233,7 @@ def closing(
             )
             doubles = twice.astype(jnp.int32)
         info = info._replace(removed=info.removed | (before & ~joint.alive))
-        tried = report.explained >= options.get("least", 5)
+        tried = report.explained >= chosen["least"]
         done = report.merged > 0
         return Closed(
             joint=joint,

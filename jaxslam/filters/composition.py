@@ -19,7 +19,7 @@ def lever_of_motion(joint: Joint, chart: Chart) -> jax.Array:
     """g (D, 3): what an error of the last motion, in its own frame, does to all errors."""
     assert chart.basis is not None
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
-    robot = linalg.inverse(basis.pose[0]) @ _out_of(joint.last.frame)
+    robot = linalg.inverse(basis.pose[0]) @ out_of(joint.last.frame)
     own = -basis.cross @ robot
     if basis.landmark is not None:
         own = jnp.einsum("nij,njk->nik", jax.vmap(linalg.inverse)(basis.landmark), own)
@@ -41,7 +41,7 @@ def moved_anew(
     """
     assert chart.basis is not None
     frame = joint.last.frame + turn
-    change = _out_of(frame) @ step
+    change = out_of(frame) @ step
     pose = joint.pose + change
     pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
@@ -63,6 +63,6 @@ def moved_anew(
     )
 
 
-def _out_of(frame: jax.Array) -> jax.Array:
+def out_of(frame: jax.Array) -> jax.Array:
     """Steps in a frame of that heading as steps in the map, (3, 3)."""
     return se2.adjoint(jnp.stack([jnp.zeros_like(frame), jnp.zeros_like(frame), frame]))

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg, slots
+from jaxslam import linalg, slots, validation
 from jaxslam.filters.ekf_slam import ekf_slam
 from jaxslam.linalg import check_count
 from jaxslam.protocols import Filter, Motion, Sensor
@@ -58,14 +58,15 @@ def compressed_ekf_slam(
         area: landmarks K that are worked on; at least the places of a scan.
         options: those of `ekf_slam` in the Euclidean chart, whose landmarks stand still, with a
             linearizer that remembers nothing (at_estimate, unscented), but for associate, watch,
-            square_root and life.
+            square_root, life and merge.
     Raises:
         ValueError: as `ekf_slam`; on an area below 1, an option that is not for this filter; and,
             when a scan has more places than the area, from `update`.
     """
+    validation.check_models("compressed_ekf_slam", motion, sensor)
     check_count("compressed_ekf_slam: capacity", capacity)
     check_count("compressed_ekf_slam: area", area)
-    for name in ("associate", "watch", "square_root", "life"):
+    for name in ("associate", "watch", "square_root", "life", "merge"):
         if options.get(name):
             raise ValueError(f"compressed_ekf_slam: does not take {name}")
     if sensor.reduced is not None:

@@ -5,12 +5,14 @@ the robot and one landmark: no dense D×D product is formed. They take the model
 set of equations serves every sensor, chart and linearizer. `filters.ekf_slam` binds them.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxslam import linalg
+from jaxslam.filters import parted
 from jaxslam.filters.composition import lever_of_motion, moved_anew
 from jaxslam.filters.watching import along, informed, split
 from jaxslam.filters.weighing import Correction, Weighed, view_of, weigh
@@ -121,14 +123,16 @@ def correct_in_turn(
     localization and map-building algorithm for real-time implementation", IEEE T-RA 17(3)), over
     one scan. A group without a known measurement in any run of a batch costs nothing.
 
-    Options are those of `correct`, which is used as it is, one measurement at a time, for forms of
-    the update that need all of P.
+    In a chart that keeps the last motion apart, map and motion are corrected side by side, and
+    composed once (`filters.parted`). Options are those of `correct`, which is used as it is, one
+    measurement at a time, for forms of the update that need all of P.
     """
-    whole = joseph or square_root or chart.motion_apart
+    whole = joseph or square_root
+    one_by_one = whole or chart.motion_apart
     m, size_l = z.shape[0], joint.landmarks.shape[1]
     size = joint.cov.shape[1]
     cached = size <= _CACHED
-    group = 1 if whole else max(1, min(_GROUP if cached else _GROUP_BEYOND, m))
+    group = 1 if one_by_one else max(1, min(_GROUP if cached else _GROUP_BEYOND, m))
     groups = -(-m // group)
 
     def padded(part: jax.Array) -> jax.Array:
@@ -176,19 +180,43 @@ def correct_in_turn(
         cov = joint.cov - linalg.gram(v[:, :size], v)
         return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov, watch=watch), done
 
-    work = one_of_all if whole else in_group
+    def in_groups(work: Any, state: Any) -> tuple[Any, Correction]:
+        def of_group(state: Any, part: Any) -> tuple[Any, Correction]:
+            nothing = _zeros_like(work, state, part)
+            some = part[2].any()
+            after: tuple[Any, Correction] = where_any(
+                some, lambda s: work(s, part), lambda s: (s, nothing), state
+            )
+            return after
 
-    def of_group(joint: Joint, part: Any) -> tuple[Joint, Correction]:
-        nothing = jax.tree.map(
-            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(work, joint, part)[1]
-        )
-        return where_any(part[2].any(), lambda j: work(j, part), lambda j: (j, nothing), joint)
+        state, done = jax.lax.scan(of_group, state, jax.tree.map(padded, (z, slot, known)))
+        shape = (groups * group,)
+        return state, jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[2:])[:m], done)
 
-    if cached and not whole:
+    if whole:
+        return in_groups(one_of_all, joint)
+    if chart.motion_apart:
+        work = partial(parted.correct_one, chart=chart, retracted=retracted, **options)
+
+        def with_motion(joint: Joint) -> tuple[Joint, Correction]:
+            rest, done = in_groups(work, parted.part(joint, chart))
+            # A run without a measurement must keep its map to the bit.
+            after = parted.whole(rest, chart)
+            kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)
+            return kept, done
+
+        nothing = _zeros_like(with_motion, joint)
+        return where_any(known.any(), with_motion, lambda joint: (joint, nothing), joint)
+    if cached:
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
-    joint, done = jax.lax.scan(of_group, joint, jax.tree.map(padded, (z, slot, known)))
-    joint = joint._replace(cov=joint.cov[:, :size])
-    return joint, jax.tree.map(lambda leaf: leaf.reshape(groups * group, *leaf.shape[2:])[:m], done)
+    joint, done = in_groups(in_group, joint)
+    return joint._replace(cov=joint.cov[:, :size]), done
+
+
+def _zeros_like(work: Any, *arguments: Any) -> Any:
+    """The `Correction` that work(*arguments) would return beside a state, all zero."""
+    shapes = jax.eval_shape(work, *arguments)[1]
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 def _moved(joint: Joint, found: Weighed, xi: jax.Array, slot: jax.Array, chart: Chart) -> Joint:

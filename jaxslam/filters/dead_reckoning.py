@@ -4,8 +4,9 @@ import dataclasses
 
 import jax
 
+from jaxslam import validation
 from jaxslam.filters.ekf_slam import ekf_slam
-from jaxslam.filters.scanning import left_alone
+from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
@@ -23,10 +24,11 @@ def dead_reckoning(
     Every measurement is `Status.UNMATCHED`, and the map stays empty. The sensor only says of what
     size measurements are; chart and linearize are those of `ekf_slam`, and raise as there.
     """
+    validation.check_models("dead_reckoning", motion, sensor)
+    validation.check_parts("dead_reckoning", chart=chart, linearize=linearize)
     filter = ekf_slam(motion, sensor, 1, chart=chart, linearize=linearize)
 
     def update(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
-        joint, info, _ = left_alone(joint, scan)
-        return joint, info
+        return joint, nothing_of(scan)
 
     return dataclasses.replace(filter, name="dead_reckoning", update=update)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam import validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.correction import correct_in_turn
@@ -12,7 +13,7 @@ from jaxslam.filters.ekf_slam import ekf_slam
 from jaxslam.filters.expectation import prediction_of
 from jaxslam.filters.meeting import Meeting, meeting_of
 from jaxslam.filters.promotion import promote
-from jaxslam.filters.scanning import first_that_holds, seen_before
+from jaxslam.filters.reporting import info_of, seen_before, status_of
 from jaxslam.filters.sightings import confirm, intersect, take
 from jaxslam.filters.waiting import SIZE, Delayed, Distance, Fresh, Layout, Rules, empty
 from jaxslam.linalg import check_count, is_concrete
@@ -21,7 +22,7 @@ from jaxslam.protocols import Associate, Association, Filter, Motion, Sensor
 from jaxslam.sensors.suite import on_ground
 from jaxslam.staging import where_any
 from jaxslam.stats import chi2_quantile
-from jaxslam.types import Estimate, Info, Scan, Status
+from jaxslam.types import Estimate, Info, Scan
 
 Array = jax.Array
 
@@ -110,9 +111,11 @@ def delayed_slam(
     Raises:
         ValueError: on counts below 1, parameters out of range, or a sensor that does not fit.
     """
+    validation.check_models("delayed_slam", motion, sensor)
+    validation.check_parts("delayed_slam", associate=associate)
+    _check_sensor(sensor)
     tagged = associate is None
     associate = associate or known_association()
-    _check_sensor(sensor)
     meeting = meeting_of(sensor) if meet is None else meet
     gate = chi2_quantile(0.99, 1) if gate is None else gate
     if same is None:
@@ -166,7 +169,7 @@ def delayed_slam(
         state = where_any(
             lonely.any(), lambda s: intersect(rules, s, scan, slot, lonely), lambda s: s, state
         )
-        none = jnp.full_like(scan.tag, -1)
+        none = jnp.full(scan.tag.shape, -1, jnp.int32)
 
         def once(carry: Any, _: None) -> tuple[Any, None]:
             state, by, born, refused = carry
@@ -199,7 +202,7 @@ def delayed_slam(
         fresh = is_new & ~repeated
         tag = scan.tag if tagged else jnp.full_like(scan.tag, -1)
         none = jnp.zeros_like(fresh)
-        nothing = _Outcome(none, jnp.full_like(scan.tag, -1), none)
+        nothing = _Outcome(none, jnp.full(scan.tag.shape, -1, jnp.int32), none)
         if len(scan.tag) > 0:
             state, outcome = where_any(
                 fresh.any(),
@@ -209,26 +212,26 @@ def delayed_slam(
             )
         else:
             outcome = nothing
-        born = outcome.born >= 0
-        status = first_that_holds(
-            (matched & ~done.inside, Status.REJECTED),
-            (matched & ~done.positive, Status.SINGULAR),
-            (matched, Status.FUSED),
-            (repeated, Status.REPEATED),
-            (born, Status.BORN),
-            (outcome.refused, Status.OVERFLOW),
-            (outcome.sighted, Status.SIGHTED),
-            (fresh, Status.DEFERRED),
-            (scan.valid, Status.UNMATCHED),
+        status = status_of(
+            scan.valid,
+            matched=matched,
+            positive=done.positive,
+            inside=done.inside,
+            new=is_new,
+            repeated=repeated,
+            granted=outcome.born >= 0,
+            deferred=fresh & ~outcome.sighted & ~outcome.refused,
+            stored=outcome.sighted & ~outcome.refused,
         )
-        fused = status == Status.FUSED
-        info = Info(
-            nis=jnp.where(matched, done.nis, 0.0),
-            dof=jnp.where(fused, 1, 0),
-            innovation=jnp.where(matched[:, None], done.innovation, 0.0),
-            innovation_cov=jnp.where(matched[:, None, None], done.innovation_cov, 0.0),
-            slot=jnp.where(fused, found.slot, outcome.born).astype(jnp.int32),
-            status=status,
+        info = info_of(
+            status,
+            matched,
+            size=1,
+            slot=found.slot,
+            born=outcome.born,
+            nis=done.nis,
+            innovation=done.innovation,
+            innovation_cov=done.innovation_cov,
             log_likelihood=done.log_likelihood.sum(),
             exhausted=jnp.asarray(found.exhausted),
         )

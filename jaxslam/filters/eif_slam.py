@@ -5,16 +5,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg, slots
+from jaxslam import linalg, slots, validation
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import canonical
 from jaxslam.filters.moments import moments
-from jaxslam.filters.scanning import seen_before
+from jaxslam.filters.reporting import seen_before
 from jaxslam.linalg import check_count, check_gate
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Scan, Status
+from jaxslam.types import Estimate, Info, Scan
 
 
 class Canonical(NamedTuple):
@@ -68,7 +68,7 @@ def eif_slam(
         ValueError: on a capacity below 1, a gate or floor not above 0, a suite, or a sensor that
             has no landmarks or whose landmarks become points.
     """
-    check_models("eif_slam", sensor, capacity, gate, floor)
+    check_models("eif_slam", motion, sensor, capacity, gate, floor)
     size = len(sensor.landmark)
 
     def init(pose: jax.Array, pose_cov: jax.Array) -> Canonical:
@@ -116,13 +116,14 @@ def eif_slam(
             tag=state.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
             broken=state.broken + (scan.valid.any() & ~sound),
         )
-        info = canonical.with_births(
-            canonical.unless(sound, weighed.info),
+        info = canonical.reported(
+            canonical.judged(weighed, sound),
             scan,
             jnp.where(new, fresh, at),
-            new,
-            [repeated, granted, room, jnp.ones_like(new)],
-            [Status.REPEATED, Status.BORN, Status.SINGULAR, Status.OVERFLOW],
+            new=new,
+            repeated=repeated,
+            granted=granted,
+            singular=room,
         )
         return after, info
 
@@ -144,9 +145,15 @@ def eif_slam(
 
 
 def check_models(
-    name: str, sensor: Sensor, capacity: int, gate: float | None, floor: float
+    name: str,
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    gate: float | None,
+    floor: float,
 ) -> None:
     """Raise ValueError on what no filter in canonical form takes."""
+    validation.check_models(name, motion, sensor)
     check_count(f"{name}: capacity", capacity)
     check_gate(name, gate)
     canonical.check_floor(name, floor)

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg, slots
+from jaxslam import linalg, slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import checks, propagation, reduction
@@ -79,15 +79,18 @@ def ekf_slam(
         merge: take two landmarks for one (`filters.merging.duplicates`); default never.
         watch: keep a `slots.Watch` in the state, which campaigns report.
     Raises:
-        ValueError: on a capacity, iterations or births below 1, a gate not above 0, an unknown
+        ValueError: on models, charts, linearizers or associations that are none or of wrong sizes
+            (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
             update, a chart or linearizer that does not fit the sensor's landmarks or one another,
             a life that is none, Joseph's form of a square root, several iterations of a statistical
             linearizer, or a linearizer of landmarks for a suite with an absolute sensor.
     """
+    validation.check_models("ekf_slam", motion, sensor)
+    validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
     chart = chart or euclidean()
     linearize = linearize or at_estimate()
     associate = associate or known_association()
-    checks.check_numbers(capacity, update, gate, iterations, births)
+    checks.check_numbers("ekf_slam", capacity, update, gate, iterations, births)
     checks.check_chart(sensor, chart)
     checks.check_parts(sensor, chart, linearize, iterations, joseph, square_root)
     checks.check_map_manager(sensor, life, merge)

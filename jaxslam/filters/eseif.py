@@ -18,7 +18,7 @@ from jaxslam.filters.sparse_parts import (
 )
 from jaxslam.filters.sparsification import activated, departed, retired
 from jaxslam.protocols import Filter, Motion, Sensor
-from jaxslam.types import Info, Scan, Status
+from jaxslam.types import Info, Scan
 
 
 def eseif(
@@ -77,6 +77,7 @@ def eseif(
     """
     check_sparse(
         "eseif",
+        motion,
         sensor,
         capacity,
         gate,
@@ -125,26 +126,29 @@ def eseif(
         omega, points, granted = canonical.born(omega, state.pose, scan.z, place, room, sensor)
         state = closed(state, of, place, placed, omega, points, granted, sound, scan.valid.any())
 
-        info = _joined(first, canonical.unless(good, second.info), late & fits)
+        weighed = _joined(first, canonical.judged(second, good), late & fits)
         # What found no place waits; where the area is lost, all do nothing.
-        left = jnp.where(sound, Status.DEFERRED, Status.SINGULAR)
-        info = info._replace(
-            status=jnp.where(late & ~fits, left, info.status).astype(jnp.int32),
+        left = late & ~fits
+        weighed = weighed._replace(
+            positive=jnp.where(left, sound, weighed.positive), inside=weighed.inside | left
         )
-        waiting = of.wanted & ~placed & sound
-        info = canonical.with_births(
-            info,
+        info = canonical.reported(
+            weighed,
             scan,
             of.slot,
-            of.new,
-            [of.repeated, granted, waiting, of.wanted, jnp.ones_like(of.new)],
-            [Status.REPEATED, Status.BORN, Status.DEFERRED, Status.SINGULAR, Status.OVERFLOW],
+            matched=of.known,
+            postponed=left,
+            new=of.new,
+            repeated=of.repeated,
+            granted=granted,
+            deferred=of.wanted & ~placed & sound,
+            singular=of.wanted,
         )
         return state, info
 
     def _measured(
         state: Sparse, scan: Scan, of: Asked, needs: jax.Array
-    ) -> tuple[Sparse, Info, jax.Array]:
+    ) -> tuple[Sparse, canonical.Weighed, jax.Array]:
         """Measurements of landmarks in the area fused, by an old pose or a relocated one."""
         held = of.match.any(axis=0)
         beta = of.known & of.match.any(axis=1)
@@ -175,7 +179,7 @@ def eseif(
             cut_nats=state.counts.cut_nats + jnp.where(done, nats, 0.0),
         )
         state = state._replace(omega=jnp.where(sound, omega, state.omega), counts=counts)
-        return state, canonical.unless(sound, weighed.info), sound
+        return state, canonical.judged(weighed, sound), sound
 
     return sparse_filter(
         "eseif",
@@ -233,12 +237,16 @@ def _log_det(omega: jax.Array) -> jax.Array:
     return 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
 
 
-def _joined(first: Info, second: Info, late: jax.Array) -> Info:
-    """What two passes over a scan did: the second to the places late (M,), the first to others."""
+def _joined(
+    first: canonical.Weighed, second: canonical.Weighed, late: jax.Array
+) -> canonical.Weighed:
+    """What two passes over a scan found: the second of the places late (M,), the first of others;
+    the rows are the first's, of both passes none is left to use."""
+    names = ("known", "positive", "inside", "fused", "nu", "s", "nis", "log_likelihood")
 
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(late.reshape(-1, *[1] * (a.ndim - 1)), b, a)
 
-    names = ("nis", "dof", "innovation", "innovation_cov", "slot", "status")
-    both = {name: pick(getattr(first, name), getattr(second, name)) for name in names}
-    return first._replace(**both, log_likelihood=first.log_likelihood + second.log_likelihood)
+    return first._replace(
+        **{name: pick(getattr(first, name), getattr(second, name)) for name in names}
+    )

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
+from jaxslam import linalg, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import particle_map, particle_scan
@@ -19,6 +19,7 @@ from jaxslam.filters.particles import (
     moments,
     over_particles,
 )
+from jaxslam.filters.reporting import has_distance
 from jaxslam.linearize import first_order
 from jaxslam.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
 from jaxslam.resampling import weights
@@ -94,6 +95,8 @@ def fastslam(
             gate not above 0, an unknown proposal, a life that is none, a resample that is no
             function, or a sensor that is a suite, absolute, or whose landmarks turn into points.
     """
+    validation.check_models("fastslam", motion, sensor)
+    validation.check_parts("fastslam", associate=associate)
     counts = {"capacity": capacity, "particles": particles, "births": births}
     _check(sensor, counts, threshold, gate, (proposal, resample, life))
     associate = associate or known_association()
@@ -167,7 +170,7 @@ def fastslam(
         state, infos = jax.vmap(change_map, in_axes=(0, 0, None))(state, sight, scan)
         info: Info = jax.tree.map(lambda of_all: of_all[best], infos)
         info = info._replace(
-            nis=jnp.where(sight.matched[best], nis, 0.0),
+            nis=jnp.where(has_distance(info.status), nis, 0.0),
             log_likelihood=log_likelihood,
             exhausted=sight.exhausted.any(),
             ess=ess,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam import linalg, slots
+from jaxslam import linalg, slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import checks, propagation
@@ -71,11 +71,13 @@ def localization(
         ValueError: on a map that is not finite (N, L), tags that are not N different numbers from 0
             on, a chart or linearizer that needs the landmarks' errors, and as `ekf_slam` does.
     """
+    validation.check_models("localization", motion, sensor)
+    validation.check_parts("localization", chart=chart, linearize=linearize, associate=associate)
     points, names = checked_map("localization", sensor, landmarks, tags)
     capacity = points.shape[0]
     chart = _of_pose(chart or euclidean())
     linearize = linearize or at_estimate()
-    checks.check_numbers(capacity, update, gate, iterations, None)
+    checks.check_numbers("localization", capacity, update, gate, iterations, None)
     if linearize.euclidean or linearize.name == "at_truth":
         raise ValueError(f"localization: the linearizer {linearize.name} is for maps with errors")
     if linearize.name == "unscented" and iterations > 1:
@@ -230,7 +232,7 @@ def checked_map(
     if is_concrete(landmarks) and not np.isfinite(np.asarray(landmarks)).all():
         raise ValueError(f"{name}: the map is not finite")
     count = np.shape(landmarks)[0]
-    names = np.arange(count) if tags is None else np.asarray(tags)
+    names: np.ndarray = np.arange(count) if tags is None else np.asarray(tags)
     good = names.shape == (count,) and np.issubdtype(names.dtype, np.integer)
     most = np.iinfo(np.int32).max
     if not good or len(set(names.tolist())) != count or not 0 <= names.min() <= names.max() <= most:

@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
+from jaxslam import linalg, validation
 from jaxslam.angles import wrap
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
@@ -46,6 +46,8 @@ def mapping(
         ValueError: on a capacity or births below 1, a gate not above 0, or a sensor that is a
             suite, absolute, or whose landmarks turn into points.
     """
+    validation.check_sensor("mapping", sensor)
+    validation.check_parts("mapping", associate=associate)
     for name, value in (("capacity", capacity), ("births", births)):
         if value is not None or name != "births":
             linalg.check_count(f"mapping: {name}", value)

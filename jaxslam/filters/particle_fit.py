@@ -31,6 +31,8 @@ class Fit(NamedTuple):
     """(M,) bool"""
     used: Array
     """(M,) bool: matched, in the gate, and R positive definite"""
+    positive: Array
+    """(M,) bool: its R is positive definite"""
     inside: Array
     """(M,) bool: in the gate; without one, of a d² that did not overflow"""
     innovation: Array
@@ -97,6 +99,7 @@ def fit(
         slot=slot,
         matched=matched,
         used=of_map & inside,
+        positive=positive,
         inside=inside,
         innovation=jnp.where(matched[:, None], nu, 0.0),
         cov=jnp.where(matched[:, None, None], noise, 0.0),
@@ -116,6 +119,7 @@ def no_fit(pose: Array, scan: Scan) -> Fit:
         slot=jnp.full_like(scan.tag, -1),
         matched=no,
         used=no,
+        positive=no,
         inside=no,
         innovation=jnp.zeros((m, size), pose.dtype),
         cov=jnp.zeros((m, size, size), pose.dtype),

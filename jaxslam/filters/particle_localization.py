@@ -9,21 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam import linalg
+from jaxslam import linalg, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import cloud, particle_checks, particle_fit
 from jaxslam.filters.cloud import Cloud
 from jaxslam.filters.localization import checked_map
 from jaxslam.filters.particles import finite, over_particles
-from jaxslam.filters.scanning import first_that_holds
+from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.protocols import Associate, Differentiable, Filter, Motion, Resample, Sensor
 from jaxslam.resampling.kld import bins_of, enough
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import effective_size, normalized, survivors
 from jaxslam.sensors.suite import Suite
 from jaxslam.stats import chi2_quantile
-from jaxslam.types import Estimate, Info, Scan, Status
+from jaxslam.types import Estimate, Info, Scan
 
 Array = jax.Array
 
@@ -116,6 +116,8 @@ def particle_localization(
             a threshold outside [0, 1], a gate, bins, error or slack not above 0, a confidence not
             within (0, 1), or rates that do not fit.
     """
+    validation.check_models("particle_localization", motion, sensor)
+    validation.check_parts("particle_localization", associate=associate)
     points, names = checked_map("particle_localization", sensor, landmarks, tags)
     least = particle_checks.checked_least(particles, least)
     particle_checks.check_resample(resample)
@@ -212,21 +214,14 @@ def particle_localization(
         if inject:
             due = due | (lost > 0)
         own: particle_fit.Fit = jax.tree.map(lambda of_all: of_all[best], fit)
-        status = first_that_holds(
-            (own.matched & ~own.inside, Status.REJECTED),
-            (own.matched & ~own.used, Status.SINGULAR),
-            (own.matched, Status.FUSED),
-            (scan.valid, Status.UNMATCHED),
-        )
-        fused = status == Status.FUSED
-        nis = over_particles(fit.nis, fit.matched, weight)
-        info = Info(
-            nis=jnp.where(own.matched, nis, 0.0),
-            dof=jnp.where(fused, jnp.concatenate(_dof(parts, len(scan.tag))), 0),
+        info = info_of(
+            status_of(scan.valid, matched=own.matched, positive=own.positive, inside=own.inside),
+            own.matched,
+            size=jnp.concatenate(_dof(parts, len(scan.tag))),
+            slot=own.slot,
+            nis=over_particles(fit.nis, fit.matched, weight),
             innovation=own.innovation,
             innovation_cov=own.cov,
-            slot=jnp.where(fused, own.slot, -1),
-            status=status,
             log_likelihood=log_likelihood,
             exhausted=fit.exhausted.any(),
             ess=ess,

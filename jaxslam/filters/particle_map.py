@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxslam import linalg, slots
 from jaxslam.filters.particle_scan import Sight
 from jaxslam.filters.particles import Particles, moments
-from jaxslam.filters.scanning import first_that_holds, seen_before
+from jaxslam.filters.reporting import info_of, seen_before, status_of
 from jaxslam.linearize import first_order
 from jaxslam.protocols import Life, Sensor
 from jaxslam.slots import Joint
@@ -47,17 +47,16 @@ def after_scan(
         own,
     )
     into = jnp.where(granted, at, own.alive.shape[0])
-    status = first_that_holds(
-        (sight.matched & ~sight.inside, Status.REJECTED),
-        (sight.matched & ~sight.used, Status.SINGULAR),
-        (sight.matched, Status.FUSED),
-        (repeated, Status.REPEATED),
-        (deferred, Status.DEFERRED),
-        (granted, Status.BORN),
-        (sight.is_new, Status.OVERFLOW),
-        (scan.valid, Status.UNMATCHED),
+    status = status_of(
+        scan.valid,
+        matched=sight.matched,
+        positive=sight.positive,
+        inside=sight.inside,
+        new=sight.is_new,
+        repeated=repeated,
+        granted=granted,
+        deferred=deferred,
     )
-    fused = status == Status.FUSED
     own = own._replace(
         landmarks=own.landmarks.at[into].set(new, mode="drop"),
         covs=own.covs.at[into].set(new_covs, mode="drop"),
@@ -65,13 +64,15 @@ def after_scan(
         tag=own.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
         lost=own.lost + (status == Status.OVERFLOW).sum().astype(jnp.int32),
     )
-    info = Info(
+    info = info_of(
+        status,
+        sight.matched,
+        size=scan.z.shape[1],
+        slot=sight.slot,
+        born=at,
         nis=sight.nis,
-        dof=jnp.where(fused, scan.z.shape[1], 0),
         innovation=sight.innovation,
         innovation_cov=sight.innovation_cov,
-        slot=jnp.where(fused, sight.slot, jnp.where(granted, at, -1)),
-        status=status,
         log_likelihood=jnp.zeros((), scan.z.dtype),
     )
     if life is not None:

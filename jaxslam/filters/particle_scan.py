@@ -31,6 +31,8 @@ class Sight(NamedTuple):
     """(M,) bool"""
     used: Array
     """(M,) bool: matched, in the gate, and its S positive definite"""
+    positive: Array
+    """(M,) bool: its S is positive definite"""
     inside: Array
     """(M,) bool: in the gate; without one, of a d² that did not overflow"""
     innovation: Array
@@ -106,6 +108,7 @@ def look(
         rest = rest + jnp.where(valid & ~of_map, other, 0.0)
         return (x, p, fit, rest), (
             used,
+            positive,
             inside,
             nu,
             s,
@@ -115,12 +118,13 @@ def look(
     rows: tuple[Array, ...] = (scan.z, landmarks[slot], covs[slot], matched, scan.valid)
     none = jnp.zeros((), pose.dtype)
     (pose, pose_cov, fit, rest), done = jax.lax.scan(place, (pose, pose_cov, none, none), rows)
-    used, inside, nu, s, nis = done
+    used, positive, inside, nu, s, nis = done
     sight = Sight(
         slot=slot,
         matched=matched,
         is_new=scan.valid & found.is_new,
         used=used,
+        positive=positive,
         inside=inside,
         innovation=jnp.where(matched[:, None], nu, 0.0),
         innovation_cov=jnp.where(matched[:, None, None], s, 0.0),

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from jaxslam import slots
 from jaxslam.filters import augmentation, correction
 from jaxslam.filters.expectation import prediction_of
+from jaxslam.filters.reporting import info_of, nothing_of, seen_before, status_of
 from jaxslam.protocols import Associate, Association, Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Part, Suite, on_ground
 from jaxslam.slots import Joint
 from jaxslam.staging import where_any
-from jaxslam.types import Info, Scan, Status
+from jaxslam.types import Info, Scan
 
 
 class Births(NamedTuple):
@@ -129,24 +130,25 @@ def scan_update(
         else:
             joint, born = where_any(is_new.any(), start, start_none, joint)
 
-        status = first_that_holds(
-            (matched & ~done.inside, Status.REJECTED),
-            (matched & ~done.positive, Status.SINGULAR),
-            (matched, Status.FUSED),
-            (born.repeated, Status.REPEATED),
-            (born.deferred, Status.DEFERRED),
-            (born.granted, Status.BORN),
-            (is_new, Status.OVERFLOW),
-            (scan.valid, Status.UNMATCHED),
+        status = status_of(
+            scan.valid,
+            matched=matched,
+            positive=done.positive,
+            inside=done.inside,
+            new=is_new,
+            repeated=born.repeated,
+            granted=born.granted,
+            deferred=born.deferred,
         )
-        fused = status == Status.FUSED
-        info = Info(
-            nis=jnp.where(matched, done.nis, 0.0),
-            dof=jnp.where(fused, size_z, 0),
-            innovation=jnp.where(matched[:, None], done.innovation, 0.0),
-            innovation_cov=jnp.where(matched[:, None, None], done.innovation_cov, 0.0),
-            slot=jnp.where(fused, slot, jnp.where(born.granted, born.slot, -1)),
-            status=status,
+        info = info_of(
+            status,
+            matched,
+            size=size_z,
+            slot=slot,
+            born=born.slot,
+            nis=done.nis,
+            innovation=done.innovation,
+            innovation_cov=done.innovation_cov,
             log_likelihood=done.log_likelihood.sum(),
             exhausted=exhausted,
         )
@@ -181,20 +183,7 @@ def part_update(part: Part, size_l: int, **options: Any) -> ScanUpdate:
 
 def left_alone(joint: Joint, scan: Scan) -> tuple[Joint, Info, jax.Array]:
     """A `ScanUpdate` that uses nothing: every valid place is `Status.UNMATCHED`."""
-    m, size_z = scan.z.shape
-    zero = jnp.zeros(m, scan.z.dtype)
-    status = jnp.where(scan.valid, Status.UNMATCHED, Status.EMPTY).astype(jnp.int32)
-    info = Info(
-        nis=zero,
-        dof=jnp.zeros(m, jnp.int32),
-        innovation=jnp.zeros_like(scan.z),
-        innovation_cov=jnp.zeros((m, size_z, size_z), scan.z.dtype),
-        slot=jnp.full(m, -1, jnp.int32),
-        status=status,
-        log_likelihood=jnp.zeros((), scan.z.dtype),
-        exhausted=jnp.asarray(False),
-    )
-    return joint, info, jnp.zeros_like(joint.alive)
+    return joint, nothing_of(scan), jnp.zeros_like(joint.alive)
 
 
 def in_order(
@@ -241,16 +230,3 @@ def joined(infos: list[Info], size_z: int) -> Info:
         log_likelihood=jnp.stack([info.log_likelihood for info in infos]).sum(),
         exhausted=jnp.stack([jnp.asarray(info.exhausted) for info in infos]).any(),
     )
-
-
-def first_that_holds(*cases: tuple[jax.Array, Status]) -> jax.Array:
-    """`Status` (M,) of the first condition (M,) that holds at a place, EMPTY where none does."""
-    where, status = zip(*cases, strict=True)
-    return jnp.select(list(where), list(status), Status.EMPTY).astype(jnp.int32)
-
-
-def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
-    """Whether the same non-negative tag occurs at an earlier place, (M,)."""
-    earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
-    same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
-    return (same & earlier).any(axis=1)

@@ -17,7 +17,7 @@ from jaxslam.filters.sparse_parts import (
 )
 from jaxslam.filters.sparsification import activated, retired
 from jaxslam.protocols import Filter, Motion, Sensor
-from jaxslam.types import Info, Scan, Status
+from jaxslam.types import Info, Scan
 
 
 def seif(
@@ -72,6 +72,7 @@ def seif(
     """
     check_sparse(
         "seif",
+        motion,
         sensor,
         capacity,
         gate,
@@ -104,13 +105,14 @@ def seif(
         room = of.wanted & of.new & sound
         omega, points, granted = canonical.born(omega, state.pose, scan.z, place, room, sensor)
         state = closed(state, of, place, of.wanted, omega, points, granted, sound, scan.valid.any())
-        info = canonical.with_births(
-            canonical.unless(sound, weighed.info),
+        info = canonical.reported(
+            canonical.judged(weighed, sound),
             scan,
             of.slot,
-            of.new,
-            [of.repeated, granted, of.wanted, jnp.ones_like(of.new)],
-            [Status.REPEATED, Status.BORN, Status.SINGULAR, Status.OVERFLOW],
+            new=of.new,
+            repeated=of.repeated,
+            granted=granted,
+            singular=of.wanted,
         )
         return state, info
 

@@ -12,7 +12,7 @@ from jaxslam.filters import canonical
 from jaxslam.filters.blankets import marginals, whole_marginals
 from jaxslam.filters.eif_slam import check_models
 from jaxslam.filters.recovery import owed_of, owing
-from jaxslam.filters.scanning import seen_before
+from jaxslam.filters.reporting import seen_before
 from jaxslam.filters.sparse_map import Sparse, empty
 from jaxslam.linalg import check_count
 from jaxslam.protocols import Filter, Motion, Sensor
@@ -147,10 +147,16 @@ def sparse_filter(
 
 
 def check_sparse(
-    name: str, sensor: Sensor, capacity: int, gate: float | None, floor: float, **counts: Any
+    name: str,
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    gate: float | None,
+    floor: float,
+    **counts: Any,
 ) -> None:
     """Raise ValueError on what no filter of a `Sparse` map takes; counts are to be above 0."""
-    check_models(name, sensor, capacity, gate, floor)
+    check_models(name, motion, sensor, capacity, gate, floor)
     for what, value in counts.items():
         check_count(f"{name}: {what}", value)
     if len(sensor.landmark) != 2:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import se2, slots
+from jaxslam import se2, slots, validation
 from jaxslam.angles import wrap
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
@@ -75,6 +75,9 @@ def team_slam(
             it is, or as `ekf_slam` does.
     """
     tags = check_team("team_slam", robots, tags, _count(capacity))
+    for robot in robots:
+        validation.check_models("team_slam", robot.motion, robot.sensors)
+    validation.check_parts("team_slam", chart=chart, associate=associate)
     _check(robots, report, chart, update, gate, iterations, births)
     count = len(robots)
     control_ends, place_ends, size_z = sizes(robots)

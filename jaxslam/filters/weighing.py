@@ -139,8 +139,7 @@ def weigh(
             innovation, alone, positive = nu, marginal, definite
             distance = (_product(own, nu[:, :, None]) ** 2).sum(axis=(1, 2))
             # A finite measurement so far off that its d² is not is outside any gate.
-            near = jnp.isfinite(distance) if gate is None else distance <= gate
-            inside = ~positive | near
+            inside = jnp.isfinite(distance) if gate is None else distance <= gate
             fuse = known & inside & positive
         hp = hp.reshape(m * size_z, -1)
         both = fuse[:, None, None, None] & fuse[None, None, :, None]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from jaxslam import derivatives, linalg, programs
+from jaxslam import derivatives, linalg, programs, validation
 from jaxslam.angles import wrap
 from jaxslam.filters.ekf_slam import ekf_slam
 from jaxslam.protocols import Associate, Estimator, Filter, Motion, Sensor
@@ -60,6 +60,8 @@ def filter_of(
     landmarks that turn into points, or landmarks whose birth makes a part of them exact (the anchor
     of a ray, where the robot was).
     """
+    validation.check_models(name, motion, sensor)
+    validation.check_parts(name, associate=associate)
     if isinstance(sensor, Suite) or sensor.reduced is not None:
         raise ValueError(
             f"{name}: expected one sensor of landmarks that stay what they are, not a suite or "

@@ -1,0 +1,149 @@
+"""From gate to `Status` to `Info`: the one table that every filter reports by."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.types import Info, Scan, Status
+
+Mask = jax.Array | None
+
+
+def status_of(
+    valid: jax.Array,
+    *,
+    matched: Mask = None,
+    positive: Mask = None,
+    inside: Mask = None,
+    postponed: Mask = None,
+    new: Mask = None,
+    repeated: Mask = None,
+    granted: Mask = None,
+    deferred: Mask = None,
+    stored: Mask = None,
+    singular: Mask = None,
+) -> jax.Array:
+    """`Status` (M,) int32 of each measurement place, by masks (M,) bool; None is False everywhere.
+
+    The first row that holds decides:
+
+    | place | status |
+    |---|---|
+    | not valid | EMPTY |
+    | matched, S not positive definite | SINGULAR |
+    | matched, outside the gate, or d² not finite | REJECTED |
+    | matched, postponed | DEFERRED |
+    | matched | FUSED |
+    | new, its tag earlier in the scan | REPEATED |
+    | new, a slot granted | BORN |
+    | new, beyond the quota or postponed | DEFERRED |
+    | new, stored for a later initialization | SIGHTED |
+    | new, with a covariance that is not positive definite | SINGULAR |
+    | new, nothing of these: no slot is left | OVERFLOW |
+    | neither matched nor new | UNMATCHED |
+
+    A singular S is SINGULAR on both sides of the gate: d² = νᵀ S⁻¹ ν needs S⁻¹, so there is no
+    gate to be outside of. A measurement without a finite value is REJECTED by `run` before a filter
+    sees it, and one that concerns a robot without a place in the map is UNMATCHED (`team_slam`).
+
+    Args:
+        valid: there is a measurement.
+        matched: association found its landmark (or it is of an absolute sensor); wins over new.
+        positive: S is positive definite, alone and with those of the scan that are fused with it,
+            and so is whatever the filter needs to compute S.
+        inside: d² is finite and at most the gate. May be anything where S is not positive definite.
+        postponed: known, but the filter has no place to work on it now (`eseif`).
+        new: association found it to be of no landmark.
+        repeated, granted, deferred, stored, singular: what became of a new one.
+    """
+    no = jnp.zeros_like(valid)
+    matched, new = no if matched is None else matched, no if new is None else new
+    cases: list[tuple[jax.Array, Status]] = [(~valid, Status.EMPTY)]
+    if positive is not None:
+        cases.append((matched & ~positive, Status.SINGULAR))
+    if inside is not None:
+        cases.append((matched & ~inside, Status.REJECTED))
+    if postponed is not None:
+        cases.append((matched & postponed, Status.DEFERRED))
+    cases.append((matched, Status.FUSED))
+    fates = (
+        (repeated, Status.REPEATED),
+        (granted, Status.BORN),
+        (deferred, Status.DEFERRED),
+        (stored, Status.SIGHTED),
+        (singular, Status.SINGULAR),
+    )
+    cases += [(new & mask, status) for mask, status in fates if mask is not None]
+    cases.append((new, Status.OVERFLOW))
+    where, status = zip(*cases, strict=True)
+    return jnp.select(list(where), list(status), Status.UNMATCHED).astype(jnp.int32)
+
+
+def info_of(
+    status: jax.Array,
+    matched: jax.Array,
+    *,
+    size: int | jax.Array,
+    slot: jax.Array,
+    born: jax.Array | None = None,
+    nis: jax.Array,
+    innovation: jax.Array,
+    innovation_cov: jax.Array,
+    log_likelihood: jax.Array,
+    **more: Any,
+) -> Info:
+    """The `Info` of M places with these statuses, zeros where a number says nothing.
+
+    Args:
+        status: (M,) as of `status_of`.
+        matched: (M,) bool: measurements that were compared with their landmark.
+        size: Z, or (M,) int, which dof is where fused.
+        slot: (M,) of the landmark matched.
+        born: (M,) of the landmark started; default none is.
+        nis, innovation, innovation_cov: (M,), (M, Z), (M, Z, Z) of the places matched; nis counts
+            where `has_distance`.
+        log_likelihood: () of the scan.
+        more: fields of `Info` that one filter has.
+    """
+    fused = status == Status.FUSED
+    none = jnp.full_like(status, -1)
+    started = none if born is None else jnp.where(status == Status.BORN, born, none)
+    return Info(
+        nis=jnp.where(has_distance(status), nis, 0.0),
+        dof=jnp.where(fused, size, 0).astype(jnp.int32),
+        innovation=jnp.where(matched[:, None], innovation, 0.0),
+        innovation_cov=jnp.where(matched[:, None, None], innovation_cov, 0.0),
+        slot=jnp.where(fused, slot, started).astype(jnp.int32),
+        status=status,
+        log_likelihood=log_likelihood,
+        **more,
+    )
+
+
+def has_distance(status: jax.Array) -> jax.Array:
+    """Whether a place has a squared Mahalanobis distance, (M,) bool: it was fused or rejected."""
+    return (status == Status.FUSED) | (status == Status.REJECTED)
+
+
+def nothing_of(scan: Scan) -> Info:
+    """The `Info` of a scan that is left alone: every valid place is `Status.UNMATCHED`."""
+    m, size_z = scan.z.shape
+    return info_of(
+        status_of(scan.valid),
+        jnp.zeros_like(scan.valid),
+        size=0,
+        slot=jnp.full(m, -1, jnp.int32),
+        nis=jnp.zeros(m, scan.z.dtype),
+        innovation=jnp.zeros_like(scan.z),
+        innovation_cov=jnp.zeros((m, size_z, size_z), scan.z.dtype),
+        log_likelihood=jnp.zeros((), scan.z.dtype),
+        exhausted=jnp.asarray(False),
+    )
+
+
+def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
+    """Whether the same non-negative tag occurs at an earlier place, (M,)."""
+    earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
+    same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
+    return (same & earlier).any(axis=1)

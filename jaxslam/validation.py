@@ -1,0 +1,160 @@
+"""What factories refuse before anything is traced: records of another kind, functions of the wrong
+arguments, results of the wrong size. One line each, with what was expected."""
+
+import inspect
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.sensors.suite import Suite
+from jaxslam.types import Info
+
+_Shape = tuple[int, ...]
+
+_SOUND: weakref.WeakSet[Any] = weakref.WeakSet()
+"""Models that have been evaluated and found to be of the right sizes."""
+
+
+def check_models(name: str, motion: Any, sensor: Any) -> None:
+    """Raise ValueError, which begins with a factory's name, unless these are a Motion and a Sensor.
+
+    Their functions are evaluated on shapes alone (`jax.eval_shape`): they must take the arguments
+    that `protocols` says and return arrays of the sizes that their names say.
+    """
+    if isinstance(motion, Sensor) and isinstance(sensor, Motion):
+        raise ValueError(
+            f"{name}: expected a Motion, then a Sensor, got the sensor {motion.name} and "
+            f"the motion {sensor.name}: they are swapped"
+        )
+    check_motion(name, motion)
+    check_sensor(name, sensor)
+
+
+def check_motion(name: str, motion: Any) -> None:
+    """As `check_models`, of a Motion alone."""
+    check_record(name, "motion", motion, Motion)
+    if motion in _SOUND:
+        return
+    pose, u, w = _numbers(3), _numbers(len(motion.controls)), _numbers(len(motion.noises))
+    _check_size(name, motion, "step", {"pose": pose, "u": u, "w": w}, (3,))
+    _check_size(name, motion, "noise_cov", {"pose": pose, "u": u}, (len(motion.noises),) * 2)
+    _SOUND.add(motion)
+
+
+def check_sensor(name: str, sensor: Any) -> None:
+    """As `check_models`, of a Sensor alone, or of each in a suite."""
+    check_record(name, "sensor", sensor, Sensor)
+    if isinstance(sensor, Suite):
+        for part in sensor.parts:
+            check_sensor(name, part.sensor)
+        return
+    if sensor in _SOUND:
+        return
+    size_z, size_l = len(sensor.measurements), len(sensor.landmark)
+    pose, z, landmark = _numbers(3), _numbers(size_z), _numbers(size_l)
+    free = np.shape(sensor.free.mean)
+    if len(free) != 1 or np.shape(sensor.free.cov) != free * 2:
+        raise ValueError(
+            f"{name}: expected {sensor.name}.free of shapes (K,) and (K, K), got {free} and "
+            f"{np.shape(sensor.free.cov)}"
+        )
+    _check_size(name, sensor, "observe", {"pose": pose, "l": landmark}, (size_z,))
+    _check_size(name, sensor, "residual", {"z": z, "z_hat": z}, (size_z,))
+    _check_size(name, sensor, "noise_cov", {"z": z}, (size_z, size_z))
+    _check_size(name, sensor, "invert", {"pose": pose, "z": z, "s": _numbers(*free)}, (size_l,))
+    _check_size(name, sensor, "position", {"l": landmark}, (2,))
+    _SOUND.add(sensor)
+
+
+def check_parts(
+    name: str,
+    *,
+    chart: Any = None,
+    linearize: Any = None,
+    associate: Any = None,
+) -> None:
+    """Raise ValueError unless each is of its kind; None is for the default."""
+    if chart is not None:
+        check_record(name, "chart", chart, Chart)
+    if linearize is not None:
+        check_record(name, "linearize", linearize, Linearizer)
+    if associate is not None:
+        check_associate(name, associate)
+
+
+def check_record(name: str, what: str, value: Any, kind: type) -> None:
+    """Raise ValueError unless the value is such a record, not a factory that was not called."""
+    if isinstance(value, kind):
+        return
+    if callable(value):
+        factory = getattr(value, "__name__", repr(value))
+        raise ValueError(
+            f"{name}: expected {what} to be a {kind.__name__}, got the function {factory}: "
+            f"call it, {factory}(…)"
+        )
+    raise ValueError(f"{name}: expected {what} to be a {kind.__name__}, got {type(value).__name__}")
+
+
+def check_associate(name: str, associate: Any) -> None:
+    """Raise ValueError unless this is a function of (prediction, scan)."""
+    if not callable(associate):
+        raise ValueError(
+            f"{name}: expected associate to be a function of (prediction, scan), got "
+            f"{type(associate).__name__}"
+        )
+    called = getattr(associate, "__qualname__", "")
+    ours = getattr(associate, "__module__", "").startswith("jaxslam.association.")
+    if ours and "<locals>" not in called:
+        raise ValueError(
+            f"{name}: expected associate to be a function of (prediction, scan), got the factory "
+            f"{called}: call it, {called}(…)"
+        )
+    try:
+        inspect.signature(associate).bind(None, None)
+    except TypeError as error:
+        raise ValueError(
+            f"{name}: expected associate to be a function of (prediction, scan): {error}"
+        ) from None
+    except ValueError:  # a builtin, which has no signature to look at
+        return
+
+
+def state_and_info(name: str, found: Any) -> tuple[Any, Info]:
+    """What a filter's update returned; ValueError unless it is a state and an `Info`."""
+    if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Info):
+        return found
+    got = type(found).__name__
+    if isinstance(found, tuple) and not hasattr(found, "_fields"):
+        got = "(" + ", ".join(type(part).__name__ for part in found) + ")"
+    raise ValueError(f"{name}: expected update to return (state, Info), got {got}")
+
+
+def _numbers(*shape: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
+
+
+def _check_size(
+    name: str, model: Any, field: str, arguments: dict[str, Any], shape: _Shape
+) -> None:
+    """The function of a model takes these arguments and returns an array of this shape."""
+    function: Callable[..., Any] = getattr(model, field)
+    told = ", ".join(f"{key} {_told(value.shape)}" for key, value in arguments.items())
+    call = f"{model.name}.{field}({told})"
+    try:
+        found = jax.eval_shape(function, *arguments.values())
+    except Exception as error:
+        why = next(iter(str(error).strip().splitlines()), "")
+        raise ValueError(f"{name}: {call} fails: {type(error).__name__}: {why}") from error
+    got = getattr(found, "shape", None)
+    if got != shape:
+        what = f"a {type(found).__name__}" if got is None else f"shape {_told(got)}"
+        raise ValueError(f"{name}: expected {call} to return shape {_told(shape)}, got {what}")
+
+
+def _told(shape: _Shape) -> str:
+    return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"

@@ -1,0 +1,216 @@
+"""One table from gate to status, for every family of filters."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import filters, motion, sensors
+from jaxslam.filters.reporting import info_of, nothing_of, status_of
+from jaxslam.types import Scan, Status
+
+MASKS = (
+    "valid", "matched", "positive", "inside", "postponed",
+    "new", "repeated", "granted", "deferred", "stored", "singular",
+)  # fmt: skip
+
+
+def expected(**of):
+    """The table of the docstring, row by row."""
+    table = [
+        (not of["valid"], Status.EMPTY),
+        (of["matched"] and not of["positive"], Status.SINGULAR),
+        (of["matched"] and not of["inside"], Status.REJECTED),
+        (of["matched"] and of["postponed"], Status.DEFERRED),
+        (of["matched"], Status.FUSED),
+        (of["new"] and of["repeated"], Status.REPEATED),
+        (of["new"] and of["granted"], Status.BORN),
+        (of["new"] and of["deferred"], Status.DEFERRED),
+        (of["new"] and of["stored"], Status.SIGHTED),
+        (of["new"] and of["singular"], Status.SINGULAR),
+        (of["new"], Status.OVERFLOW),
+        (True, Status.UNMATCHED),
+    ]
+    return next(status for holds, status in table if holds)
+
+
+def test_every_combination_of_masks_has_the_status_of_the_table():
+    rows = np.array(list(itertools.product([False, True], repeat=len(MASKS))))
+    columns = dict(zip(MASKS, rows.T, strict=True))
+    valid = jnp.asarray(columns.pop("valid"))
+    got = status_of(valid, **{name: jnp.asarray(mask) for name, mask in columns.items()})
+    wanted = [expected(**dict(zip(MASKS, row, strict=True))) for row in rows]
+    np.testing.assert_array_equal(got, wanted)
+    assert got.dtype == jnp.int32
+
+
+def test_masks_that_are_left_out_hold_nowhere_and_the_rest_is_unmatched():
+    valid, yes = jnp.asarray([False, True]), jnp.ones(2, bool)
+    assert list(status_of(valid)) == [Status.EMPTY, Status.UNMATCHED]
+    assert list(status_of(valid, matched=yes)) == [Status.EMPTY, Status.FUSED]
+    assert list(status_of(valid, new=yes)) == [Status.EMPTY, Status.OVERFLOW]
+
+
+def test_numbers_of_places_without_a_comparison_are_zero():
+    status = jnp.asarray(
+        [Status.FUSED, Status.REJECTED, Status.SINGULAR, Status.BORN, 0], jnp.int32
+    )
+    matched = jnp.asarray([True, True, True, False, False])
+    info = info_of(
+        status,
+        matched,
+        size=2,
+        slot=jnp.arange(5),
+        born=jnp.arange(5) + 10,
+        nis=jnp.full(5, 7.0),
+        innovation=jnp.ones((5, 2)),
+        innovation_cov=jnp.ones((5, 2, 2)),
+        log_likelihood=jnp.zeros(()),
+    )
+    assert list(info.nis) == [7, 7, 0, 0, 0]
+    assert list(info.dof) == [2, 0, 0, 0, 0]
+    assert list(info.slot) == [0, -1, -1, 13, -1]
+    assert list(info.innovation[:, 0]) == list(info.innovation_cov[:, 0, 1]) == [1, 1, 1, 0, 0]
+
+
+def test_a_scan_left_alone_is_unmatched_where_there_is_one():
+    scan = Scan(jnp.ones((2, 3)), jnp.zeros(2, int), jnp.asarray([True, False]))
+    info = nothing_of(scan)
+    assert list(info.status) == [Status.UNMATCHED, Status.EMPTY]
+    assert not info.nis.any() and not info.innovation.any() and list(info.slot) == [-1, -1]
+
+
+# One world for every family: three landmarks that a first scan starts, in a map with room for five.
+LANDMARKS = np.array([[4.0, 0.0], [4.0, 3.0], [4.0, -3.0], [2.0, 2.0], [2.0, -2.0]])
+WILD = 50.0
+"""a first coordinate beyond which the sensor's claimed noise is no covariance"""
+
+SCAN = {  # tag, z, and what becomes of it
+    "as expected": (0, LANDMARKS[0] + [0.02, 0.01], Status.FUSED),
+    "outside the gate": (1, LANDMARKS[1] + [0.0, 9.0], Status.REJECTED),
+    "singular, and far outside in what is regular": (
+        2,
+        LANDMARKS[2] + [99.0, 9.0],
+        Status.SINGULAR,
+    ),
+    "new": (7, LANDMARKS[3], Status.BORN),
+    "the same again": (7, LANDMARKS[3], Status.REPEATED),
+    "new too": (8, LANDMARKS[4], Status.BORN),
+    "new without room": (9, [1.0, 1.0], Status.OVERFLOW),
+    "of nothing": (-1, [1.0, 1.0], Status.UNMATCHED),
+    "no measurement": (0, [np.nan, np.inf], Status.EMPTY),
+}
+
+
+def seen_in_the_map():
+    """A sensor of positions in the robot's frame, which claims nonsense of far ones."""
+
+    def noise(z):
+        honest = jnp.diag(jnp.full(2, 0.01))
+        return jnp.where(jnp.abs(z[0]) > WILD, jnp.diag(jnp.asarray([0.01, -1e4])), honest)
+
+    return sensors.relative_position(noise)
+
+
+MOVE = motion.pose_increment(np.diag([1e-4, 1e-4, 1e-6]))
+KNOWN = np.concatenate([LANDMARKS[:3], np.full((2, 2), 77.0)])
+FAMILIES = {
+    "ekf_slam": lambda s: filters.ekf_slam(MOVE, s, 5, gate=20.0),
+    "ekf_slam, at once": lambda s: filters.ekf_slam(MOVE, s, 5, gate=20.0, update="joint"),
+    "compressed_ekf_slam": lambda s: filters.compressed_ekf_slam(MOVE, s, 5, area=9, gate=20.0),
+    "eif_slam": lambda s: filters.eif_slam(MOVE, s, 5, gate=20.0),
+    "fastslam": lambda s: filters.fastslam(MOVE, s, 5, 3, gate=20.0),
+    "mapping": lambda s: filters.mapping(s, 5, gate=20.0),
+    "localization": lambda s: filters.localization(MOVE, s, LANDMARKS[:3], gate=20.0),
+    "particle_localization": lambda s: filters.particle_localization(
+        MOVE, s, LANDMARKS[:3], 3, gate=20.0
+    ),
+}
+SPARSE = {
+    "seif": lambda s: filters.seif(MOVE, s, 5, active=9, links=4, gate=20.0),
+    "eseif": lambda s: filters.eseif(MOVE, s, 5, active=9, links=4, gate=20.0),
+}
+
+
+def after_two_scans(filter, tags):
+    """The info of SCAN, after a scan that started the first three landmarks."""
+    z = np.array([where for _, where, _ in SCAN.values()])
+    valid = np.array([status != Status.EMPTY for *_, status in SCAN.values()])
+    first = Scan(
+        jnp.asarray(np.concatenate([LANDMARKS[:3], np.zeros((len(z) - 3, 2))])),
+        jnp.asarray([0, 1, 2, *[-1] * (len(z) - 3)]),
+        jnp.arange(len(z)) < 3,
+    )
+    second = Scan(jnp.asarray(z), jnp.asarray(tags), jnp.asarray(valid))
+    u, key = jnp.zeros(3), jax.random.key(0)
+
+    @jax.jit
+    def both(first, second):
+        state = filter.init(jnp.zeros(3), jnp.diag(jnp.asarray([1e-4, 1e-4, 1e-6])))
+        state, _ = filter.update(filter.predict(state, u, key), first, key)
+        return filter.update(filter.predict(state, u, key), second, key)[1]
+
+    return both(first, second)
+
+
+@pytest.mark.parametrize("family", [*FAMILIES, *SPARSE])
+def test_every_family_reports_a_scan_by_the_table(family):
+    tags = [tag for tag, *_ in SCAN.values()]
+    wanted = [status for *_, status in SCAN.values()]
+    if family in SPARSE:  # a landmark's slot is its tag
+        tags = [{7: 3, 8: 4}.get(tag, tag) for tag in tags]
+    if "localization" in family:  # nothing is new in a map that is known
+        born = (Status.BORN, Status.REPEATED, Status.OVERFLOW)
+        wanted = [Status.UNMATCHED if status in born else status for status in wanted]
+    info = after_two_scans((FAMILIES | SPARSE)[family](seen_in_the_map()), tags)
+    got = [Status(int(status)).name for status in info.status]
+    assert dict(zip(SCAN, got, strict=True)) == {
+        name: status.name for name, status in zip(SCAN, wanted, strict=True)
+    }
+    compared = np.isin(info.status, [Status.FUSED, Status.REJECTED])
+    assert (np.asarray(info.nis)[compared] > 0).all()
+    assert not np.asarray(info.nis)[~compared].any()
+    np.testing.assert_array_equal(info.dof, np.where(info.status == Status.FUSED, 2, 0))
+    assert np.isfinite(info.log_likelihood)
+
+
+def test_a_delayed_filter_reports_bearings_by_the_table():
+    def noise(z):
+        return jnp.where(jnp.abs(z[0]) > 3.0, -1e4, 1e-4)[None, None]
+
+    sensor = dataclasses.replace(
+        sensors.bearing_only(np.diag([1e-4])), noise_cov=noise, residual=lambda z, zh: z - zh
+    )
+    filter = filters.delayed_slam(MOVE, sensor, 2, gate=20.0, sightings=4, hypotheses=2)
+    state = filter.init(jnp.zeros(3), 1e-4 * jnp.eye(3))
+    joint = state.joint
+    joint = joint._replace(
+        landmarks=joint.landmarks.at[0, :2].set(jnp.asarray([4.0, 0.0])),
+        alive=joint.alive.at[0].set(True),
+        tag=joint.tag.at[0].set(0),
+    )
+    cases = (  # tag, bearing, valid; each in a scan of its own but the last two
+        (0, 0.0, True, Status.FUSED),
+        (0, 2.5, True, Status.REJECTED),
+        (0, 3.1, True, Status.SINGULAR),
+        (1, 0.5, True, Status.SIGHTED),
+        (-1, 0.5, True, Status.UNMATCHED),
+        (1, 0.5, False, Status.EMPTY),
+    )
+    scans = Scan(
+        jnp.asarray([[[z], [z]] for _, z, *_ in cases]),
+        jnp.asarray([[tag, tag] for tag, *_ in cases]),
+        jnp.asarray([[valid, False] for *_, valid, _ in cases]),
+    )
+    # One more: the same new tag twice in a scan.
+    twice = Scan(jnp.full((1, 2, 1), 0.5), jnp.ones((1, 2), int), jnp.ones((1, 2), bool))
+    scans = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scans, twice)
+    update = jax.jit(
+        jax.vmap(lambda scan: filter.update(state._replace(joint=joint), scan, None)[1])
+    )
+    status = np.asarray(update(scans).status)
+    assert list(status[:-1, 0]) == [wanted for *_, wanted in cases]
+    assert list(status[-1]) == [Status.SIGHTED, Status.REPEATED]

@@ -1,0 +1,234 @@
+"""What a user gets wrong is one line that says what was expected, before anything is traced."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam import association, charts, filters, life, linearize, motion, sensors, smoothing, team
+from jaxslam.filters import merging, reporting
+from jaxslam.filters.closing import _OPTIONS, closing
+from jaxslam.protocols import Free, Sensor
+from jaxslam.validation import check_models, state_and_info
+
+MOVE = motion.pose_increment(np.diag([1e-4, 1e-4, 1e-6]))
+SEES = sensors.range_bearing(np.diag([1e-2, 1e-4]))
+BEARING = sensors.bearing_only(np.diag([1e-4]))
+POINTS = np.array([[1.0, 2.0]])
+
+FACTORIES = {
+    "ekf_slam": lambda m, s, **o: filters.ekf_slam(m, s, 3, **o),
+    "compressed_ekf_slam": lambda m, s, **o: filters.compressed_ekf_slam(m, s, 3, area=2, **o),
+    "localization": lambda m, s, **o: filters.localization(m, s, POINTS, **o),
+    "particle_localization": lambda m, s, **o: filters.particle_localization(m, s, POINTS, 4, **o),
+    "fastslam": lambda m, s, **o: filters.fastslam(m, s, 3, 4, **o),
+    "eif_slam": lambda m, s, **o: filters.eif_slam(m, s, 3, **o),
+    "seif": lambda m, s, **o: filters.seif(m, s, 3, active=2, links=2, **o),
+    "eseif": lambda m, s, **o: filters.eseif(m, s, 3, active=2, links=2, **o),
+    "delayed_slam": lambda m, s, **o: filters.delayed_slam(m, s, 3, **o),
+    "dead_reckoning": lambda m, s, **o: filters.dead_reckoning(m, s, **o),
+    "smooth": lambda m, s, **o: smoothing.smooth(m, s, 3, np.zeros(3), np.eye(3), **o),
+    "batch_map": lambda m, s, **o: smoothing.batch_map(m, s, 3, np.zeros(3), np.eye(3), **o),
+}
+
+
+def one_line(caught):
+    message = str(caught.value)
+    assert "\n" not in message and len(message) < 300
+    return message
+
+
+@pytest.mark.parametrize("name", FACTORIES)
+def test_swapped_models_are_told_by_the_factory_that_got_them(name):
+    sensor = BEARING if name == "delayed_slam" else SEES
+    with pytest.raises(
+        ValueError, match=f"^{name}: expected a Motion, then a Sensor.*swapped"
+    ) as e:
+        FACTORIES[name](sensor, MOVE)
+    one_line(e)
+
+
+@pytest.mark.parametrize("name", FACTORIES)
+def test_a_model_that_was_not_called_or_is_none_is_told(name):
+    with pytest.raises(
+        ValueError, match=rf"^{name}: expected motion to be a Motion.*call it, velo"
+    ):
+        FACTORIES[name](motion.velocity, SEES)
+    with pytest.raises(ValueError, match=rf"^{name}: expected sensor to be a Sensor, got int"):
+        FACTORIES[name](MOVE, 3)
+
+
+def test_mapping_and_teams_look_at_their_models_too():
+    with pytest.raises(ValueError, match=r"^mapping: expected sensor to be a Sensor.*call it"):
+        filters.mapping(sensors.range_bearing, 3)
+    wrong = dataclasses.replace(SEES, observe=lambda pose, at: pose)
+    robot = team.Robot(MOVE, sensors.suite((wrong, 2)))
+    with pytest.raises(ValueError, match=r"^team_slam: expected range_bearing.observe"):
+        filters.team_slam([robot], 3)
+
+
+@pytest.mark.parametrize("name", ["ekf_slam", "localization", "dead_reckoning"])
+def test_a_chart_or_linearizer_that_was_not_called_is_told(name):
+    make = FACTORIES[name]
+    with pytest.raises(
+        ValueError, match=rf"^{name}: expected chart to be a Chart.*right_invariant\("
+    ):
+        make(MOVE, SEES, chart=charts.right_invariant)
+    with pytest.raises(
+        ValueError, match=rf"^{name}: expected linearize.*call it, first_estimate\("
+    ):
+        make(MOVE, SEES, linearize=linearize.first_estimate)
+    with pytest.raises(ValueError, match=rf"^{name}: expected chart to be a Chart, got str"):
+        make(MOVE, SEES, chart="euclidean")
+
+
+@pytest.mark.parametrize(
+    "name", sorted(set(FACTORIES) - {"dead_reckoning", "eif_slam", "seif", "eseif"})
+)
+def test_an_association_that_was_not_called_or_is_none_is_told(name):
+    if name == "compressed_ekf_slam":
+        return  # it takes none
+    sensor = BEARING if name == "delayed_slam" else SEES
+    for wrong, told in (
+        (association.known, r"got the factory known: call it"),
+        (association.nearest, r"got the factory nearest: call it"),
+        (lambda prediction: None, "too many positional arguments"),
+        ("known", "got str"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name}: expected associate to be.*{told}") as e:
+            FACTORIES[name](MOVE, sensor, associate=wrong)
+        one_line(e)
+
+
+def own_sensor(**other):
+    """A user's sensor of points, by hand."""
+    functions = {
+        "observe": lambda pose, at: at - pose[:2],
+        "residual": lambda z, z_hat: z - z_hat,
+        "noise_cov": lambda z: jnp.eye(2),
+        "invert": lambda pose, z, s: pose[:2] + z,
+        "position": lambda at: at,
+        "embed": lambda pose, point: point,
+    }
+    free = Free(jnp.zeros(0), jnp.zeros((0, 0)))
+    fields = {"measurements": ("x [m]", "y [m]"), "landmark": ("x [m]", "y [m]"), "free": free}
+    return Sensor(name="own", **(fields | functions | other))
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong", "told"),
+    [
+        ("observe", lambda pose, at: pose, r"own.observe\(pose \(3,\), l \(2,\)\) to return shape \(2,\), got shape \(3,\)"),
+        ("observe", lambda pose, at: (at, at), r"to return shape \(2,\), got a tuple"),
+        ("residual", lambda z: z, r"own.residual\(z \(2,\), z_hat \(2,\)\) fails: TypeError"),
+        ("noise_cov", lambda z: jnp.ones(2), r"own.noise_cov\(z \(2,\)\) to return shape \(2, 2\)"),
+        ("invert", lambda pose, z: z, r"own.invert\(pose \(3,\), z \(2,\), s \(0,\)\) fails: TypeError.* takes 2 positional"),
+        ("invert", lambda pose, z, s: pose, r"own.invert.* to return shape \(2,\), got shape \(3,\)"),
+        ("position", lambda at: at[:1], r"own.position\(l \(2,\)\) to return shape \(2,\)"),
+        ("free", Free(jnp.zeros(1), jnp.zeros((2, 2))), r"own.free of shapes \(K,\) and \(K, K\)"),
+    ],
+)  # fmt: skip
+def test_a_model_of_ones_own_is_evaluated_on_shapes(field, wrong, told):
+    check_models("mine", MOVE, own_sensor())
+    with pytest.raises(ValueError, match=f"^mine: .*{told}") as e:
+        check_models("mine", MOVE, own_sensor(**{field: wrong}))
+    one_line(e)
+    with pytest.raises(ValueError, match=f"^mine: .*{told}"):  # in a suite too
+        check_models("mine", MOVE, sensors.suite((SEES, 2), (own_sensor(**{field: wrong}), 1)))
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong", "told"),
+    [
+        ("step", lambda pose, u: pose, r"pose_increment.step\(pose \(3,\), u \(3,\), w \(3,\)\) fails"),
+        ("step", lambda pose, u, w: pose[:2], r"to return shape \(3,\), got shape \(2,\)"),
+        ("noise_cov", lambda pose, u: jnp.eye(2), r"to return shape \(3, 3\), got shape \(2, 2\)"),
+    ],
+)  # fmt: skip
+def test_a_motion_of_ones_own_is_evaluated_on_shapes(field, wrong, told):
+    with pytest.raises(ValueError, match=f"^mine: .*{told}"):
+        check_models("mine", dataclasses.replace(MOVE, **{field: wrong}), SEES)
+
+
+def test_what_has_been_found_sound_is_not_looked_at_again():
+    asked = []
+    sensor = own_sensor(observe=lambda pose, at: asked.append(1) or at)
+    check_models("mine", MOVE, sensor)
+    check_models("mine", MOVE, sensor)
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize("record", [MOVE, SEES], ids=["Motion", "Sensor"])
+def test_an_array_where_a_function_belongs_is_told_when_the_record_is_made(record):
+    kind = type(record).__name__
+    with pytest.raises(ValueError, match=rf"^{kind} '{record.name}': expected noise_cov to be a function that returns one, got an array of shape \(2, 2\)"):  # fmt: skip
+        dataclasses.replace(record, noise_cov=np.eye(2))
+    with pytest.raises(
+        ValueError, match=f"^{kind} '{record.name}': expected noise_cov to be a func"
+    ):
+        dataclasses.replace(record, noise_cov=None)
+    with pytest.raises(ValueError, match=f"^{kind} 3: expected a name, got int"):
+        dataclasses.replace(record, name=3)
+
+
+def test_names_are_tuples_of_strings():
+    for wrong in (2, "range [m]", ["x", "y"], (1, 2)):
+        with pytest.raises(ValueError, match=r"expected measurements to be a tuple of names"):
+            own_sensor(measurements=wrong)
+        with pytest.raises(ValueError, match=r"expected controls to be a tuple of names"):
+            dataclasses.replace(MOVE, controls=wrong)
+    with pytest.raises(ValueError, match=r"expected free to be a Free\(mean, cov\), got NoneType"):
+        own_sensor(free=None)
+
+
+def test_charts_linearizers_and_filters_hold_functions():
+    with pytest.raises(ValueError, match=r"^Chart 'euclidean': expected retract to be a function"):
+        dataclasses.replace(charts.euclidean(), retract=None)
+    with pytest.raises(
+        ValueError, match=r"^Linearizer 'at_estimate': expected born to be a functi"
+    ):
+        dataclasses.replace(linearize.at_estimate(), born=0)
+    with pytest.raises(ValueError, match=r"^Filter 'ekf_slam': expected predict to be a function"):
+        dataclasses.replace(FACTORIES["ekf_slam"](MOVE, SEES), predict="predict")
+
+
+def test_an_update_that_returns_no_info_is_told():
+    scan = jaxslam.types.Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))
+    info = reporting.nothing_of(scan)
+    assert state_and_info("run: mine", ("state", info)) == ("state", info)
+    for wrong, told in (
+        ("state", "got str"),
+        (("state", 1), r"got \(str, int\)"),
+        (("state", info, 1), r"got \(str, Info, int\)"),
+        (info, "got Info"),
+    ):
+        with pytest.raises(ValueError, match=rf"^run: mine: expected update to return.*{told}"):
+            state_and_info("run: mine", wrong)
+
+
+def test_localization_is_named_by_its_own_name():
+    for wrong in ({"gate": 0.0}, {"iterations": 0}, {"update": "at once"}):
+        with pytest.raises(ValueError, match=r"^localization: "):
+            filters.localization(MOVE, SEES, POINTS, **wrong)
+
+
+def test_a_compressed_filter_refuses_to_merge():
+    with pytest.raises(ValueError, match=r"^compressed_ekf_slam: does not take merge"):
+        FACTORIES["compressed_ekf_slam"](MOVE, SEES, merge=merging.duplicates(1.0))
+
+
+def test_closing_checks_its_options_when_it_is_made():
+    ekf = filters.ekf_slam(MOVE, SEES, 3, life=life.recency())
+    with pytest.raises(ValueError, match=r"^closing: expected options of close_loop, got leest"):
+        closing(ekf, leest=3)
+    with pytest.raises(ValueError, match="least"):
+        closing(ekf, least=2)
+    with pytest.raises(ValueError, match="drift"):
+        closing(ekf, drift=1.0)
+    assert _OPTIONS["least"] == 5
+
+
+def test_calibration_is_reached_from_the_package():
+    assert "calibration" in jaxslam.__all__ and callable(jaxslam.calibration.calibrate)
