@@ -92,7 +92,7 @@ def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iter
             pass
     except (OSError, RuntimeError) as error:
         where = whole or "the user's cache folder"
-        _warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); going on without")
+        warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); going on without")
         with _set(jax_compilation_cache_dir=None):
             yield
         return
@@ -174,7 +174,7 @@ def _troubles_told(folder: Path) -> Iterator[None]:
         if once.acquire(blocking=False):
             what = "is damaged" if match[1] == "reading" else "cannot be written"
             reason = " ".join(str(message)[match.end() :].split())[:200]
-            _warn(f"a compiled program in {folder} {what} ({reason}); going on without it")
+            warn(f"a compiled program in {folder} {what} ({reason}); going on without it")
 
     with warnings.catch_warnings():
         warnings.filterwarnings("always", message=_TROUBLE.pattern)
@@ -186,5 +186,6 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
-def _warn(sentence: str) -> None:
+def warn(sentence: str) -> None:
+    """One line on the standard error, before going on."""
     print(f"jaxslam: warning: {sentence}", file=sys.stderr)
