@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             devices.prepare(options)
         else:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
-        with Spent() as spent, cache.programs(options.cache, options.no_cache):
+        with Spent() as spent, cache.asked_for(options):
             status = int(options.command(options, shlex.join(["jaxslam", *arguments])))
             if status != INTERRUPTED and jax.process_index() == 0:
                 print(spent)

@@ -115,14 +115,11 @@ def _keep(options: argparse.Namespace, out: Path, asked: dict[str, Any]) -> stor
     """Where this campaign's blocks are kept: a new folder, or that of the campaign resumed."""
     folder, runs = out / BLOCKS, asked["runs"]
     settings = {"asked": {name: value for name, value in asked.items() if name != "runs"}}
-    if jax.process_index() == 0:
-        if options.resume is None:
-            _make_room(options, out, settings, runs)
-            store.create(folder, settings, runs)
-        else:
-            store.resume(folder, settings, runs)  # which extends it
+    if options.resume is None and jax.process_index() == 0:
+        _make_room(options, out, settings, runs)
+        store.create(folder, settings, runs)
     devices.wait_for_all("campaign folder")
-    return store.resume(folder, settings)
+    return store.resume(folder, settings, runs)
 
 
 def _make_room(options: argparse.Namespace, out: Path, settings: dict[str, Any], runs: int) -> None:
