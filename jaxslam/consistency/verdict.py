@@ -98,10 +98,12 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
     """In words what a campaign that rejects nothing would have noticed; "" where it is nothing."""
     parts = []
     for name, (low, high) in noticed.items():
-        ends = [f"of {high:.3g} on"] * (high < np.inf) + [f"below {low:.3g}"] * (low > 0)
-        if ends:
-            parts.append(f"a {TESTS[name]} {' or '.join(ends)}")
-    return f"would have been noticed from {', from '.join(parts)}" if parts else ""
+        above, below = f"from a {TESTS[name]} of {high:.3g} on", f"below {low:.3g}"
+        if high < np.inf:
+            parts.append(above + f" (or {below})" * bool(low > 0))
+        elif low > 0:
+            parts.append(f"{below} of {TESTS[name]}")
+    return f"would have been noticed {', '.join(parts)}" if parts else ""
 
 
 def _side(found: Spread, low: float, high: float) -> int:
@@ -150,8 +152,8 @@ def _doubts(per_run: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> tup
     free = free[np.isfinite(free)]
     if free.size and free.mean() < 3:
         out.append(
-            f"unobservable directions {free.mean():.3g}, where 3 are unless a sensor measures the "
-            "pose in the frame of the map: the filter takes for known what nothing has told it"
+            f"unobservable directions {free.mean():.3g} instead of 3: unless a sensor measures the "
+            "robot in the frame of the map, the filter takes for known what nothing has told it"
         )
     return tuple(out)
 
