@@ -101,10 +101,7 @@ def drive(
             found.append(look(state))
     whole: list[Any] = [np.concatenate(parts) for parts in zip(*pieces, strict=True)]
     pose, cov, status, nis, dof, log_likelihood = whole
-    nothing: Any = ()
-    path: Any = Estimate(
-        pose=pose, pose_cov=cov, points=nothing, point_covs=nothing, alive=nothing, tag=nothing
-    )
+    path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
     return Driven(
         path=path,
         status=status,

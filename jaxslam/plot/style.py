@@ -121,6 +121,16 @@ def caption(figure: Figure, title: str) -> None:
         line.set_linewidth(1.6)
 
 
+def head(campaign: Any) -> str:
+    """The name of a campaign's scenario, for a title."""
+    return plain(campaign.scenario)
+
+
+def runs_of(campaign: Any) -> str:
+    """How many runs a campaign has, in words."""
+    return f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
+
+
 def span(steps: int) -> tuple[float, float]:
     """The first to the last step, and room for a single one."""
     return (1, steps) if steps > 1 else (0.5, 1.5)
