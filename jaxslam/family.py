@@ -123,7 +123,8 @@ LEAST_AREA, LARGEST_AREA = 8, 20
 def in_pieces(filter: Filter, places: int) -> Filter:
     """The filter, to which a scan of more places comes as several of so many, one after the other.
 
-    Place i is in piece i mod their number. The log-likelihood is the sum of theirs.
+    Place i is in piece i mod their number. What is said of a scan as a whole is the sum of theirs,
+    or whether it is so of any.
     """
 
     def update(state: Any, scan: Scan, key: jax.Array) -> tuple[Any, Info]:
@@ -142,13 +143,13 @@ def in_pieces(filter: Filter, places: int) -> Filter:
         each = jax.tree.map(dealt, scan), jax.random.split(key, pieces)
         state, infos = jax.lax.scan(one, state, each)
 
-        def back(leaf: jax.Array) -> jax.Array:
+        def whole(leaf: jax.Array) -> jax.Array:
+            if leaf.ndim == 1:  # of a scan, not of its places
+                return leaf.any() if leaf.dtype == bool else leaf.sum()
             return leaf.swapaxes(0, 1).reshape(places * pieces, *leaf.shape[2:])[:m]
 
-        said = infos.log_likelihood.sum()
-        apart: Any = infos._replace(log_likelihood=jnp.zeros((pieces, places)))
-        info: Info = jax.tree.map(back, apart)
-        return state, info._replace(log_likelihood=said)
+        info: Info = jax.tree.map(whole, infos)
+        return state, info
 
     return dataclasses.replace(filter, update=update)
 
@@ -196,8 +197,8 @@ CANONICAL: dict[str, Callable[..., Candidate]] = {
 
 KINDS: dict[str, tuple[str, ...]] = {
     "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
-    "other Jacobians": ("fej", "oc"),
-    "other errors": ("right_invariant", "left_invariant", "robocentric"),
+    "consistent Jacobians": ("fej", "oc"),
+    "error coordinates": ("right_invariant", "left_invariant", "robocentric"),
     "unscented": ("ukf", "ukf_right", "ukf_left"),
     "information": ("eif_slam", "seif", "eseif"),
     "particles": ("fastslam1", "fastslam2", "particle_localization"),

@@ -82,12 +82,12 @@ def test_all_filters_are_drawn_in_small_multiples_with_the_band_in_each():
             low, high = axes.get_ylim()
             np.testing.assert_allclose([heights.min(), heights.max()], [0.7 * dof, 1.3 * dof])
             # Seen: a tenth of the panel's height at least, whatever one filter does.
-            assert low < heights.min() and heights.max() < high <= 400 * dof
+            assert low < heights.min() and heights.max() < high <= 130 * dof
             assert np.log(heights.max() / heights.min()) > 0.08 * np.log(high / low)
             lines = {line.get_label().split(" (")[0]: line for line in axes.lines}
             for name in names:
                 drawn = found.filters[name].curves[f"nees_{block}"]
-                np.testing.assert_array_equal(lines[name].get_ydata(), np.minimum(drawn, 300 * dof))
+                np.testing.assert_array_equal(lines[name].get_ydata(), np.minimum(drawn, 100 * dof))
 
 
 def test_nothing_of_it_overlaps_and_names_are_told():

@@ -24,7 +24,7 @@ from jaxslam.plot.style import (
 _TOGETHER = 5
 """curves that can be told apart in one panel"""
 
-_RANGE = (1 / 30, 300.0)
+_RANGE = (1 / 10, 100.0)
 """times dof: what small panels show at most; beyond it a filter is wrong by any measure"""
 
 
@@ -33,7 +33,7 @@ def nees_figure(campaign: Campaign, *, blocks: Sequence[str] = tuple(DOF)) -> Fi
 
     The band is that of the filter with the most finite runs, the narrowest. Of more than five
     filters a row of panels is drawn for each kind of filter (`family.KINDS`), on the same scales,
-    which end at 300 times an honest NEES: a curve beyond it runs along the upper edge.
+    which end at 100 times an honest NEES: a curve beyond it runs along the upper edge.
     """
     if len(campaign.filters) > _TOGETHER:
         return _by_kind(campaign, blocks)
@@ -81,7 +81,7 @@ def _by_kind(campaign: Campaign, blocks: Sequence[str]) -> Figure:
             for i, name in enumerate(names):
                 summary = campaign.filters[name]
                 values = np.minimum(summary.curves[f"nees_{block}"], top)
-                curve(axes, i, step, values, f"{name} ({summary.verdict})")
+                curve(axes, i, step, values, f"{name} ({summary.verdict})", width=0.9)
             axes.tick_params(labelsize=8)
         panels[0].set_ylabel(kind, fontsize=9)
         handles, labels = panels[0].get_legend_handles_labels()
