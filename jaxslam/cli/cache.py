@@ -83,7 +83,7 @@ def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iter
         bound: bytes that the folder is held to.
     """
     if none:
-        with _set(jax_compilation_cache_dir=None):
+        with settings(jax_compilation_cache_dir=None):
             yield
         return
     if asked is None and (told := jax.config.jax_compilation_cache_dir):
@@ -100,12 +100,12 @@ def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iter
     except (OSError, RuntimeError) as error:
         where = whole or "the user's cache folder"
         warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); going on without")
-        with _set(jax_compilation_cache_dir=None):
+        with settings(jax_compilation_cache_dir=None):
             yield
         return
     try:
         with (
-            _set(
+            settings(
                 jax_compilation_cache_dir=str(folder),
                 jax_persistent_cache_min_compile_time_secs=0.0,
                 jax_persistent_cache_min_entry_size_bytes=-1,
@@ -144,7 +144,7 @@ def _kind() -> str:
 
 
 @contextlib.contextmanager
-def _set(**values: Any) -> Iterator[None]:
+def settings(**values: Any) -> Iterator[None]:
     """JAX's configuration within a block. It opens its cache once, so it has to be told."""
     before = {name: getattr(jax.config, name) for name in values}
     try:

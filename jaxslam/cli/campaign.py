@@ -71,7 +71,10 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     keep = _keep(options, out, asked)
     known = library.identity(asked, here[0].platform)
     try:
-        with Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress:
+        with (
+            Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress,
+            library.of_this_command(known) as kept,
+        ):
             campaign = monte_carlo(
                 scenario,
                 filters,
@@ -83,7 +86,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
                 dtype=asked["dtype"],
                 keep=keep,
                 identity=known,
-                library=library.of_this_command(known),
+                library=kept,
                 progress=progress,
                 glimpse=progress.glimpse,
             )

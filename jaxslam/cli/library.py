@@ -8,7 +8,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import jax
 
 import jaxslam
 from jaxslam import report
-from jaxslam.cli.cache import warn
+from jaxslam.cli import cache
 
 
 def identity(asked: Mapping[str, Any], platform: str) -> dict[str, str]:
@@ -38,12 +38,17 @@ def _source() -> str:
     return total.hexdigest()[:16]
 
 
+_NO_PROGRAM = frozenset({"seed", "filters", "bound"})
+"""Of an identity, what is no part of a single program."""
+
+
 class Programs:
     """A `monte_carlo.Library` in JAX's cache folder: what is there is whole, or is not used."""
 
     def __init__(self, folder: Path, known: Mapping[str, str]) -> None:
         self._folder = folder
-        self._known = json.dumps({k: v for k, v in known.items() if k != "seed"}, sort_keys=True)
+        told = {name: value for name, value in known.items() if name not in _NO_PROGRAM}
+        self._known = json.dumps(told, sort_keys=True)
 
     def get(self, name: str) -> bytes | None:
         """The program of that name, or None; a damaged one is deleted, and said."""
@@ -59,7 +64,7 @@ class Programs:
             return content
         with contextlib.suppress(OSError):
             path.unlink()
-        warn(f"a compiled program in {self._folder} is damaged; going on without it")
+        cache.warn(f"a compiled program in {self._folder} is damaged; going on without it")
         return None
 
     def put(self, name: str, content: bytes) -> None:
@@ -71,7 +76,7 @@ class Programs:
             os.replace(hidden, path)
         except OSError as error:
             reason = error.strerror or error
-            warn(f"a compiled program cannot be kept in {self._folder} ({reason})")
+            cache.warn(f"a compiled program cannot be kept in {self._folder} ({reason})")
         finally:
             with contextlib.suppress(OSError):
                 hidden.unlink()
@@ -81,10 +86,13 @@ class Programs:
         return self._folder / f"jaxslam-{digest[:32]}-cache"
 
 
-def of_this_command(known: Mapping[str, str]) -> Programs | None:
-    """The programs that are kept for it; None where none are to be kept, or several processes
-    share the work."""
+@contextlib.contextmanager
+def of_this_command(known: Mapping[str, str]) -> Iterator[Programs | None]:
+    """The programs that are kept for it, instead of JAX's own cache; None where none are to be
+    kept, or several processes share the work."""
     folder = jax.config.jax_compilation_cache_dir
     if folder is None or jax.process_count() > 1:
-        return None
-    return Programs(Path(folder), known)
+        yield None
+        return
+    with cache.settings(jax_compilation_cache_dir=None):
+        yield Programs(Path(folder), known)
