@@ -372,7 +372,12 @@ def test_bad_options_are_refused(case):
 
 def test_a_chart_that_does_not_fit_the_landmarks_is_refused():
     tall = dataclasses.replace(
-        SENSOR, landmark=("x", "y", "height"), free=Free(jnp.zeros(1), jnp.eye(1))
+        SENSOR,
+        landmark=("x", "y", "height"),
+        free=Free(jnp.zeros(1), jnp.eye(1)),
+        observe=lambda pose, landmark: SENSOR.observe(pose, landmark[:2]),
+        invert=lambda pose, z, s: jnp.concatenate([SENSOR.invert(pose, z, s[:0]), s]),
+        position=lambda landmark: landmark[:2],
     )
     with pytest.raises(ValueError, match="right_invariant does not act on the 3-parameter"):
         ekf_slam(MOTION, tall, 3, chart=charts.right_invariant())

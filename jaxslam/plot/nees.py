@@ -83,7 +83,7 @@ def _by_kind(campaign: Campaign, blocks: Sequence[str]) -> Figure:
                 values = np.minimum(summary.curves[f"nees_{block}"], top)
                 curve(axes, i, step, values, f"{name} ({summary.verdict})", width=0.9)
             axes.tick_params(labelsize=8)
-        panels[0].set_ylabel(kind, fontsize=9)
+        panels[0].set_ylabel(kind, fontsize=8)
         handles, labels = panels[0].get_legend_handles_labels()
         beside.legend(
             handles[1:], labels[1:], loc="center left", frameon=False, fontsize=8, borderpad=0
