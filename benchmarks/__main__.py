@@ -3,7 +3,7 @@
 A table of every metric with the range it must lie in; the exit status is 1 if one is missed. Each
 part is also a program of its own: compile, consistency, victoria_park, real_data, speed, gradient,
 association, baselines, bearing, delayed, plaza, team, smoothing, fastslam, plain_particles,
-scaling, comparison, monte_carlo_localization, seif.
+scaling, comparison, monte_carlo_localization, seif, verdict.
 """
 
 import argparse
@@ -31,6 +31,7 @@ from benchmarks import (
     seif,
     smoothing,
     team,
+    verdict,
     victoria_park,
 )
 from benchmarks.association.__main__ import measure as measure_association
@@ -59,6 +60,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "compile": compile.measure,
         "speed": lambda: gated(measure_speed(quick)),
         "gradient": gradient.measure,
+        "verdict": lambda: verdict.measure(1000 if quick else 4000),
         "circle": lambda: circle.measure(200 if quick else 1000)[1],
         "victoria_park": victoria_park.measure,
         "real_data": real_data.measure,

@@ -5,9 +5,12 @@ A variant is a chart, a linearizer or an option, given in one line; `monte_carlo
 line run them side by side.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.charts.left_invariant import left_invariant
@@ -27,7 +30,7 @@ from jaxslam.linearize.observability import observability
 from jaxslam.linearize.unscented import unscented
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulate import Scenario
-from jaxslam.types import Truth
+from jaxslam.types import Info, Scan, Truth
 
 
 def variant(scenario: Scenario, **options: Any) -> Filter:
@@ -95,17 +98,60 @@ def in_canonical_form(
 ) -> Filter:
     """An information filter in a scenario; of the options of `ekf_slam`, the gate.
 
-    A sparse one has half the map active or 20 landmarks, twice the places of a scan if those are
-    more, all links, and reports the covariance of its whole Ω: the campaign is to judge what it
-    believes, and what sparseness costs, not blankets.
+    A sparse one has half the map active, 8 landmarks at least and 20 at most, all links, and
+    reports the covariance of its whole Ω: the campaign is to judge what it believes, and what
+    sparseness costs, not blankets. With all of the map active it would be `eif_slam` by definition;
+    a scan of more places than half of what is active, as in `cloister`, where all 36 columns are
+    measured in every step, is taken in pieces (`in_pieces`), since what a scan measures has to be
+    active at once.
     """
     count = int(np.shape(scenario.landmarks)[0])
     asked = scenario.filter_options | options
     mine: dict[str, Any] = {name: asked[name] for name in ("gate",) if name in asked}
-    if sparse:
-        active = max(min(20, count // 2), 2 * (scenario.places or count))
-        mine |= {"active": min(active, count), "links": max(1, count - 1), "whole": True}
-    return make(scenario.motion, scenario.sensor, count, **mine)
+    if not sparse:
+        return make(scenario.motion, scenario.sensor, count, **mine)
+    active = min(max(min(LARGEST_AREA, count // 2), LEAST_AREA), count)
+    mine |= {"active": active, "links": max(1, count - 1), "whole": True}
+    filter = make(scenario.motion, scenario.sensor, count, **mine)
+    return filter if active == count else in_pieces(filter, active // 2)
+
+
+LEAST_AREA, LARGEST_AREA = 8, 20
+"""active landmarks of the sparse information filters in the family"""
+
+
+def in_pieces(filter: Filter, places: int) -> Filter:
+    """The filter, to which a scan of more places comes as several of so many, one after the other.
+
+    Place i is in piece i mod their number. What is said of a scan as a whole is the sum of theirs,
+    or whether it is so of any.
+    """
+
+    def update(state: Any, scan: Scan, key: jax.Array) -> tuple[Any, Info]:
+        m = scan.tag.shape[0]
+        if m <= places:
+            return filter.update(state, scan, key)
+        pieces = -(-m // places)
+
+        def dealt(leaf: jax.Array) -> jax.Array:
+            wide = jnp.pad(leaf, [(0, pieces * places - m), *[(0, 0)] * (leaf.ndim - 1)])
+            return wide.reshape(places, pieces, *leaf.shape[1:]).swapaxes(0, 1)
+
+        def one(state: Any, piece: tuple[Scan, jax.Array]) -> tuple[Any, Info]:
+            return filter.update(state, *piece)
+
+        each = jax.tree.map(dealt, scan), jax.random.split(key, pieces)
+        state, infos = jax.lax.scan(one, state, each)
+
+        def whole(leaf: jax.Array) -> jax.Array:
+            if leaf.ndim == 1:  # of a scan, not of its places
+                return leaf.any() if leaf.dtype == bool else leaf.sum()
+            return leaf.swapaxes(0, 1).reshape(places * pieces, *leaf.shape[2:])[:m]
+
+        info: Info = jax.tree.map(whole, infos)
+        return state, info
+
+    return dataclasses.replace(filter, update=update)
 
 
 FILTERS: dict[str, Callable[..., Candidate]] = {
@@ -148,6 +194,17 @@ CANONICAL: dict[str, Callable[..., Candidate]] = {
     "eseif": lambda world, **more: in_canonical_form(world, eseif, **more),
 }
 """The information filters, exact and sparse; as FILTERS."""
+
+KINDS: dict[str, tuple[str, ...]] = {
+    "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
+    "consistent Jacobians": ("fej", "oc"),
+    "error coordinates": ("right_invariant", "left_invariant", "robocentric"),
+    "unscented": ("ukf", "ukf_right", "ukf_left"),
+    "information": ("eif_slam", "seif", "eseif"),
+    "particles": ("fastslam1", "fastslam2", "particle_localization"),
+    "baselines": ("dead_reckoning", "localization"),
+}
+"""Their names by what is particular to them; figures of many filters are divided so."""
 
 ALL = FILTERS | CANONICAL | PARTICLES | BASELINES
 """Every one of them: what the command line knows, and runs for `--filters all`."""

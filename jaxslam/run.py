@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
-from jaxslam.linalg import check_covariance, is_concrete
+from jaxslam.linalg import check_covariance, check_key, is_concrete
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Status, Trace, check_log
 
@@ -50,6 +50,7 @@ def run(
             or valid measurements, tags repeated within a scan, or a bad pose_cov.
     """
     check_run(filter, log, pose, pose_cov)
+    check_key("run", key)
     return programs.call(_drive, (filter, probe, checkpoint), log, pose, pose_cov, key)
 
 

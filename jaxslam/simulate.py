@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam import programs
 from jaxslam.angles import wrap
-from jaxslam.linalg import check_covariance, is_concrete, root_psd
+from jaxslam.linalg import check_covariance, check_key, is_concrete, root_psd
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Part, Suite
 from jaxslam.spurious import Spurious, spoil
@@ -94,6 +94,7 @@ def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
     trace it is compiled once for a structure, as `run` is. The filters of a campaign all get the
     same draws.
     """
+    check_key("simulate", key)
     return programs.call(_simulate, (scenario,), key)
 
 

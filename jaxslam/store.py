@@ -64,14 +64,16 @@ class Store:
     def claim(self, fingerprint: Mapping[str, str]) -> None:
         """Say whose runs these are: a new folder notes it, any other must hold that campaign.
 
-        Raises ValueError that names every difference, as "key: … there, … here".
+        The number of runs is noted with it, which extends a campaign. Raises ValueError that names
+        every difference, as "key: … there, … here".
         """
         mine = {str(name): str(value) for name, value in fingerprint.items()}
         there = resume(self.folder)  # another process may have claimed it meanwhile
-        if not there.campaign:
-            _write_manifest(self.folder, there.settings, mine, there.runs)
-        elif differences := _differences(there.campaign, mine):
+        if there.campaign and (differences := _differences(there.campaign, mine)):
             raise ValueError(f"{self.folder} holds another campaign: {'; '.join(differences)}")
+        runs = there.runs if self.runs is None else self.runs
+        if not there.campaign or runs != there.runs:
+            _write_manifest(self.folder, there.settings, mine, runs)
         self.campaign.clear()
         self.campaign.update(mine)
 
@@ -209,7 +211,8 @@ def resume(
     Args:
         folder: where.
         settings: where given, they must be those of the manifest.
-        runs: where given, how many the campaign is to have from now on; more than before extend it.
+        runs: where given, how many the campaign is to have from its next `claim` on; more than
+            before extend it.
     Raises:
         ValueError: if there is no campaign, if its manifest cannot be read, if it has more runs
             than are asked for, and on any difference of settings, naming all.
@@ -228,11 +231,10 @@ def resume(
     if settings is not None and (differences := _differences(own, _plain(settings))):
         raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
     kept = Store(folder, own, manifest.get("runs"), campaign)
-    if runs is None or runs == kept.runs:
+    if runs is None:
         return kept
     if (end := max((first + count for first, count in kept.spans()), default=0)) > runs:
         raise ValueError(f"{folder} has runs up to {end}: expected at least as many, got {runs}")
-    _write_manifest(folder, own, campaign, runs)
     return replace(kept, runs=runs)
 
 

@@ -151,6 +151,17 @@ def test_a_damaged_program_is_said_and_compiled_anew(tmp_path, capsys, spoil):
     assert warned(capsys) == []
 
 
+def test_a_folder_that_jax_was_told_of_is_not_ours_to_mend(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    with (
+        cache._set(jax_compilation_cache_dir=str(tmp_path / "file" / "below")),
+        cache.programs(None),
+    ):
+        assert one_program() + one_program(2.0) == 0
+    (line,) = warned(capsys)
+    assert f"a compiled program in {tmp_path / 'file' / 'below'}" in line
+
+
 def test_a_full_disk_is_said_once_and_leaves_no_half_of_a_program(tmp_path, capsys, monkeypatch):
     def full(path, content):
         with open(path, "wb") as file:

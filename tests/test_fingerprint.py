@@ -93,6 +93,15 @@ def test_another_precision_platform_version_or_bound_is_another_campaign(folder,
     assert changed() == {"jax"}
 
 
+def test_fewer_runs_than_are_kept_are_refused(tmp_path):
+    kept = store.create(tmp_path)
+    kept.claim(fingerprint(**campaign(), platform="cpu"))
+    kept.save(0, {"0/x": np.zeros(2)}, 2)
+    kept.save(2, {"0/x": np.zeros(2)}, 2)
+    with pytest.raises(ValueError, match=r"runs up to 4 are kept: expected at least as many .* 3"):
+        monte_carlo(runs=3, keep=store.resume(tmp_path), **campaign())
+
+
 def test_a_gate_that_a_filter_closes_over_is_seen():
     scenario = world()
     ekfs = [

@@ -367,3 +367,18 @@ def test_a_square_and_its_slopes_are_those_of_the_product(rows):
     np.testing.assert_allclose(slope, by_a.T @ a + a.T @ by_a, atol=1e-12)
     back = jax.grad(lambda a: jnp.sum(weight * linalg.square(a)))(a)
     np.testing.assert_allclose(back, a @ (weight + weight.T), atol=1e-12)
+
+
+def test_a_key_is_one_prng_key():
+    one = jax.random.key(0)
+    for key in (one, jax.random.PRNGKey(0), np.asarray(jax.random.PRNGKey(0))):
+        linalg.check_key("it", key)
+    jax.eval_shape(lambda key: linalg.check_key("it", key), one)
+    for key, shown in (
+        (0, "got 0"),
+        (None, "got None"),
+        (np.zeros(2), r"an array of float64 of shape \(2,\)"),
+        (jax.random.split(one, 3), r"one PRNG key, got keys of shape \(3,\)"),
+    ):
+        with pytest.raises(ValueError, match=f"it: expected .*{shown}"):
+            linalg.check_key("it", key)

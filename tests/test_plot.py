@@ -251,7 +251,7 @@ def test_information_gained_is_drawn_for_watched_filters_and_zeros_are_nothing(c
     assert [text.get_text() for text in axes.texts] == ["no filter was watched"]
 
 
-@pytest.mark.parametrize("draw", CAMPAIGN_FIGURES)
+@pytest.mark.parametrize("draw", CAMPAIGN_FIGURES[1:])  # tests/test_nees_figure.py has the first
 def test_twelve_filters_can_be_told_apart_and_nothing_overlaps(campaign, draw):
     figure = draw(many(campaign, [f"filter_number_{i}" for i in range(12)]))
     plot.png(figure, 60)

@@ -307,14 +307,22 @@ def test_a_campaign_claims_its_folder_and_no_other_gets_it(made):
 
 def test_the_number_of_runs_may_grow_but_not_below_what_is_there(tmp_path):
     made = store.create(tmp_path, runs=64)
+    made.claim({"key": "0"})
     fill(made, 32)
-    assert store.resume(tmp_path).runs == 64
-    assert store.resume(tmp_path, runs=100).runs == 100
-    assert store.resume(tmp_path, {}).runs == 100
-    assert store.resume(tmp_path, runs=64).runs == 64
+    wished = store.resume(tmp_path, runs=100)
+    assert (wished.runs, store.resume(tmp_path).runs) == (100, 64)
+    with pytest.raises(ValueError, match="another campaign"):
+        wished.claim({"key": "1"})
+    assert store.resume(tmp_path).runs == 64  # what is refused extends nothing
+    wished.claim({"key": "0"})
+    made.claim({"key": "0"})
+    assert store.resume(tmp_path, {}).runs == 64
+    wished.claim({"key": "0"})
+    store.resume(tmp_path).claim({"key": "0"})
+    assert store.resume(tmp_path).runs == 100
     with pytest.raises(ValueError, match="has runs up to 64: expected at least as many, got 63"):
         store.resume(tmp_path, runs=63)
-    assert store.resume(tmp_path).runs == 64
+    assert store.resume(tmp_path).runs == 100
     assert spans(store.resume(tmp_path)) == [(32, 32)]
 
 

@@ -120,7 +120,7 @@ def test_few_runs_say_what_they_would_have_noticed():
     low, high = found.noticed["nees_pose"]
     assert 1 < low < 3 < high < 5
     said = power_of(found.noticed)
-    assert said == f"would have been noticed from a pose NEES of {high:.3g} on or below {low:.3g}"
+    assert said == f"would have been noticed from a pose NEES of {high:.3g} on (or below {low:.3g})"
     more = judge({"nees_pose": np.repeat(nees, 25)}, COUNTS).noticed["nees_pose"]
     assert low < more[0] < 3 < more[1] < high
     wide = judge({"nees_pose": np.array([1.0, 5.0, 3.0])}, COUNTS)
@@ -172,7 +172,7 @@ def test_doubts_are_said():
     assert judge(each, COUNTS | {"unmatched": 400}) == judge(each, COUNTS)
     two = judge(each | {"unobservable": np.full(20, 2.0)}, COUNTS)
     assert two.word == "consistent"
-    assert two.doubts[0].startswith("unobservable directions 2, where 3 are")
+    assert two.doubts[0].startswith("unobservable directions 2 instead of 3")
     assert not judge(each | {"unobservable": np.full(20, 3.0)}, COUNTS).doubts
 
 

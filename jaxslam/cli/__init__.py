@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             devices.prepare(options)
         else:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
-        with Spent() as spent, cache.programs(options.cache, options.no_cache):
+        with Spent() as spent, cache.asked_for(options):
             status = int(options.command(options, shlex.join(["jaxslam", *arguments])))
             if status != INTERRUPTED and jax.process_index() == 0:
                 print(spent)
@@ -139,6 +139,13 @@ def _parser() -> argparse.ArgumentParser:
     drive.add_argument("--dataset", required=True, help=f"one of: {', '.join(READERS)}")
     drive.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
     drive.add_argument("--robot", type=int, help="which robot, where a data set has several")
+    drive.add_argument(
+        "--check-every",
+        type=int,
+        metavar="K",
+        help="is the covariance positive definite? look after every K steps, 0 never; None: at 20 "
+        "steps spread over the log",
+    )
     drive.set_defaults(command=run_dataset)
 
     check = commands.add_parser(

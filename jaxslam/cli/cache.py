@@ -16,6 +16,7 @@ import tempfile
 import threading
 import warnings
 from collections.abc import Iterator
+from glob import escape
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TextIO
@@ -36,14 +37,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--cache",
         type=Path,
         metavar="DIR",
-        default=None,
+        default=argparse.SUPPRESS,  # which a formatter that adds defaults does not print
         help="keep compiled programs there for the next time "
         "(default: the user's cache folder, as ~/.cache/jaxslam)",
     )
     where.add_argument(
         "--no-cache",
         action="store_true",
-        default=False,
+        default=argparse.SUPPRESS,
         help="keep no compiled programs, and use none that are kept",
     )
 
@@ -64,6 +65,11 @@ def user_folder() -> Path:
     return base / "jaxslam"
 
 
+def asked_for(options: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
+    """`programs`, as the options say."""
+    return programs(getattr(options, "cache", None), getattr(options, "no_cache", False))
+
+
 @contextlib.contextmanager
 def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iterator[None]:
     """A block in which JAX keeps what it compiles in a folder, and takes it from there.
@@ -77,11 +83,12 @@ def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iter
         bound: bytes that the folder is held to.
     """
     if none:
-        with _set(jax_compilation_cache_dir=None):
+        with settings(jax_compilation_cache_dir=None):
             yield
         return
-    if asked is None and jax.config.jax_compilation_cache_dir:
-        yield
+    if asked is None and (told := jax.config.jax_compilation_cache_dir):
+        with _troubles_told(Path(told), ours=False):
+            yield
         return
     whole = asked
     try:
@@ -92,18 +99,18 @@ def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iter
             pass
     except (OSError, RuntimeError) as error:
         where = whole or "the user's cache folder"
-        _warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); going on without")
-        with _set(jax_compilation_cache_dir=None):
+        warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); going on without")
+        with settings(jax_compilation_cache_dir=None):
             yield
         return
     try:
         with (
-            _set(
+            settings(
                 jax_compilation_cache_dir=str(folder),
                 jax_persistent_cache_min_compile_time_secs=0.0,
                 jax_persistent_cache_min_entry_size_bytes=-1,
             ),
-            _troubles_told(folder),
+            _troubles_told(folder, ours=True),
         ):
             yield
     finally:
@@ -137,7 +144,7 @@ def _kind() -> str:
 
 
 @contextlib.contextmanager
-def _set(**values: Any) -> Iterator[None]:
+def settings(**values: Any) -> Iterator[None]:
     """JAX's configuration within a block. It opens its cache once, so it has to be told."""
     before = {name: getattr(jax.config, name) for name in values}
     try:
@@ -152,8 +159,9 @@ def _set(**values: Any) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _troubles_told(folder: Path) -> Iterator[None]:
-    """What JAX warns of its cache becomes one line; what cannot be read, or written whole, goes."""
+def _troubles_told(folder: Path, ours: bool) -> Iterator[None]:
+    """What JAX warns of its cache becomes one line; what cannot be read, or written whole, goes
+    where the folder is ours."""
     once = threading.Lock()
 
     def show(
@@ -168,13 +176,13 @@ def _troubles_told(folder: Path) -> Iterator[None]:
         if match is None:
             plain(message, category, filename, lineno, file, line)
             return
-        for path in folder.glob(f"{match[2]}-*-cache"):
+        for path in folder.glob(f"{escape(match[2])}-*-cache") if ours else ():
             with contextlib.suppress(OSError):
                 path.unlink()
         if once.acquire(blocking=False):
             what = "is damaged" if match[1] == "reading" else "cannot be written"
             reason = " ".join(str(message)[match.end() :].split())[:200]
-            _warn(f"a compiled program in {folder} {what} ({reason}); going on without it")
+            warn(f"a compiled program in {folder} {what} ({reason}); going on without it")
 
     with warnings.catch_warnings():
         warnings.filterwarnings("always", message=_TROUBLE.pattern)
@@ -186,5 +194,6 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
-def _warn(sentence: str) -> None:
+def warn(sentence: str) -> None:
+    """One line on the standard error, before going on."""
     print(f"jaxslam: warning: {sentence}", file=sys.stderr)

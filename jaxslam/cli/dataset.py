@@ -12,35 +12,35 @@ import numpy as np
 
 from jaxslam import report, se2
 from jaxslam.cli.asking import Progress, pick
+from jaxslam.cli.driving import Driven, drive
 from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS
 from jaxslam.filters.ekf_slam import ekf_slam
-from jaxslam.linalg import is_positive_definite
-from jaxslam.run import run
 from jaxslam.types import Status
 
 
 def run_dataset(options: argparse.Namespace, command: str) -> int:
     """Run EKF-SLAM over the data set, print its summary, write its files; exit status."""
+    if options.check_every is not None and options.check_every < 0:
+        raise ValueError(f"run: expected --check-every of at least 0, got {options.check_every}")
     data = pick("dataset", options.dataset, READERS)(options.path, options.robot)
     report.check_writable(options.out)
     ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
-    with Progress(f"{data.name}, {data.steps:,} steps") as progress:
-        progress.say("running …")
+    with Progress(data.name, "steps") as progress:
         began = time.perf_counter()
-        # Value checks happen on the host here; the log then enters the run in the chosen dtype.
-        trace = run(
+        # The reader has checked the values; the log enters the run in the chosen dtype.
+        driven = drive(
             ekf,
             jax.tree.map(jnp.asarray, data.log),
             data.pose,
             data.pose_cov,
-            jax.random.key(0),
-            probe=lambda joint: is_positive_definite(joint.cov),
+            every=options.check_every,
+            look=lambda joint: positive_definite(np.asarray(joint.cov)),
+            progress=progress,
         )
-        jax.block_until_ready(trace)
     seconds = time.perf_counter() - began
-    last = jax.tree.map(lambda leaf: leaf[-1], trace.estimate)
-    nis = jnp.where(trace.info.status == Status.FUSED, trace.info.nis, 0.0).sum()
+    last = driven.last
+    nis = np.where(driven.status == Status.FUSED, driven.nis, 0.0).sum()
     summary: dict[str, Any] = {
         "dataset": data.name,
         "source": data.source,
@@ -50,14 +50,13 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         "measurements": data.measurements,
         "landmarks": int(last.alive.sum()),
         "status": {
-            s.name.lower(): int(trace.info.tally(s).sum()) for s in Status if s != Status.EMPTY
+            s.name.lower(): int((driven.status == s).sum()) for s in Status if s != Status.EMPTY
         },
         "dropped by the reader": data.dropped,
         "corrections to the data": list(data.corrections),
-        "NIS / dof": float(nis / jnp.maximum(trace.info.dof.sum(), 1)),
-        "log-likelihood": float(trace.info.log_likelihood.sum()),
-        # P0 = 0 is singular until noise has entered; from then on P must stay positive definite.
-        "positive definite from step": 2 + int(np.max(np.flatnonzero(~trace.probe), initial=-1)),
+        "NIS / dof": float(nis / max(int(driven.dof.sum()), 1)),
+        "log-likelihood": float(driven.log_likelihood.sum()),
+        "P positive definite": _counted(driven),
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
@@ -68,9 +67,10 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         surveyed = np.asarray(into_map(jnp.asarray(frame), jnp.asarray(data.landmarks)))
     from jaxslam import plot  # matplotlib only once there is a result to draw
 
-    figure = plot.map_figure(trace.estimate, true_points=surveyed, title=data.name)
+    at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive")}
+    figure = plot.map_figure(driven.path._replace(**at_end), true_points=surveyed, title=data.name)
     files: dict[str, str | Callable[[Path], object]] = {
-        "trajectory.csv": report.trajectory_csv(data.time, trace.estimate),
+        "trajectory.csv": report.trajectory_csv(data.time, driven.path),
         "map.csv": report.map_csv(last, data.tags),
         "summary.json": report.json_text(summary | {"versions": report.versions()}),
         "map.png": figure.savefig,
@@ -80,6 +80,26 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     written = report.write_files(options.out, files)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
+
+
+def positive_definite(cov: np.ndarray) -> bool:
+    """Whether a covariance (D, D) has a Cholesky factor; on the host."""
+    try:
+        return bool(np.isfinite(np.linalg.cholesky(cov)).all())
+    except np.linalg.LinAlgError:
+        return False
+
+
+def _counted(driven: Driven) -> str:
+    """In how many of the steps looked at the covariance was positive definite, and where not."""
+    if not driven.looked:
+        return "not looked at"
+    not_there = [step for step, good in zip(driven.looked, driven.found, strict=True) if not good]
+    of = f"at {sum(driven.found)} of {len(driven.found)} steps looked at"
+    if not not_there:
+        return of
+    more = ", …" if len(not_there) > 5 else ""
+    return f"{of}, not at {', '.join(map(str, not_there[:5]))}{more}"
 
 
 def _shown(value: Any) -> str:

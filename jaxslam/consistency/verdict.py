@@ -98,10 +98,12 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
     """In words what a campaign that rejects nothing would have noticed; "" where it is nothing."""
     parts = []
     for name, (low, high) in noticed.items():
-        ends = [f"of {high:.3g} on"] * (high < np.inf) + [f"below {low:.3g}"] * (low > 0)
-        if ends:
-            parts.append(f"a {TESTS[name]} {' or '.join(ends)}")
-    return f"would have been noticed from {', from '.join(parts)}" if parts else ""
+        above, below = f"from a {TESTS[name]} of {high:.3g} on", f"below {low:.3g}"
+        if high < np.inf:
+            parts.append(above + f" (or {below})" * bool(low > 0))
+        elif low > 0:
+            parts.append(f"{below} of {TESTS[name]}")
+    return f"would have been noticed {', '.join(parts)}" if parts else ""
 
 
 def _side(found: Spread, low: float, high: float) -> int:
@@ -130,10 +132,16 @@ def _after_gate(counts: Mapping[str, int], nis_dof: float) -> float:
     return truncated_chi2_mean(rejected / (fused + rejected), nis_dof / fused)
 
 
+def _became(counts: Mapping[str, int]) -> tuple[int, dict[str, int]]:
+    """How many measurements were used, and how many dropped by reason."""
+    drops = {name: counts.get(name, 0) for name in map(_name, DROPS)}
+    return sum(counts.get(name, 0) for name in map(_name, KEPT)), drops
+
+
 def _starved(counts: Mapping[str, int]) -> bool:
     """Whether over half of the measurements were dropped, by a filter that takes measurements."""
-    drops = {name: counts.get(name, 0) for name in map(_name, DROPS)}
-    used, dropped = sum(counts.get(name, 0) for name in map(_name, KEPT)), sum(drops.values())
+    used, drops = _became(counts)
+    dropped = sum(drops.values())
     takes_none = not used and dropped == drops["unmatched"]  # dead reckoning
     return dropped > used and not takes_none
 
@@ -141,17 +149,16 @@ def _starved(counts: Mapping[str, int]) -> bool:
 def _doubts(per_run: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> tuple[str, ...]:
     out = []
     if _starved(counts):
-        drops = {name: counts.get(name, 0) for name in map(_name, DROPS)}
+        used, drops = _became(counts)
         dropped = sum(drops.values())
-        every = dropped + sum(counts.get(name, 0) for name in map(_name, KEPT))
         reasons = ", ".join(f"{count:,} {name}" for name, count in drops.items() if count)
-        out.append(f"{dropped:,} of {every:,} measurements were dropped: {reasons}")
+        out.append(f"{dropped:,} of {used + dropped:,} measurements were dropped: {reasons}")
     free = np.asarray(per_run.get("unobservable", ()), np.float64)
     free = free[np.isfinite(free)]
     if free.size and free.mean() < 3:
         out.append(
-            f"unobservable directions {free.mean():.3g}, where 3 are unless a sensor measures the "
-            "pose in the frame of the map: the filter takes for known what nothing has told it"
+            f"unobservable directions {free.mean():.3g} instead of 3: unless a sensor measures the "
+            "robot in the frame of the map, the filter takes for known what nothing has told it"
         )
     return tuple(out)
 

@@ -45,8 +45,9 @@ class Programs:
         glimpse: Glimpse | None = None,
         dtype: Any = None,
         library: Library | None = None,
+        with_first: bool = True,
     ) -> None:
-        self.dtype, self.library = dtype, library
+        self.dtype, self.library, self.with_first = dtype, library, with_first
         self.key, self.wide, self.devices, self.bound = key, block * devices, devices, bound
         self.glimpse = glimpse
         self.draw: Future[Callable[..., Any]] = Future()
@@ -57,8 +58,12 @@ class Programs:
         self.least: Future[Callable[..., Any]] = Future()
         self.first: dict[str, tuple[Truth, Estimate]] = {}
         """run 0 of each filter, once its block has run"""
-        self.limit: Future[jax.Array] = Future()
-        """() [m] the divergence limit, from run 0"""
+        self.limit: Future[np.ndarray] = Future()
+        """() [m] the divergence limit, from run 0; set by its block, where there is one"""
+        self.limit_of: Callable[[dict[str, np.ndarray]], np.ndarray] | None = None
+        """of what `least` found of a block whose first run is run 0"""
+        self.all: Future[None] = Future()
+        """nothing is being compiled any more"""
         self._quiet = threading.Event()
         self._spent: dict[str, list[tuple[bool, float]]] = {name: [] for name in names}
         """whether nothing was being compiled, and wall seconds; of each block so far"""
@@ -71,8 +76,18 @@ class Programs:
         early: begin while other programs are being compiled, and do not time that. tell: let
         `glimpse` know of each filter as soon as it has run.
         """
+        try:
+            return self._block(first, runs, early, tell)
+        except BaseException as error:
+            if first == 0:
+                self.give_up(error)  # nobody else finds the limit
+            raise
+
+    def _block(
+        self, first: int, runs: int, early: bool, tell: bool
+    ) -> dict[str, dict[str, np.ndarray]]:
         if not early:
-            self.limit.result()
+            self.all.result()
         # A run has its place in the block by its number, in whatever piece: the same bits.
         base = first // self.wide * self.wide
         mine = slice(first - base, first - base + runs)
@@ -107,11 +122,16 @@ class Programs:
                 judge()
         while held:
             judge()
+        least: dict[str, np.ndarray] = {}
+        if self.bound or first == 0:
+            least = jax.device_get(self.least.result()(self.key, which, world))
+        if first == 0 and not self.limit.done():
+            assert self.limit_of is not None
+            self.limit.set_result(self.limit_of(least))
         limit = self.limit.result()
         out = {name: condense(each, first, float(limit)) for name, each in scores.items()}
-        out[BOUND] = {"limit": np.asarray(limit)}
+        out[BOUND] = {"limit": limit}
         if self.bound:
-            least = jax.device_get(self.least.result()(self.key, which, world))
             out[BOUND] |= condensed_sums({name: rows[mine] for name, rows in least.items()})
         return out
 
@@ -124,11 +144,14 @@ class Programs:
             *self.scores.values(),
             self.least,
             self.limit,
+            self.all,
         ]
 
     def complete(self) -> None:
         """Nothing is being compiled any more."""
         self._quiet.set()
+        if not self.all.done():
+            self.all.set_result(None)
 
     def give_up(self, error: BaseException) -> None:
         """Whoever waits for a program that is not there gets the error."""

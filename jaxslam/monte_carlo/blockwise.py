@@ -24,8 +24,12 @@ from jaxslam.staging import quick_options
 
 
 class Library(Protocol):
-    """Compiled programs by name, kept beyond the process. Whoever gives one answers for it: the
-    same name is the same program, whatever scenario and filters it is of."""
+    """Compiled programs by name, kept beyond the process.
+
+    Whoever gives one answers for it: the same name is the same program, whatever scenario and
+    filters it is of. JAX's own cache on the disk must be off: an executable that came from there
+    cannot be kept again, since it would not run.
+    """
 
     def get(self, name: str) -> bytes | None:
         """What was put under the name, whole, or None."""

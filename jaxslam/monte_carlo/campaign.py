@@ -46,6 +46,8 @@ class Campaign:
     seconds: float
     """wall time, compilation included."""
     compile_seconds: float
+    """wall time until the last program was there; blocks begun meanwhile ran beside. 0 where
+    nothing was left to run."""
     step_seconds: dict[str, float]
     """Wall time of a step of one run on one device, by filter: the median over the blocks that this
     process computed while nothing was being compiled (where there are none, over all), several of
@@ -243,6 +245,12 @@ class _Work:
         """Add those of the pieces that are not yet in the tallies, in blocks of size a device."""
         if not todo:
             return
+        before, wide = own[next(iter(own))].pieces(), size * len(self.devices)
+        queue = [
+            piece
+            for first, count in todo
+            for piece in missing([(0, first), *before], first + count, wide)
+        ][::-1]
         programs = Programs(
             list(self.filters),
             self.key,
@@ -252,13 +260,8 @@ class _Work:
             self.glimpse,
             self.dtype,
             self.library,
+            with_first=any(first == 0 for first, _ in queue),
         )
-        before = own[next(iter(own))].pieces()
-        queue = [
-            piece
-            for first, count in todo
-            for piece in missing([(0, first), *before], first + count, programs.wide)
-        ][::-1]
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
         early = len(queue) > self.workers

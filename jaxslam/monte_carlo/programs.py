@@ -132,14 +132,15 @@ def compile_programs(
             before = name, driven
         if before is not None:
             scored(*before)
+        promised.limit_of = partial(_divergence_limit, scenario, world[0].pose.dtype)
         program(promised.least, "least", (scenario,), least, (None, 0, 0), 0, key, which, world)
-        found = promised.least.result()(key, which, promised.draw.result()(key, which))
-        ideal = float(np.asarray(found["position"])[0, -1]) ** 0.5
-        dtype = world[0].pose.dtype
-        for promise in (*promised.drives.values(), *promised.scores.values()):
+        for promise in (*promised.drives.values(), *promised.scores.values(), promised.least):
             promise.result()
         promised.complete()
-        promised.limit.set_result(jnp.asarray(_divergence_limit(scenario, ideal, dtype), dtype))
+        if not promised.with_first:
+            drawn = promised.draw.result()(key, which)
+            found = jax.device_get(promised.least.result()(key, which, drawn))
+            promised.limit.set_result(promised.limit_of(found))
     finally:
         maker.close()
 
@@ -160,7 +161,13 @@ def _keys(key: jax.Array, i: jax.Array) -> jax.Array:
     return jax.random.split(jax.random.fold_in(key, i))
 
 
-def _divergence_limit(scenario: Scenario, spread: float, dtype: Any) -> float:
-    """5 σ of the ideal spread, or, in a world without noise, what rounding can do."""
+def _divergence_limit(
+    scenario: Scenario, dtype: Any, least: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    """5 σ of the ideal spread of run 0, or, in a world without noise, what rounding can do.
+
+    least: of a block whose first run it is; position [m²] (runs, T).
+    """
+    spread = float(least["position"][0, -1]) ** 0.5
     reach = 1.0 + float(np.max(np.abs(np.asarray(scenario.landmarks)), initial=0.0))
-    return max(5 * spread, 1000 * float(jnp.finfo(dtype).eps) * reach)
+    return np.asarray(max(5 * spread, 1000 * float(jnp.finfo(dtype).eps) * reach), dtype)

@@ -9,9 +9,9 @@ from jaxslam.plot.campaign import (
     cost_figure,
     coverage_figure,
     gained_figure,
-    nees_figure,
     whiteness_figure,
 )
+from jaxslam.plot.nees import nees_figure
 from jaxslam.plot.single import ellipse, errors_figure, map_figure
 from jaxslam.plot.style import COLORS, Figure, describe, png
 

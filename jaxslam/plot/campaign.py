@@ -1,6 +1,4 @@
-"""What a campaign shows, for all of its filters: NEES, errors, coverage, whiteness, information."""
-
-from collections.abc import Sequence
+"""What a campaign shows, for all of its filters: errors, coverage, whiteness, information."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,39 +10,16 @@ from jaxslam.plot.style import (
     caption,
     curve,
     few_digits,
+    head,
     logarithmic,
     lone_mark,
     panels_of,
-    plain,
+    runs_of,
     span,
 )
 
 _NOTHING = 1e-6
 """[1/rad²] information on a heading of which one has learnt nothing: σ is 1000 rad."""
-
-
-def nees_figure(campaign: Campaign, *, blocks: Sequence[str] = tuple(DOF)) -> Figure:
-    """Average NEES over the steps for every filter of a campaign, with the 95 % chi-square band.
-
-    The band is that of the filter with the most finite runs, the narrowest.
-    """
-    figure, panels = panels_of(7.0, 1.9 * len(blocks) + 0.8, len(blocks))
-    step = np.arange(1, campaign.steps + 1)
-    most = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
-    for axes, block in zip(panels, blocks, strict=True):
-        low, high = most[f"nees_{block}_low"], most[f"nees_{block}_high"]
-        axes.fill_between(
-            step, low, high, color="#999999", alpha=0.45, lw=0, label="95 % band", zorder=1
-        )
-        axes.axhline(DOF[block], color=INK, lw=0.6, zorder=1.5)
-        for i, (name, summary) in enumerate(campaign.filters.items()):
-            label = f"{name} ({summary.verdict})"
-            curve(axes, i, step, summary.curves[f"nees_{block}"], label)
-        axes.set(ylabel=f"{block} NEES (dof {DOF[block]})")
-        logarithmic(axes)
-    caption(figure, f"{_head(campaign)}: NEES, average over {_runs(campaign)}")
-    panels[-1].set(xlabel="step", xlim=span(campaign.steps))
-    return figure
 
 
 def bound_figure(campaign: Campaign) -> Figure:
@@ -77,7 +52,7 @@ def bound_figure(campaign: Campaign) -> Figure:
             axes.set_ylim(bottom=0.0)
     known = any("bound_position" in summary.curves for summary in campaign.filters.values())
     said = "error against the bound" if known else "error"
-    caption(figure, f"{_head(campaign)}: {said}, {_runs(campaign)}")
+    caption(figure, f"{head(campaign)}: {said}, {runs_of(campaign)}")
     panels[-1].set(xlabel="step", xlim=span(campaign.steps))
     return figure
 
@@ -110,7 +85,7 @@ def cost_figure(campaign: Campaign) -> Figure:
     else:
         said = "no filter was timed"
         panels[0].text(0.5, 0.5, said, transform=panels[0].transAxes, ha="center")
-    caption(figure, f"{_head(campaign)}: what a step costs, and what it gives, {_runs(campaign)}")
+    caption(figure, f"{head(campaign)}: what a step costs, and what it gives, {runs_of(campaign)}")
     return figure
 
 
@@ -131,7 +106,7 @@ def coverage_figure(campaign: Campaign) -> Figure:
         axes.set_title(f"{block} (dof {DOF[block]})", fontsize="medium")
     panels[0].set(ylabel="share of truth within")
     panels[len(panels) // 2].set(xlabel="probability p of the ellipsoid")
-    caption(figure, f"{_head(campaign)}: coverage, {_runs(campaign)}")
+    caption(figure, f"{head(campaign)}: coverage, {runs_of(campaign)}")
     return figure
 
 
@@ -154,7 +129,7 @@ def whiteness_figure(campaign: Campaign) -> Figure:
         extreme = np.max(np.abs(values), initial=extreme, where=np.isfinite(values))
         axes.set(xticks=lags)
     axes.set(xlabel="lag [steps]", ylabel="autocorrelation", ylim=(-1.1 * extreme, 1.1 * extreme))
-    caption(figure, f"{_head(campaign)}: whiteness of innovations, {_runs(campaign)}")
+    caption(figure, f"{head(campaign)}: whiteness of innovations, {runs_of(campaign)}")
     return figure
 
 
@@ -188,13 +163,5 @@ def gained_figure(campaign: Campaign) -> Figure:
     )
     axes.set_yticks([], minor=True)
     axes.set(xlabel="step", xlim=span(campaign.steps), ylabel="information [1/rad²]")
-    caption(figure, f"{_head(campaign)}: learnt of a turn of the whole frame, {_runs(campaign)}")
+    caption(figure, f"{head(campaign)}: learnt of a turn of the whole frame, {runs_of(campaign)}")
     return figure
-
-
-def _head(campaign: Campaign) -> str:
-    return plain(campaign.scenario)
-
-
-def _runs(campaign: Campaign) -> str:
-    return f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"

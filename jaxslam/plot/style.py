@@ -49,9 +49,16 @@ def panels_of(
 
 
 def curve(
-    axes: Axes, i: int, x: np.ndarray, y: np.ndarray, label: str, *, mark: float = 0.0
+    axes: Axes,
+    i: int,
+    x: np.ndarray,
+    y: np.ndarray,
+    label: str,
+    *,
+    mark: float = 0.0,
+    width: float = 1.2,
 ) -> None:
-    """The line of filter number i; marks of that size in points, and where a line needs them."""
+    """The line of filter number i; width and marks in points, marks where a line needs them too."""
     dashes = _DASHES[i // _HUES % len(_DASHES)]
     marks: dict[str, Any] = {"marker": _MARKS[i // _HUES % len(_MARKS)], "ms": mark or 3.0}
     axes.plot(
@@ -59,7 +66,7 @@ def curve(
         y,
         color=COLORS[i % _HUES],
         ls=dashes,
-        lw=1.2,
+        lw=width,
         label=plain(label),
         zorder=3 + 0.01 * i,
         **(marks if mark else lone_mark(y)),
@@ -119,6 +126,16 @@ def caption(figure: Figure, title: str) -> None:
     )
     for line in legend.get_lines():
         line.set_linewidth(1.6)
+
+
+def head(campaign: Any) -> str:
+    """The name of a campaign's scenario, for a title."""
+    return plain(campaign.scenario)
+
+
+def runs_of(campaign: Any) -> str:
+    """How many runs a campaign has, in words."""
+    return f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
 
 
 def span(steps: int) -> tuple[float, float]:

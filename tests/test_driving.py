@@ -1,0 +1,122 @@
+"""A log in pieces of one program, and the looks between them; by a toy filter."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import charts, cli
+from jaxslam.cli.dataset import positive_definite
+from jaxslam.cli.driving import drive
+from jaxslam.filters.reporting import nothing_of
+from jaxslam.protocols import Filter
+from jaxslam.types import Estimate, Log, Scan
+
+STEPS = 11
+
+
+def toy(traced):
+    """A filter whose pose is the sum of its controls."""
+
+    def predict(pose, u, key):
+        traced.append(1)
+        return pose + u
+
+    def estimate(pose):
+        return Estimate(
+            pose=pose,
+            pose_cov=jnp.outer(pose, pose),
+            points=jnp.zeros((1, 2)),
+            point_covs=jnp.zeros((1, 2, 2)),
+            alive=jnp.zeros(1, bool),
+            tag=jnp.full(1, -1),
+        )
+
+    return Filter(
+        name="toy",
+        control_size=3,
+        measurement_size=2,
+        init=lambda pose, pose_cov: pose,
+        predict=predict,
+        update=lambda pose, scan, key: (pose, nothing_of(scan)._replace(log_likelihood=pose[0])),
+        estimate=estimate,
+        chart=charts.euclidean(),
+    )
+
+
+def log_of(steps=STEPS):
+    control = np.arange(3.0 * steps).reshape(steps, 3)
+    valid = np.arange(2 * steps).reshape(steps, 2) % 3 == 0
+    scan = Scan(np.zeros((steps, 2, 2)), np.full((steps, 2), -1), valid)
+    return Log(control, scan)
+
+
+@pytest.mark.parametrize(
+    ("every", "looked"),
+    [(4, [4, 8, 11]), (None, list(range(1, 12))), (0, []), (20, [11]), (11, [11])],
+)
+def test_a_log_in_pieces_is_the_whole_log(every, looked):
+    traced, shown, seen = [], [], []
+    driven = drive(
+        toy(traced),
+        log_of(),
+        np.ones(3),
+        np.zeros((3, 3)),
+        every=every,
+        look=lambda pose: seen.append(np.asarray(pose)) or float(pose[0]) > 20,
+        progress=lambda done, total: shown.append((done, total)),
+    )
+    wanted = 1 + np.cumsum(log_of().control, axis=0)
+    np.testing.assert_array_equal(driven.path.pose, wanted)
+    np.testing.assert_array_equal(driven.path.pose_cov[:, 0, 1], wanted[:, 0] * wanted[:, 1])
+    np.testing.assert_array_equal(driven.log_likelihood, wanted[:, 0])
+    np.testing.assert_array_equal(driven.status, np.where(log_of().scan.valid, 8, 0))
+    np.testing.assert_array_equal(driven.last.pose, wanted[-1])
+    assert driven.looked == looked
+    assert driven.found == [bool(wanted[step - 1, 0] > 20) for step in looked]
+    for step, pose in zip(looked, seen, strict=True):
+        np.testing.assert_array_equal(pose, wanted[step - 1])
+    assert shown[-1] == (STEPS, STEPS) and all(
+        a < b for (a, _), (b, _) in itertools.pairwise(shown)
+    )
+    assert len(traced) <= 2  # its shapes and its program, however many pieces there are
+
+
+def test_a_long_log_is_shown_every_500_steps_at_least():
+    shown = []
+    drive(
+        toy([]),
+        log_of(1200),
+        np.ones(3),
+        np.zeros((3, 3)),
+        every=0,
+        look=lambda pose: True,
+        progress=lambda done, total: shown.append(done),
+    )
+    assert shown == [500, 1000, 1200]
+
+
+def test_a_covariance_is_judged_on_the_host():
+    assert positive_definite(np.diag([1.0, 1e-12]))
+    assert not positive_definite(np.diag([1.0, -1e-12]))
+    assert not positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
+
+
+def write_bonn(folder):
+    folder.mkdir()
+    (folder / "world.dat").write_text("1 2 0\n2 0 3\n")
+    steps = ["ODOMETRY 0 0.1 0.1", "SENSOR 1 1.9 -0.1", "SENSOR 2 3.0 1.5"] * 3
+    (folder / "sensor_data.dat").write_text("\n".join(steps) + "\n")
+    return str(folder)
+
+
+def test_the_command_says_in_how_many_steps_it_looked(tmp_path, capsys):
+    run = ["run", "--dataset", "bonn", write_bonn(tmp_path / "bonn"), "--out"]
+    assert cli.main([*run, str(tmp_path / "a"), "--check-every", "2"]) == 0
+    assert "at 2 of 2 steps looked at" in capsys.readouterr().out
+    assert cli.main([*run, str(tmp_path / "b"), "--check-every", "-1"]) == 2
+    assert "expected --check-every of at least 0" in capsys.readouterr().err
+    assert not (tmp_path / "b").exists()
+    assert jax.config.jax_enable_x64

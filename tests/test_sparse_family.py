@@ -1,0 +1,46 @@
+"""The sparse information filters of the family are sparse wherever there is a map to speak of."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import family, scenarios
+from jaxslam.charts import euclidean
+from jaxslam.filters.reporting import nothing_of
+from jaxslam.protocols import Filter
+from jaxslam.types import Scan
+
+
+@pytest.mark.parametrize("name", ["seif", "eseif"])
+@pytest.mark.parametrize(("scenario", "active"), [("cloister", 18), ("circle", 10)])
+def test_fewer_landmarks_are_active_than_the_map_has(name, scenario, active):
+    world = scenarios.SCENARIOS[scenario](20)
+    count = len(world.landmarks)
+    filter = family.CANONICAL[name](world)
+    pose, cov = jnp.zeros(3), jnp.eye(3)
+    state = jax.eval_shape(filter.init, pose, cov)
+    assert state.slot.shape == (active,) and active < count
+    places = world.places or count
+    scan = Scan(jnp.zeros((places, 2)), jnp.arange(places), jnp.ones(places, bool))
+    _, info = jax.eval_shape(filter.update, state, scan, jax.random.key(0))
+    assert info.status.shape == (places,) and info.innovation_cov.shape == (places, 2, 2)
+
+
+def test_a_scan_in_pieces_loses_and_moves_nothing():
+    def update(state, scan, key):
+        assert scan.tag.shape == (3,)
+        info = nothing_of(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
+        return state + jnp.where(scan.valid, scan.z[:, 0], 0.0).sum(), info
+
+    seen = family.in_pieces(
+        Filter("toy", 3, 2, lambda p, c: p[0], lambda s, u, k: s, update, lambda s: s, euclidean()),
+        3,
+    )
+    tag = jnp.asarray([7, 3, 9, 1, 4, 8, 0])
+    scan = Scan(jnp.stack([tag, -tag], axis=1) * 1.0 + 1.0, tag, tag != 9)
+    state, info = jax.jit(seen.update)(jnp.zeros(()), scan, jax.random.key(0))
+    np.testing.assert_array_equal(info.slot, tag)
+    np.testing.assert_array_equal(info.status != 0, tag != 9)
+    assert state == np.asarray(tag)[np.asarray(tag) != 9].sum() + 6
+    assert info.log_likelihood == 14 and info.nis.shape == (7,) and info.exhausted.shape == ()
