@@ -1,13 +1,13 @@
 """Loops closed by the cluster of recent landmarks: what is merged, what is refused, and a whole run."""
 
-from functools import cache
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import association, charts, motion, sensors, slots
+from jaxslam import association, charts, motion, programs, sensors, slots
 from jaxslam.filters import eif_slam, ekf_slam
 from jaxslam.filters.closing import close_loop, closing
 from jaxslam.filters.merging import merge
@@ -51,13 +51,10 @@ def two_visits(seed=0, drift=4.0, shape=0.05, symmetric=False):
     return joint, of
 
 
-@cache
-def looking(**options):
-    return jax.jit(lambda joint: close_loop(joint, EUCLIDEAN, **(OPTIONS | options)))
-
-
 def look(joint, **options):
-    return looking(**options)(joint)
+    """By a program for all values of the options that are no integers."""
+    closed = partial(close_loop, chart=EUCLIDEAN, **(OPTIONS | options))
+    return programs.call(closed, (), joint)
 
 
 MERGE = jax.jit(lambda joint, k, m: merge(joint, EUCLIDEAN, k, m))
@@ -83,7 +80,7 @@ def test_the_cluster_is_found_and_merged_exactly(seed):
 
 def test_what_was_seen_by_turns_is_never_one():
     joint, _ = two_visits()
-    both = joint._replace(life=joint.life._replace(last=jnp.full(15, 100)))
+    both = joint._replace(life=joint.life._replace(last=jnp.full_like(joint.life.last, 100)))
     same, report = look(both)
     assert report.merged == report.explained == 0
     for left, right in zip(jax.tree.leaves(same), jax.tree.leaves(both), strict=True):

@@ -336,7 +336,9 @@ def many(request):
         truth, log = jaxslam.simulate(scenario, key)
         return truth, log, go(filter, log)
 
-    return jax.device_get(one(jax.random.split(jax.random.key(5), RUNS)))
+    # The worlds of a campaign of this key.
+    keys = [jax.random.split(jax.random.fold_in(jax.random.key(5), i))[0] for i in range(RUNS)]
+    return jax.device_get(one(jnp.stack(keys)))
 
 
 @pytest.fixture(scope="module")
@@ -456,7 +458,8 @@ def test_float32_finds_the_landmarks(kind):
     np.testing.assert_allclose(trace.estimate.pose, truth.pose, atol=0.2)
 
 
-def test_gradients_reach_the_noise_and_are_finite():
+def test_derivatives_reach_the_noise_and_are_finite():
+    """Of the whole filter forward; in reverse it compiles for minutes, and its parts are below."""
     scenario, _ = small("circles")
     _, log = draw(scenario, 1)
 
@@ -466,10 +469,47 @@ def test_gradients_reach_the_noise_and_are_finite():
         trace = jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
         return trace.info.log_likelihood.sum()
 
-    both = jax.jit(jax.value_and_grad(likelihood))
+    both = jax.jit(lambda sigma: jax.jvp(likelihood, (sigma,), (jnp.ones(()),)))
     at = jnp.asarray(0.05)
     by_differences = (both(at + 1e-6)[0] - both(at - 1e-6)[0]) / 2e-6
     np.testing.assert_allclose(both(at)[1], by_differences, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_in_reverse_what_makes_a_landmark_is_as_forward(kind):
+    """A hypothesis formed and confirmed, a point fitted and entered, by means and covariances."""
+    joint = table(kind)
+    which = closest_point(kind, joint.landmarks[4:6])
+    born, parents = jnp.array([True, False]), jnp.array([[4, 5], [4, 4]])
+    sightings, use = jnp.array([4, 5, 6, 7, 4]), jnp.arange(5) < 4
+
+    def loss(landmarks, cov):
+        start = joint._replace(landmarks=landmarks, cov=cov)
+        new = hypotheses.form(
+            start, LAYOUT, KINDS[kind], born, parents, jnp.array([which, 0]), jnp.zeros(2, int)
+        )
+        slots = jnp.array([2, 3])
+        found = hypotheses.misses(new, KINDS[kind], slots, jnp.array([6, 7]))
+        part = found.value[:, 0], found.by_point[:, 0], found.by_sight[:, 0]
+        constraint = hypotheses.constraints(new, slots, jnp.array([6, 6]), *part)
+        moved = hypotheses.move_hypotheses(new, LAYOUT, constraint, born)
+        fit = placing.fit(start, KINDS[kind], jnp.array([1.1, 5.1]), sightings, use)
+        entered = placing.enter(start, fit, jnp.asarray(1), sightings)
+        parts = [(x.landmarks**2).sum() + (x.cov**2).sum() for x in (moved, entered)]
+        return sum(parts) + fit.nis
+
+    at = joint.landmarks, joint.cov
+    rng = np.random.default_rng(0)
+    along = tuple(rng.normal(size=x.shape) for x in at)
+
+    @jax.jit
+    def ways(at, along):
+        return jax.grad(loss, argnums=(0, 1))(*at), jax.jvp(loss, at, along)[1]
+
+    slopes, forward = ways(at, along)
+    assert all(np.isfinite(slope).all() and slope.any() for slope in slopes)
+    reverse = sum((slope * way).sum() for slope, way in zip(slopes, along, strict=True))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8)
 
 
 def test_without_names_intersections_find_the_landmarks():

@@ -86,7 +86,7 @@ def by_hand(pose, scan, gate=math.inf, edge=9.21034037197618):
 @pytest.mark.parametrize("gate", [math.inf, 16.0])
 def test_weights_are_the_scans_densities(gate):
     _, log = history(1)
-    scan = jax.tree.map(lambda x: x[0], log.scan)
+    scan = jax.tree.map(lambda x: jnp.asarray(x[0]), log.scan)
     tag = scan.tag.at[2].set(-1)
     scan = Scan(scan.z.at[4].add(jnp.array([3.0, 0.0])), tag, scan.valid.at[5].set(False))
     filter = of(30, BLUNT, gate=None if gate == math.inf else gate)

@@ -99,11 +99,11 @@ def test_sensors_in_turn_are_filters_in_turn(chart):
 
 
 def test_a_world_has_each_sensor_at_its_rate_and_in_its_places():
-    scenario = world(steps=20)
+    scenario = world()
     truth, log = drawn(scenario)
-    steps = np.arange(20)
+    steps = np.arange(40)
     valid, tag = np.asarray(log.scan.valid), np.asarray(log.scan.tag)
-    assert log.scan.z.shape == (20, 11, 2)
+    assert log.scan.z.shape == (40, 11, 2)
     np.testing.assert_array_equal(valid[:, 4:10].all(1), steps % 3 == 1)
     np.testing.assert_array_equal(valid[:, 4:10].any(1), steps % 3 == 1)
     np.testing.assert_array_equal(valid[:, 10], steps % 5 == 0)
@@ -121,11 +121,11 @@ def test_a_world_has_each_sensor_at_its_rate_and_in_its_places():
 
 
 def test_info_is_of_all_places():
-    scenario = world(steps=20)
+    scenario = world()
     _, log = drawn(scenario)
     info = go(scenario, log).info
-    assert info.status.shape == (20, 11)
-    assert info.innovation_cov.shape == (20, 11, 2, 2)
+    assert info.status.shape == (40, 11)
+    assert info.innovation_cov.shape == (40, 11, 2, 2)
     fused = np.asarray(info.status) == Status.FUSED
     dof = np.asarray(info.dof)
     assert set(dof[:, :10][fused[:, :10]]) == {2}
@@ -183,7 +183,7 @@ def test_gradients_reach_every_part():
 
 
 def test_float32():
-    scenario = world(steps=20)
+    scenario = world()
     _, log = drawn(scenario)
     single = jax.tree.map(
         lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, log
@@ -207,7 +207,7 @@ def test_places_for_robots_are_left_alone():
 
 
 def test_a_scan_with_other_places_is_refused():
-    scenario = world(steps=3)
+    scenario = world()
     _, log = drawn(scenario)
     short = log._replace(scan=jax.tree.map(lambda leaf: leaf[:, :10], log.scan))
     with pytest.raises(ValueError, match="expected 11 places"):
