@@ -1,8 +1,10 @@
 """`jaxslam consistency`: a campaign, its table and its files."""
 
 import argparse
+import importlib
 import shutil
 import sys
+import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -70,6 +72,8 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     here = devices.chosen(options.devices)
     keep = _keep(options, out, asked)
     known = library.identity(asked, here[0].platform)
+    # What draws is imported while filters run, and needed when they have.
+    threading.Thread(target=importlib.import_module, args=("jaxslam.page",), daemon=True).start()
     try:
         with (
             Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress,
