@@ -32,6 +32,7 @@ from jax._src import config as jax_config
 from jax._src import core as jax_core
 
 from jaxslam.hoisting import hoisted
+from jaxslam.staging import hot_options
 
 _T = TypeVar("_T")
 
@@ -174,8 +175,9 @@ def _program(
         return None, None, None
     lowered = jax.jit(traced.call).lower(traced.numbers, *structs)
     numbers = [jnp.asarray(number) for number in traced.numbers]
-    devices = tuple(s.sharding for s in shapes)
-    return compiled(lowered, (devices, jax_config.default_device.value)), numbers, traced.out
+    where = tuple(s.sharding for s in shapes), jax_config.default_device.value
+    options = hot_options(jax.default_backend())
+    return compiled(lowered, where, options), numbers, traced.out
 
 
 class Traced(NamedTuple):

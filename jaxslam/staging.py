@@ -38,6 +38,34 @@ def quick_options(platform: str) -> dict[str, Any] | None:
     return {"xla_backend_optimization_level": 1} if platform == "cpu" else None
 
 
+def hot_options(platform: str) -> dict[str, Any] | None:
+    """Options with which a program that runs long runs faster; None where there are none.
+
+    XLA vectorizes code of a CPU for 256 bits unless it is told. Where the processor has AVX-512,
+    512 made 32 runs of EKF-SLAM 1.1 times as fast in float64 and float32.
+    """
+    return _wide_vectors() if platform == "cpu" else None
+
+
+@functools.cache
+def _wide_vectors() -> dict[str, Any] | None:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            flags = next((line for line in file if line.startswith("flags")), "")
+    except OSError:  # not Linux
+        return None
+    if "avx512f" not in flags.split():
+        return None
+    options: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512}
+    try:
+        jax.jit(lambda: 0).lower().compile(options)
+    except jax.errors.JaxRuntimeError as error:
+        if "No such compile option" not in str(error):
+            raise
+        return None
+    return options
+
+
 def quick_jit(function: Callable[..., _T]) -> Callable[..., _T]:
     """jax.jit(function) for a program that runs but once; see `quick_options`."""
     options = quick_options(jax.default_backend())

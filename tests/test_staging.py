@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.staging import anywhere, apart, quick_jit, settle, where_any
+from jaxslam.staging import anywhere, apart, hot_options, quick_jit, settle, where_any
 
 
 def test_settle_is_the_identity_under_every_transformation():
@@ -44,6 +44,14 @@ def test_a_quick_program_is_the_function(monkeypatch, platform):
     x = np.array([0.3, 2.0])
     np.testing.assert_allclose(quick_jit(jax.vmap(jnp.sin))(x), np.sin(x))
     assert bool(told[-1]["compiler_options"]) == (platform == "cpu")
+
+
+def test_hot_programs_are_compiled_for_the_processor():
+    options = hot_options("cpu")
+    if options is not None:
+        program = jax.jit(lambda x: 2 * x + 1).lower(np.arange(9.0)).compile(options)
+        np.testing.assert_array_equal(program(np.arange(9.0)), 2 * np.arange(9.0) + 1)
+    assert hot_options("gpu") is None
 
 
 @pytest.mark.parametrize("kept", [True, False])

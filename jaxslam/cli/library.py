@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 
-import jaxslam
 from jaxslam import report
 from jaxslam.cli import cache
 
@@ -30,11 +29,10 @@ def identity(asked: Mapping[str, Any], platform: str) -> dict[str, str]:
 
 def _source() -> str:
     """A digest of every source file of the package."""
-    total = hashlib.sha256()
-    for folder in jaxslam.__path__:
-        for path in sorted(Path(folder).rglob("*.py")):
-            total.update(f"{path.relative_to(folder).as_posix()}\n".encode())
-            total.update(path.read_bytes().replace(b"\r\n", b"\n"))
+    total, package = hashlib.sha256(), Path(report.__file__).parent
+    for path in sorted(package.rglob("*.py")):
+        total.update(f"{path.relative_to(package).as_posix()}\n".encode())
+        total.update(path.read_bytes().replace(b"\r\n", b"\n"))
     return total.hexdigest()[:16]
 
 

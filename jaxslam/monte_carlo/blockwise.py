@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxslam import programs
 from jaxslam.monte_carlo.pieces import cores
-from jaxslam.staging import quick_options
+from jaxslam.staging import hot_options, quick_options
 
 
 class Library(Protocol):
@@ -148,7 +148,7 @@ class Blockwise:
         shapes: Any,
         straight: bool,
     ) -> Callable[..., Any]:
-        options = quick_options(self._devices[0].platform) if straight else None
+        options = (quick_options if straight else hot_options)(self._devices[0].platform)
         compiled: Any = programs.compiled(lowered, self._devices, options)
         keys = any(jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key) for x in numbers)
         if self._library is not None and not keys:
