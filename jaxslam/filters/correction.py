@@ -195,7 +195,7 @@ def correct_in_turn(
 
     if whole:
         return in_groups(one_of_all, joint)
-    if chart.motion_apart:
+    if chart.motion_apart and joint.last:
         work = partial(parted.correct_one, chart=chart, retracted=retracted, **options)
 
         def with_motion(joint: Joint) -> tuple[Joint, Correction]:
