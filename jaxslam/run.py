@@ -12,6 +12,7 @@ from jaxslam import programs
 from jaxslam.linalg import check_covariance, check_key, is_concrete
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Status, Trace, check_log
+from jaxslam.validation import state_and_info
 
 
 def run(
@@ -91,7 +92,8 @@ def _drive(
         # Under jit nobody has looked for NaN, and one would go through the whole state.
         lost = scan.valid & ~jnp.isfinite(scan.z).all(axis=1)
         scan = scan._replace(valid=scan.valid & ~lost)
-        state, info = filter.update(state, scan, key_update)
+        found = filter.update(state, scan, key_update)
+        state, info = state_and_info(f"run: {filter.name}", found)
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
         return state, (filter.estimate(state), info, () if probe is None else probe(state))

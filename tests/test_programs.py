@@ -263,3 +263,16 @@ def test_an_error_of_the_function_comes_as_it_is():
             ring.pose_cov,
             jax.random.key(0),
         )
+
+
+def test_an_update_without_info_and_a_key_that_is_none_are_refused():
+    ring = worlds.ring(3)
+    ekf = filters.ekf_slam(ring.motion, ring.sensor, 6)
+    _, log = simulate(ring, jax.random.key(0))
+    bare = dataclasses.replace(ekf, update=lambda joint, scan, key: ekf.update(joint, scan, key)[0])
+    with pytest.raises(ValueError, match=r"expected update to return \(state, Info\), got Joint"):
+        run(bare, log, ring.pose, ring.pose_cov, jax.random.key(0))
+    with pytest.raises(ValueError, match="run: expected a PRNG key"):
+        run(ekf, log, ring.pose, ring.pose_cov, 0)
+    with pytest.raises(ValueError, match="simulate: expected a PRNG key"):
+        simulate(ring, 0)
