@@ -156,7 +156,9 @@ def weigh(
             v, whitened = apart(_whitened, whiten, hp, nu)
             pivots = jnp.diagonal(own, axis1=1, axis2=2)
         else:
-            v, whitened = apart(_solved, factor, hp, nu.reshape(-1))
+            # As a vector, the factor has one layout: LAPACK wants columns, and XLA (jaxlib 0.12)
+            # may pass rows to a computation that was compiled for columns.
+            v, whitened = apart(_solved, factor.reshape(-1), hp, nu.reshape(-1))
         xi = linalg.gram(v, whitened[:, None])[:, 0]
         if iteration == 0:
             positive = positive & regular
@@ -203,6 +205,7 @@ def _seen_rows(
 
 
 def _solved(factor: jax.Array, hp: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
+    factor = factor.reshape(len(nu), len(nu))
     both = linalg.solve_lower(factor, jnp.concatenate([hp, nu[:, None]], axis=1))
     return both[:, :-1], both[:, -1]
 
