@@ -208,8 +208,14 @@ def whitener(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def whitener_by_rows(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`whitener` as a loop over rows: as little to compile at any size, and slower to run."""
+    """`whitener` as a loop over rows: little to compile, for what is factored once a step.
+
+    Beyond 8×8 by `cholesky`, zero as a whole where a pivot is.
+    """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    if n > _UNROLLED:
+        factor, positive = cholesky(matrix)
+        return solve_lower(factor, jnp.eye(n, dtype=matrix.dtype)), positive
     every = jnp.arange(n)
 
     def row(carry: Any, j: jax.Array) -> tuple[Any, Any]:

@@ -170,8 +170,12 @@ def correct_in_turn(
             done = jax.tree.map(lambda leaf: leaf[0], found.correction)
             return moved, (reach, found.whitened, done)
 
+        # A gradient keeps what each begins with, and computes the rest of these few rows again.
         local, (reach, whitened, done) = jax.lax.scan(
-            one, local, (jnp.arange(group), part), unroll=True
+            jax.checkpoint(one, prevent_cse=False),
+            local,
+            (jnp.arange(group), part),
+            unroll=True,
         )
         v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
         landmarks = _moved_map(joint, v[:, :size], whitened, chart)
