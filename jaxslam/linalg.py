@@ -207,6 +207,32 @@ def whitener(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.stack([jnp.stack(row) for row in rows]), positive
 
 
+def whitener_by_rows(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`whitener` as a loop over rows: little to compile, for what is factored once a step.
+
+    Beyond 8×8 by `cholesky`, zero as a whole where a pivot is.
+    """
+    n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    if n > _UNROLLED:
+        factor, positive = cholesky(matrix)
+        return solve_lower(factor, jnp.eye(n, dtype=matrix.dtype)), positive
+    every = jnp.arange(n)
+
+    def row(carry: Any, j: jax.Array) -> tuple[Any, Any]:
+        rest, ahead = carry
+        pivot = rest[j, j]
+        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        scale = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        below, own = jnp.where(every > j, rest[:, j] * scale, 0.0), ahead[j] * scale
+        return (
+            rest - below[:, None] * below[None, :],
+            ahead - below[:, None] * own[None, :],
+        ), (own, good)
+
+    rows, good = jax.lax.scan(row, (matrix, jnp.eye(n, dtype=matrix.dtype)), every)[1]
+    return rows, good.all()
+
+
 def inverse(matrix: jax.Array) -> jax.Array:
     """A⁻¹ of a regular (n, n) matrix: by cofactors up to 3×3, which fuses; by LU beyond."""
     n = matrix.shape[-1]

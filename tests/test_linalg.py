@@ -133,6 +133,14 @@ def test_whitener_is_the_inverse_of_the_factor(n):
     )
 
 
+def test_whitener_as_a_loop_is_the_same_matrix():
+    a = np.concatenate([random_covariances(6), semi_definite(6), np.full((1, 6, 6), np.nan)])
+    rows, flags = jax.jit(jax.vmap(linalg.whitener_by_rows))(a)
+    whiten, same = jax.jit(jax.vmap(linalg.whitener))(a)
+    np.testing.assert_array_equal(flags, same)
+    np.testing.assert_allclose(rows[:-1], whiten[:-1], rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_whitener_of_a_semi_definite_matrix_leaves_out_what_the_factor_leaves_out(n):
     a, b = semi_definite(n), np.ones(n)

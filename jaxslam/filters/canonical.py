@@ -134,12 +134,11 @@ def weigh(
     fused = known & inside & positive
     both = fused[:, None, None, None] & fused[None, None, :, None]
     unit = same * jnp.eye(size_z, dtype=z.dtype)[None, :, None]
-    whole = linalg.cholesky(jnp.where(both, s, unit).reshape(m * size_z, m * size_z))[0]
+    whiten = linalg.whitener_by_rows(jnp.where(both, s, unit).reshape(m * size_z, m * size_z))[0]
     fused_nu = jnp.where(fused[:, None], nu, 0.0)
-    white = linalg.solve_lower(whole, fused_nu.reshape(-1)).reshape(m, size_z)
-    nis = (white**2).sum(axis=1)
-    pivots = jnp.diagonal(whole).reshape(m, size_z)
-    log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
+    nis = ((whiten @ fused_nu.reshape(-1)).reshape(m, size_z) ** 2).sum(axis=1)
+    pivots = jnp.diagonal(whiten).reshape(m, size_z)
+    log_det = -2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
     likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
 
     def whitened(root: jax.Array, values: jax.Array) -> jax.Array:

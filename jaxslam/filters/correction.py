@@ -170,8 +170,12 @@ def correct_in_turn(
             done = jax.tree.map(lambda leaf: leaf[0], found.correction)
             return moved, (reach, found.whitened, done)
 
+        # A gradient keeps what each begins with, and computes the rest of these few rows again.
         local, (reach, whitened, done) = jax.lax.scan(
-            one, local, (jnp.arange(group), part), unroll=True
+            jax.checkpoint(one, prevent_cse=False),
+            local,
+            (jnp.arange(group), part),
+            unroll=True,
         )
         v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
         landmarks = _moved_map(joint, v[:, :size], whitened, chart)
@@ -182,7 +186,7 @@ def correct_in_turn(
 
     def in_groups(work: Any, state: Any) -> tuple[Any, Correction]:
         def of_group(state: Any, part: Any) -> tuple[Any, Correction]:
-            nothing = _zeros_like(work, state, part)
+            nothing = _nothing(joint, part[0])
             some = part[2].any()
             after: tuple[Any, Correction] = where_any(
                 some, lambda s: work(s, part), lambda s: (s, nothing), state
@@ -205,7 +209,7 @@ def correct_in_turn(
             kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)
             return kept, done
 
-        nothing = _zeros_like(with_motion, joint)
+        nothing = _nothing(joint, z)
         return where_any(known.any(), with_motion, lambda joint: (joint, nothing), joint)
     if cached:
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
@@ -213,10 +217,19 @@ def correct_in_turn(
     return joint._replace(cov=joint.cov[:, :size]), done
 
 
-def _zeros_like(work: Any, *arguments: Any) -> Any:
-    """The `Correction` that work(*arguments) would return beside a state, all zero."""
-    shapes = jax.eval_shape(work, *arguments)[1]
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+def _nothing(joint: Joint, z: jax.Array) -> Correction:
+    """The `Correction` of m measurements z (m, Z) that nothing is done with, all zero."""
+    m, size = z.shape
+    dtype = jnp.result_type(z, joint.pose, joint.cov)
+    each, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
+    return Correction(
+        innovation=jnp.zeros((m, size), dtype),
+        innovation_cov=jnp.zeros((m, size, size), dtype),
+        nis=each,
+        log_likelihood=each,
+        inside=flags,
+        positive=flags,
+    )
 
 
 def _moved(joint: Joint, found: Weighed, xi: jax.Array, slot: jax.Array, chart: Chart) -> Joint:

@@ -1,6 +1,6 @@
 """A landmark as many sightings of it place it at once, and what they say beyond that of the map."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -76,18 +76,22 @@ def fit(joint: Joint, meeting: Meeting, start: Array, sightings: Array, use: Arr
         )
         by_sight = jnp.where(use[:, None], by_sight, 0.0)
         own = jnp.einsum("mi,minj,nj->mn", by_sight, blocks, by_sight)
-        factor, positive = linalg.cholesky(jnp.where(both, own, unit))
-        whiten = settle(linalg.solve_lower(factor, unit))
+        whiten, positive = linalg.whitener_by_rows(jnp.where(both, own, unit))
         by_point = whiten @ jnp.where(use[:, None], by_point, 0.0)
         return whiten @ value, by_sight, by_point, whiten, positive
 
-    def descend(point: Array, _: None) -> tuple[Array, None]:
-        value, _by_sight, by_point, _whiten, positive = rows(point)
+    def descend(before: Any, _: None) -> tuple[Any, None]:
+        point = before[0]
+        found = rows(point)
+        value, _by_sight, by_point, _whiten, positive = found
         step, regular = linalg.solve_psd(by_point.T @ by_point, by_point.T @ value)
-        return point - jnp.where(regular & positive, step, 0.0), None
+        return (point - jnp.where(regular & positive, step, 0.0), point, found), None
 
-    point = jax.lax.scan(descend, start, None, length=_DESCENTS)[0]
-    value, by_sight, by_point, whiten, positive = rows(point)
+    # The rows at the end of the last descent are those of one more, whose end is not used.
+    nothing = jnp.zeros((m, 3 + SIZE + m), seen.dtype)
+    none = nothing[:, 0], nothing[:, :SIZE], nothing[:, :2], nothing[:, 6:], jnp.asarray(True)
+    _, point, found = jax.lax.scan(descend, (start, start, none), None, length=_DESCENTS + 1)[0]
+    value, by_sight, by_point, whiten, positive = found
     turn = settle(_triangular(by_point))
     triangle, value, turn = (turn @ by_point)[:2], turn @ value, turn @ whiten
     regular = (use.sum() >= 2) & (jnp.abs(triangle[0, 0] * triangle[1, 1]) > 0)

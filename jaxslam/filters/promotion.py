@@ -4,12 +4,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam.filters import hypotheses as table
 from jaxslam.filters import placing
-from jaxslam.filters.waiting import Delayed, Rules, more, without
-from jaxslam.staging import where_any
-from jaxslam.stats import chi2_tail
+from jaxslam.filters.waiting import Delayed, Rules, after, more, without
+from jaxslam.staging import settle, where_any
+from jaxslam.stats import chi2_quantiles
 
 Array = jax.Array
 
@@ -64,6 +65,8 @@ def promote(
         variance = miss.variance[0] + state.noise
         seeing = seen & (miss.value[0] ** 2 <= rules.gate * variance)
         fit, sights, verdict = _explanation(rules, state, origin, seeing)
+        # Of a batch, the runs without a promotion wait, and keep all they have to the bit.
+        verdict = settle(_Verdict(verdict.yes & go, verdict.wait | ~go))
         entered = placing.enter(joint, fit, home, sights)
         joint = jax.tree.map(lambda a, b: jnp.where(verdict.yes, a, b), entered, joint)
         mine = verdict.yes & (jnp.arange(layout.slots) == home)
@@ -82,14 +85,8 @@ def promote(
         )
         return without(layout, state._replace(joint=joint, counts=counts), gone)
 
-    def kept(state: Delayed) -> Delayed:
-        # Of a batch, only the runs with a promotion may change, to the bit.
-        new = enter(state)
-        same_as_before: Delayed = jax.tree.map(lambda a, b: jnp.where(go, a, b), new, state)
-        return same_as_before
-
     before = state.counts.promoted
-    state = where_any(go, kept, lambda s: s, state)
+    state = where_any(go, enter, lambda s: s, state)
     dealt_with = any_may & (jnp.arange(layout.hypotheses) == chosen)
     by = jnp.where(dealt_with | ~state.joint.alive[layout.of_hypotheses], -1, by)
     done = go & (state.counts.promoted > before)
@@ -112,8 +109,7 @@ def _explanation(
     the slots of those it is made of."""
     joint = state.joint
     # The oldest and the newest, from the farthest places.
-    order = jnp.argsort(state.taken)
-    rank = jnp.cumsum(seeing[order])[jnp.argsort(order)]
+    rank = (seeing[None, :] & ~after(state.taken)).sum(axis=1)
     outer = jnp.where(seeing, jnp.maximum(rank, seeing.sum() + 1 - rank), 0)
     best = jax.lax.top_k(outer, min(_USED, rules.layout.sightings))[1]
     use, sights = seeing[best], rules.layout.sighting_slots[best]
@@ -134,8 +130,10 @@ def _explanation(
     scale = (_ONE_PLACE**2) * ((fit.point - places[0, :2]) ** 2).sum()
     ambiguous = ((cost < fit.nis + _CLOSE) & (far > scale)).any()
     wait = fit.regular & (ambiguous | (fit.spread > rules.ready))
+    # By degrees of freedom, from 1 on; of numbers, since the tail itself is much code to compile.
+    limits = jnp.asarray(chi2_quantiles(1 - _UNLIKELY, np.arange(1, _USED)), fit.nis.dtype)
     dof = jnp.maximum(use.sum() - 2, 1)
-    likely = chi2_tail(fit.nis, dof) >= _UNLIKELY
+    likely = fit.nis <= limits[dof - 1]
     return fit, sights, _Verdict(fit.regular & likely & ~wait, wait)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from jaxslam import slots
 from jaxslam.filters import hypotheses as table
-from jaxslam.filters.waiting import Delayed, Fresh, Rules, more, without
+from jaxslam.filters.waiting import Delayed, Fresh, Rules, after, more, without
 from jaxslam.staging import where_any
 
 Array = jax.Array
@@ -27,7 +27,7 @@ def take(rules: Rules, state: Delayed, scan: Fresh) -> tuple[Delayed, Array, Arr
     alive = joint.alive[layout.of_sightings]
     needed = wanted.sum() - (~alive).sum()
     age = jnp.where(alive, state.taken, state.clock + 1)
-    evicted = alive & (jnp.argsort(jnp.argsort(age)) < needed)
+    evicted = alive & (after(age).sum(axis=0) < needed)
     gone = jnp.zeros(layout.slots, bool).at[layout.of_sightings].set(evicted)
     state = where_any(evicted.any(), lambda s: without(layout, s, gone), lambda s: s, state)
     joint = state.joint
@@ -107,14 +107,15 @@ def intersect(rules: Rules, state: Delayed, scan: Fresh, slot: Array, lonely: Ar
     place, pair, which = best // (w * a), best // a, best % a
     tag = scan.tag[place]
     # At most once at a place: not where an equal or better one is, nor a hypothesis of before.
-    again = table.near(rules.distance, rules.same, points, covs, points, covs)
+    old, old_covs = table.from_robot(joint, layout)
+    others = jnp.concatenate([points, joint.pose[None, :2] + old])
+    close = table.near(
+        rules.distance, rules.same, points, covs, others, jnp.concatenate([covs, old_covs])
+    )
+    again, there = close[:, :tried], close[:, tried:]
     earlier = jnp.arange(tried)[:, None] > jnp.arange(tried)[None, :]
     again = again & earlier & good[None, :] & (pair[:, None] != pair[None, :])
     again = again & (tag[:, None] == tag[None, :])
-    old, old_covs = table.from_robot(joint, layout)
-    there = table.near(
-        rules.distance, rules.same, points, covs, joint.pose[None, :2] + old, old_covs
-    )
     there = there & joint.alive[layout.of_hypotheses][None, :]
     there = there & (tag[:, None] == joint.tag[layout.of_hypotheses][None, :])
     wanted = good & ~again.any(axis=1) & ~there.any(axis=1)

@@ -157,6 +157,16 @@ def without(layout: Layout, state: Delayed, gone: Array) -> Delayed:
     )
 
 
+def after(when: Array) -> Array:
+    """(W, W) bool: whether sighting j was taken after i, when (W,); of one scan, whether j > i.
+
+    A rank is a row's sum: one kernel, where two sorts are more to compile than all else around.
+    """
+    place = jnp.arange(len(when))
+    later = when[None, :] > when[:, None]
+    return later | ((when[None, :] == when[:, None]) & (place[None, :] > place[:, None]))
+
+
 def more(count: Array, these: Array) -> Array:
     """A count () and how many of these more."""
     return count + these.sum(dtype=jnp.int32)

@@ -129,7 +129,7 @@ def weigh(
         # One array, and so one kernel and not three.
         found = settle(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
         by_pose, by_landmark, nu = found[:, :, :3], found[:, :, 3:-1], found[:, :, -1]
-        hp = hx = apart(_seen_rows, by_pose, by_landmark, view.robot, view.own)
+        hp = hx = apart(_seen_rows, found, view.robot, view.own)
         if square_root:
             hp = settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
         s = innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
@@ -195,12 +195,12 @@ def weigh(
     )
 
 
-def _seen_rows(
-    by_pose: jax.Array, by_landmark: jax.Array, robot: jax.Array, own: jax.Array
-) -> jax.Array:
-    """H P (m, Z, D) of H by pose (m, Z, 3) and landmark (m, Z, L), rows (3, D) and (m, L, D)."""
-    terms = [by_pose[:, :, k, None] * robot[None, None, k] for k in range(3)]
-    terms += [by_landmark[:, :, k, None] * own[:, None, k] for k in range(own.shape[1])]
+def _seen_rows(found: jax.Array, robot: jax.Array, own: jax.Array) -> jax.Array:
+    """H P (m, Z, D) of H by pose and landmark, first in found (m, Z, 3+L+1), rows (3, D) and
+    (m, L, D).
+    """
+    terms = [found[:, :, k, None] * robot[None, None, k] for k in range(3)]
+    terms += [found[:, :, 3 + k, None] * own[:, None, k] for k in range(own.shape[1])]
     return linalg.total(terms)
 
 
