@@ -213,6 +213,8 @@ def whitener_by_rows(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     Beyond 8×8 by `cholesky`, zero as a whole where a pivot is.
     """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    if n == 0:
+        return matrix, jnp.asarray(True)
     if n > _UNROLLED:
         factor, positive = cholesky(matrix)
         return solve_lower(factor, jnp.eye(n, dtype=matrix.dtype)), positive

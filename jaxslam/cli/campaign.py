@@ -46,11 +46,14 @@ DEFAULTS: dict[str, Any] = {
 def consistency(options: argparse.Namespace, command: str) -> int:
     """Run the campaign that was asked for, print its table, write its files; exit status."""
     asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
+    block: int | None = options.block
     if options.resume is not None:
         there = store.resume(options.resume / BLOCKS)
         if "asked" not in there.settings:
             raise ValueError(f"{options.resume} holds a campaign that no command began")
         asked = there.settings["asked"] | {"runs": there.runs} | asked
+        block = there.settings.get("block")  # other blocks would round differently
+        options.block = block if options.block is None else options.block
     asked = DEFAULTS | asked
     out = options.resume or options.out
     # Worlds are drawn in float64 whatever filters compute in: both precisions see the same.
@@ -70,7 +73,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         check_count("block", options.block)
     report.check_writable(out)
     here = devices.chosen(options.devices)
-    keep = _keep(options, out, asked)
+    keep = _keep(options, out, asked, block)
     known = library.identity(asked, here[0].platform)
     # What draws is imported while filters run, and needed when they have.
     threading.Thread(target=importlib.import_module, args=("jaxslam.page",), daemon=True).start()
@@ -118,10 +121,16 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _keep(options: argparse.Namespace, out: Path, asked: dict[str, Any]) -> store.Store:
-    """Where this campaign's blocks are kept: a new folder, or that of the campaign resumed."""
+def _keep(
+    options: argparse.Namespace, out: Path, asked: dict[str, Any], block: int | None
+) -> store.Store:
+    """Where this campaign's blocks are kept: a new folder, or that of the campaign resumed.
+
+    block: the size of blocks that the campaign was begun with.
+    """
     folder, runs = out / BLOCKS, asked["runs"]
-    settings = {"asked": {name: value for name, value in asked.items() if name != "runs"}}
+    told = {name: value for name, value in asked.items() if name != "runs"}
+    settings = {"asked": told, "block": block}
     if options.resume is None and jax.process_index() == 0:
         _make_room(options, out, settings, runs)
         store.create(folder, settings, runs)
