@@ -28,7 +28,7 @@ def test_the_suite_writes_nothing_into_the_users_folder():
 def as_it_was(monkeypatch, tmp_path):
     """The test run may have a cache of its own; here JAX has been told of none."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "of the user"))
-    with cache._set(jax_compilation_cache_dir=None):
+    with cache.settings(jax_compilation_cache_dir=None):
         before = {name: getattr(jax.config, name) for name in OURS}
         yield
         assert {name: getattr(jax.config, name) for name in OURS} == before
@@ -65,7 +65,7 @@ def test_by_default_they_are_kept_in_the_users_folder_or_where_jax_was_told(tmp_
     with cache.programs(None):
         one_program()
     assert len(entries(tmp_path / "of the user" / "jaxslam")) == 1
-    with cache._set(
+    with cache.settings(
         jax_compilation_cache_dir=str(tmp_path / "told"),
         jax_persistent_cache_min_compile_time_secs=0.0,
     ):
@@ -154,7 +154,7 @@ def test_a_damaged_program_is_said_and_compiled_anew(tmp_path, capsys, spoil):
 def test_a_folder_that_jax_was_told_of_is_not_ours_to_mend(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     with (
-        cache._set(jax_compilation_cache_dir=str(tmp_path / "file" / "below")),
+        cache.settings(jax_compilation_cache_dir=str(tmp_path / "file" / "below")),
         cache.programs(None),
     ):
         assert one_program() + one_program(2.0) == 0
