@@ -259,42 +259,22 @@ def solve_psd(matrix: jax.Array, rhs: jax.Array) -> tuple[jax.Array, jax.Array]:
     return solve_lower(reverse, solve_lower(factor, rhs)[::-1])[::-1], positive
 
 
-def mahalanobis_squared(
-    error: jax.Array, cov: jax.Array, scale: jax.Array | None = None
-) -> tuple[jax.Array, jax.Array]:
+def mahalanobis_squared(error: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
     """eᵀ P⁻¹ e and whether P (n, n) is numerically regular; 0 and False where it is not.
 
-    P is judged in units of `scale` (n,), by default each coordinate's own standard deviation, so
-    that metres, radians and a covariance of 1e-30 are judged alike. Coordinates of one unit are
-    better given one scale: a variance that is rounding next to its neighbour's then counts as none.
-    Regular means that each Cholesky pivot exceeds 100 n·eps, i.e. no direction is known exactly.
+    P is judged in units of each coordinate's own standard deviation, so that metres, radians and a
+    covariance of 1e-30 are judged alike. Regular means that each Cholesky pivot exceeds 100 n·eps,
+    i.e. no direction is known exactly, and that e is finite.
     """
-    return mahalanobis_leading(error, cov, (cov.shape[-1],), scale)[0]
-
-
-def mahalanobis_leading(
-    error: jax.Array, cov: jax.Array, sizes: Iterable[int], scale: jax.Array | None = None
-) -> list[tuple[jax.Array, jax.Array]]:
-    """`mahalanobis_squared` of leading blocks of P (n, n), of k×k for each k of sizes.
-
-    error: (n, …); each result is of shape (…). One factor serves all blocks and errors.
-    """
-    if scale is None:  # the square root's slope at a zero variance is infinite, hence the 1.0
-        variance = jnp.diagonal(cov)
-        scale = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
-    spread = scale > 0
-    unit = jnp.where(spread, 1.0 / jnp.where(spread, scale, 1.0), 0.0)
+    n, variance = cov.shape[-1], jnp.diagonal(cov)
+    spread = variance > 0  # the square root's slope at a zero variance is infinite, hence the 1.0
+    unit = jnp.where(spread, 1.0 / jnp.sqrt(jnp.where(spread, variance, 1.0)), 0.0)
     factor = cholesky(cov * unit[:, None] * unit[None, :])[0]
-    pivots = jnp.diagonal(factor) ** 2
     known = jnp.isfinite(error)
-    in_units = jnp.where(known, error, 0.0) * unit.reshape(-1, *(1,) * (error.ndim - 1))
-    squares = solve_lower(factor, in_units) ** 2
-    out = []
-    for k in sizes:
-        regular = jnp.all(pivots[:k] > 100 * k * jnp.finfo(cov.dtype).eps)
-        regular = regular & jnp.all(known[:k], axis=0)
-        out.append((jnp.where(regular, jnp.sum(squares[:k], axis=0), 0.0), regular))
-    return out
+    squares = solve_lower(factor, jnp.where(known, error, 0.0) * unit) ** 2
+    regular = jnp.all(jnp.diagonal(factor) ** 2 > 100 * n * jnp.finfo(cov.dtype).eps)
+    regular = regular & jnp.all(known)
+    return jnp.where(regular, jnp.sum(squares), 0.0), regular
 
 
 def is_positive_definite(matrix: jax.Array) -> jax.Array:

@@ -261,7 +261,8 @@ def results(out):
 
 
 def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys):
-    out, again = tmp_path / "out", ["consistency", "--resume", str(tmp_path / "out")]
+    out = tmp_path / "out"
+    again = ["consistency", "--resume", str(out), "--devices", "1"]
     asked = [
         *QUICK,
         "--filters",

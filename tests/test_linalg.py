@@ -224,36 +224,6 @@ def test_mahalanobis_masks_directions_that_are_known_exactly():
     assert not by_cov.any()
 
 
-def test_mahalanobis_with_a_common_scale_judges_coordinates_against_each_other():
-    error, cov = np.array([1.0, 1e-9]), np.diag([1.0, 1e-18])
-    judge = jax.jit(linalg.mahalanobis_squared)
-    np.testing.assert_allclose(judge(error, cov), [2.0, True], rtol=1e-12)
-    np.testing.assert_array_equal(judge(error, cov, np.ones(2)), [0.0, False])
-    np.testing.assert_allclose(judge(error, cov + np.eye(2), np.full(2, 7.0)), [0.5, True])
-
-
-def test_mahalanobis_of_leading_blocks_is_that_of_each_block_alone():
-    rng = np.random.default_rng(8)
-    root = rng.normal(size=(40, 4, 4))
-    cov = root @ root.transpose(0, 2, 1)
-    cov[:10, 2, :] = cov[:10, :, 2] = 0.0  # known exactly: 3×3 and beyond are singular
-    errors = rng.normal(size=(40, 4, 2))
-    errors[30:, 3, 1] = np.nan
-    scale = rng.uniform(0.5, 2.0, (40, 4))
-    found = jax.jit(jax.vmap(lambda e, p, s: linalg.mahalanobis_leading(e, p, (1, 2, 3, 4), s)))(
-        errors, cov, scale
-    )
-    for k, (squares, regular) in zip((1, 2, 3, 4), found, strict=True):
-        for i in (0, 1):
-            alone = distance(errors[:, :k, i], cov[:, :k, :k], scale[:, :k])
-            np.testing.assert_allclose(squares[:, i], alone[0], rtol=1e-12)
-            np.testing.assert_array_equal(regular[:, i], alone[1])
-    assert not found[2][1][:10].any()
-    assert found[1][1].all()
-    assert not found[3][1][30:, 1].any()
-    assert found[3][1][30:, 0].all()
-
-
 def test_is_positive_definite():
     cases = np.stack([np.eye(3), np.diag([1.0, -1e-9, 1.0]), np.full((3, 3), np.nan)])
     flags = jax.vmap(linalg.is_positive_definite)(jnp.asarray(cases))

@@ -1,16 +1,17 @@
 """The consistency measures beyond NEES and NIS: each against a definition or a known answer."""
 
 import dataclasses
+from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
 import worlds
-from test_consistency import STEPS, plain_nees, summed, synthetic
+from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
 from jaxslam import charts, consistency, motion, sensors
+from jaxslam.consistency.nees import block_nees
 from jaxslam.simulate import simulate
 from jaxslam.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 
@@ -70,6 +71,37 @@ def test_credibility_of_what_is_not_positive_definite_is_left_out():
     errors[8, 0] = 0
     index, _ = consistency.credibility(errors, covs, np.ones((20, 2), bool))
     assert np.isfinite(index).all()
+
+
+def test_pose_nees_judges_blocks_in_common_units():
+    """Of x and y in metres, a variance that is rounding next to its neighbour's counts as none."""
+    rng = np.random.default_rng(8)
+    root = rng.normal(size=(6, 3, 3))
+    cov = root @ root.transpose(0, 2, 1)
+    cov[0] = np.diag([1.0, 1e-18, 0.1])
+    cov[1, 2] = cov[1, :, 2] = 0.0
+    cov[2] = np.diag([0.0, 0.0, 0.2])
+    error, own = rng.normal(size=(2, 6, 3))
+    own[3, 1], error[4, 2] = np.nan, np.inf
+    found = block_nees(rng.normal(size=(6, 3)), error, own, cov)
+    regular = {name: nees.regular.tolist() for name, nees in found.items()}
+    assert regular == {
+        "position": [False, True, False, True, True, True],
+        "pose": [False, False, False, True, False, True],
+        "own": [False, False, False, False, True, True],
+        "heading": [True, False, True, True, False, True],
+    }
+    for name, e, block in (
+        ("position", error, slice(2)),
+        ("pose", error, slice(3)),
+        ("own", own, slice(3)),
+        ("heading", error, slice(2, 3)),
+    ):
+        value, there = found[name]
+        e, p = e[there, block], cov[there, block, block]
+        expected = np.einsum("ri,ri->r", e, np.linalg.solve(p, e[..., None])[..., 0])
+        np.testing.assert_allclose(value[there], expected, rtol=1e-9)
+        assert not value[~there].any()
 
 
 def correlated(rng, rho, runs=30, steps=200, slots=3):
@@ -144,16 +176,10 @@ def test_landmark_nees_and_own_coordinates():
     )
     np.testing.assert_allclose(summary.measures["nees_landmarks"].value, nees.mean(), rtol=1e-9)
 
-    @jax.jit
-    def own(trace, truth):
-        def one(trace, truth):
-            sensor = worlds.ring().sensor
-            error = consistency.own_error_of(charts.right_invariant(), sensor, trace, truth)
-            return consistency.score(trace, truth, sensor, error)
-
-        return jax.vmap(one)(trace, truth)
-
-    total, steps = own(*jax.tree.map(jnp.asarray, (trace, truth))).measures["nees_own"]
+    own = jax.jit(
+        jax.vmap(partial(consistency.own_error_of, charts.right_invariant(), worlds.ring().sensor))
+    )
+    total, steps = scored(trace, truth, own).measures["nees_own"]
     found = total / steps
     local = jax.jit(jax.vmap(charts.right_invariant().local, (0, None, 0, None)))
     for run in range(6):

@@ -5,7 +5,8 @@ from jaxslam.consistency.bound import conditional_bound, posterior_bound, van_tr
 from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.intervals import LEVEL, Measure, interval, lopsided, positive_interval
 from jaxslam.consistency.nees import DOF, mean_pose_nees, own_error_of
-from jaxslam.consistency.score import LAGS, LANDMARK_DOF, LEVELS, Score, score
+from jaxslam.consistency.score import LANDMARK_DOF, LEVELS, Score, score
+from jaxslam.consistency.statistics import LAGS, Statistics, statistics
 from jaxslam.consistency.summary import Summary, summarize
 from jaxslam.consistency.tally import Tally, condense
 from jaxslam.consistency.verdict import Verdict, judge, power_of
@@ -18,6 +19,7 @@ __all__ = [
     "LEVELS",
     "Measure",
     "Score",
+    "Statistics",
     "Summary",
     "Tally",
     "Verdict",
@@ -34,6 +36,7 @@ __all__ = [
     "posterior_bound",
     "power_of",
     "score",
+    "statistics",
     "summarize",
     "van_trees",
 ]

@@ -1,10 +1,14 @@
-"""The NEES of a pose, eᵀ P⁻¹ e with e = truth - estimate, of its blocks, and in own coordinates."""
+"""The NEES of a pose, eᵀ P⁻¹ e with e = truth - estimate, of its blocks, and in own coordinates.
+
+It is taken on the host, by NumPy in float64: nothing of it is compiled.
+"""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxslam.angles import wrap
-from jaxslam.linalg import mahalanobis_leading, mahalanobis_squared
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.types import Trace, Truth
 
@@ -15,58 +19,74 @@ ROUNDING = 32
 """A claimed deviation of at most so many ulp of its coordinate is taken for zero."""
 
 
-def pose_error(truth: jax.Array, pose: jax.Array) -> jax.Array:
-    """truth - estimate (T, 3), heading wrapped."""
-    error = truth - pose
-    return jnp.concatenate([error[:, :2], wrap(error[:, 2:])], axis=1)
+class Nees(NamedTuple):
+    """Of a block of the error at each step."""
+
+    value: np.ndarray
+    """0 where there is none."""
+    regular: np.ndarray
+    """bool: whether there is one"""
+
+
+def pose_error(truth: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """truth - estimate (…, 3), heading wrapped to (-π, π]."""
+    error = np.asarray(truth, np.float64) - np.asarray(pose, np.float64)
+    turn = error[..., 2]
+    error[..., 2] = turn - 2 * np.pi * np.ceil((turn - np.pi) / (2 * np.pi))
+    return error
 
 
 def block_nees(
-    pose: jax.Array, error: jax.Array, own: jax.Array, cov: jax.Array
-) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """NEES (T,), and where there is one, of the blocks of `DOF` and of the own error.
+    pose: np.ndarray, error: np.ndarray, own: np.ndarray, cov: np.ndarray
+) -> dict[str, Nees]:
+    """NEES (…,), and where there is one, of the blocks of `DOF` and of the own error ("own").
 
-    There is none where the claimed covariance is singular, and none where a claimed deviation is
-    what rounding makes of zero: at most `ROUNDING` ulp of the coordinate, that is of π for the
-    heading and of max(|x|, |y|) for the position. So particles that are copies of one, whose sample
-    covariance is zero but for rounding, have no NEES, instead of one of 1e27.
+    There is none where the claimed covariance is singular, i.e. some direction is known exactly: a
+    pivot of its Cholesky factor is at most 100 n·eps, in units of which x and y have one. And none
+    where a claimed deviation is what rounding makes of zero: at most `ROUNDING` ulp of the
+    coordinate, that is of π for the heading and of max(|x|, |y|) for the position. So particles
+    that are copies of one, whose sample covariance is zero but for rounding, have no NEES, instead
+    of one of 1e27.
 
     Args:
-        pose: (T, 3) as estimated; error, own: (T, 3); cov: (T, 3, 3) as claimed.
+        pose: (…, 3) as estimated; error, own: (…, 3); cov: (…, 3, 3) as claimed. eps is that of the
+            dtype of cov.
     """
-
-    def one(
-        errors: jax.Array, cov: jax.Array, scale: jax.Array
-    ) -> dict[str, tuple[jax.Array, jax.Array]]:
-        position, pose = mahalanobis_leading(errors, cov, (2, 3), scale)
-        return {
-            "position": (position[0][0], position[1][0]),
-            "pose": (pose[0][0], pose[1][0]),
-            "own": (pose[0][1], pose[1][1]),
-            "heading": mahalanobis_squared(errors[2:, 0], cov[2:, 2:], scale[2:]),
+    eps = float(np.finfo(cov.dtype).eps)
+    with np.errstate(all="ignore"):
+        unit = _unit(pose, cov, eps)
+        scaled = {
+            (i, j): cov[..., i, j] * unit[i] * unit[j] for i in range(3) for j in range(i + 1)
         }
-
-    return jax.vmap(one)(jnp.stack([error, own], axis=2), cov, _scale(pose, cov))
+        factor, pivots = _cholesky(scaled, eps)
+        found = {}
+        for name, e in (("pose", error), ("own", own)):
+            squares, known = _whitened(factor, e, unit)
+            for block, k in (("position", 2), ("pose", 3)):
+                if name == "pose" or block == "pose":
+                    regular = _above(pivots[:k], 100 * k * eps) & _every(known[:k])
+                    value = np.where(regular, sum(squares[:k]), 0.0)
+                    found[block if name == "pose" else name] = Nees(value, regular)
+        turn = error[..., 2]
+        regular = _above([scaled[2, 2]], 100 * eps) & np.isfinite(turn)
+        square = (turn * unit[2]) ** 2 / np.where(regular, scaled[2, 2], 1.0)
+        found["heading"] = Nees(np.where(regular, square, 0.0), regular)
+    return found
 
 
 def mean_pose_nees(
-    truth: jax.Array, pose: jax.Array, cov: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """The mean over time of a run's pose NEES, and whether there is one, () each.
-
-    It is `score`'s measure of that name, alone: a program that compiles in a fraction of the time.
+    truth: np.ndarray, pose: np.ndarray, cov: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mean over time of each run's pose NEES, and whether there is one, (R,) each.
 
     Args:
-        truth, pose: (T, 3); cov: (T, 3, 3), what the filter claims.
+        truth, pose: (R, T, 3); cov: (R, T, 3, 3), what the filter claims.
     """
-
-    def one(error: jax.Array, cov: jax.Array, scale: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return mahalanobis_leading(error, cov, (DOF["pose"],), scale)[0]
-
-    nees, regular = jax.vmap(one)(pose_error(truth, pose), cov, _scale(pose, cov))
-    count = regular.sum()
-    finite = jnp.isfinite(pose).all() & jnp.isfinite(cov).all()
-    return nees.sum() / jnp.maximum(count, 1), finite & (count > 0)
+    error = pose_error(truth, pose)
+    nees, regular = block_nees(pose, error, error, cov)["pose"]
+    count = regular.sum(axis=1)
+    finite = np.isfinite(pose).all(axis=(1, 2)) & np.isfinite(cov).all(axis=(1, 2, 3))
+    return nees.sum(axis=1) / np.maximum(count, 1), finite & (count > 0)
 
 
 def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> jax.Array:
@@ -83,12 +103,59 @@ def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> ja
     return jax.vmap(one)(trace.estimate.pose, truth.pose)
 
 
-def _scale(pose: jax.Array, cov: jax.Array) -> jax.Array:
-    """Units (T, 3) in which a pose covariance is judged: x and y, both metres, have one; 0 where
-    it is rounding."""
-    variance = jnp.maximum(jnp.diagonal(cov, axis1=1, axis2=2), 0.0)
-    spread = jnp.stack([variance[:, :2].max(axis=1)] * 2 + [variance[:, 2]], axis=1)
-    reach = jnp.abs(pose[:, :2]).max(axis=1)
-    size = jnp.stack([reach, reach, jnp.full_like(reach, jnp.pi)], axis=1)
-    there = spread > (ROUNDING * float(jnp.finfo(cov.dtype).eps) * size) ** 2
-    return jnp.where(there, jnp.sqrt(jnp.where(there, spread, 1.0)), 0.0)
+def _unit(pose: np.ndarray, cov: np.ndarray, eps: float) -> list[np.ndarray]:
+    """1/σ of x, y and θ: the units in which a pose covariance is judged. x and y, both metres, have
+    one; 0 where the deviation is rounding."""
+    x, y, heading = (np.maximum(cov[..., i, i].astype(np.float64), 0.0) for i in range(3))
+    reach = np.abs(pose[..., :2]).max(axis=-1)
+
+    def unit(variance: np.ndarray, size: np.ndarray | float) -> np.ndarray:
+        there = variance > (ROUNDING * eps * size) ** 2
+        return np.where(there, 1.0 / np.sqrt(np.where(there, variance, 1.0)), 0.0)
+
+    metres = unit(np.maximum(x, y), reach)
+    return [metres, metres, unit(heading, np.pi)]
+
+
+def _cholesky(
+    matrix: dict[tuple[int, int], np.ndarray], eps: float
+) -> tuple[dict[tuple[int, int], np.ndarray], list[np.ndarray]]:
+    """The lower factor of 3×3 matrices, entry by entry, and its pivots before the root is taken.
+
+    A pivot not above 3 eps times its diagonal entry counts as zero, as do the others of its column.
+    """
+    factor: dict[tuple[int, int], np.ndarray] = {}
+    pivots = []
+    for j in range(3):
+        pivot = matrix[j, j] - sum(factor[j, k] ** 2 for k in range(j))
+        good = pivot > 3 * eps * np.abs(matrix[j, j])
+        pivots.append(np.where(good, pivot, 0.0))
+        root = np.sqrt(np.where(good, pivot, 1.0))
+        factor[j, j] = np.where(good, root, 0.0)
+        for i in range(j + 1, 3):
+            rest = matrix[i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))
+            factor[i, j] = np.where(good, rest / root, 0.0)
+    return factor, pivots
+
+
+def _whitened(
+    factor: dict[tuple[int, int], np.ndarray], error: np.ndarray, unit: list[np.ndarray]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The squares of L⁻¹e by coordinate, and whether the error is finite there."""
+    known = [np.isfinite(error[..., i]) for i in range(3)]
+    rows: list[np.ndarray] = []
+    for i in range(3):
+        rest = np.where(known[i], error[..., i], 0.0) * unit[i]
+        rest = rest - sum(factor[i, k] * rows[k] for k in range(i))
+        there = factor[i, i] > 0
+        rows.append(np.where(there, rest / np.where(there, factor[i, i], 1.0), 0.0))
+    return [row**2 for row in rows], known
+
+
+def _above(pivots: list[np.ndarray], least: float) -> np.ndarray:
+    return _every([pivot > least for pivot in pivots])
+
+
+def _every(flags: list[np.ndarray]) -> np.ndarray:
+    out: np.ndarray = np.logical_and.reduce(flags)
+    return out

@@ -4,16 +4,16 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.consistency import Measure, Score, condense, interval
+from jaxslam.consistency import Measure, Score, condense, interval, mean_pose_nees, score
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.monte_carlo.blockwise import Library
-from jaxslam.types import Estimate, Truth
+from jaxslam.types import Estimate, Info, Trace, Truth
 
 BOUND = "bound"
 """Under this name a block keeps the sums of the conditional bound, and the divergence limit."""
@@ -21,6 +21,12 @@ BOUND = "bound"
 
 Glimpse = Callable[[str, int, Measure | None], Any]
 """(filter, runs, their mean pose NEES)."""
+
+
+class Watched(NamedTuple):
+    """Of a filter's final state, what a score looks at."""
+
+    watch: Any
 
 
 def numbers(first: int, runs: int) -> np.ndarray:
@@ -51,10 +57,8 @@ class Programs:
         self.key, self.wide, self.devices, self.bound = key, block * devices, devices, bound
         self.glimpse = glimpse
         self.draw: Future[Callable[..., Any]] = Future()
-        self.peek: Future[Callable[..., Any]] = Future()
-        """the pose NEES of each run alone, which `glimpse` is told before all else is compiled"""
         self.drives: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
-        self.scores: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
+        self.statistics: dict[str, Future[Callable[..., Any]]] = {name: Future() for name in names}
         self.least: Future[Callable[..., Any]] = Future()
         self.first: dict[str, tuple[Truth, Estimate]] = {}
         """run 0 of each filter, once its block has run"""
@@ -93,32 +97,37 @@ class Programs:
         mine = slice(first - base, first - base + runs)
         which = numbers(base, self.wide)
         world = jax.block_until_ready(self.draw.result()(self.key, which))
+        truth = jax.device_get(world[0])
         scores: dict[str, Score] = {}
-        held: list[tuple[str, Any]] = []
+        held: list[tuple[str, Any, Trace]] = []
 
         def judge() -> None:
-            name, driven = held.pop(0)
-            found = jax.device_get(self.scores[name].result()(world[0], driven))
-            scores[name] = jax.tree.map(lambda leaf: leaf[mine], found)
+            name, driven, trace = held.pop(0)
+            found = jax.device_get(
+                self.statistics[name].result()(world[0], driven.estimate, driven.info)
+            )
+            own = np.swapaxes(jax.device_get(driven.own_error), 0, 1)
+            of = jax.tree.map(lambda leaf: leaf[mine], (trace, truth, found, own))
+            scores[name] = score(*of)
 
         for name, promised in self.drives.items():
             drive = promised.result()
             began, quiet = time.perf_counter(), self._quiet.is_set()
             driven = jax.block_until_ready(drive(self.key, which, world))
             self._spent[name].append((quiet, time.perf_counter() - began))
+            trace = _looked_at(driven)
             if first == 0:
-                truth = jax.tree.map(lambda leaf: np.asarray(leaf)[0], world[0])
-                estimate = jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], driven.estimate)
-                self.first[name] = truth, estimate
+                self.first[name] = (
+                    jax.tree.map(lambda leaf: leaf[0], truth),
+                    jax.tree.map(_first_run, driven.estimate),
+                )
             if tell and self.glimpse is not None:
-                peek = self.peek.result()
-                estimate = driven.estimate
-                found = peek(world[0].pose, estimate.pose, estimate.pose_cov)
-                nees, defined = (leaf[mine] for leaf in jax.device_get(found))
+                poses = truth.pose, *trace.estimate[:2]
+                nees, defined = mean_pose_nees(*(np.asarray(rows)[mine] for rows in poses))
                 self.glimpse(name, runs, interval(nees[defined]))
-            held.append((name, driven))
-            # A filter is compiled before the score of the one before it.
-            while held and (len(held) > 1 or self.scores[held[0][0]].done()):
+            held.append((name, driven, trace))
+            # A filter is compiled before the statistics of the one before it.
+            while held and (len(held) > 1 or self.statistics[held[0][0]].done()):
                 judge()
         while held:
             judge()
@@ -139,9 +148,8 @@ class Programs:
         """All that blocks may wait for."""
         return [
             self.draw,
-            self.peek,
             *self.drives.values(),
-            *self.scores.values(),
+            *self.statistics.values(),
             self.least,
             self.limit,
             self.all,
@@ -168,3 +176,27 @@ class Programs:
             if times:
                 out[name] = self.devices / self.wide * float(np.median(times))
         return out
+
+
+def _looked_at(driven: Any) -> Trace:
+    """What `score` looks at itself, on the host, by run first."""
+    nothing: Any = ()
+    estimate, info = driven.estimate, driven.info
+    by_time = (
+        Estimate(estimate.pose, estimate.pose_cov, *[nothing] * 4),
+        info._replace(innovation=nothing, innovation_cov=nothing, slot=nothing),
+        driven.probe,
+    )
+    found: tuple[Estimate, Info, Any] = jax.tree.map(
+        lambda leaf: np.swapaxes(leaf, 0, 1), jax.device_get(by_time)
+    )
+    watch = driven.watch
+    if watch:
+        watch = jax.device_get(watch._replace(directions=nothing))
+    return Trace(found[0], found[1], Watched(watch), found[2])
+
+
+def _first_run(leaf: jax.Array) -> np.ndarray:
+    """(T, …) of a block's arrays (T, runs, …), without a copy of the others."""
+    shard = next(one for one in leaf.addressable_shards if not one.index[1].start)
+    return np.asarray(shard.data)[:, 0].copy()

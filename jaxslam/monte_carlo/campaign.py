@@ -1,8 +1,9 @@
 """The campaign: blocks of runs over devices and processes, kept as they finish, then summed up.
 
-A run is a number: its key, hence its world and its filters' results, are the same to the bit in
-whatever block, on whatever device and in whatever process it runs. Only condensed scores leave the
-devices, so memory is that of the blocks in flight however many runs there are.
+A run is a number: its key and its place in a block. For one size of blocks and one number of
+devices its world and its filters' results are the same to the bit, whatever workers and processes
+there are and whatever was interrupted; otherwise to rounding. Only scores are kept of a block, so
+memory is that of the blocks in flight however many runs there are.
 """
 
 import time

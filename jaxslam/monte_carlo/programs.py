@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.consistency import Score, conditional_bound, mean_pose_nees, own_error_of, score
+from jaxslam.consistency import Statistics, conditional_bound, own_error_of, statistics
 from jaxslam.monte_carlo.block import Programs, numbers
 from jaxslam.monte_carlo.blockwise import Blockwise
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
@@ -38,10 +38,6 @@ _BY_TIME: Any = Driven(*cast(Any, (1, 1, 1, 0, 1)))
 """Which axis of what a filter made goes over runs: that of time comes first, as its loop has it."""
 
 
-class _Final(NamedTuple):
-    watch: Any
-
-
 def compile_programs(
     promised: Programs,
     scenario: Scenario,
@@ -50,7 +46,7 @@ def compile_programs(
 ) -> None:
     """Fill in the programs, each compiled while the next is traced; back when all are there.
 
-    Filters whose results have the same shapes share the program that scores them.
+    Filters whose results have the same shapes share the program that sums them up.
     """
     key, wide = promised.key, promised.wide
     maker = Blockwise(devices, wide, promised.library)
@@ -72,16 +68,11 @@ def compile_programs(
         driven: Driven = jax.vmap(one, out_axes=_BY_TIME)(which, *world)
         return driven
 
-    def judge(truth: Truth, driven: Driven) -> Score:
-        def one(truth: Truth, driven: Driven) -> Score:
-            trace = Trace(driven.estimate, driven.info, _Final(driven.watch), driven.probe)
-            return score(trace, truth, scenario.sensor, driven.own_error)
+    def read(truth: Truth, estimate: Estimate, info: Info) -> Statistics:
+        def one(truth: Truth, estimate: Estimate, info: Info) -> Statistics:
+            return statistics(Trace(estimate, info, (), ()), truth, scenario.sensor)
 
-        scores: Score = jax.vmap(one, in_axes=(0, _BY_TIME))(truth, driven)
-        return scores
-
-    def peek(truth: jax.Array, pose: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
-        found: tuple[jax.Array, jax.Array] = jax.vmap(mean_pose_nees, (0, 1, 1))(truth, pose, cov)
+        found: Statistics = jax.vmap(one, in_axes=(0, 1, 1))(truth, estimate, info)
         return found
 
     def least(key: jax.Array, which: jax.Array, world: tuple[Truth, Log]) -> dict[str, jax.Array]:
@@ -104,23 +95,12 @@ def compile_programs(
         world = program(
             promised.draw, "draw", (scenario,), draw, (None, 0), 0, key, which, straight=True
         )
-        if promised.glimpse is not None:
-            pose = world[0].pose
-            steps, size = pose.shape[1:]
-            by_time, cov = (
-                jax.ShapeDtypeStruct((steps, wide, *shape), pose.dtype)
-                for shape in ((size,), (size, size))
-            )
-            program(
-                promised.peek, "peek", (), peek, (0, 1, 1), 0, pose, by_time, cov, straight=True
-            )
 
         def scored(name: str, driven: Any) -> None:
-            promise = promised.scores[name]
-            axes, made = (0, _BY_TIME), (world[0], driven)
-            program(promise, "judge", (scenario,), judge, axes, 0, *made, straight=True)
+            promise, made = promised.statistics[name], (world[0], driven.estimate, driven.info)
+            program(promise, "statistics", (scenario,), read, (0, 1, 1), 0, *made)
 
-        # Each filter before the score of the one before it: `Programs.block` wants them so.
+        # Each filter before the statistics of the one before it: `Programs.block` wants them so.
         before: tuple[str, Any] | None = None
         for name, candidate in filters.items():
             one = partial(drive, candidate)
@@ -134,7 +114,7 @@ def compile_programs(
             scored(*before)
         promised.limit_of = partial(_divergence_limit, scenario, world[0].pose.dtype)
         program(promised.least, "least", (scenario,), least, (None, 0, 0), 0, key, which, world)
-        for promise in (*promised.drives.values(), *promised.scores.values(), promised.least):
+        for promise in (*promised.drives.values(), *promised.statistics.values(), promised.least):
             promise.result()
         promised.complete()
         if not promised.with_first:

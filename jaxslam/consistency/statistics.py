@@ -1,0 +1,154 @@
+"""What a score needs of a run's maps and innovations: sums, taken in one pass over its steps."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import linalg
+from jaxslam.consistency.associations import associations, identities
+from jaxslam.protocols import Sensor
+from jaxslam.types import Estimate, Info, Status, Trace, Truth
+
+LAGS = 10
+"""The autocorrelation of innovations is taken up to so many steps."""
+
+_UNROLLED = 4
+"""Places of a scan that are looked at in one piece of compiled code."""
+
+
+class Statistics(NamedTuple):
+    """Of one run; with a leading axis, of many."""
+
+    finite: Any
+    """() bool: every number of its estimates and infos is finite."""
+    landmark_nees: Any
+    """(T,) summed over the landmarks of the map."""
+    regular_landmarks: Any
+    """(T,) how many of them have one."""
+    landmark_squares: Any
+    """(2,) of the final map, unaligned: Σ |p̂ - p|² [m²], and over how many landmarks that is."""
+    autocorrelation: Any
+    """(LAGS, 3) of whitened innovations: Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and how many
+    products of numbers that is. Of the same landmark at t and t + l, w = L⁻¹ν with S = L Lᵀ;
+    without landmarks, of one place."""
+    associations: dict[str, tuple[Any, Any]]
+    """of a world of spurious data; see `associations.associations`."""
+
+
+class _Sums(NamedTuple):
+    poison: jax.Array
+    """0 times every number so far: NaN once one was not finite"""
+    recent: list[jax.Array]
+    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and whether there is one"""
+    pairs: list[jax.Array]
+    """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
+
+
+def statistics(trace: Trace, truth: Truth, sensor: Sensor) -> Statistics:
+    """The sums over one run that `score` is made of. For `vmap`, over runs."""
+    estimate, info = trace.estimate, trace.info
+    held = jnp.where(estimate.alive, estimate.tag, -1)
+    found: dict[str, tuple[Any, Any]] = {}
+    if not isinstance(truth.origin, tuple):
+        held = identities(trace, truth.origin)
+        found = associations(trace, truth.origin, held)
+    points = jax.vmap(sensor.position)(truth.landmarks)
+    size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
+    dtype = estimate.pose.dtype
+
+    def step(sums: _Sums, row: tuple[Estimate, Info, jax.Array]) -> tuple[_Sums, Any]:
+        estimate, info, held = row
+        off = points[jnp.maximum(held, 0)] - estimate.points
+        nees, regular = _planar_nees(off, estimate.point_covs)
+        counts = regular & (held >= 0)
+        white = _white(estimate, info)
+        *w, energy, there = sums.recent
+        *w_now, energy_now, there_now = white
+        products = [
+            linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True)),
+            energy * there_now[None],
+            there * energy_now[None],
+            there * there_now[None],
+        ]
+        sums = _Sums(
+            poison=sums.poison + 0 * _numbers((estimate, info)),
+            recent=[
+                jnp.concatenate([new[None], old[:-1]])
+                for new, old in zip(white, sums.recent, strict=True)
+            ],
+            pairs=[old + new for old, new in zip(sums.pairs, products, strict=True)],
+        )
+        return sums, (jnp.where(counts, nees, 0.0).sum(), counts.sum().astype(dtype))
+
+    first = jax.tree.map(lambda leaf: leaf[0], (estimate, info))
+    nothing = _Sums(
+        poison=jnp.zeros_like(_numbers(first)),
+        recent=[jnp.zeros((LAGS, count), dtype)] * (size + 2),
+        pairs=[jnp.zeros((LAGS, count), dtype)] * 4,
+    )
+    sums, (nees, regular) = jax.lax.scan(step, nothing, (estimate, info, held))
+    product, left, right, pairs = (pair.sum(axis=1) for pair in sums.pairs)
+    both = left * right
+    length = jnp.where(both > 0, jnp.sqrt(jnp.where(both > 0, both, 1.0)), 0.0)
+    named = held[-1] >= 0
+    off = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
+    square = jnp.where(named, (off**2).sum(axis=-1), 0.0).sum()
+    return Statistics(
+        finite=jnp.isfinite(sums.poison).all(),
+        landmark_nees=nees,
+        regular_landmarks=regular,
+        landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
+        autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
+        associations=found,
+    )
+
+
+def _numbers(tree: Any) -> jax.Array:
+    """Every floating-point number of a tree, in one row."""
+    leaves = map(jnp.asarray, jax.tree.leaves(tree))
+    return jnp.concatenate(
+        [leaf.ravel() for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    )
+
+
+def _planar_nees(error: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """eᵀ P⁻¹ e (N,) of e (N, 2) and P (N, 2, 2), and whether P is regular: 1 - ρ² > 200 eps.
+
+    a²/p₁ + (b - a p₁₂/p₁)²/(p₂(1 - ρ²)); 0 where P is not regular or e not finite.
+    """
+    p1, p12, p2 = cov[:, 0, 0], cov[:, 1, 0], cov[:, 1, 1]
+    there = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
+    p1, p2 = (jnp.where(there, p, 1.0) for p in (p1, p2))
+    left = 1 - (p12 / p1) * (p12 / p2)
+    regular = there & (left > 200 * float(jnp.finfo(cov.dtype).eps))
+    a = error[:, 0]
+    b = error[:, 1] - a * (p12 / p1)
+    nees = a**2 / p1 + b**2 / (p2 * jnp.where(regular, left, 1.0))
+    return jnp.where(regular, nees, 0.0), regular
+
+
+def _white(estimate: Estimate, info: Info) -> list[jax.Array]:
+    """(N,) each, by landmark, or by place where there are none: the numbers of the whitened
+    innovation w of the first place fused with it, |w|², and 1; 0 where there is none."""
+    fused = info.status == Status.FUSED
+
+    def whiten(nu: jax.Array, cov: jax.Array) -> jax.Array:
+        return linalg.solve_lower(linalg.cholesky(cov)[0], nu)
+
+    white = jax.vmap(whiten)(info.innovation, info.innovation_cov)
+    white = jnp.where(fused[:, None], white, 0.0)
+    rows = [*white.T, (white**2).sum(axis=1), fused.astype(white.dtype)]
+    count = estimate.alive.shape[0]
+    if count == 0:
+        return rows
+    slot = jnp.where(fused, info.slot, -1)
+
+    def place(kept: list[jax.Array], at: tuple[list[jax.Array], jax.Array]) -> tuple[Any, None]:
+        row, slot = at
+        mine = jnp.arange(count) == slot
+        return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None
+
+    nothing = [jnp.zeros(count, white.dtype)] * len(rows)
+    unroll = max(min(len(slot), _UNROLLED), 1)
+    return jax.lax.scan(place, nothing, (rows, slot), reverse=True, unroll=unroll)[0]
