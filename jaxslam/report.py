@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import os
 import platform
 import tempfile
@@ -157,11 +158,10 @@ def as_csv(campaign: Campaign) -> str:
     """The curves: one row a filter and step; an empty cell where there is no number."""
     keys = list(dict.fromkeys(key for s in _of(campaign) for key in s.curves))
     nothing = np.full(campaign.steps, np.nan)  # a filter without landmarks, say, lacks some
-    rows = [
-        [name, str(step + 1), *(_blank(s.curves.get(key, nothing)[step]) for key in keys)]
-        for name, s in campaign.filters.items()
-        for step in range(campaign.steps)
-    ]
+    rows: list[list[str]] = []
+    for name, s in campaign.filters.items():
+        columns = [map(_blank, s.curves.get(key, nothing).tolist()) for key in keys]
+        rows += [[name, str(step + 1), *row] for step, row in enumerate(zip(*columns, strict=True))]
     return csv_text(["filter", "step", *keys], rows)
 
 
@@ -320,4 +320,4 @@ def _finite(values: dict[str, float]) -> dict[str, float | None]:
 
 
 def _blank(value: float) -> str:
-    return f"{value:.9g}" if np.isfinite(value) else ""
+    return f"{value:.9g}" if math.isfinite(value) else ""

@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
         "--bound",
         action=argparse.BooleanOptionalAction,
         default=argparse.SUPPRESS,
-        help="also the Cramér-Rao bound given each true trajectory (default: yes)",
+        help="also the Cramér-Rao bound given each true trajectory (default: no)",
     )
     asked.add_argument(
         "--dtype",

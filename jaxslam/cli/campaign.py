@@ -1,7 +1,6 @@
 """`jaxslam consistency`: a campaign, its table and its files."""
 
 import argparse
-import importlib
 import shutil
 import sys
 import threading
@@ -37,7 +36,7 @@ DEFAULTS: dict[str, Any] = {
     "runs": 100,
     "steps": None,
     "seed": 0,
-    "bound": True,
+    "bound": False,
     "dtype": "float64",
 }
 """What a campaign is asked for by, unless said or resumed otherwise."""
@@ -76,7 +75,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     keep = _keep(options, out, asked, block)
     known = library.identity(asked, here[0].platform)
     # What draws is imported while filters run, and needed when they have.
-    threading.Thread(target=importlib.import_module, args=("jaxslam.page",), daemon=True).start()
+    threading.Thread(target=_prepare_drawing, daemon=True).start()
     try:
         with (
             Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress,
@@ -119,6 +118,12 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         + ", ".join(str(path) for path in written)
     )
     return 0
+
+
+def _prepare_drawing() -> None:
+    from jaxslam import page, plot  # noqa: F401
+
+    plot.warm_up()
 
 
 def _keep(

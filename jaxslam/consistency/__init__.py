@@ -1,7 +1,14 @@
 """Is a filter honest? Scores of runs, their averages with bands and intervals, and a verdict."""
 
 from jaxslam.consistency.alignment import align_map
-from jaxslam.consistency.bound import conditional_bound, posterior_bound, van_trees
+from jaxslam.consistency.bound import (
+    Slopes,
+    conditional_bound,
+    final_covariance,
+    posterior_bound,
+    slopes_at_truth,
+    van_trees,
+)
 from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.intervals import LEVEL, Measure, interval, lopsided, positive_interval
 from jaxslam.consistency.nees import DOF, mean_pose_nees, own_error_of
@@ -19,6 +26,7 @@ __all__ = [
     "LEVELS",
     "Measure",
     "Score",
+    "Slopes",
     "Statistics",
     "Summary",
     "Tally",
@@ -27,6 +35,7 @@ __all__ = [
     "condense",
     "conditional_bound",
     "credibility",
+    "final_covariance",
     "interval",
     "judge",
     "lopsided",
@@ -36,6 +45,7 @@ __all__ = [
     "posterior_bound",
     "power_of",
     "score",
+    "slopes_at_truth",
     "statistics",
     "summarize",
     "van_trees",

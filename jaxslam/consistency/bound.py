@@ -82,7 +82,7 @@ def posterior_bound(
     at = snapshot_steps(total) if steps is None else np.asarray(steps, int)
     if at.size == 0 or at.min() < 0 or at.max() >= total:
         raise ValueError(f"posterior_bound: expected steps within 0 and {total - 1}, got {steps}")
-    found = jax.device_get(jax.jit(jax.vmap(partial(_jacobians, scenario)))(truth, log))
+    found = jax.device_get(jax.jit(jax.vmap(partial(slopes_at_truth, scenario)))(truth, log))
     start = np.asarray(jax.jit(root_psd)(jnp.asarray(scenario.pose_cov, truth.pose.dtype)))
     slopes: Any = 0.0
     information: Any = 0.0
@@ -113,20 +113,36 @@ def van_trees(
     return _inverted(np.mean(slopes, axis=0), prior + gained)
 
 
-class _Jacobians(NamedTuple):
-    """Of one run; rows of measurements are whitened, and zero where nothing was measured."""
+class Sights(NamedTuple):
+    """The Jacobians of what one sensor measured in a run, at the truth."""
+
+    by_pose: Any
+    """(T, M, Z, 3)"""
+    by_landmark: Any
+    """(T, M, Z, L)"""
+    noise_cov: Any
+    """(T, M, Z, Z)"""
+    tag: Any
+    """(T, M) which landmark"""
+    valid: Any
+    """(T, M) whether anything was measured there"""
+
+
+class Slopes(NamedTuple):
+    """The Jacobians of one run at the truth."""
 
     by_pose: Any
     """(T, 3, 3) of the motion"""
     by_noise: Any
     """(T, 3, W) times √Q"""
-    measured: list[tuple[Any, Any, Any]]
-    """by sensor: by the pose (T, M, Z, 3), by the landmark (T, M, Z, L), which one (T, M)"""
+    measured: list[Sights]
+    """by sensor"""
     landmarks: Any
     """(N, L)"""
 
 
-def _jacobians(scenario: Scenario, truth: Truth, log: Log) -> _Jacobians:
+def slopes_at_truth(scenario: Scenario, truth: Truth, log: Log) -> Slopes:
+    """The Jacobians of one run of one robot, nothing spurious, identities known. For `vmap`."""
     motion, dtype = scenario.motion, truth.pose.dtype
     old = jnp.concatenate([truth.start[None], truth.pose[:-1]])
     still = jnp.zeros(len(motion.noises), dtype)
@@ -144,29 +160,65 @@ def _jacobians(scenario: Scenario, truth: Truth, log: Log) -> _Jacobians:
         if isinstance(sensor, Suite)
         else [(sensor, log.scan.tag.shape[1])]
     )
-    measured, first = [], 0
+    measured: list[Sights] = []
+    first = 0
     for model, places in parts:
         size = len(model.measurements)
 
-        def seen(
-            pose: jax.Array, z: jax.Array, tag: jax.Array, valid: jax.Array, model: Any = model
-        ) -> tuple[jax.Array, jax.Array]:
+        def seen(pose: jax.Array, z: jax.Array, tag: jax.Array, model: Any = model) -> Any:
             landmark = truth.landmarks[tag][: len(model.landmark)]
-            found = derivatives.observe_jacobians(model, pose, landmark)
-            factor = jnp.linalg.cholesky(model.noise_cov(z))
-            white = [jax.scipy.linalg.solve_triangular(factor, by, lower=True) for by in found]
-            return jnp.where(valid, white[0], 0.0), jnp.where(valid, white[1], 0.0)
+            return *derivatives.observe_jacobians(model, pose, landmark), model.noise_cov(z)
 
         z, tag, valid = (leaf[:, first : first + places] for leaf in log.scan)
         tag = jnp.maximum(tag, 0)
-        by = jax.vmap(jax.vmap(seen, (None, 0, 0, 0)))(truth.pose, z[:, :, :size], tag, valid)
-        measured.append((*by, tag))
+        found = jax.vmap(jax.vmap(seen, (None, 0, 0)))(truth.pose, z[:, :, :size], tag)
+        by_pose_there, by_landmark, noise_cov = found
+        measured.append(Sights(by_pose_there, by_landmark, noise_cov, tag, valid))
         first += places
-    return _Jacobians(by_pose, by_noise, measured, truth.landmarks)
+    return Slopes(by_pose, by_noise, measured, truth.landmarks)
+
+
+def final_covariance(slopes: Slopes, pose_cov: np.ndarray) -> np.ndarray:
+    """The covariance (3, 3) of the last pose in `conditional_bound`, of one run, by NumPy.
+
+    The Kalman filter of the linear system that the Jacobians make. A landmark begins with its first
+    measurement, where that determines it, and otherwise with a deviation of 100 times the map's
+    reach. A billionth of the reach is added to the noise of measurements, which may be none.
+    """
+    count, size = slopes.landmarks.shape
+    reach = 1.0 + float(np.max(np.abs(slopes.landmarks), initial=0.0))
+    cov = np.zeros((3 + count * size,) * 2)
+    cov[:3, :3] = pose_cov
+    known = np.zeros(count, bool)
+    for t in range(len(slopes.by_pose)):
+        cov[:3] = slopes.by_pose[t] @ cov[:3]
+        cov[:, :3] = cov[:, :3] @ slopes.by_pose[t].T
+        cov[:3, :3] += slopes.by_noise[t] @ slopes.by_noise[t].T
+        for sights in slopes.measured:
+            for i in np.flatnonzero(sights.valid[t]):
+                by_pose, by_landmark = sights.by_pose[t, i], sights.by_landmark[t, i]
+                noise = sights.noise_cov[t, i] + (1e-9 * reach) ** 2 * np.eye(len(by_pose))
+                begin = 3 + int(sights.tag[t, i]) * size
+                own = slice(begin, begin + by_landmark.shape[1])
+                if by_landmark.shape[1] and not known[sights.tag[t, i]]:
+                    known[sights.tag[t, i]] = True
+                    if by_landmark.shape == (size, size) and np.linalg.cond(by_landmark) < 1e6:
+                        by = np.linalg.inv(by_landmark)
+                        cov[own] = -by @ by_pose @ cov[:3]
+                        cov[:, own] = cov[own].T
+                        cov[own, own] = by @ (by_pose @ cov[:3, :3] @ by_pose.T + noise) @ by.T
+                        continue
+                    whole = slice(begin, begin + size)
+                    cov[whole, whole] = (100 * reach) ** 2 * np.eye(size)
+                cross = by_pose @ cov[:3] + by_landmark @ cov[own]
+                innovation = cross[:, :3] @ by_pose.T + cross[:, own] @ by_landmark.T + noise
+                cov -= cross.T @ np.linalg.solve(innovation, cross)
+        cov = (cov + cov.T) / 2
+    return cov[:3, :3]
 
 
 def _by_parameters(
-    found: _Jacobians, start: np.ndarray, at: np.ndarray
+    found: Slopes, start: np.ndarray, at: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """∂x_t/∂p (3, P), and what was gained until then (P, P), at each step of at."""
     steps, _, width = found.by_noise.shape
@@ -176,21 +228,31 @@ def _by_parameters(
     slope[:, :3] = start
     gained = np.zeros((slope.shape[1],) * 2)
     kept = {}
+    white = [_whitened(sights) for sights in found.measured]
     for t in range(steps):
         slope = found.by_pose[t] @ slope
         slope[:, 3 + t * width : 3 + (t + 1) * width] = found.by_noise[t]
-        for by_pose, by_landmark, tag in found.measured:
+        for (by_pose, by_landmark), sights in zip(white, found.measured, strict=True):
             rows = by_pose[t] @ slope
-            for i, place in enumerate(tag[t]):
+            for i, place in enumerate(sights.tag[t]):
                 begin = map_at + int(place) * size
                 rows[i, :, begin : begin + by_landmark.shape[3]] += by_landmark[t, i]
             rows = rows.reshape(-1, slope.shape[1])
             gained += rows.T @ rows
         if t in at:
             kept[t] = slope.copy(), gained.copy()
-    if not np.isfinite(gained).all():
-        raise ValueError("posterior_bound: a measurement noise is not positive definite")
     return iter([kept[t] for t in at])
+
+
+def _whitened(sights: Sights) -> list[np.ndarray]:
+    """The Jacobians by pose and landmark in units of the noise; zero where nothing was measured."""
+    there = sights.valid[:, :, None, None]
+    noise = np.where(there, sights.noise_cov, np.eye(sights.noise_cov.shape[2]))
+    try:
+        factor = np.linalg.cholesky(noise)
+    except np.linalg.LinAlgError:
+        raise ValueError("posterior_bound: a measurement noise is not positive definite") from None
+    return [np.where(there, np.linalg.solve(factor, by), 0.0) for by in sights[:2]]
 
 
 def _inverted(slope: np.ndarray, information: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.io
 from numpy.typing import NDArray
 
 from jaxslam.datasets.dataset import Dataset, make_log
@@ -118,6 +117,8 @@ def plaza(
 
 
 def _read(path: Path) -> dict[str, NDArray[np.float64]]:
+    import scipy.io  # a tenth of a second, for this one kind of file
+
     try:
         content = scipy.io.loadmat(path, appendmat=False)
     except Exception as problem:  # scipy's own MatReadError is of no public class

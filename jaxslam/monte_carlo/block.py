@@ -64,8 +64,11 @@ class Programs:
         """run 0 of each filter, once its block has run"""
         self.limit: Future[np.ndarray] = Future()
         """() [m] the divergence limit, from run 0; set by its block, where there is one"""
-        self.limit_of: Callable[[dict[str, np.ndarray]], np.ndarray] | None = None
-        """of what `least` found of a block whose first run is run 0"""
+        self.limit_of: Callable[[Any], np.ndarray] | None = None
+        """of what `least` found of a block whose first run is run 0; without a bound, of what
+        `slopes` found of run 0"""
+        self.slopes: Future[Callable[..., Any] | None] = Future()
+        """without a bound, the Jacobians of run 0; None where `least` is to be asked"""
         self.all: Future[None] = Future()
         """nothing is being compiled any more"""
         self._quiet = threading.Event()
@@ -132,17 +135,26 @@ class Programs:
         while held:
             judge()
         least: dict[str, np.ndarray] = {}
-        if self.bound or first == 0:
+        if self.bound:
             least = jax.device_get(self.least.result()(self.key, which, world))
         if first == 0 and not self.limit.done():
-            assert self.limit_of is not None
-            self.limit.set_result(self.limit_of(least))
+            self.limit.set_result(self.found_limit(which, world, least))
         limit = self.limit.result()
         out = {name: condense(each, first, float(limit)) for name, each in scores.items()}
         out[BOUND] = {"limit": limit}
         if self.bound:
             out[BOUND] |= condensed_sums({name: rows[mine] for name, rows in least.items()})
         return out
+
+    def found_limit(self, which: np.ndarray, world: Any, least: dict[str, np.ndarray]) -> Any:
+        """The divergence limit, of the block of run 0. least: what was found already, if so."""
+        slopes = self.slopes.result()
+        if slopes is not None:
+            found = jax.device_get(slopes(*jax.tree.map(_first, world)))
+        else:
+            found = least or jax.device_get(self.least.result()(self.key, which, world))
+        assert self.limit_of is not None
+        return self.limit_of(found)
 
     def promises(self) -> list[Future[Any]]:
         """All that blocks may wait for."""
@@ -151,6 +163,7 @@ class Programs:
             *self.drives.values(),
             *self.statistics.values(),
             self.least,
+            self.slopes,
             self.limit,
             self.all,
         ]
@@ -200,3 +213,10 @@ def _first_run(leaf: jax.Array) -> np.ndarray:
     """(T, …) of a block's arrays (T, runs, …), without a copy of the others."""
     shard = next(one for one in leaf.addressable_shards if not one.index[1].start)
     return np.asarray(shard.data)[:, 0].copy()
+
+
+def _first(leaf: jax.Array) -> np.ndarray:
+    """The same of arrays (runs, …)."""
+    shard = next(one for one in leaf.addressable_shards if not one.index[0].start)
+    out: np.ndarray = np.asarray(shard.data)[0].copy()
+    return out

@@ -6,7 +6,7 @@ values, in this campaign and the next. Runs are divided over the devices with `s
 ever waits for another.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
 from typing import Any, NamedTuple, cast
@@ -15,7 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.consistency import Statistics, conditional_bound, own_error_of, statistics
+from jaxslam.consistency import (
+    Slopes,
+    Statistics,
+    conditional_bound,
+    final_covariance,
+    own_error_of,
+    slopes_at_truth,
+    statistics,
+)
 from jaxslam.monte_carlo.block import Programs, numbers
 from jaxslam.monte_carlo.blockwise import Blockwise
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
@@ -112,15 +120,26 @@ def compile_programs(
             before = name, driven
         if before is not None:
             scored(*before)
-        promised.limit_of = partial(_divergence_limit, scenario, world[0].pose.dtype)
-        program(promised.least, "least", (scenario,), least, (None, 0, 0), 0, key, which, world)
-        for promise in (*promised.drives.values(), *promised.statistics.values(), promised.least):
+        # Without a bound, the Jacobians of run 0 tell the divergence limit; where there are none to
+        # be had, the ideal filter does, as of the bound.
+        plain = scenario.draw is None and scenario.spurious is None
+        slow = promised.bound or not plain
+        last: Future[Any] = promised.least if slow else promised.slopes
+        spread_of = _spread_of_bound if slow else partial(_spread_of_slopes, scenario)
+        promised.limit_of = partial(_divergence_limit, scenario, world[0].pose.dtype, spread_of)
+        if slow:
+            promised.slopes.set_result(None)
+            program(last, "least", (scenario,), least, (None, 0, 0), 0, key, which, world)
+        else:
+            one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), world)
+            slopes = partial(slopes_at_truth, scenario)
+            program(last, "slopes", (scenario,), slopes, (None, None), None, *one, straight=True)
+        for promise in (*promised.drives.values(), *promised.statistics.values(), last):
             promise.result()
         promised.complete()
         if not promised.with_first:
             drawn = promised.draw.result()(key, which)
-            found = jax.device_get(promised.least.result()(key, which, drawn))
-            promised.limit.set_result(promised.limit_of(found))
+            promised.limit.set_result(promised.found_limit(which, drawn, {}))
     finally:
         maker.close()
 
@@ -141,13 +160,19 @@ def _keys(key: jax.Array, i: jax.Array) -> jax.Array:
     return jax.random.split(jax.random.fold_in(key, i))
 
 
-def _divergence_limit(
-    scenario: Scenario, dtype: Any, least: Mapping[str, np.ndarray]
-) -> np.ndarray:
-    """5 σ of the ideal spread of run 0, or, in a world without noise, what rounding can do.
+def _spread_of_bound(least: Mapping[str, np.ndarray]) -> float:
+    """[m²] of run 0's last position. least: of a block whose first run it is, (runs, T)."""
+    return float(least["position"][0, -1])
 
-    least: of a block whose first run it is; position [m²] (runs, T).
-    """
-    spread = float(least["position"][0, -1]) ** 0.5
+
+def _spread_of_slopes(scenario: Scenario, slopes: Slopes) -> float:
+    return float(np.trace(final_covariance(slopes, np.asarray(scenario.pose_cov))[:2, :2]))
+
+
+def _divergence_limit(
+    scenario: Scenario, dtype: Any, spread_of: Callable[[Any], float], found: Any
+) -> np.ndarray:
+    """5 σ of the ideal spread of run 0, or, in a world without noise, what rounding can do."""
+    spread = max(spread_of(found), 0.0) ** 0.5
     reach = 1.0 + float(np.max(np.abs(np.asarray(scenario.landmarks)), initial=0.0))
     return np.asarray(max(5 * spread, 1000 * float(jnp.finfo(dtype).eps) * reach), dtype)

@@ -13,7 +13,7 @@ from jaxslam.plot.campaign import (
 )
 from jaxslam.plot.nees import nees_figure
 from jaxslam.plot.single import ellipse, errors_figure, map_figure
-from jaxslam.plot.style import COLORS, Figure, describe, png
+from jaxslam.plot.style import COLORS, Figure, describe, png, warm_up
 
 __all__ = [
     "COLORS",
@@ -28,5 +28,6 @@ __all__ = [
     "map_figure",
     "nees_figure",
     "png",
+    "warm_up",
     "whiteness_figure",
 ]

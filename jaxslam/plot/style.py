@@ -25,6 +25,13 @@ def png(figure: Figure, dpi: float = 180) -> bytes:
     return out.getvalue()
 
 
+def warm_up() -> None:
+    """Load what drawing takes fonts, text and formulas from: half a second, once a process."""
+    figure, (axes, *_) = panels_of(1.0, 1.0, 1)
+    axes.set_title("$x^2$")
+    png(figure, dpi=10)
+
+
 def describe(figure: Figure) -> str:
     """What the figure shows, in a sentence, for those who cannot see it."""
     panels = [" ".join(filter(None, (a.get_title(), a.get_ylabel()))) for a in figure.axes]
