@@ -1,9 +1,9 @@
-"""Factors and solutions beyond the size that is written out: by library, but not in a batch on CPU.
+"""Factors and solutions beyond the size that is written out: by library, one by one on a CPU.
 
 jaxlib's LAPACK kernels divide a batch among the threads of XLA's pool, and wait for them on a
 thread of that pool (jaxlib 0.10, `ParallelBatchMap`). Where as many of them run at once as the pool
 has threads, all wait for ever: two blocks of a campaign on two cores are enough. Under `vmap` on a
-CPU there are hence loops of elementwise code here, which give the same numbers.
+CPU there is hence a loop of calls, each of one matrix.
 """
 
 from collections.abc import Callable
@@ -14,49 +14,32 @@ import jax
 import jax.numpy as jnp
 
 
-def _unless_batched_on_cpu(
-    library: Callable[..., jax.Array], loop: Callable[..., jax.Array]
-) -> Callable[..., jax.Array]:
-    """The library's function; under vmap on a CPU the loop."""
+def _one_by_one_on_cpu(library: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """The library's function; under vmap on a CPU a loop of it."""
     either = jax.custom_batching.custom_vmap(library)
 
     @either.def_vmap
-    def rule(_: int, batched: Any, *arguments: jax.Array) -> tuple[jax.Array, bool]:
+    def rule(size: int, batched: Any, *arguments: jax.Array) -> tuple[jax.Array, bool]:
         axes = tuple(0 if one else None for one in batched)
-        out = jax.lax.platform_dependent(
-            *arguments, cpu=jax.vmap(loop, axes), default=jax.vmap(library, axes)
-        )
+
+        def loop(*arguments: jax.Array) -> jax.Array:
+            whole = [
+                x if one else jnp.broadcast_to(x[None], (size, *x.shape))
+                for x, one in zip(arguments, batched, strict=True)
+            ]
+            out: jax.Array = jax.lax.map(lambda rows: either(*rows), tuple(whole))
+            return out
+
+        out = jax.lax.platform_dependent(*arguments, cpu=loop, default=jax.vmap(library, axes))
         return out, True
 
     return either
 
 
-def _factor_by_columns(matrix: jax.Array) -> jax.Array:
-    def column(rest: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
-        own = jnp.where(jnp.arange(len(rest)) >= j, rest[:, j] / jnp.sqrt(rest[j, j]), 0.0)
-        return rest - own[:, None] * own[None, :], own
-
-    return jax.lax.scan(column, matrix, jnp.arange(len(matrix)))[1].T
-
-
-def _solve_by_rows(factor: jax.Array, rhs: jax.Array) -> jax.Array:
-    def row(rest: jax.Array, at: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        i, column = at
-        own = rest[i] / column[i]
-        below = jnp.where(jnp.arange(len(rest)) > i, column, 0.0)
-        return rest - below[:, None] * own[None, :], own
-
-    return jax.lax.scan(row, rhs, (jnp.arange(len(rhs)), factor.T))[1]
-
-
-factor = _unless_batched_on_cpu(
-    partial(jnp.linalg.cholesky, symmetrize_input=False), _factor_by_columns
-)
+factor = _one_by_one_on_cpu(partial(jnp.linalg.cholesky, symmetrize_input=False))
 """Lower L (n, n) with L Lᵀ = A, NaN where A is not positive definite. Has no derivative."""
 
-_solve = _unless_batched_on_cpu(
-    partial(jax.scipy.linalg.solve_triangular, lower=True), _solve_by_rows
-)
+_solve = _one_by_one_on_cpu(partial(jax.scipy.linalg.solve_triangular, lower=True))
 
 
 def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:

@@ -60,7 +60,7 @@ def test_blocks_follow_the_memory_of_an_accelerator():
         device = SimpleNamespace(platform=platform, memory_stats=lambda: stats)
         return fitting_block(SHORT, {"ekf": worlds.ekf(SHORT)}, device)
 
-    assert fits("cpu", None) == 32
+    assert fits("cpu", None) == 16
     assert fits("gpu", None) == 1024
     assert fits("gpu", 10**6) == 32
     assert 32 < fits("gpu", 10**8) < 4096

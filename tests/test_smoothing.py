@@ -517,7 +517,10 @@ def test_a_batch_of_runs_ends_where_each_does():
     for name in ("pose", "pose_cov", "points", "point_covs"):
         last, wanted = getattr(smoothed, name)[:, -1], getattr(filtered, name)[:, -1]
         np.testing.assert_allclose(last, wanted, rtol=0, atol=1e-10)
-    assert (traces["batch"].final.ending == Ending.CONVERGED).all()
+    # Where a step is all rounding, no share of it need lower the cost.
+    ending = traces["batch"].final.ending
+    assert set(ending.tolist()) <= {Ending.CONVERGED, Ending.STALLED}
+    assert (ending == Ending.CONVERGED).mean() > 0.95
     assert len(set(traces["batch"].final.iterations.tolist())) > 1  # each its own number
     # Shorter than √eps, or than what a cost that rounds hides: a step s takes s²/2 off it.
     hidden = np.sqrt(4 * np.finfo(float).eps * traces["batch"].final.cost)

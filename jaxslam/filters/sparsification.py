@@ -141,6 +141,28 @@ def linked(
     return state._replace(own=own, counts=counts, neighbours=index, links=links)
 
 
+def all_linked(
+    state: Sparse, i: jax.Array, j: jax.Array, links: jax.Array, on: jax.Array
+) -> Sparse:
+    """`linked` of landmark i () with each of j (A,), where lists have room for all N - 1 others.
+
+    Each link takes the first free place of a list, as if they came one after the other.
+    """
+    n = state.own.shape[0]
+    on = on & ((links**2).sum(axis=(1, 2)) > 0)
+    row = state.neighbours.at[i].get(mode="fill", fill_value=n)
+    free = jnp.argsort(row < n, stable=True)
+    at_i = jnp.where(on, free[jnp.cumsum(on) - 1], len(row))
+    j = jnp.where(on, j, n)
+    rows = state.neighbours.at[j].get(mode="fill", fill_value=0)
+    at_j = jnp.argmax(rows == n, axis=1)
+    index = state.neighbours.at[i, at_i].set(j.astype(jnp.int32), mode="drop")
+    index = index.at[j, at_j].set(i.astype(jnp.int32), mode="drop")
+    kept = state.links.at[i, at_i].set(links, mode="drop")
+    kept = kept.at[j, at_j].set(jnp.swapaxes(links, 1, 2), mode="drop")
+    return state._replace(neighbours=index, links=kept)
+
+
 def retired(state: Sparse, gone: jax.Array, most: int, conservative: bool = False) -> Sparse:
     """The landmarks of the places gone (A,), at most `most` of them, made passive.
 
@@ -180,8 +202,15 @@ def departed(state: Sparse, gone: jax.Array, most: int, conservative: bool = Fal
         pair = state.slot[a], state.slot[b]
         return linked(state, *pair, blocks[a, b], on, conservative), None
 
-    pairs = jnp.repeat(order, count), jnp.tile(diagonal, len(order)), wanted.reshape(-1)
-    state, _ = jax.lax.scan(enter, state, pairs)
+    def enter_all(state: Sparse, of: tuple[jax.Array, jax.Array]) -> tuple[Sparse, None]:
+        a, on = of
+        return all_linked(state, state.slot[a], state.slot, blocks[a], on), None
+
+    if state.neighbours.shape[1] >= n - 1:
+        state, _ = jax.lax.scan(enter_all, state, (order, wanted))
+    else:
+        pairs = jnp.repeat(order, count), jnp.tile(diagonal, len(order)), wanted.reshape(-1)
+        state, _ = jax.lax.scan(enter, state, pairs)
     own = state.own.at[state.slot].get(mode="fill", fill_value=0)
     unit = jnp.eye(2, dtype=omega.dtype)
     out = gone | (state.slot >= n)

@@ -105,7 +105,7 @@ def monte_carlo(
         filters: by name. A function instead of a filter is called with each run's `Truth`.
         runs: how many worlds; run i has key fold_in(key, i).
         key: a PRNG key.
-        block: runs vmapped together on a device, which sets memory; default 32 on a CPU, and
+        block: runs vmapped together on a device, which sets memory; default 16 on a CPU, and
             by its memory on an accelerator. Where memory does not suffice, half of it is tried,
             with a warning.
         devices: of this process; default all of `jax.local_devices()`.

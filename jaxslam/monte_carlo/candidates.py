@@ -22,14 +22,14 @@ _T = TypeVar("_T")
 
 
 def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: jax.Device) -> int:
-    """Runs that are well computed together on a device: 32 on a CPU, whose caches they fit.
+    """Runs that are well computed together on a device: 16 on a CPU, whose caches they fit.
 
     On an accelerator as many as take a quarter of its memory, counting a run's world and what the
     first filter makes of it, which the scores read several times over: a power of two from 32 on,
     4096 at most, and 1024 where the device does not tell its memory.
     """
     if device.platform == "cpu":
-        return 32
+        return 16
     room = (device.memory_stats() or {}).get("bytes_limit")
     if room is None:
         return 1024
