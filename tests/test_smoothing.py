@@ -522,8 +522,9 @@ def test_a_batch_of_runs_ends_where_each_does():
     assert set(ending.tolist()) <= {Ending.CONVERGED, Ending.STALLED}
     assert (ending == Ending.CONVERGED).mean() > 0.95
     assert len(set(traces["batch"].final.iterations.tolist())) > 1  # each its own number
-    # Shorter than √eps, or than what a cost that rounds hides: a step s takes s²/2 off it.
-    hidden = np.sqrt(4 * np.finfo(float).eps * traces["batch"].final.cost)
+    # Shorter than √eps, or than what a cost that rounds hides: a step s takes s²/2 off it, and a
+    # sum of some hundred terms is known to several eps.
+    hidden = np.sqrt(16 * np.finfo(float).eps * traces["batch"].final.cost)
     assert (traces["batch"].final.step < np.maximum(2e-8, hidden)).all()
 
 
