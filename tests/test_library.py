@@ -76,7 +76,7 @@ def test_what_cannot_be_written_is_said_and_costs_nothing_else(tmp_path, capsys)
     assert "cannot be kept" in capsys.readouterr().err
 
 
-def test_a_program_is_of_its_scenario_precision_and_source_whatever_seed_and_runs(tmp_path):
+def test_a_program_is_of_its_scenario_precision_source_and_processor(tmp_path, monkeypatch):
     library.Programs(tmp_path, library.identity(ASKED, "cpu")).put("drive ekf", b"a program")
     for change, found in (
         ({"seed": 1}, True),
@@ -87,6 +87,9 @@ def test_a_program_is_of_its_scenario_precision_and_source_whatever_seed_and_run
     ):
         other = library.Programs(tmp_path, library.identity(ASKED | change, "cpu"))
         assert (other.get("drive ekf") is not None) == found
+    monkeypatch.setattr(cache, "kind", lambda: "another processor")
+    other = library.Programs(tmp_path, library.identity(ASKED, "cpu"))
+    assert other.get("drive ekf") is None
     assert library.identity(ASKED, "cpu") != library.identity(ASKED, "gpu")
 
 

@@ -93,7 +93,7 @@ def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iter
     whole = asked
     try:
         whole = whole or user_folder()
-        folder = whole / _kind()
+        folder = whole / kind()
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -133,7 +133,7 @@ def prune(folder: Path, bound: int) -> None:
             total -= size
 
 
-def _kind() -> str:
+def kind() -> str:
     """Which programs run here: JAX does not tell processors of one architecture apart, though code
     for one may be illegal on another that mounts the same home."""
     features = platform.processor()

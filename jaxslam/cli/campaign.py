@@ -185,7 +185,7 @@ def _campaign_files(
     figures = {
         "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
         "bound": (
-            "RMSE, and the Cramér-Rao bound" if bound else "RMSE",
+            "RMSE, and the conditional Cramér-Rao bound" if bound else "RMSE",
             plot.bound_figure(campaign),
         ),
         "cost": ("Error and NEES against the time of a step", plot.cost_figure(campaign)),

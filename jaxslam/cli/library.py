@@ -46,7 +46,8 @@ class Programs:
     def __init__(self, folder: Path, known: Mapping[str, str]) -> None:
         self._folder = folder
         told = {name: value for name, value in known.items() if name not in _NO_PROGRAM}
-        self._known = json.dumps(told, sort_keys=True)
+        # The folder may be one that JAX was told of, shared by unlike machines.
+        self._known = json.dumps(told | {"kind": cache.kind()}, sort_keys=True)
 
     def get(self, name: str) -> bytes | None:
         """The program of that name, or None; a damaged one is deleted, and said."""

@@ -40,7 +40,7 @@ def bound_figure(campaign: Campaign) -> Figure:
         for summary in campaign.filters.values():
             bound = summary.curves.get(f"bound_{key}")
             if bound is not None:
-                label = "Cramér-Rao bound"
+                label = "conditional Cramér-Rao bound"
                 axes.plot(step, bound, color=INK, lw=2.0, label=label, zorder=5, **lone_mark(bound))
                 break
         axes.set(ylabel=named)
