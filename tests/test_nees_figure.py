@@ -7,7 +7,7 @@ import pytest
 
 from jaxslam import plot
 from jaxslam.consistency import DOF, LEVELS
-from jaxslam.consistency.score import LAGS
+from jaxslam.consistency import LAGS
 from jaxslam.consistency.summary import Summary
 from jaxslam.family import ALL, KINDS
 from jaxslam.monte_carlo import Campaign

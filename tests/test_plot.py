@@ -8,7 +8,7 @@ import pytest
 import worlds
 
 from jaxslam import plot, run, simulate
-from jaxslam.consistency.score import LAGS, LEVELS
+from jaxslam.consistency import LAGS, LEVELS
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.plot.style import logarithmic, panels_of
 
