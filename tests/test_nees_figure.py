@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam import plot
-from jaxslam.consistency import DOF, LEVELS
-from jaxslam.consistency import LAGS
+from jaxslam.consistency import DOF, LAGS, LEVELS
 from jaxslam.consistency.summary import Summary
 from jaxslam.family import ALL, KINDS
 from jaxslam.monte_carlo import Campaign

@@ -168,9 +168,9 @@ def test_an_ordinate_is_logarithmic_beyond_a_decade_and_has_numbers(low, high, s
 def test_errors_are_drawn_above_the_bound(campaign):
     figure = plot.bound_figure(campaign)
     assert [axes.get_ylabel() for axes in figure.axes] == ["position RMSE [m]", "heading RMSE [°]"]
-    assert named(figure) == ["a", "b", "Cramér-Rao bound"]
+    assert named(figure) == ["a", "b", "conditional Cramér-Rao bound"]
     for axes, key in zip(figure.axes, ("position", "heading_deg"), strict=True):
-        bound = line(axes, "Cramér-Rao bound")
+        bound = line(axes, "conditional Cramér-Rao bound")
         np.testing.assert_array_equal(
             bound.get_ydata(), campaign.filters["a"].curves[f"bound_{key}"]
         )
