@@ -175,7 +175,6 @@ def correct_in_turn(
             jax.checkpoint(one, prevent_cse=False),
             local,
             (jnp.arange(group), part),
-            unroll=True,
         )
         v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
         landmarks = _moved_map(joint, v[:, :size], whitened, chart)
