@@ -7,9 +7,9 @@ behind NaN; hence the unrolled factor below, which reports it and stays finite.
 
 import functools
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from numbers import Integral
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam import lapack
+
+_T = TypeVar("_T")
 
 # Up to this many rows a product AᵀB is written as outer products, which XLA fuses into one pass
 # over the result; beyond, as one matrix product.
@@ -36,11 +38,25 @@ def total(terms: Iterable[jax.Array]) -> jax.Array:
     return functools.reduce(operator.add, terms)
 
 
+def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
+    """The function, of which reverse mode keeps the arguments and not each entry that it takes.
+
+    What is written out entry by entry would otherwise leave an array of the whole loop for each.
+    """
+    # Within a scan or a batch nothing merges the recomputation with what it repeats.
+    return jax.checkpoint(function, prevent_cse=False)
+
+
 def gram(a: jax.Array, b: jax.Array) -> jax.Array:
     """Aᵀ B of A (k, D), B (k, E), for small k."""
     if a.shape[0] > _OUTER_PRODUCTS or a.shape[0] == 0:
         # Not a.T @ b, of which a gradient would keep a transposed copy of A.
         return jax.lax.dot_general(a, b, (((0,), (0,)), ((), ())))
+    return _outer_products(a, b)
+
+
+@kept_whole
+def _outer_products(a: jax.Array, b: jax.Array) -> jax.Array:
     return total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
 
 
@@ -74,11 +90,15 @@ def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     becomes NaN (beyond 8×8, L is then zero as a whole). Only the lower
     triangle is read. Non-finite input gives False.
     """
-    n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    n = matrix.shape[-1]
     if n == 0:
         return matrix, jnp.asarray(True)
-    if n > _UNROLLED:
-        return _cholesky_beyond(matrix)
+    return _cholesky_beyond(matrix) if n > _UNROLLED else _cholesky(matrix)
+
+
+@jax.custom_jvp
+def _cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    n, tolerance = matrix.shape[-1], _tolerance(matrix)
     zero = jnp.zeros((), matrix.dtype)
     rows: list[list[jax.Array]] = [[zero] * n for _ in range(n)]
     positive = jnp.asarray(True)
@@ -94,8 +114,29 @@ def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.stack([jnp.stack(row) for row in rows]), positive
 
 
+@_cholesky.defjvp
+def _cholesky_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """dL = L Φ(L⁻¹ dA L⁻ᵀ); where a pivot is zero, its column stays zero, and 1 stands for it."""
+    factor, positive = _cholesky(*primals)
+    good = jnp.diagonal(factor) > 0
+    regular = factor + jnp.diag((~good).astype(factor.dtype))
+    inner = solve_lower(regular, solve_lower(regular, _mirrored(tangents[0])).T)
+    slope = regular @ jnp.where(good, _lower_half(inner), 0.0)
+    return (factor, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
+
+
+def _mirrored(matrix: jax.Array) -> jax.Array:
+    """The symmetric matrix of a lower triangle."""
+    return jnp.tril(matrix) + jnp.tril(matrix, -1).T
+
+
+def _lower_half(matrix: jax.Array) -> jax.Array:
+    """Φ: the lower triangle with half of the diagonal."""
+    return jnp.tril(matrix) - 0.5 * jnp.diag(jnp.diagonal(matrix))
+
+
 def _cholesky_beyond(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    factor = _factor(jnp.tril(matrix) + jnp.tril(matrix, -1).T)
+    factor = _factor(_mirrored(matrix))
     return factor, factor[0, 0] > 0
 
 
@@ -116,7 +157,7 @@ def _factor_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     regular = factor[0, 0] > 0
     safe = jnp.where(regular, factor, jnp.eye(len(factor), dtype=factor.dtype))
     inner = lapack.solve_lower(safe, lapack.solve_lower(safe, tangents[0]).T)
-    slope = safe @ (jnp.tril(inner) - 0.5 * jnp.diag(jnp.diagonal(inner)))
+    slope = safe @ _lower_half(inner)
     return factor, jnp.where(regular, slope, 0.0)
 
 
@@ -174,14 +215,30 @@ def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
         safe = factor + jnp.diag(singular.astype(factor.dtype))
         out = lapack.solve_lower(safe, rhs.reshape(n, -1))
         return jnp.where(singular[:, None], 0.0, out).reshape(rhs.shape)
+
+    def lower(x: jax.Array) -> jax.Array:
+        return jnp.tensordot(jnp.tril(factor), x, 1)
+
+    out: jax.Array = jax.lax.custom_linear_solve(
+        lower,
+        rhs,
+        lambda _, b: _substituted(factor, b),
+        transpose_solve=lambda _, b: _substituted(factor[::-1, ::-1].T, b[::-1])[::-1],
+    )
+    return out
+
+
+def _substituted(factor: jax.Array, rhs: jax.Array) -> jax.Array:
+    """L⁻¹ B, row after row written out."""
     rows: list[jax.Array] = []
-    for i in range(n):
+    for i in range(len(factor)):
         rest = rhs[i] - sum((factor[i, k] * rows[k] for k in range(i)), jnp.zeros_like(rhs[i]))
         pivot = factor[i, i]
         rows.append(rest * jnp.where(pivot > 0, 1.0 / jnp.where(pivot > 0, pivot, 1.0), 0.0))
     return jnp.stack(rows)
 
 
+@jax.custom_jvp
 def whitener(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Lower W = L⁻¹ (n, n), so W A Wᵀ = I, for A = L Lᵀ of a few rows; and `cholesky`'s flag.
 
@@ -205,6 +262,14 @@ def whitener(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
             rest = matrix[i, j] - sum((factor[i][k] * factor[j][k] for k in range(j)), zero)
             factor[i][j] = jnp.where(good, rest * rows[j][j], 0.0)
     return jnp.stack([jnp.stack(row) for row in rows]), positive
+
+
+@whitener.defjvp
+def _whitener_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """dW = -Φ(W dA Wᵀ) W, with rows and columns of zeros where a pivot is zero."""
+    white, positive = whitener(*primals)
+    slope = -_lower_half(white @ _mirrored(tangents[0]) @ white.T) @ white
+    return (white, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
 
 
 def whitener_by_rows(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -195,6 +195,7 @@ def weigh(
     )
 
 
+@linalg.kept_whole
 def _seen_rows(found: jax.Array, robot: jax.Array, own: jax.Array) -> jax.Array:
     """H P (m, Z, D) of H by pose and landmark, first in found (m, Z, 3+L+1), rows (3, D) and
     (m, L, D).
@@ -214,6 +215,7 @@ def _whitened(whiten: jax.Array, hp: jax.Array, nu: jax.Array) -> tuple[jax.Arra
     return _product(whiten, hp[None])[0], _product(whiten, nu[:, :, None]).reshape(-1)
 
 
+@linalg.kept_whole
 def _product(whiten: jax.Array, rhs: jax.Array) -> jax.Array:
     """W B (m, Z, k) of W (m, Z, Z) and B (m, Z, k)."""
     each = range(whiten.shape[1])
