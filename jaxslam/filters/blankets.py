@@ -73,7 +73,7 @@ def whole_marginals(state: Sparse) -> tuple[jax.Array, jax.Array]:
     """P of the robot (3, 3) and of landmarks (N, 2, 2), of the whole Ω inverted, O(N³)."""
     count = state.own.shape[0]
     omega = information_of(state, jnp.arange(count, dtype=jnp.int32))
-    cov = linalg.symmetrize(linalg.solve_psd(omega, jnp.eye(omega.shape[0], dtype=omega.dtype))[0])
+    cov = linalg.inverse_psd(omega)
     every = jnp.arange(count)
     points = cov[3:, 3:].reshape(count, 2, count, 2)[every, :, every]
     return cov[:3, :3], points

@@ -49,6 +49,8 @@ class Weighed(NamedTuple):
     """(M,) of fused places given those before, of the others alone"""
     log_likelihood: jax.Array
     """(M,), 0 where not fused"""
+    sound: jax.Array
+    """() bool: Ω is positive definite"""
 
 
 def started(pose_cov: jax.Array, floor: float) -> jax.Array:
@@ -156,6 +158,7 @@ def weigh(
         s=marginal,
         nis=jnp.where(fused, nis, distance),
         log_likelihood=jnp.where(fused, likelihood, 0.0),
+        sound=sound,
     )
 
 

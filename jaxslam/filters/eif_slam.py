@@ -97,7 +97,7 @@ def eif_slam(
         )
         omega, owed = canonical.informed(state.omega, state.owed, weighed)
         step, sound = linalg.solve_psd(omega, owed)
-        sound = sound & linalg.cholesky(state.omega)[1]
+        sound = sound & weighed.sound
         step = jnp.where(sound, step, 0.0)
         pose = canonical.stepped(state.pose, step[:3])
         moved = state.landmarks + step[3:].reshape(capacity, size)
@@ -128,7 +128,7 @@ def eif_slam(
         return after, info
 
     def estimate(state: Canonical) -> Estimate:
-        cov = linalg.solve_psd(state.omega, jnp.eye(len(state.owed), dtype=state.omega.dtype))[0]
+        cov = linalg.inverse_psd(state.omega)
         joint = Joint(state.pose, state.landmarks, cov, state.alive, state.tag, ())
         return moments(joint, sensor, euclidean())
 

@@ -18,6 +18,7 @@ from jaxslam.filters.sparse_parts import (
 )
 from jaxslam.filters.sparsification import activated, departed, retired
 from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.staging import where_any
 from jaxslam.types import Info, Scan
 
 
@@ -118,7 +119,7 @@ def eseif(
             state.omega, state.pose, in_area(state), scan, place, late & fits, sensor, gate
         )
         omega, owed = canonical.informed(state.omega, owed_of(state), second)
-        state, good = solved(state, omega, owed, linalg.cholesky(state.omega)[1])
+        state, good = solved(state, omega, owed, second.sound)
         sound = sound & good
         state = swept(state, omega, sound, share, sweeps - 1)
         placed = of.wanted & (inside | fits)
@@ -169,10 +170,14 @@ def eseif(
         omega = jnp.where(relocate, without, state.omega)
         owed = jnp.where(relocate, owed_without, owed)
         omega, owed = canonical.informed(omega, owed, weighed)
-        before = linalg.cholesky(state.omega)[1]
-        state, sound = solved(state, omega, owed, before)
+        state, sound = solved(state, omega, owed, weighed.sound)
         done = relocate & sound
-        nats = jnp.maximum(0.5 * (_log_det(full) - _log_det(omega)), 0.0)
+        nats = where_any(
+            relocate,
+            lambda pair: jnp.maximum(0.5 * (_log_det(pair[0]) - _log_det(pair[1])), 0.0),
+            lambda pair: jnp.zeros((), pair[0].dtype),
+            (full, omega),
+        )
         counts = state.counts._replace(
             relocated=state.counts.relocated + done.astype(jnp.int32),
             cut=state.counts.cut + (done & ties & ~tied(omega)).sum(dtype=jnp.int32),

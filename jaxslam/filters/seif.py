@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
 from jaxslam.filters import canonical
 from jaxslam.filters.recovery import owed_of, relaxed, solved, swept
 from jaxslam.filters.sparse_map import Sparse
@@ -100,7 +99,7 @@ def seif(
             state.omega, state.pose, in_area(state), scan, place, of.known, sensor, gate
         )
         omega, owed = canonical.informed(state.omega, owed_of(state), weighed)
-        state, sound = solved(state, omega, owed, linalg.cholesky(state.omega)[1])
+        state, sound = solved(state, omega, owed, weighed.sound)
         state = swept(state, omega, sound, share, sweeps - 1)
         room = of.wanted & of.new & sound
         omega, points, granted = canonical.born(omega, state.pose, scan.z, place, room, sensor)

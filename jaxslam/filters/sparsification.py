@@ -20,30 +20,33 @@ def sparsified(omega: jax.Array, gone: jax.Array) -> tuple[jax.Array, jax.Array]
 
         Ω̃ = Ω - Ω F_m0 (..)⁻¹ F_m0ᵀ Ω + Ω F_x,m0 (..)⁻¹ F_x,m0ᵀ Ω - Ω F_x (..)⁻¹ F_xᵀ Ω,
 
-    (..) the block of Ω that F selects. Positive definite as Ω is; ρ stays. Dropped is
-    I(x; m0 | m+) = (log|Ω_x| + log|Ω_m0| - log|Ω_x,m0|)/2. Ω̃ claims more than Ω in some directions.
+    (..) the block of Ω that F selects. With G = Ω F_x - Ω F_m0 Ω_m0⁻¹ Ω_m0,x (D, 3) and Σ = F_xᵀ G,
+    the information of x given m+ and not m0, that is Ω + G Σ⁻¹ Gᵀ - Ω F_x Ω_x⁻¹ F_xᵀ Ω. Positive
+    definite as Ω is; ρ stays. Dropped is I(x; m0 | m+) = (log|Ω_x| - log|Σ|)/2. Ω̃ claims more than
+    Ω in some directions.
     """
-    d = omega.shape[0]
-    robot = jnp.arange(d) < 3
     leaves = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(gone, 2)])
-
-    def selected(mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-        eye = jnp.eye(d, dtype=omega.dtype)
-        factor = linalg.cholesky(jnp.where(mask[:, None] & mask[None, :], omega, eye))[0]
-        half = linalg.solve_lower(factor, jnp.where(mask[:, None], omega, 0.0))
-        pivots = jnp.diagonal(factor)
-        return half.T @ half, 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
-
-    (by_gone, det_gone), (by_both, det_both), (by_robot, det_robot) = (
-        selected(leaves),
-        selected(leaves | robot),
-        selected(robot),
-    )
+    by_robot = omega[:, :3]
+    eye = jnp.eye(len(omega), dtype=omega.dtype)
+    of_gone = jnp.where(leaves[:, None] & leaves[None, :], omega, eye)
+    to_gone = jnp.where(leaves[:, None], by_robot, 0.0)
+    left = by_robot - omega @ linalg.solve_psd(of_gone, to_gone)[0]
+    left = jnp.where(leaves[:, None], 0.0, left)
+    before, after = linalg.whitener(omega[:3, :3])[0], linalg.whitener(left[:3])[0]
+    new = omega + linalg.square(after @ left.T) - linalg.square(before @ by_robot.T)
+    robot = jnp.arange(len(omega)) < 3
     cut = (leaves[:, None] & robot[None, :]) | (leaves[None, :] & robot[:, None])
-    after = jnp.where(cut, 0.0, linalg.symmetrize(omega - by_gone + by_both - by_robot))
-    nats = jnp.maximum(0.5 * (det_robot + det_gone - det_both), 0.0)
+    nats = jnp.maximum(_log_diagonal(after) - _log_diagonal(before), 0.0)
     any_gone = gone.any()
-    return jnp.where(any_gone, after, omega), jnp.where(any_gone, nats, 0.0)
+    return (
+        jnp.where(any_gone, jnp.where(cut, 0.0, linalg.symmetrize(new)), omega),
+        jnp.where(any_gone, nats, 0.0),
+    )
+
+
+def _log_diagonal(factor: jax.Array) -> jax.Array:
+    pivots = jnp.diagonal(factor)
+    return jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
 
 
 def spring(link: jax.Array) -> tuple[jax.Array, jax.Array]:
