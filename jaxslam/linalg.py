@@ -219,13 +219,13 @@ def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
     def lower(x: jax.Array) -> jax.Array:
         return jnp.tensordot(jnp.tril(factor), x, 1)
 
-    out: jax.Array = jax.lax.custom_linear_solve(
+    solution: jax.Array = jax.lax.custom_linear_solve(
         lower,
         rhs,
         lambda _, b: _substituted(factor, b),
         transpose_solve=lambda _, b: _substituted(factor[::-1, ::-1].T, b[::-1])[::-1],
     )
-    return out
+    return solution
 
 
 def _substituted(factor: jax.Array, rhs: jax.Array) -> jax.Array:

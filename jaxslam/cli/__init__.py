@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
+from threadpoolctl import threadpool_limits
 
 from jaxslam.cli import cache, devices
 from jaxslam.cli.asking import INTERRUPTED
@@ -37,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             devices.prepare(options)
         else:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
-        with Spent() as spent, cache.asked_for(options):
+        with Spent() as spent, cache.asked_for(options), threadpool_limits(1, "blas"):
             status = int(options.command(options, shlex.join(["jaxslam", *arguments])))
             if status != INTERRUPTED and jax.process_index() == 0:
                 print(spent)

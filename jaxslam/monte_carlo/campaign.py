@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.linalg import check_count, check_key
@@ -268,7 +269,8 @@ class _Work:
         early = len(queue) > self.workers
         flight: dict[Future[Any], tuple[int, int]] = {}
         stop: BaseException | None = None
-        with ThreadPoolExecutor(self.workers) as pool:
+        # XLA uses the cores; threads of the BLAS below its LAPACK would only spin beside it.
+        with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
             try:
                 while queue and len(flight) <= self.workers:
                     first, count = queue.pop()
