@@ -91,7 +91,7 @@ def simulated(runs: int = 8, steps: int = 200, seed: int = 0) -> Callable[[jax.A
         ekf = jaxslam.filters.ekf_slam(*models(sigma), capacity=len(POINTS), update="joint")
 
         def of_run(log: Any, key: jax.Array) -> jax.Array:
-            trace = jaxslam.run(ekf, log, world.pose, world.pose_cov, key, checkpoint=True)
+            trace = jaxslam.run(ekf, log, world.pose, world.pose_cov, key)
             return trace.info.log_likelihood.sum()
 
         return jax.vmap(of_run)(logs, keys).sum()
@@ -111,7 +111,7 @@ def recorded(data: Any, steps: int) -> Callable[..., Any]:
         sensor = jaxslam.sensors.range_bearing(jnp.diag(sigma[2:] ** 2))
         ekf = jaxslam.filters.ekf_slam(motion, sensor, data.capacity, **data.filter_options)
         key = jax.random.key(0)
-        info = jaxslam.run(ekf, log, data.pose, data.pose_cov, key, checkpoint=True).info
+        info = jaxslam.run(ekf, log, data.pose, data.pose_cov, key).info
         return info.log_likelihood.sum(), info.nis.sum() / jnp.maximum(info.dof.sum(), 1)
 
     return log_likelihood

@@ -23,7 +23,6 @@ def run(
     key: jax.Array,
     *,
     probe: Callable[[Any], Any] | None = None,
-    checkpoint: bool = False,
 ) -> Trace:
     """Drive a filter along a log: per row predict with the control, then update with the scan.
 
@@ -31,7 +30,8 @@ def run(
     trace it is compiled once for a structure: another call, with other values or a filter that its
     factory made anew with other noises, runs the same program (`programs`). The arithmetic runs in
     the wider dtype of the log's controls and measurements. A valid measurement that is not finite
-    is refused where its value is concrete, and dropped as `Status.REJECTED` under a trace.
+    is refused where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse
+    mode keeps one state a step, and computes each step again on the way back.
 
     Args:
         filter: made by a factory of `jaxslam.filters`.
@@ -40,10 +40,6 @@ def run(
         pose_cov: (3, 3) how well that is known; zero is allowed.
         key: a PRNG key, split into two a step; a filter without randomness ignores them.
         probe: called with the filter's own state after each update; what it returns is stacked.
-        checkpoint: for reverse mode over long logs: keep one state a step instead of every
-            intermediate of every step, and compute each step again on the way back. The same
-            numbers, for about one more forward run; T filter states of memory. Without reverse mode
-            it does nothing. `compiled.memory_analysis().temp_size_in_bytes` measures what it saves.
     Returns:
         Trace with estimates and infos of leading axis T, and the final state.
     Raises:
@@ -52,7 +48,7 @@ def run(
     """
     check_run(filter, log, pose, pose_cov)
     check_key("run", key)
-    return programs.call(_drive, (filter, probe, checkpoint), log, pose, pose_cov, key)
+    return programs.call(_drive, (filter, probe), log, pose, pose_cov, key)
 
 
 def check_run(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
@@ -73,7 +69,6 @@ def check_run(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) ->
 def _drive(
     filter: Filter,
     probe: Callable[[Any], Any] | None,
-    checkpoint: bool,
     log: Log,
     pose: jax.Array,
     pose_cov: jax.Array,
@@ -99,6 +94,6 @@ def _drive(
         return state, (filter.estimate(state), info, () if probe is None else probe(state))
 
     # What a scan runs cannot be merged with its own recomputation, so no barrier is needed.
-    body = jax.checkpoint(step, prevent_cse=False) if checkpoint else step
-    final, (estimate, info, probed) = jax.lax.scan(body, start, (log, keys))
+    again = jax.checkpoint(step, prevent_cse=False)
+    final, (estimate, info, probed) = jax.lax.scan(again, start, (log, keys))
     return Trace(estimate, info, final, probed)

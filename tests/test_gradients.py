@@ -44,7 +44,7 @@ def world():
     return dataclasses.replace(cloister(), motion=car, sensor=sensor, controls=controls)
 
 
-def log_likelihood(p, log, *, capacity=36, gate=None, checkpoint=False):
+def log_likelihood(p, log, *, capacity=36, gate=None):
     """Σ over the run, and the statuses; births as the scenario has them.
 
     No gate by default: the likelihood jumps where a measurement crosses it, and has no derivative
@@ -53,7 +53,7 @@ def log_likelihood(p, log, *, capacity=36, gate=None, checkpoint=False):
     car, sensor = models(p)
     filter = ekf_slam(car, sensor, capacity, births=1, gate=gate)
     start = cloister()
-    info = run(filter, log, start.pose, start.pose_cov, KEY, checkpoint=checkpoint).info
+    info = run(filter, log, start.pose, start.pose_cov, KEY).info
     return info.log_likelihood.sum(), info.status
 
 
@@ -64,28 +64,18 @@ def log():
 
 @pytest.fixture(scope="module")
 def compiled(log):
-    """Value, statuses and gradient, without and with checkpoint."""
-    return {
-        checkpoint: jax.jit(
-            jax.value_and_grad(
-                lambda p, log, checkpoint=checkpoint: log_likelihood(p, log, checkpoint=checkpoint),
-                has_aux=True,
-            )
-        )
-        .lower(AT, log)
-        .compile()
-        for checkpoint in (False, True)
-    }
+    """Value, statuses and gradient."""
+    return jax.jit(jax.value_and_grad(log_likelihood, has_aux=True)).lower(AT, log).compile()
 
 
 @pytest.fixture(scope="module")
 def gradient(compiled, log):
-    return np.asarray(compiled[False](AT, log)[1])
+    return np.asarray(compiled(AT, log)[1])
 
 
 def test_the_gradient_of_200_steps_is_that_of_central_differences(log, compiled, gradient):
     value = jax.jit(lambda p: log_likelihood(p, log)[0])
-    (total, status), _ = compiled[False](AT, log)
+    (total, status), _ = compiled(AT, log)
     counts = np.bincount(np.asarray(status).ravel(), minlength=len(Status))
     assert counts[Status.BORN] == 36  # one a step, then all of them are fused
     assert counts[Status.FUSED] == 200 * 36 - counts[Status.DEFERRED] - 36
@@ -100,18 +90,9 @@ def test_the_gradient_of_200_steps_is_that_of_central_differences(log, compiled,
         assert abs(gradient[i]) > 1.0, name  # every parameter is reached
 
 
-def test_checkpoint_changes_memory_and_no_number(compiled, gradient, log):
-    (total, status), again = compiled[True](AT, log)
-    (expected, expected_status), _ = compiled[False](AT, log)
-    np.testing.assert_allclose(total, expected, rtol=1e-10)
-    np.testing.assert_array_equal(status, expected_status)
-    np.testing.assert_allclose(again, gradient, rtol=1e-10)
-    bytes_without, bytes_with = (
-        compiled[checkpoint].memory_analysis().temp_size_in_bytes for checkpoint in (False, True)
-    )
+def test_reverse_mode_keeps_one_state_a_step(compiled):
     state = 8 * (3 + 2 * 36) ** 2
-    assert bytes_with < bytes_without / 2
-    assert bytes_with < 1.5 * 200 * state
+    assert compiled.memory_analysis().temp_size_in_bytes < 1.5 * 200 * state
 
 
 @pytest.fixture(scope="module")
