@@ -43,14 +43,14 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
 def test_on_a_terminal_a_line_tells_of_each_filter_as_soon_as_it_can(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     with asking.Progress("circle") as progress:
-        progress.glimpse("ekf", 64, Measure(5.814, 4.414, 7.214))
-        progress.glimpse("one", 1, Measure(2.0, -np.inf, np.inf))
+        progress.glimpse("ekf", 64, Measure(5.814, 4.712, 7.214))
+        progress.glimpse("one", 1, Measure(2.0, 0.0, np.inf))
         progress.glimpse("none", 64, None)
         progress(64, 100)
     shown = capsys.readouterr().err
     lines = [line.rpartition("\x1b[K")[2] for line in shown.split("\n")]
     assert lines[:2] == [
-        "ekf: pose NEES 5.81 ± 1.4 over a first block of 64 runs; honest is 3",
+        "ekf: pose NEES 5.81 (4.71 to 7.21) over a first block of 64 runs; honest is 3",
         "one: pose NEES 2 over a first run; honest is 3",
     ]
     assert "64/100 runs" in shown

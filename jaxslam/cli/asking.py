@@ -57,7 +57,7 @@ class Progress:
         """A line that stays: what the first block says of a filter, while others are compiled."""
         if self._shown and nees is not None:
             one = runs == 1
-            shown = f"{nees.value:.3g}" + ("" if one else f" ± {nees.high - nees.value:.2g}")
+            shown = f"{nees.value:.3g}" + ("" if one else f" ({nees.low:.3g} to {nees.high:.3g})")
             of = "run" if one else f"block of {runs} runs"
             self._draw(f"{name}: pose NEES {shown} over a first {of}; honest is {DOF['pose']}\n")
             self.say("compiling …")

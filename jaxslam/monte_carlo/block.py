@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.consistency import Measure, Score, condense, interval, mean_pose_nees, score
+from jaxslam.consistency import Measure, Score, condense, mean_pose_nees, positive_interval, score
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.monte_carlo.blockwise import Library
 from jaxslam.types import Estimate, Info, Trace, Truth
@@ -127,7 +127,7 @@ class Programs:
             if tell and self.glimpse is not None:
                 poses = truth.pose, *trace.estimate[:2]
                 nees, defined = mean_pose_nees(*(np.asarray(rows)[mine] for rows in poses))
-                self.glimpse(name, runs, interval(nees[defined]))
+                self.glimpse(name, runs, positive_interval(nees[defined]))
             held.append((name, driven, trace))
             # A filter is compiled before the statistics of the one before it.
             while held and (len(held) > 1 or self.statistics[held[0][0]].done()):
