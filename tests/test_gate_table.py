@@ -1,6 +1,7 @@
 """One table from gate to status, for every family of filters."""
 
 import dataclasses
+import functools
 import itertools
 
 import jax
@@ -55,20 +56,19 @@ def test_masks_that_are_left_out_hold_nowhere_and_the_rest_is_unmatched():
 
 
 def test_numbers_of_places_without_a_comparison_are_zero():
-    status = jnp.asarray(
-        [Status.FUSED, Status.REJECTED, Status.SINGULAR, Status.BORN, 0], jnp.int32
-    )
-    matched = jnp.asarray([True, True, True, False, False])
-    info = info_of(
-        status,
-        matched,
-        size=2,
-        slot=jnp.arange(5),
-        born=jnp.arange(5) + 10,
-        nis=jnp.full(5, 7.0),
-        innovation=jnp.ones((5, 2)),
-        innovation_cov=jnp.ones((5, 2, 2)),
-        log_likelihood=jnp.zeros(()),
+    status = np.array([Status.FUSED, Status.REJECTED, Status.SINGULAR, Status.BORN, 0], np.int32)
+    matched = np.array([True, True, True, False, False])
+    info = jax.device_get(
+        jax.jit(functools.partial(info_of, size=2))(
+            status,
+            matched,
+            slot=np.arange(5),
+            born=np.arange(5) + 10,
+            nis=np.full(5, 7.0),
+            innovation=np.ones((5, 2)),
+            innovation_cov=np.ones((5, 2, 2)),
+            log_likelihood=np.zeros(()),
+        )
     )
     assert list(info.nis) == [7, 7, 0, 0, 0]
     assert list(info.dof) == [2, 0, 0, 0, 0]
