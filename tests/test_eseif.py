@@ -23,6 +23,7 @@ COUNT, STEPS, RUNS = 36, 60, 12
 ODOMETRY = np.diag([0.002, 0.004]) ** 2  # good, so that the robot's links last
 NOISE = np.diag([0.1, np.deg2rad(2.0)]) ** 2
 MODELS = motion.increment(ODOMETRY), sensors.range_bearing(NOISE), COUNT
+AREA = {"active": 9, "links": COUNT - 1, "passive": 5}
 
 
 @functools.cache
@@ -53,12 +54,13 @@ def logs():
 def made(name, **options):
     """Predict and update, of one run after the other and of all of `logs` at once."""
     make = getattr(filters, name)
-    f = make(*MODELS, **options) if name != "eif_slam" else make(*MODELS)
-    return f, jax.jit(lambda s, u, scan: f.update(f.predict(s, u, KEY), scan, KEY))
+    f = make(*MODELS, **options)
+    predict, update = jax.jit(f.predict), jax.jit(f.update)
+    return f, lambda s, u, scan: update(predict(s, u, KEY), scan, KEY), predict, update
 
 
 def start(f, dtype=float):
-    return f.init(jnp.asarray(cloister(2).pose, dtype), jnp.asarray(P0, dtype))
+    return jax.jit(f.init)(np.asarray(cloister(2).pose, dtype), np.asarray(P0, dtype))
 
 
 def rows(run=0, upto=STEPS):
@@ -100,12 +102,12 @@ def least(matrix):
 @functools.cache
 def driven(name, **options):
     """States of the noise-free run, after each step, and infos."""
-    f, step = made(name, **options)
+    f, step, *_ = made(name, **options)
     state, out = start(f), []
     for u, scan in rows():
         state, info = step(state, u, scan)
         out.append((state, info))
-    return out
+    return jax.device_get(out)
 
 
 # --- one relocation ------------------------------------------------------------------------------
@@ -119,10 +121,10 @@ def test_tachers_counter_example_and_relocation_on_the_same_information():
     gone = np.array([False, False, False, True, True])
     h = rng.normal(size=(6, 13))
     h[:, 9:] = 0  # measurements of the landmarks that stay
-    after = np.asarray(sparsification.sparsified(jnp.asarray(omega), jnp.asarray(gone))[0])
+    after = np.asarray(jax.jit(sparsification.sparsified)(omega, gone)[0])
     assert np.linalg.eigvalsh(omega - after)[0] < -1e-3
     owed = rng.normal(size=13)
-    less, owed_less = (np.asarray(x) for x in without_pose(jnp.asarray(omega), jnp.asarray(owed)))
+    less, owed_less = jax.device_get(jax.jit(without_pose)(omega, owed))
     assert not less[:3].any() and not owed_less[:3].any()
     # the marginal of the landmarks: covariance and mean
     close(np.linalg.inv(less[3:, 3:]), np.linalg.inv(omega)[3:, 3:])
@@ -130,20 +132,19 @@ def test_tachers_counter_example_and_relocation_on_the_same_information():
     relocated, full = less + h.T @ h, omega + h.T @ h
     assert np.linalg.eigvalsh(full - relocated)[0] > -1e-9
     assert np.linalg.eigvalsh(np.linalg.inv(relocated) - np.linalg.inv(full))[0] > -1e-9
-    np.testing.assert_array_equal(tied(jnp.asarray(relocated)), ~gone)
+    np.testing.assert_array_equal(jax.jit(tied)(relocated), ~gone)
 
 
 def test_every_step_is_the_dense_formula():
     """Relocation, measurements of both kinds and births, by dense NumPy, on a noisy run."""
-    options = {"active": 10, "links": COUNT - 1, "passive": 5}
-    f, step = made("eseif", **options)
-    predict, relax = jax.jit(f.predict), jax.jit(functools.partial(relaxed, share=5))
+    f, step, predict, _ = made("eseif", **AREA)
+    relax = jax.jit(functools.partial(relaxed, share=5))
     state, relocations, late = start(f), 0, 0
     there = list(rows(run=1, upto=40))
     back = [(-u, scan) for (u, _), (_, scan) in zip(there[:20:-1], there[19:0:-1], strict=False)]
     for u, scan in there + back:
-        before = relax(predict(state, u, KEY))
-        state, info = step(state, u, scan)
+        before = jax.device_get(relax(predict(state, u, KEY)))
+        state, info = jax.device_get(step(state, u, scan))
         omega = np.array(dense(before))
         owed = np.concatenate([before.owed_robot, np.ravel(before.owed)])
         mean = np.concatenate([before.pose, np.ravel(before.landmarks)])
@@ -188,10 +189,12 @@ def test_every_step_is_the_dense_formula():
             own = at([slot], robot=False)
             omega[own, own] -= 1.0  # padding
         close(np.asarray(dense(state)), omega)
-        xi_after = dense(state) @ mean + np.concatenate([state.owed_robot, np.ravel(state.owed)])
+        xi_after = np.asarray(dense(state)) @ mean + np.concatenate(
+            [state.owed_robot, np.ravel(state.owed)]
+        )
         close(np.asarray(xi_after), xi, 1e-6)
         ties = np.flatnonzero(np.abs(omega[:3, 3:]).max(axis=0).reshape(-1, 2).max(axis=1))
-        assert len(ties) <= 10
+        assert len(ties) <= 9
     assert relocations >= 2 and late > 2
     assert int(state.counts.relocated) == relocations
     assert int(state.counts.dropped) == int(state.counts.broken) == 0
@@ -219,8 +222,7 @@ def test_while_nothing_is_cut_it_is_the_eif():
 
 def test_relocation_is_conservative_over_a_run_and_sparsification_is_not():
     """Without noise in the data all filters linearize at the truth: covariances alone differ."""
-    options = {"active": 9, "links": COUNT - 1}
-    eif, exact, sparse = driven("eif_slam"), driven("eseif", **options), driven("seif", **options)
+    eif, exact, sparse = driven("eif_slam"), driven("eseif", **AREA), driven("seif", **AREA)
     claims_more = 0
     for t in range(9, STEPS, 10):
         tag = np.asarray(eif[t][0].tag)
@@ -244,7 +246,7 @@ def test_relocation_is_conservative_over_a_run_and_sparsification_is_not():
 
 def test_its_nees_is_that_of_an_honest_filter():
     """Of pose and landmarks together, by the whole Ω, at three times of four noisy runs."""
-    f, step = made("eseif", active=9, links=COUNT - 1)
+    f, step, *_ = made("eseif", **AREA)
     total = []
     for run in range(1, 5):
         truth = jax.tree.map(lambda leaf, run=run: np.asarray(leaf[run]), logs()[0])
@@ -287,7 +289,7 @@ def test_what_gives_a_pose():
 def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
     """A full area, and a scan of strangers: nothing is cut, all are deferred, counted and later
     fused or born."""
-    f, step = made("eseif", active=9, links=COUNT - 1)
+    f, step, _, update = made("eseif", **AREA)
     state, scans = start(f), list(rows(run=1))
     for u, scan in scans:
         state, info = step(state, u, scan)
@@ -299,28 +301,28 @@ def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
     omega = np.array(state.omega)
     for p in places:
         omega[0, 3 + 2 * p] = omega[3 + 2 * p, 0] = omega[0, 3 + 2 * p] or 1e-6
-    full = state._replace(omega=jnp.asarray(omega))
+    full = state._replace(omega=omega)
     assert len(places) == 9 and len(away) == 2 and len(new) == 2
     tag = np.array(scan.tag)
     tag[:4] = [*new, *away]
     z = np.array(scan.z)
     for i, slot in zip((2, 3), away, strict=True):
         z[i] = h_of(np.asarray(state.pose), np.asarray(state.landmarks[slot]), 0)[1]
-    odd = scan._replace(tag=jnp.asarray(tag), z=jnp.asarray(z), valid=jnp.arange(len(tag)) < 4)
-    after, info = jax.jit(f.update)(full, odd, KEY)
+    odd = scan._replace(tag=tag, z=z, valid=np.arange(len(tag)) < 4)
+    after, info = update(full, odd, KEY)
     np.testing.assert_array_equal(info.status[:4], [Status.DEFERRED] * 4)
     assert np.all(np.asarray(info.slot) == -1)
     np.testing.assert_array_equal(after.slot, full.slot)
     assert int(after.counts.relocated) == int(state.counts.relocated)
     # or links are cut instead, and counted
-    bold = filters.eseif(*MODELS, active=9, links=COUNT - 1, wait=False)
+    bold = filters.eseif(*MODELS, **AREA, wait=False)
     cut, info = jax.jit(bold.update)(full, odd, KEY)
     np.testing.assert_array_equal(info.status[:4], [Status.BORN] * 2 + [Status.FUSED] * 2)
     assert int(cut.counts.cut) == int(full.counts.cut) + 4
     assert int(cut.counts.relocated) == int(full.counts.relocated)
     # two open places: the known ones have them
     omega[:3, 3:7], omega[3:7, :3] = 0, 0
-    after, info = jax.jit(f.update)(full._replace(omega=jnp.asarray(omega)), odd, KEY)
+    after, info = update(full._replace(omega=omega), odd, KEY)
     np.testing.assert_array_equal(info.status[:4], [Status.DEFERRED] * 2 + [Status.FUSED] * 2)
     assert set(away) <= set(np.asarray(after.slot).tolist())
 
@@ -329,11 +331,11 @@ def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
 
 
 def test_float32_gradients_and_a_lost_area():
-    f, step = made("eseif", active=9, links=COUNT - 1)
+    f, step, *_ = made("eseif", **AREA)
 
     def narrow(tree):
         return jax.tree.map(
-            lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, tree
+            lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, tree
         )
 
     state = start(f, jnp.float32)
@@ -342,7 +344,9 @@ def test_float32_gradients_and_a_lost_area():
     kinds = {leaf.dtype for leaf in jax.tree.leaves(state)}
     assert kinds == {jnp.dtype("float32"), jnp.dtype("int32"), jnp.dtype("bool")}
     assert int(state.counts.broken) == 0 and int(state.counts.relocated) > 0
-    lost = state._replace(omega=state.omega.at[0, 0].set(-1.0))
+    omega = np.array(state.omega)
+    omega[0, 0] = -1.0
+    lost = state._replace(omega=omega)
     after, info = step(lost, narrow(u), narrow(scan))
     assert int(after.counts.broken) == 1
     assert set(np.asarray(info.status)[np.asarray(scan.valid)]) == {int(Status.SINGULAR)}
@@ -350,22 +354,22 @@ def test_float32_gradients_and_a_lost_area():
     before, row = next(
         (a, row)
         for (a, _), (b, _), row in zip(
-            driven("eseif", active=9, links=COUNT - 1),
-            driven("eseif", active=9, links=COUNT - 1)[1:],
+            driven("eseif", **AREA),
+            driven("eseif", **AREA)[1:],
             list(rows())[1:],
             strict=False,
         )
         if int(b.counts.relocated) > int(a.counts.relocated)
     )
 
-    def loss(sigma):
+    def loss(sigma, before):
         sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.03])) ** 2)
         other = filters.eseif(MODELS[0], sensor, COUNT, active=9, links=COUNT - 1, passive=1)
         scan = row[1]._replace(z=row[1].z + 0.01)
         after, _ = other.update(other.predict(before, row[0], KEY), scan, KEY)
         return after.pose[:2].sum() + after.omega[0, 0] * 1e-3, after.counts.relocated
 
-    slope, relocated = jax.jit(jax.grad(loss, has_aux=True))(0.1)
+    slope, relocated = jax.jit(jax.grad(loss, has_aux=True))(0.1, before)
     assert int(relocated) > int(before.counts.relocated)
     assert np.isfinite(slope) and abs(slope) > 0
 

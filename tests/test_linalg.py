@@ -1,6 +1,7 @@
 """linalg: factors and solves against NumPy, what singular matrices give, and refusals."""
 
 import re
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from jax.test_util import check_grads
 from jaxslam import lapack, linalg
 
 UNROLLED, LAPACK = [1, 2, 3, 4, 5, 6, 7, 8], [9, 20]
+ROWS = 20
 
 
 def random_covariances(n, count=20, seed=0):
@@ -36,17 +38,40 @@ def semi_definite(n):
     return np.array(cases)
 
 
+@cache
+def used(n):
+    """(a, b) -> factor, its flag, half and whole solution, their flag; of (n, n) and (n, 2)."""
+
+    def use(a, b):
+        factor, positive = linalg.cholesky(a)
+        solution, solvable = linalg.solve_psd(a, b)
+        return factor, positive, linalg.solve_lower(factor, b), solution, solvable
+
+    return over_rows(use)
+
+
+@cache
+def whitened(n):
+    return over_rows(linalg.whitener)
+
+
+def over_rows(function):
+    """The function over up to ROWS rows of its arguments, as one program for any number."""
+    program = jax.jit(jax.vmap(function))
+
+    def padded(*arguments):
+        wide = [np.concatenate([x, np.ones((ROWS - len(x), *x.shape[1:]))]) for x in arguments]
+        return [np.asarray(part)[: len(arguments[0])] for part in program(*wide)]
+
+    return padded
+
+
 @pytest.mark.parametrize("n", UNROLLED + LAPACK)
 def test_factor_and_solves_equal_numpy(n):
     a = random_covariances(n)
     b = np.random.default_rng(1).normal(size=(len(a), n, 2))
-
-    def everything(a, b):
-        factor, positive = linalg.cholesky(a)
-        solution, solvable = linalg.solve_psd(a, b)
-        return factor, positive & solvable, linalg.solve_lower(factor, b), solution
-
-    factor, flags, half, solution = jax.jit(jax.vmap(everything))(a, b)
+    factor, positive, half, solution, solvable = used(n)(a, b)
+    flags = positive & solvable
     expected = np.linalg.cholesky(a)
     unit = np.sqrt(np.einsum("cii->ci", a))[:, :, None]
     np.testing.assert_allclose(factor / unit, expected / unit, rtol=0, atol=1e-10)
@@ -87,22 +112,15 @@ def test_cholesky_reads_the_lower_triangle_alone(n):
 @pytest.mark.parametrize("n", [1, 2, 3, 6, 9, 20])
 def test_semi_definite_matrices_are_flagged_and_nothing_is_nan(n):
     a = semi_definite(n)
-    b = np.ones((len(a), n))
-
-    def use(a, b):
-        solution, positive = linalg.solve_psd(a, b)
-        factor, also = linalg.cholesky(a)
-        return factor, positive | also, solution, linalg.solve_lower(factor, b)
-
-    factor, flags, solution, half = jax.jit(jax.vmap(use))(a, b)
-    assert not flags.any()
+    factor, positive, half, solution, solvable = used(n)(a, np.ones((len(a), n, 2)))
+    assert not (positive | solvable).any()
     for part in (factor, solution, half):
         assert np.isfinite(part).all()
     # A zero pivot has a zero column in the factor, and a zero row in the solution.
-    dead = np.einsum("cii->ci", np.asarray(factor)) == 0
+    dead = np.einsum("cii->ci", factor) == 0
     assert dead.any(axis=1).all()
-    assert not np.asarray(factor).transpose(0, 2, 1)[dead].any()
-    assert not np.asarray(half)[dead].any()
+    assert not factor.transpose(0, 2, 1)[dead].any()
+    assert not half[dead].any()
     if n <= 8:  # … so that a usable square root remains.
         rebuilt = factor @ factor.transpose(0, 2, 1)
         np.testing.assert_allclose(rebuilt, a, rtol=1e-14)
@@ -125,7 +143,7 @@ def test_gradients_through_semi_definite_matrices_are_finite(n):
 @pytest.mark.parametrize("n", UNROLLED)
 def test_whitener_is_the_inverse_of_the_factor(n):
     a = random_covariances(n)
-    whiten, flags = jax.jit(jax.vmap(linalg.whitener))(a)
+    whiten, flags = whitened(n)(a)
     assert flags.all()
     assert not np.triu(whiten, 1).any()
     np.testing.assert_allclose(
@@ -134,20 +152,21 @@ def test_whitener_is_the_inverse_of_the_factor(n):
 
 
 def test_whitener_as_a_loop_is_the_same_matrix():
-    a = np.concatenate([random_covariances(6), semi_definite(6), np.full((1, 6, 6), np.nan)])
+    some = random_covariances(6)[: ROWS - 6]
+    a = np.concatenate([some, semi_definite(6), np.full((1, 6, 6), np.nan)])
     rows, flags = jax.jit(jax.vmap(linalg.whitener_by_rows))(a)
-    whiten, same = jax.jit(jax.vmap(linalg.whitener))(a)
+    whiten, same = whitened(6)(a)
     np.testing.assert_array_equal(flags, same)
     np.testing.assert_allclose(rows[:-1], whiten[:-1], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_whitener_of_a_semi_definite_matrix_leaves_out_what_the_factor_leaves_out(n):
-    a, b = semi_definite(n), np.ones(n)
-    whiten, flags = jax.jit(jax.vmap(linalg.whitener))(a)
+    a = semi_definite(n)
+    whiten, flags = whitened(n)(a)
+    half = used(n)(a, np.ones((len(a), n, 2)))[2]
     assert not flags.any()
-    half = jax.vmap(lambda a: linalg.solve_lower(linalg.cholesky(a)[0], b))(a)
-    np.testing.assert_allclose(whiten @ b, half, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(whiten @ np.ones((n, 2)), half, rtol=1e-12, atol=1e-12)
     slopes = jax.jit(jax.vmap(jax.grad(lambda a: jnp.sum(linalg.whitener(a)[0]))))(a)
     assert np.isfinite(slopes).all()
 
@@ -300,13 +319,15 @@ def test_a_batch_gives_what_each_of_its_matrices_gives_alone(n):
         values, _ = everything(a, b)
         return jnp.sum(jnp.cos(jnp.arange(values.size)) * values)
 
-    for f in (everything, jax.grad(weighed, (0, 1))):
-        alone = list(map(jax.jit(f), a, b))
-        together = jax.jit(jax.vmap(f))(a, b)
-        for i, one in enumerate(alone):
-            for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(together), strict=True):
-                scale = float(jnp.abs(x.astype(float)).max())
-                np.testing.assert_allclose(y[i], x, atol=1e-7 * scale)
+    def both(a, b):
+        return everything(a, b), jax.grad(weighed, (0, 1))(a, b)
+
+    alone = jax.device_get(list(map(jax.jit(both), a, b)))
+    together = jax.device_get(jax.jit(jax.vmap(both))(a, b))
+    for i, one in enumerate(alone):
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(together), strict=True):
+            scale = np.abs(x.astype(float)).max()
+            np.testing.assert_allclose(y[i], x, atol=1e-7 * scale)
 
 
 def test_slopes_of_slopes_equal_differences():

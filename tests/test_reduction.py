@@ -25,6 +25,7 @@ def camera(**options):
     return sensors.bearing_inverse_depth(NOISE, min_distance=1.0, **options)
 
 
+SENSOR = camera(to_point=0.1)
 REDUCE = jax.jit(reduce, static_argnums=(2, 3))
 READY = jax.jit(ready, static_argnums=(1, 2))
 
@@ -44,65 +45,76 @@ def a_log(steps=40, seed=0, dtype=np.float64):
     return Log(control, Scan(np.array(rows, dtype), tag, np.ones((steps, 3), bool)))
 
 
-def driven(filter, log):
+def driven(filter, log, **options):
     dtype = log.control.dtype
-    start = jnp.zeros(3, dtype), jnp.zeros((3, 3), dtype), jax.random.key(0)
-    return run(filter, log, *start)
+    start = np.zeros(3, dtype), np.zeros((3, 3), dtype), jax.random.key(0)
+    return run(filter, log, *start, **options)
 
 
 CHARTS = {"euclidean": charts.euclidean, "right_invariant": lambda: right_invariant(rays=True)}
 
 
+def state_of(joint):
+    return joint
+
+
+@cache
+def traced(name, square_root, to_point):
+    """A run whose probe is the state after every step; one program for every `to_point`."""
+    options = {"chart": CHARTS[name](), "square_root": square_root, "watch": True}
+    filter = ekf_slam(MOTION, camera(to_point=to_point), 4, **options)
+    return jax.device_get(driven(filter, a_log(), probe=state_of)._replace(final=()))
+
+
 @cache
 def joint_of(name="euclidean", square_root=False):
     """The state of a filter on rays after 15 steps, with room for points."""
-    options = {"chart": CHARTS[name](), "square_root": square_root, "watch": True}
-    return driven(ekf_slam(MOTION, camera(to_point=1e-9), 4, **options), a_log(15)).final
+    states = traced(name, square_root, 1e-9).probe
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[14]), states)
 
 
 @pytest.mark.parametrize("square_root", [False, True])
 @pytest.mark.parametrize("name", CHARTS)
 def test_the_covariance_goes_through_the_derivative_of_position(name, square_root):
-    chart, sensor = CHARTS[name](), camera(to_point=0.1)
     joint = joint_of(name, square_root)
-    which = jnp.array([True, False, True, False])
-    less = REDUCE(joint, which, sensor, square_root)
-
-    # Brute force: retract by all errors, take positions, ask the chart of points for their errors.
-    of_points = charts.REGISTRY[name]()
-
-    def errors(xi):
-        rows = xi[3:].reshape(4, 4)
-        pose, moved = jax.vmap(chart.retract, (None, 0, None, 0))(
-            joint.pose, joint.landmarks, xi[:3], rows
-        )
-        points, points0 = (
-            jax.vmap(sensor.position)(moved),
-            jax.vmap(sensor.position)(joint.landmarks),
-        )
-        dx, dl = jax.vmap(of_points.local, (None, 0, None, 0))(joint.pose, points0, pose[0], points)
-        own = jnp.where(which[:, None], jnp.pad(dl, [(0, 0), (0, 2)]), rows)
-        return jnp.concatenate([dx[0], own.reshape(-1)])
-
-    slope = np.asarray(jax.jit(jax.jacfwd(errors))(jnp.zeros(19)))
-    full = np.asarray(joint.cov @ joint.cov.T if square_root else joint.cov)
+    which = np.array([True, False, True, False])
+    less = jax.device_get(REDUCE(joint, which, SENSOR, square_root))
+    slope = np.asarray(slope_of(name)(joint.pose, joint.landmarks, which))
+    joint = jax.device_get(joint)
+    full = joint.cov @ joint.cov.T if square_root else joint.cov
     expected = slope @ full @ slope.T
     freed = [3 + 4 * slot + k for slot in (0, 2) for k in (2, 3)]
     expected[freed, freed] = 1.0
-    actual = np.asarray(less.cov @ less.cov.T if square_root else less.cov)
+    actual = less.cov @ less.cov.T if square_root else less.cov
     np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(less.landmarks[0, :2], sensor.position(joint.landmarks[0]))
+    np.testing.assert_allclose(less.landmarks[0, :2], SENSOR.position(joint.landmarks[0]))
     np.testing.assert_array_equal(less.landmarks[0, 2:], [0, 0])
     np.testing.assert_array_equal(less.landmarks[1], joint.landmarks[1])
     np.testing.assert_array_equal(less.reduced, which)
-    directions = slope @ np.asarray(joint.watch.directions)
+    directions = slope @ joint.watch.directions
     np.testing.assert_allclose(less.watch.directions, directions, rtol=1e-9, atol=1e-9)
+
+
+@cache
+def slope_of(name):
+    """Brute force: retract by all errors, take positions, ask the chart of points for theirs."""
+    chart, of_points = CHARTS[name](), charts.REGISTRY[name]()
+
+    def errors(xi, pose, landmarks, which):
+        rows = xi[3:].reshape(4, 4)
+        own, moved = jax.vmap(chart.retract, (None, 0, None, 0))(pose, landmarks, xi[:3], rows)
+        points, points0 = jax.vmap(SENSOR.position)(moved), jax.vmap(SENSOR.position)(landmarks)
+        dx, dl = jax.vmap(of_points.local, (None, 0, None, 0))(pose, points0, own[0], points)
+        rows = jnp.where(which[:, None], jnp.pad(dl, [(0, 0), (0, 2)]), rows)
+        return jnp.concatenate([dx[0], rows.reshape(-1)])
+
+    return jax.jit(lambda *at: jax.jacfwd(errors)(jnp.zeros(19), *at))
 
 
 @pytest.mark.parametrize("square_root", [False, True])
 def test_nothing_to_reduce_changes_nothing(square_root):
     joint = joint_of("euclidean", square_root)
-    same = REDUCE(joint, jnp.zeros(4, bool), camera(to_point=0.1), square_root)
+    same = REDUCE(joint, np.zeros(4, bool), SENSOR, square_root)
     for a, b in zip(jax.tree.leaves(joint), jax.tree.leaves(same), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -110,8 +122,8 @@ def test_nothing_to_reduce_changes_nothing(square_root):
 @pytest.mark.parametrize("options", [{}, {"linearize": unscented()}, {"update": "joint"}])
 def test_a_reduced_map_is_filtered_as_one_of_points(options):
     """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
-    log, sensor = a_log(), camera(to_point=0.1)
-    start = REDUCE(joint_of(), jnp.array([1, 1, 1, 0], bool), sensor, False)
+    log = a_log()
+    start = jax.device_get(REDUCE(joint_of(), np.array([1, 1, 1, 0], bool), SENSOR, False))
     # Without a watch, and never to be reduced again.
     start = start._replace(watch=())
     keep = np.r_[0:3, np.arange(3, 19).reshape(4, 4)[:, :2].reshape(-1)]
@@ -125,18 +137,20 @@ def test_a_reduced_map_is_filtered_as_one_of_points(options):
     )
     of_points = sensors.bearing_only(NOISE, free=((1.0,), ((1.0,),)))
     finals = []
-    for state, model in ((start, sensor), (point, of_points)):
+    for state, model in ((start, SENSOR), (point, of_points)):
         filter = ekf_slam(MOTION, model, 4, **options)
 
         @jax.jit
         def step(state, row, filter=filter):
             state = filter.predict(state, row.control, jax.random.key(0))
-            return filter.update(state, row.scan, jax.random.key(0))
+            state, info = filter.update(state, row.scan, jax.random.key(0))
+            return state, info, filter.estimate(state)
 
         for t in range(15, 25):
-            state, info = step(state, jax.tree.map(lambda leaf, t=t: jnp.asarray(leaf[t]), log))
-        finals.append((state, filter.estimate(state), info))
-    (wide, estimate, info), (narrow, expected, plain) = finals
+            found = step(state, jax.tree.map(lambda leaf, t=t: leaf[t], log))
+            state = found[0]
+        finals.append(jax.device_get(found))
+    (wide, info, estimate), (narrow, plain, expected) = finals
     # Sigma points of 7 variables are not those of 5.
     near = {"rtol": 1e-5, "atol": 1e-8} if "linearize" in options else {"rtol": 1e-8, "atol": 1e-12}
     np.testing.assert_allclose(wide.pose, narrow.pose, **near)
@@ -154,20 +168,19 @@ def test_a_reduced_map_is_filtered_as_one_of_points(options):
 @pytest.mark.parametrize("square_root", [False, True])
 @pytest.mark.parametrize("name", CHARTS)
 def test_a_run_turns_rays_into_points_where_the_index_allows(name, square_root):
-    options = {"chart": CHARTS[name](), "square_root": square_root}
-    sensor = camera(to_point=0.1)
-    trace = driven(ekf_slam(MOTION, sensor, 4, **options), a_log())
-    became = np.asarray(trace.info.reduced)
+    trace = traced(name, square_root, 0.1)
+    became = trace.info.reduced
     assert became.sum() >= 2
     assert became.sum(axis=0).max() == 1  # once a slot
-    np.testing.assert_array_equal(became.any(axis=0), trace.final.reduced)
+    np.testing.assert_array_equal(became.any(axis=0), trace.probe.reduced[-1])
     assert (trace.info.status != Status.REJECTED).all()
     last = jax.tree.map(lambda leaf: leaf[-1], trace.estimate)
-    off = np.linalg.norm(np.asarray(last.points[:3]) - POINTS, axis=1)
-    spread = np.sqrt(np.asarray(jnp.trace(last.point_covs[:3], axis1=1, axis2=2)))
+    off = np.linalg.norm(last.points[:3] - POINTS, axis=1)
+    spread = np.sqrt(np.trace(last.point_covs[:3], axis1=1, axis2=2))
     assert (off < 3 * spread).all(), (off, spread)
     # A conversion is no news: estimates go on where they would have.
-    never = driven(ekf_slam(MOTION, camera(), 4, **options), a_log())
+    never = traced(name, square_root, 1e-9)
+    assert not never.info.reduced.any()
     np.testing.assert_allclose(trace.estimate.pose, never.estimate.pose, atol=0.02)
 
 
@@ -206,7 +219,7 @@ def test_dead_and_reduced_slots_are_not_ready():
     sensor = camera(to_point=1e6)
     joint = joint_of()
     np.testing.assert_array_equal(READY(joint, sensor, False), [True, True, True, False])
-    less = REDUCE(joint, jnp.array([True, False, False, False]), sensor, False)
+    less = REDUCE(joint, np.array([True, False, False, False]), SENSOR, False)
     np.testing.assert_array_equal(READY(less, sensor, False), [False, True, True, False])
     gone = slots.remove(less, jnp.array([True, False, False, False]))
     assert not gone.reduced.any()

@@ -166,23 +166,32 @@ def test_rays_go_as_their_place_and_direction():
     it is the same in every map frame."""
     chart, rng = REGISTRY["right_invariant"](rays=True), np.random.default_rng(4)
 
+    points = REGISTRY["right_invariant"]()
+
     def end(ray):
         return ray[:2] + np.array([np.cos(ray[2]), np.sin(ray[2])]) / ray[3]
 
+    @jax.jit
+    def everything(pose, ray, dx, dl, at):
+        moved = chart.retract(pose, ray, dx, dl)
+        return (
+            chart.local(pose, ray, *moved),
+            jax.jacfwd(chart.retract, argnums=(2, 3))(pose, ray, 0 * dx, 0 * dl),
+            chart.basis(pose, ray),
+            chart.retract(pose, ray, dx, 0 * dl)[1],
+            points.retract(pose, at, dx, jnp.zeros(2))[1],
+        )
+
     for _ in range(5):
         pose, ray, dx, dl = (rng.normal(size=n) for n in (3, 4, 3, 4))
-        moved = chart.retract(pose, ray, dx, dl)
-        for back, error in zip(chart.local(pose, ray, *moved), (dx, dl), strict=True):
+        found = jax.device_get(everything(pose, ray, dx, dl, end(ray)))
+        again, slopes, basis, turned, there = found
+        for back, error in zip(again, (dx, dl), strict=True):
             np.testing.assert_allclose(back, error, atol=1e-12)
-        slopes = jax.jacfwd(chart.retract, argnums=(2, 3))(pose, ray, 0 * dx, 0 * dl)
-        basis = chart.basis(pose, ray)
         np.testing.assert_allclose(slopes[0][0], basis.pose, atol=1e-12)
         np.testing.assert_allclose(slopes[1][0], basis.cross, atol=1e-12)
         np.testing.assert_allclose(slopes[1][1], np.eye(4), atol=1e-12)
         # A motion of the whole takes the point at the ray's end where it takes points.
-        points = REGISTRY["right_invariant"]()
-        turned = chart.retract(pose, ray, dx, np.zeros(4))[1]
-        there = points.retract(pose, end(ray), dx, np.zeros(2))[1]
         np.testing.assert_allclose(end(turned), there, atol=1e-11)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import charts, linearize, motion, programs, sensors
+from jaxslam import charts, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.protocols import Free, Motion, Sensor
 from jaxslam.run import run
@@ -21,6 +21,7 @@ MOUNT = (0.2, -0.1, 0.4)
 MOTION, SENSOR = motion.increment(Q), sensors.range_bearing(R, mount=MOUNT)
 OBSERVE, INVERT, STEP = jax.jit(SENSOR.observe), jax.jit(SENSOR.invert), jax.jit(MOTION.step)
 OBSERVE_JACOBIANS, STEP_JACOBIANS = jax.jit(SENSOR.observe_jacobians), jax.jit(MOTION.jacobians)
+ROWS = 32
 KEY = jax.random.key(0)
 CAPACITY = 4
 
@@ -56,10 +57,17 @@ def updater(**options):
     options = dict(options)
     chart = charts.REGISTRY[options.pop("chart", "euclidean")]()
     filter = ekf_slam(MOTION, SENSOR, CAPACITY, chart=chart, **options)
-    return jax.jit(lambda joint, scan: filter.update(joint, scan, KEY))
+    update = jax.jit(lambda joint, scan: filter.update(joint, scan, KEY))
+    return lambda joint, scan: jax.device_get(update(joint, scan))
+
+
+@functools.cache
+def estimator(name):
+    return jax.jit(ekf_slam(MOTION, SENSOR, CAPACITY, chart=charts.REGISTRY[name]()).estimate)
 
 
 def assert_same(a, b, atol):
+    a, b = jax.device_get((a, b))
     for left, right in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_allclose(left, right, rtol=0, atol=atol)
 
@@ -67,28 +75,60 @@ def assert_same(a, b, atol):
 # --- dense oracle: numeric Jacobians in chart coordinates, textbook products ---------------------
 
 
+def over_rows(function):
+    """The function over up to ROWS rows of all its arguments, as one program for any number."""
+    batched = jax.jit(jax.vmap(function))
+
+    def mapped(*arguments):
+        wide = [np.pad(a, [(0, ROWS - len(a))] + [(0, 0)] * (a.ndim - 1)) for a in arguments]
+        return jax.tree.map(lambda out: np.asarray(out)[: len(arguments[0])], batched(*wide))
+
+    return mapped
+
+
+def of_map(function):
+    """A chart's function of a pose and one landmark, over all the landmarks of a map."""
+    whole = jax.vmap(function, in_axes=(None, 0, None, 0))
+    return over_rows(lambda *arguments: whole(*arguments))
+
+
+CHARTS = list(charts.REGISTRY)
+RETRACT = {name: of_map(charts.REGISTRY[name]().retract) for name in CHARTS}
+LOCAL = {name: of_map(charts.REGISTRY[name]().local) for name in CHARTS}
+SEEN = over_rows(jax.vmap(SENSOR.observe, (None, 0)))
+FOUND = over_rows(jax.vmap(lambda pose, z: SENSOR.invert(pose, z, jnp.zeros(0)), (None, 0)))
+
+
+def each(value, like):
+    """The same value in as many rows."""
+    return np.broadcast_to(value, (len(like), *np.shape(value)))
+
+
 class Dense:
-    """Functions of the whole error vector ξ (D,) of a chart about a joint, and their Jacobians."""
+    """Functions of rows of error vectors ξ (C, D) of a chart about a joint, and their Jacobians."""
 
-    def __init__(self, joint, chart):
-        self.chart, self.size = chart, joint.cov.shape[0]
+    def __init__(self, joint, name):
+        self.name, self.joint, self.size = name, joint, joint.cov.shape[0]
         self.p = np.asarray(joint.cov)
-        over = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
 
-        def retract(xi):
-            dl = xi[3:].reshape(-1, 2)
-            poses, landmarks = over(joint.pose, joint.landmarks, xi[:3], dl)
-            return poses[0], jnp.where(joint.alive[:, None], landmarks, dl)  # padding stays put
+    def retract(self, xi):
+        """Poses (C, 3), landmarks (C, N, 2)."""
+        dl = xi[:, 3:].reshape(len(xi), -1, 2)
+        pose, landmarks = each(self.joint.pose, xi), each(self.joint.landmarks, xi)
+        poses, landmarks = RETRACT[self.name](pose, landmarks, xi[:, :3], dl)
+        landmarks = np.where(self.joint.alive[:, None], landmarks, dl)  # padding stays put
+        return poses[:, 0], landmarks
 
-        self.retract = retract
+    def local(self, pose, landmarks, poses, to):
+        """Errors (C, 3), (C, N, 2) of poses and landmarks about one of each."""
+        dx, dl = LOCAL[self.name](each(pose, poses), each(landmarks, poses), poses, to)
+        return dx[:, 0], dl
 
     def jacobian(self, function, at=None, step=1e-5):
-        """Central differences of ξ -> vector, angles that cross their seam put right."""
+        """Central differences of rows ξ -> rows, angles that cross their seam put right."""
         at = np.zeros(self.size) if at is None else at
         moves = step * np.eye(len(at))
-        places = np.concatenate([at + moves, at - moves])
-        # By structure: at another state nothing compiles again.
-        values = np.asarray(programs.call(jax.vmap(function), (), places))
+        values = function(np.concatenate([at + moves, at - moves]))
         rise = values[: len(at)] - values[len(at) :]
         rise = rise - 2 * np.pi * np.round(rise / (2 * np.pi))
         return rise.T / (2 * step)
@@ -96,9 +136,11 @@ class Dense:
     def observe(self, slots_seen):
         def function(xi):
             pose, landmarks = self.retract(xi)
-            return jax.vmap(SENSOR.observe, (None, 0))(pose, landmarks[slots_seen]).ravel()
+            # Two always, so that one program serves all.
+            seen = SEEN(pose, landmarks[:, np.resize(slots_seen, 2)])
+            return seen[:, : len(slots_seen)].reshape(len(xi), -1)
 
-        return lambda xi: programs.call(function, (), xi)
+        return function
 
     def update(self, scan, slots_seen, iterations):
         """(I - KH) P and K ν with the H of the newest estimate, always from the prior."""
@@ -106,17 +148,15 @@ class Dense:
         noise = np.kron(np.eye(len(slots_seen)), R)
         for i in range(iterations):
             h = self.jacobian(observe, xi)
-            nu = np.asarray(scan.z).ravel() - np.asarray(observe(xi))
+            nu = scan.z.ravel() - observe(xi[None])[0]
             nu[1::2] = np.arctan2(np.sin(nu[1::2]), np.cos(nu[1::2]))
             s = h @ self.p @ h.T + noise
             gain = self.p @ h.T @ np.linalg.inv(s)
             if i == 0:
                 first = nu, s
             xi = gain @ (nu + h @ xi)
-        return self.retract(xi), (np.eye(self.size) - gain @ h) @ self.p, *first
-
-
-CHARTS = list(charts.REGISTRY)
+        (pose,), (landmarks,) = self.retract(xi[None])
+        return (pose, landmarks), (np.eye(self.size) - gain @ h) @ self.p, *first
 
 
 def sloping():
@@ -129,25 +169,28 @@ def sloping():
     return dataclasses.replace(MOTION, step=step)
 
 
-@pytest.mark.parametrize("robot", [MOTION, sloping()], ids=["increment", "sloping"])
+ROBOTS = {"increment": MOTION, "sloping": sloping()}
+STEPS = {name: over_rows(robot.step) for name, robot in ROBOTS.items()}
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("name", CHARTS)
 def test_prediction_is_a_p_at_plus_b_q_bt(name, robot):
     chart, joint, u = charts.REGISTRY[name](), some_joint(), np.array([0.3, 0.4])
-    dense = Dense(joint, chart)
-    ahead = jax.jit(robot.step)(joint.pose, u, np.zeros(2))
-    over = jax.vmap(chart.local, in_axes=(None, 0, None, 0))
+    dense, step = Dense(joint, name), STEPS[robot]
+    ahead = step(joint.pose[None], u[None], np.zeros((1, 2)))[0]
 
     def error_after(both):
-        pose, landmarks = dense.retract(both[: dense.size])
-        moved = robot.step(pose, u, both[dense.size :])
-        dx, dl = over(ahead, joint.landmarks, moved, landmarks)
-        dl = jnp.where(joint.alive[:, None], dl, landmarks)
-        return jnp.concatenate([dx[0], dl.ravel()])
+        pose, landmarks = dense.retract(both[:, : dense.size])
+        moved = step(pose, each(u, both), both[:, dense.size :])
+        dx, dl = dense.local(ahead, joint.landmarks, moved, landmarks)
+        dl = np.where(joint.alive[:, None], dl, landmarks)
+        return np.concatenate([dx, dl.reshape(len(dl), -1)], axis=1)
 
     both = dense.jacobian(error_after, np.zeros(dense.size + 2))
     a, b = both[:, : dense.size], both[:, dense.size :]
-    filter = ekf_slam(robot, SENSOR, CAPACITY, chart=chart)
-    out = jax.jit(filter.predict)(joint, u, KEY)
+    filter = ekf_slam(ROBOTS[robot], SENSOR, CAPACITY, chart=chart)
+    out = jax.device_get(jax.jit(filter.predict)(joint, u, KEY))
     np.testing.assert_allclose(out.cov, a @ dense.p @ a.T + b @ Q @ b.T, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(out.cov, out.cov.T)
     np.testing.assert_allclose(out.pose, ahead, atol=1e-15)
@@ -160,7 +203,7 @@ def test_prediction_is_a_p_at_plus_b_q_bt(name, robot):
 def test_joint_correction_is_the_textbook_update_in_chart_coordinates(name, iterations):
     joint = some_joint()
     scan = some_scan(joint, [13, 10])
-    dense = Dense(joint, charts.REGISTRY[name]())
+    dense = Dense(joint, name)
     (pose, landmarks), p, nu, s = dense.update(scan, [3, 0], iterations)
     out, info = updater(chart=name, update="joint", iterations=iterations)(joint, scan)
     np.testing.assert_allclose(out.pose, pose, atol=1e-8)
@@ -176,17 +219,16 @@ def test_joint_correction_is_the_textbook_update_in_chart_coordinates(name, iter
 @pytest.mark.parametrize("name", CHARTS)
 def test_augmentation_and_estimate_are_first_order_propagation(name):
     joint = some_joint((True, False, False, True))
-    chart = charts.REGISTRY[name]()
-    dense = Dense(joint, chart)
+    dense = Dense(joint, name)
     z = np.array([[2.0, 0.5], [3.0, -2.0]])
-    born = np.array([INVERT(joint.pose, one, np.zeros(0)) for one in z])
+    born = FOUND(joint.pose[None], z[None])[0]
 
     def errors_born(both):
-        pose, _ = dense.retract(both[: dense.size])
-        noisy = z + both[dense.size :].reshape(2, 2)
-        landmarks = jax.vmap(SENSOR.invert, (None, 0, None))(pose, noisy, jnp.zeros(0))
-        local = jax.vmap(chart.local, in_axes=(None, 0, None, 0))
-        return local(joint.pose, born, pose, landmarks)[1].ravel()
+        pose, _ = dense.retract(both[:, : dense.size])
+        landmarks = FOUND(pose, z + both[:, dense.size :].reshape(-1, 2, 2))
+        # Twice, so that the program of a whole map serves.
+        dl = dense.local(joint.pose, np.tile(born, (2, 1)), pose, np.tile(landmarks, (1, 2, 1)))[1]
+        return dl[:, :2].reshape(len(dl), -1)
 
     both = dense.jacobian(errors_born, np.zeros(dense.size + 4))
     by_xi, by_v = both[:, : dense.size], both[:, dense.size :]
@@ -205,15 +247,15 @@ def test_augmentation_and_estimate_are_first_order_propagation(name):
     np.testing.assert_array_equal(out.cov[np.ix_(old, old)], joint.cov[np.ix_(old, old)])
 
     # The moments in map coordinates, of the map with the new landmarks in it.
-    after = Dense(out, chart)
+    after = Dense(out, name)
 
     def coordinates(xi):
         pose, landmarks = after.retract(xi)
-        return jnp.concatenate([pose, landmarks.ravel()])
+        return np.concatenate([pose, landmarks.reshape(len(xi), -1)], axis=1)
 
     j = after.jacobian(coordinates)
     moments = j @ after.p @ j.T
-    estimate = jax.jit(ekf_slam(MOTION, SENSOR, CAPACITY, chart=chart).estimate)(out)
+    estimate = jax.device_get(estimator(name)(out))
     np.testing.assert_allclose(estimate.pose_cov, moments[:3, :3], atol=1e-7)
     for i in range(CAPACITY):
         own = moments[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i]
@@ -225,8 +267,8 @@ def test_augmentation_and_estimate_are_first_order_propagation(name):
 def test_initial_covariance_is_given_in_map_coordinates(name):
     root = np.random.default_rng(5).normal(size=(3, 3))
     filter = ekf_slam(MOTION, SENSOR, CAPACITY, chart=charts.REGISTRY[name]())
-    start = jax.jit(lambda pose, cov: filter.estimate(filter.init(pose, cov)))
-    estimate = start(np.array([5.0, -3.0, 2.0]), root @ root.T)
+    start = jax.jit(filter.init)(np.array([5.0, -3.0, 2.0]), root @ root.T)
+    estimate = estimator(name)(start)
     np.testing.assert_allclose(estimate.pose_cov, root @ root.T, atol=1e-11)
     assert not estimate.alive.any()
 
@@ -234,15 +276,15 @@ def test_initial_covariance_is_given_in_map_coordinates(name):
 def test_iterated_correction_finds_the_most_probable_state_and_counts_the_data_once():
     """Its fixed point is the minimum of ξᵀP⁻¹ξ + νᵀR⁻¹ν, its covariance that of one measurement."""
     joint = some_joint(size=0.25)
-    scan = some_scan(joint, [10], noise=0.3)
-    dense = Dense(joint, charts.euclidean())
+    scan = some_scan(joint, [10, 11], noise=0.3)._replace(valid=np.array([True, False]))
+    dense = Dense(joint, "euclidean")
     information = np.linalg.inv(dense.p)
 
     def slope(state):
         xi = np.concatenate([state.pose - joint.pose, (state.landmarks - joint.landmarks).ravel()])
         observe = dense.observe(np.array([0]))
         h = dense.jacobian(observe, xi)
-        nu = np.asarray(scan.z[0]) - np.asarray(observe(xi))
+        nu = scan.z[0] - observe(xi[None])[0]
         nu[1] = np.arctan2(np.sin(nu[1]), np.cos(nu[1]))
         curvature = information + h.T @ np.linalg.inv(R) @ h
         # In units of standard deviations.
@@ -323,7 +365,7 @@ def linear():
         for t in range(6):
             state, info = step(state, jax.tree.map(lambda part, t=t: part[t], scans))
             infos.append(info)
-        return state, infos
+        return jax.device_get((state, infos))
 
     return drive
 
