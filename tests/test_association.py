@@ -51,9 +51,8 @@ def pairs_of(innovation, cross, noise):
     return Pairs(innovation, cov, distance, log_det, np.ones(distance.shape, bool))
 
 
-def associated(method, innovation, cross, noise, valid=None, alive=None):
-    """Of one problem, traceable."""
-    innovation, cross, noise = map(jnp.asarray, (innovation, cross, noise))
+def plainly(method, innovation, cross, noise, valid=None, alive=None):
+    """Of one problem."""
     m, n = innovation.shape[:2]
     valid = jnp.ones(m, bool) if valid is None else valid
     alive = jnp.ones(n, bool) if alive is None else alive
@@ -67,6 +66,9 @@ def associated(method, innovation, cross, noise, valid=None, alive=None):
     prediction = Prediction(jnp.full(n, -1), alive, lambda scan: pairs, lambda: cross)
     scan = Scan(jnp.zeros((m, innovation.shape[2])), jnp.full(m, -1), valid)
     return Association(*method(prediction, scan))
+
+
+associated = jax.jit(plainly, static_argnums=0)
 
 
 # --- optima ---------------------------------------------------------------------------------------
@@ -256,7 +258,7 @@ def test_joint_probabilities_of_nothing_and_of_everything():
         (lambda: association.nearest(np.nan), "at least 0"),
         (lambda: association.nearest("9"), "nearest: expected a number as gate, got str$"),
         (
-            lambda: associated(association.nearest, *problem(np.random.default_rng(1), 3, 5)),
+            lambda: plainly(association.nearest, *problem(np.random.default_rng(1), 3, 5)),
             r"expected a number .*: as associate, give nearest\(gate\), not nearest$",
         ),
         (lambda: association.maximum_likelihood(9.0, 4.0), "new_gate >= gate"),

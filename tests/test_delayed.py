@@ -121,6 +121,7 @@ CONSTRAINTS = jax.jit(hypotheses.constraints)
 MOVE = jax.jit(hypotheses.move_hypotheses, static_argnums=1)
 FIT = jax.jit(placing.fit, static_argnums=1)
 ENTER = jax.jit(placing.enter)
+NEAR = jax.jit(hypotheses.near, static_argnums=0)
 
 
 def table(kind, seed=0, scale=0.01):
@@ -286,7 +287,7 @@ def test_gaussians_are_told_apart_by_either_distance():
     bhattacharyya = d2 / 4 + np.array(log_det)
     for distance, by_hand in (("mahalanobis", d2), ("bhattacharyya", bhattacharyya)):
         for limit in (0.3, 0.7, 1.0, 4.0):
-            near = hypotheses.near(distance, limit, points, cov[None], others, other_covs)
+            near = NEAR(distance, limit, points, cov[None], others, other_covs)
             np.testing.assert_array_equal(near[0], by_hand < limit)
 
 
@@ -406,16 +407,15 @@ def small(kind, **options):
 @pytest.fixture(scope="module")
 def poor():
     """With room for one landmark: the log as drawn, one of random bearings, one without a
-    measurement, one without names; as a batch."""
+    measurement, one without names."""
     scenario, filter = small("rays", capacity=1)
     _, log = draw(scenario, 0)
     z = jax.random.uniform(jax.random.key(3), log.scan.z.shape, float, -np.pi, np.pi)
     spoiled = log._replace(scan=log.scan._replace(z=z))
-    empty = log._replace(scan=log.scan._replace(valid=jnp.zeros_like(log.scan.valid)))
-    nameless = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
-    logs = jax.tree.map(lambda *x: jnp.stack(x), log, spoiled, empty, nameless)
-    trace = jax.device_get(jax.jit(jax.vmap(partial(go, filter)))(logs))
-    return scenario, filter, empty, [jax.tree.map(lambda x, i=i: x[i], trace) for i in range(4)]
+    empty = log._replace(scan=log.scan._replace(valid=np.zeros_like(log.scan.valid)))
+    nameless = log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
+    logs = log, spoiled, empty, nameless
+    return scenario, filter, empty, [jax.device_get(go(filter, each)) for each in logs]
 
 
 def test_a_full_map_refuses_and_says_so(poor):

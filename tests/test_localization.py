@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import ring
+from worlds import draw, ring
 
-from jaxslam import association, charts, linearize, monte_carlo, run, sensors, simulate
+from jaxslam import association, charts, linearize, monte_carlo, run, sensors
 from jaxslam.filters import dead_reckoning, ekf_slam, localization
 from jaxslam.sensors import Part, suite
 from jaxslam.stats import chi2_quantile
@@ -23,7 +23,7 @@ GATE, NEW = chi2_quantile(0.999, 2), chi2_quantile(0.99999, 2)
 @cache
 def world():
     scenario = dataclasses.replace(ring(40), pose=START, pose_cov=SPREAD)
-    return scenario, simulate(scenario, jax.random.key(3))
+    return scenario, draw(scenario, 3)
 
 
 def here(**options):
@@ -32,37 +32,36 @@ def here(**options):
 
 
 def driven(filter, log):
-    return run(filter, log, jnp.asarray(START), jnp.asarray(SPREAD), KEY)
+    return jax.device_get(run(filter, log, START, SPREAD, KEY))
 
 
 def slam_in_a_known_map(scenario, log, chart_name, options):
     """Poses and covariances of EKF-SLAM from a state whose landmarks are known exactly."""
     chart = charts.REGISTRY[chart_name]()
-    points = jnp.asarray(scenario.landmarks)
+    points = np.asarray(scenario.landmarks)
     count = len(points)
     filter = ekf_slam(scenario.motion, scenario.sensor, count, chart=chart, **options)
-    joint = filter.init(jnp.asarray(START), jnp.asarray(SPREAD))
-    rows = [jnp.eye(3)]
-    if chart.basis is None:
-        rows += [jnp.zeros((2, 3))] * count
-    else:  # coordinates without error: cross dx + B dl = 0
-        for point in points:
-            basis = chart.basis(joint.pose, point)
-            own = jnp.eye(2) if basis.landmark is None else basis.landmark
-            rows.append(-jnp.linalg.solve(own, basis.cross))
-    lift = jnp.concatenate(rows)
-    joint = joint._replace(
-        landmarks=points,
-        cov=lift @ joint.cov[:3, :3] @ lift.T,
-        alive=jnp.ones(count, bool),
-        tag=jnp.arange(count, dtype=jnp.int32),
-    )
 
-    def step(joint, row):
-        joint, _ = filter.update(filter.predict(joint, row.control, KEY), row.scan, KEY)
-        return joint, filter.estimate(joint)
+    def known(pose, cov):
+        joint = filter.init(pose, cov)
+        rows = [jnp.eye(3)]
+        if chart.basis is None:
+            rows += [jnp.zeros((2, 3))] * count
+        else:  # coordinates without error: cross dx + B dl = 0
+            for point in points:
+                basis = chart.basis(joint.pose, point)
+                own = jnp.eye(2) if basis.landmark is None else basis.landmark
+                rows.append(-jnp.linalg.solve(own, basis.cross))
+        lift = jnp.concatenate(rows)
+        return joint._replace(
+            landmarks=jnp.asarray(points),
+            cov=lift @ joint.cov[:3, :3] @ lift.T,
+            alive=jnp.ones(count, bool),
+            tag=jnp.arange(count, dtype=jnp.int32),
+        )
 
-    return jax.jit(lambda joint: jax.lax.scan(step, joint, log)[1])(joint)
+    slam = dataclasses.replace(filter, init=known)
+    return driven(slam, log).estimate
 
 
 @pytest.mark.parametrize(
@@ -152,7 +151,7 @@ def test_it_finds_its_landmarks_without_tags(method):
     scenario, (_, log) = world()
     make = getattr(association, method)
     associate = make(0.999, NEW) if method == "joint" else make(GATE, NEW)
-    nameless = log._replace(scan=log.scan._replace(tag=jnp.full_like(log.scan.tag, -1)))
+    nameless = log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
     trace = driven(here(associate=associate), nameless)
     fused = np.asarray(trace.info.status == Status.FUSED)
     assert fused.mean() > 0.98
@@ -199,9 +198,9 @@ def test_it_is_honest_and_dead_reckoning_is_what_it_says():
 def test_dead_reckoning_is_the_motion_alone():
     scenario, (_, log) = world()
     trace = driven(dead_reckoning(scenario.motion, scenario.sensor), log)
-    pose = START
+    pose, move = START, jax.jit(scenario.motion.step)
     for u, estimate in zip(log.control, trace.estimate.pose, strict=True):
-        pose = scenario.motion.step(pose, u, jnp.zeros(2))
+        pose = move(pose, u, np.zeros(2))
         np.testing.assert_allclose(estimate, pose, atol=1e-12)
     assert not trace.estimate.alive.any()
 
@@ -210,19 +209,18 @@ def test_gradient_and_float32():
     scenario, (_, log) = world()
     short = jax.tree.map(lambda leaf: leaf[:5], log)
 
-    @jax.jit
     def last(landmarks):
         filter = localization(scenario.motion, scenario.sensor, landmarks)
-        trace = run(filter, short, jnp.asarray(START), jnp.asarray(SPREAD), KEY)
+        trace = run(filter, short, START, SPREAD, KEY)
         return (trace.estimate.pose[-1] ** 2).sum()
 
-    slope = jax.grad(last)(jnp.asarray(scenario.landmarks))
+    slope = jax.jit(jax.grad(last))(np.asarray(scenario.landmarks))
     assert np.isfinite(slope).all() and (slope != 0).all()
     low = jax.tree.map(
-        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, log
+        lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, log
     )
     start = START.astype(np.float32), SPREAD.astype(np.float32)
-    trace = jax.jit(lambda log: run(here(), log, *start, KEY))(low)
+    trace = run(here(), low, *start, KEY)
     assert trace.estimate.pose.dtype == trace.final.cov.dtype == jnp.float32
     np.testing.assert_allclose(trace.estimate.pose, driven(here(), log).estimate.pose, atol=1e-3)
 

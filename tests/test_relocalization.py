@@ -1,6 +1,7 @@
 """A lost robot found again by geometry: exhaustive search, ambiguity, and the pose's own covariance."""
 
 import itertools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,10 @@ from jaxslam.stats import chi2_band, chi2_quantile
 from jaxslam.types import Scan, Status
 
 SENSOR = sensors.range_bearing(np.diag([0.05, 0.01]) ** 2, mount=(0.2, 0.1, 0.3))
-FIND = jax.jit(relocalize)
+FIND, ALIGN = jax.jit(relocalize), jax.jit(se2.align)
+LOST = jax.jit(lost, static_argnums=1, static_argnames="square_root")
+MAP_OF = jax.jit(map_of, static_argnums=1, static_argnames="square_root")
+RELOCATED = jax.jit(relocated, static_argnums=1)
 
 
 def world(seed, count, reach=10.0, spread=0.05):
@@ -36,16 +40,35 @@ def world(seed, count, reach=10.0, spread=0.05):
 
 def seen_from(rng, pose, points, noise=0.05):
     """A scan's points in the robot's frame with independent noise."""
-    exact = np.stack([np.asarray(se2.to_frame(jnp.asarray(pose), jnp.asarray(p))) for p in points])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    exact = (points - np.asarray(pose)[:2]) @ np.array([[c, -s], [s, c]])
     covs = np.tile(noise**2 * np.eye(2), (len(points), 1, 1))
     return exact + noise * rng.normal(size=exact.shape), covs
 
 
-def find(points, cov, seen, covs, valid=None, alive=None, **options):
+SLOTS, PLACES = 30, 11
+
+
+def padded(points, cov, seen, covs, valid=None, alive=None):
+    """What `relocalize` takes, with dead landmarks and invalid places up to one size for all."""
     valid = np.ones(len(seen), bool) if valid is None else valid
     alive = np.ones(len(points), bool) if alive is None else alive
-    go = jax.jit(lambda *parts: relocalize(*parts, **options)) if options else FIND
-    return go(*map(jnp.asarray, (points, cov, alive, seen, covs, valid)))
+    slots, places = SLOTS - len(points), PLACES - len(seen)
+    whole = np.eye(2 * SLOTS)
+    whole[: len(cov), : len(cov)] = cov
+    return (
+        np.pad(points, ((0, slots), (0, 0))),
+        whole,
+        np.pad(alive, (0, slots)),
+        np.pad(seen, ((0, places), (0, 0))),
+        np.concatenate([covs, np.tile(np.eye(2), (places, 1, 1))]),
+        np.pad(valid, (0, places)),
+    )
+
+
+def find(points, cov, seen, covs, valid=None, alive=None):
+    found = jax.device_get(FIND(*padded(points, cov, seen, covs, valid, alive)))
+    return found._replace(slot=found.slot[: len(seen)])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -90,7 +113,7 @@ def exhaustive(points, cov, seen, covs, probability=0.99):
         if n < 3 or len(set(pick)) < n or n < best[0]:
             continue
         z, m = seen[choice >= 0], points[pick]
-        start = np.asarray(se2.align(jnp.asarray(z), jnp.asarray(m)))
+        start = np.asarray(ALIGN(z, m))
         if (
             np.abs(
                 z
@@ -130,6 +153,7 @@ def test_exhaustive_search_finds_no_better(seed):
     np.testing.assert_allclose(found.pose, pose, atol=1e-2)
 
 
+@pytest.mark.usefixtures("full_optimization")
 def test_clutter_is_left_alone_and_the_right_place_found_at_full_size():
     """200 landmarks, 6 of a scan's 9 measurements of them: never sure of a wrong place."""
     right = sure = 0
@@ -141,7 +165,7 @@ def test_clutter_is_left_alone_and_the_right_place_found_at_full_size():
         pose = np.append(points[0] + 1.0, rng.uniform(-3, 3))
         seen, covs = seen_from(rng, pose, np.concatenate([points[of], clutter]))
         order = rng.permutation(9)
-        found = find(estimate, cov, seen[order], covs)
+        found = FIND(estimate, cov, np.ones(200, bool), seen[order], covs, np.ones(9, bool))
         truth = np.where(order < 6, of[np.minimum(order, 5)], -1)
         good = (np.asarray(found.slot) == truth)[truth >= 0].all()
         sure += bool(found.ok)
@@ -173,7 +197,7 @@ def test_too_few_points_and_nothing_that_agrees():
         found = find(points, cov, seen, covs, valid=np.arange(5) < count)
         assert not found.ok
         assert found.explained <= count
-    empty = relocalize(points, cov, np.ones(10, bool), seen[:1], covs[:1], np.ones(1, bool))
+    empty = FIND(points, cov, np.ones(10, bool), seen[:1], covs[:1], np.ones(1, bool))
     assert not empty.ok and empty.slot.shape == (1,)
     far = find(points, 1e-6 * np.eye(20), 100 * seen, 1e-6 * covs)
     assert far.explained == 0 and not far.ok
@@ -186,12 +210,11 @@ def test_dead_landmarks_are_not_matched_and_vmap_is_a_loop():
     alive = np.arange(12) != 3
     found = find(points, cov, seen, covs, alive=alive)
     assert found.ok and found.slot[3] == -1 and found.explained == 5
-    scans = np.stack([seen, seen[::-1]])
-    many = jax.jit(jax.vmap(relocalize, (None, None, None, 0, None, None)))(
-        *map(jnp.asarray, (points, cov, alive, scans, covs, np.ones(6, bool)))
-    )
-    np.testing.assert_array_equal(many.slot[0], found.slot)
-    np.testing.assert_array_equal(many.slot[1], found.slot[::-1])
+    parts = list(padded(points, cov, seen, covs, alive=alive))
+    parts[3] = np.stack([padded(points, cov, z, covs)[3] for z in (seen, seen[::-1])])
+    many = jax.jit(jax.vmap(relocalize, (None, None, None, 0, None, None)))(*parts)
+    np.testing.assert_array_equal(many.slot[0, :6], found.slot)
+    np.testing.assert_array_equal(many.slot[1, :6], found.slot[::-1])
     np.testing.assert_allclose(many.pose[1], found.pose, atol=1e-9)
 
 
@@ -199,20 +222,20 @@ def test_float32():
     rng, points, cov = world(3, 40, reach=40.0)
     of = np.argsort(((points - points[0]) ** 2).sum(axis=1))[:7]
     seen, covs = seen_from(rng, [1.0, 2.0, 0.5], points[of])
-    parts = [np.asarray(p, np.float32) for p in (points, cov)]
-    scan = [np.asarray(p, np.float32) for p in (seen, covs)]
-    found = find(*parts, *scan)
+    points, cov, seen, covs = (np.asarray(p, np.float32) for p in (points, cov, seen, covs))
+    found = FIND(points, cov, np.ones(40, bool), seen, covs, np.ones(7, bool))
     assert found.pose.dtype == jnp.float32
     assert found.ok
     np.testing.assert_array_equal(found.slot, of)
 
 
 def test_a_scan_as_points():
-    z = jnp.array([[2.0, 0.3], [5.0, -1.0], [9.0, 9.0]])
-    scan = Scan(z, jnp.full(3, -1), jnp.array([True, True, False]))
-    points, covs = seen_points(SENSOR, scan)
+    z = np.array([[2.0, 0.3], [5.0, -1.0], [9.0, 9.0]])
+    scan = Scan(z, np.full(3, -1), np.array([True, True, False]))
+    points, covs = jax.jit(partial(seen_points, SENSOR))(scan)
+    invert = jax.jit(SENSOR.invert)
     for i in range(2):
-        expected = SENSOR.invert(jnp.zeros(3), z[i], jnp.zeros(0))
+        expected = invert(np.zeros(3), z[i], np.zeros(0))
         np.testing.assert_allclose(points[i], expected)
         r, phi = float(z[i, 0]), float(z[i, 1]) + 0.3
         slope = np.array([[np.cos(phi), -r * np.sin(phi)], [np.sin(phi), r * np.cos(phi)]])
@@ -236,7 +259,7 @@ def some_joint(seed=0, count=6):
     whole = np.where(dead[:, None] | dead[None], np.eye(size), whole)
     points = np.where(alive[:, None], points, 0.0)
     parts = np.array([0.5, 1.0, 0.3]), points, whole, alive, np.where(alive, np.arange(count), -1)
-    return Joint(*map(jnp.asarray, parts), ())
+    return Joint(*parts, ())
 
 
 @pytest.mark.parametrize("name", ["euclidean", "right_invariant", "left_invariant"])
@@ -245,10 +268,10 @@ def test_lost_forgets_the_pose_and_nothing_else(name, square_root):
     chart = charts.REGISTRY[name]()
     joint = some_joint()
     if square_root:
-        joint = joint._replace(cov=jnp.linalg.cholesky(joint.cov))
+        joint = joint._replace(cov=np.linalg.cholesky(joint.cov))
     pose_cov = np.diag([100.0, 100.0, 9.0])
-    gone = lost(joint, chart, pose_cov, square_root=square_root)
-    before, after = (map_of(s, chart, square_root=square_root)[1] for s in (joint, gone))
+    gone = LOST(joint, chart, pose_cov, square_root=square_root)
+    before, after = (MAP_OF(s, chart, square_root=square_root)[1] for s in (joint, gone))
     np.testing.assert_allclose(after, before, atol=1e-9)
     cov = gone.cov @ gone.cov.T if square_root else gone.cov
     size = cov.shape[0]
@@ -261,7 +284,7 @@ def test_lost_forgets_the_pose_and_nothing_else(name, square_root):
             [poses[0], jnp.where(gone.alive[:, None], points, xi[3:].reshape(-1, 2)).ravel()]
         )
 
-    slope = np.asarray(jax.jacfwd(coordinates)(jnp.zeros(size)))
+    slope = np.asarray(jax.jit(jax.jacfwd(coordinates))(np.zeros(size)))
     whole = slope @ cov @ slope.T
     np.testing.assert_allclose(whole[:3, :3], pose_cov, atol=1e-9)
     np.testing.assert_allclose(whole[:3, 3:], 0, atol=1e-9)
@@ -277,14 +300,12 @@ def test_relocated_is_the_limit_of_an_update_from_a_large_covariance(name):
     pose = np.array([3.0, -1.0, 2.0])
     seen, _ = seen_from(rng, pose, np.asarray(joint.landmarks)[np.maximum(slot, 0)], 1e-3)
     covs = np.tile(0.1**2 * np.eye(2), (5, 1, 1))
-    found = jax.jit(
-        lambda j: relocated(j, chart, jnp.asarray(slot), jnp.asarray(seen), jnp.asarray(covs))
-    )(joint)
+    found = RELOCATED(joint, chart, slot, seen, covs)
     # Linearized at the answer, the same update from a large covariance hardly moves the pose.
-    wide = lost(joint._replace(pose=found.pose), chart, 1e7 * np.eye(3))
+    wide = LOST(joint._replace(pose=found.pose), chart, 1e7 * np.eye(3))
     models = {"sensor": sensor, "chart": chart, "linearize": at_estimate()}
-    known = jnp.asarray(slot >= 0)
-    limit, _ = correct(wide, jnp.asarray(seen), jnp.maximum(jnp.asarray(slot), 0), known, **models)
+    correction = jax.jit(partial(correct, **models))
+    limit, _ = correction(wide, seen, np.maximum(slot, 0), slot >= 0)
     tolerance = 1e-5 if name == "euclidean" else 1e-3  # basis at the answer, or before it
     np.testing.assert_allclose(found.pose, limit.pose, atol=tolerance)
     np.testing.assert_allclose(found.landmarks, limit.landmarks, atol=20 * tolerance)
@@ -330,10 +351,10 @@ def test_two_pairs_are_enough_and_fewer_change_nothing():
     joint, chart = some_joint(), charts.euclidean()
     rng = np.random.default_rng(0)
     seen, covs = seen_from(rng, [2.0, 1.0, -1.0], np.asarray(joint.landmarks)[[0, 4]])
-    found = relocated(joint, chart, jnp.array([0, 4]), jnp.asarray(seen), jnp.asarray(covs))
+    found = RELOCATED(joint, chart, np.array([0, 4]), seen, covs)
     assert np.abs(found.pose - np.array([2.0, 1.0, -1.0])).max() < 0.3
     for slot in ([0, -1], [-1, -1], [2, 0]):  # 2 is dead
-        same = relocated(joint, chart, jnp.array(slot), jnp.asarray(seen), jnp.asarray(covs))
+        same = RELOCATED(joint, chart, np.array(slot), seen, covs)
         for left, right in zip(jax.tree.leaves(same), jax.tree.leaves(joint), strict=True):
             np.testing.assert_array_equal(left, right)
 
@@ -350,13 +371,11 @@ def test_a_kidnapped_robot_finds_itself_and_goes_on(name):
     filter = ekf_slam(model, sensor, 25, chart=chart, gate=chi2_quantile(0.9999, 2), update="joint")
     predict, update = jax.jit(filter.predict), jax.jit(filter.update)
     look = jax.jit(jax.vmap(sensor.observe, (None, 0)))
-    find_it = jax.jit(
-        lambda s, scan: relocalize(*map_of(s, chart), *seen_points(sensor, scan), scan.valid)
-    )
+    points_of = jax.jit(partial(seen_points, sensor))
     again = jax.jit(lambda s, slot, scan: relocated(s, chart, slot, *seen_points(sensor, scan)))
     key = jax.random.key(0)
     pose, u = np.zeros(3), np.array([0.4, 0.0, 0.08])
-    state, missing, events = filter.init(jnp.zeros(3), jnp.zeros((3, 3))), False, []
+    state, missing, events = filter.init(np.zeros(3), np.zeros((3, 3))), False, []
     for step in range(160):
         noisy = u + np.array([0.02, 0.02, 0.01]) * rng.normal(size=3)
         pose = np.asarray(move(pose, noisy))
@@ -366,10 +385,11 @@ def test_a_kidnapped_robot_finds_itself_and_goes_on(name):
         near = np.argsort(exact[:, 0])[:8]
         z = exact[near] + rng.normal(size=(8, 2)) * [0.05, 0.01]
         # Identities are given while it knows where it is; afterwards they are ignored.
-        scan = Scan(jnp.asarray(z), jnp.asarray(near), jnp.ones(8, bool))
+        scan = Scan(z, near, np.ones(8, bool))
         state = predict(state, u, key)
         if missing:
-            found = find_it(state, scan)
+            points, cov, alive = MAP_OF(state, chart)
+            found = find(points, cov, *points_of(scan), scan.valid, alive)
             if found.ok:
                 state, missing = again(state, found.slot, scan), False
                 events.append(("found", step))
@@ -379,13 +399,13 @@ def test_a_kidnapped_robot_finds_itself_and_goes_on(name):
             continue
         state_after, info = update(state, scan, key)
         if (info.status == Status.REJECTED).sum() >= 5:
-            state, missing = lost(state, chart, np.diag([100.0, 100.0, 9.0])), True
+            state, missing = LOST(state, chart, np.diag([100.0, 100.0, 9.0])), True
             events.append(("lost", step))
         else:
             state = state_after
     assert [e[0] for e in events] == ["lost", "found"]
     assert events[0][1] == 100 and events[1][1] < 110
-    estimate = filter.estimate(state)
+    estimate = jax.jit(filter.estimate)(state)
     error = np.asarray(estimate.pose) - pose
     error[2] = np.arctan2(np.sin(error[2]), np.cos(error[2]))
     assert error @ np.linalg.solve(estimate.pose_cov, error) < chi2_quantile(0.999, 3)

@@ -239,18 +239,18 @@ def test_a_way_in_is_exact_without_noise(way):
 
     def to(pose, point):
         c, s = np.cos(pose[2]), np.sin(pose[2])
-        return jnp.asarray(np.array([[c, s], [-s, c]]) @ (point - pose[:2]))
+        return np.array([[c, s], [-s, c]]) @ (point - pose[:2])
 
-    cov = jnp.eye(2) * 1e-4
+    cov = np.eye(2) * 1e-4
     if way == "mutual":
-        found = entering.by_mutual_sight(
-            jnp.asarray(a), jnp.eye(3, 9), jnp.eye(3), (to(a, b[:2]), cov), (to(b, a[:2]), cov)
+        found = jax.jit(entering.by_mutual_sight)(
+            a, np.eye(3, 9), np.eye(3), (to(a, b[:2]), cov), (to(b, a[:2]), cov)
         )
     else:
         points = np.array([[0.0, 0.5], [3.0, -1.0]])
-        seen = jnp.stack([to(b, point) for point in points])
-        found = entering.by_two_landmarks(
-            jnp.asarray(points), jnp.eye(4, 9), jnp.eye(4), seen, jnp.stack([cov, cov])
+        seen = np.stack([to(b, point) for point in points])
+        found = jax.jit(entering.by_two_landmarks)(
+            points, np.eye(4, 9), np.eye(4), seen, np.stack([cov, cov])
         )
     np.testing.assert_allclose(found[0], b, rtol=0, atol=1e-12)
 
@@ -359,8 +359,7 @@ def test_gradients_are_finite():
         eyes = sensors.range_bearing(jnp.diag(theta[:2]) ** 2, mount=theta[2:5])
         robot = team.Robot(motion.increment(jnp.diag(theta[5:7]) ** 2), suite((eyes, 4)))
         robots = [robot, robot]
-        filter = team_slam(robots, 8, update="joint")
-        trace = jaxslam.run(filter, log, scenario.pose, NOTHING, jax.random.key(0))
+        trace = jaxslam.run(team_slam(robots, 8), log, scenario.pose, NOTHING, jax.random.key(0))
         return trace.info.log_likelihood.sum()
 
     slope = jax.jit(jax.grad(loss))(jnp.array([0.05, 0.02, 0.1, 0.0, 0.3, 0.01, 0.01]))
@@ -369,11 +368,9 @@ def test_gradients_are_finite():
 
 
 def test_float32():
-    scenario, log_of = drawn(2)
-    log = log_of(0)
-    start = log, np.asarray(scenario.pose), np.asarray(scenario.pose_cov)
-    single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, start)
-    a, b = (program(crew_slam(2, False))(*each) for each in (start, single))
+    *_, logs = hundred(0)
+    single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, logs)
+    a, b = (jax.device_get(many("unknown")(each)) for each in (logs, single))
     assert b.final.cov.dtype == jnp.float32
     np.testing.assert_allclose(a.estimate.pose, b.estimate.pose, atol=2e-4)
     np.testing.assert_array_equal(a.info.status, b.info.status)
