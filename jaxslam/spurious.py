@@ -60,6 +60,7 @@ def spoil(
         A scan of M + spurious.places places, clutter last and with tag -1; and the tag (M + …,)
         of the landmark each was truly measured of, -1 for none.
     """
+    scan = jax.tree.map(jnp.asarray, scan)
     m = scan.tag.shape[0]
     keys = jax.random.split(key, 5)
     key_missed, key_outlier, key_label, key_clutter, key_false = keys

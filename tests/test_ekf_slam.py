@@ -303,7 +303,7 @@ def likelihood():
         p = parameters
         robot = motion.increment(jnp.diag(p[:2]) ** 2)
         sensor = sensors.range_bearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
-        filter = ekf_slam(robot, sensor, 36, births=4)
+        filter = ekf_slam(robot, sensor, 36, births=4, update="joint")
         trace = run(filter, log, p[7:10], jnp.zeros((3, 3)), KEY)
         return trace.info.log_likelihood.sum() + trace.final.pose.sum()
 
