@@ -253,12 +253,28 @@ def test_another_seed_is_another_campaign(in_fours):
     assert abs(other.filters["ekf"].measures["rmse_position"].value / ours - 1) > 1e-3
 
 
+def test_another_key_noise_map_or_more_runs_compile_nothing():
+    def campaign(there, runs, seed):
+        tried = {"ekf": worlds.ekf(there), "ideal": family.ideal(there)}
+        more = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
+        return monte_carlo(there, tried, runs, jax.random.key(seed), **more)
+
+    same, other = worlds.scaled(1.0, WORLD.steps), worlds.scaled(1.07, WORLD.steps)
+    first = campaign(same, 3, 0)
+    with worlds.compilations() as count:
+        for there, runs, seed in ((same, 3, 1), (same, 40, 0), (other, 3, 0)):
+            found = campaign(there, runs, seed)
+            assert found.runs == runs
+            assert found.filters["ekf"].measures != first.filters["ekf"].measures
+        assert count() == 0
+
+
 def test_functions_of_the_truth_and_estimators_run_too(in_fours):
     def estimator(truth):
         return lambda log, key: run(EKF, log, WORLD.pose, WORLD.pose_cov, key)
 
     candidates = {"ideal": family.ideal(WORLD), "estimator": estimator}
-    campaign = campaign_of(candidates, block=LARGE, bound=False)
+    campaign = campaign_of(candidates)
     same(campaign.filters["estimator"], in_fours.filters["ekf"])
     assert campaign.filters["ideal"].measures["nees_pose"].value > 0
 
