@@ -64,17 +64,22 @@ def run(data, probe=None):
         trace = jaxslam.run(ekf, log, data.pose, data.pose_cov, jax.random.key(0), probe=probe)
         return trace.info, trace.estimate.pose, ekf.estimate(trace.final), trace.probe
 
-    return go(data.log)
+    return jax.device_get(go(data.log))
+
+
+@jax.jit
+def aligned(points, survey):
+    return jax.vmap(se2.from_frame, (None, 0))(se2.align(points, survey), points)
 
 
 def map_rmse(final, landmarks):
-    survey = jnp.asarray(landmarks)[final.tag]
-    moved = jax.vmap(se2.from_frame, (None, 0))(se2.align(final.points, survey), final.points)
-    return float(jnp.sqrt(((moved - survey) ** 2).sum(axis=1).mean()))
+    survey = np.asarray(landmarks)[final.tag]
+    moved = aligned(final.points, survey)
+    return float(np.sqrt(((moved - survey) ** 2).sum(axis=1).mean()))
 
 
 def nis_per_dof(info):
-    return float(jnp.where(info.status == Status.FUSED, info.nis, 0.0).sum() / info.dof.sum())
+    return np.where(info.status == Status.FUSED, info.nis, 0.0).sum() / info.dof.sum()
 
 
 # --- lines ------------------------------------------------------------------------------------
@@ -682,7 +687,7 @@ def test_ekf_maps_bonn():
     data = datasets.bonn(folder("bonn"))
     info, path, final, _ = run(data)
     assert np.all(np.isfinite(path))
-    assert int(info.tally(Status.FUSED).sum()) == data.measurements - data.capacity
+    assert (info.status == Status.FUSED).sum() == data.measurements - data.capacity
     assert map_rmse(final, data.landmarks) < 0.02
     assert 0.9 < nis_per_dof(info) < 1.0
 
@@ -707,6 +712,6 @@ def test_ekf_maps_victoria_park(victoria_file):
     assert np.all(np.isfinite(path))
     assert np.all(np.isfinite(final.points))
     assert final.alive.all()
-    assert int(info.tally(Status.BORN).sum()) == 151
-    assert int(info.tally(Status.FUSED).sum()) == 3640 - 151
+    assert (info.status == Status.BORN).sum() == 151
+    assert (info.status == Status.FUSED).sum() == 3640 - 151
     assert nis_per_dof(info) == pytest.approx(0.912, abs=0.005)

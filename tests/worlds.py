@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import filters, linearize, motion, sensors
+from jaxslam.monte_carlo import monte_carlo
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.stats import t_quantile
 from jaxslam.types import Status
@@ -42,6 +43,13 @@ def scaled(scale: float, steps: int = 20) -> Scenario:
         pose=(0.1 * scale, 0.2, 0.3),
         pose_cov=np.diag([0.1, 0.1, 0.01]) * scale,
     )
+
+
+def campaign(scenario, candidates, runs):
+    """In blocks of four, on one device, with the bound: by the programs of `test_monte_carlo`, where
+    the scenario is the ring of 100 steps."""
+    options = {"block": 4, "devices": jax.devices()[:1], "bound": True}
+    return monte_carlo(scenario, candidates, runs, key(), **options)
 
 
 @contextlib.contextmanager
