@@ -3,6 +3,7 @@
 import dataclasses
 import os
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -24,6 +25,16 @@ def folder(name):
     if not (DATA / name).is_dir():
         pytest.skip(f"no folder {DATA / name}; set JAXSLAM_DATA to where the data sets are")
     return DATA / name
+
+
+@cache
+def mrclam(robot):
+    return datasets.mrclam(folder("mrclam1"), robot)
+
+
+@cache
+def mrclam_team():
+    return datasets.mrclam_team(folder("mrclam1"))
 
 
 @pytest.fixture(scope="module")
@@ -560,8 +571,7 @@ def test_mrclam_team_has_different_robots(tmp_path, robots):
 )
 def test_mrclam_team_files(robot, of_robots):
     """Everything that one robot's reader gives, at the same times, and its sightings beside."""
-    path = folder("mrclam1")
-    data, alone = datasets.mrclam_team(path), datasets.mrclam(path, robot)
+    data, alone = mrclam_team(), mrclam(robot)
     first = sum(sum(r.sensors.places) for r in data.robots[: robot - 1])
     places, sights = data.robots[robot - 1].sensors.places
     scan, own = data.log.scan, alone.log.scan
@@ -594,7 +604,7 @@ def raw(path):
 def test_mrclam_files(robot, kept, of_robots, unknown, places):
     """Counts, times, held velocities and scans against the raw files."""
     path = folder("mrclam1")
-    data = datasets.mrclam(path, robot)
+    data = mrclam(robot)
     subject_of = {b: int(s) for s, b in raw(path / "Barcodes.dat")}
     odometry = raw(path / f"Robot{robot}_Odometry.dat")
     seen = raw(path / f"Robot{robot}_Measurement.dat")
@@ -631,7 +641,7 @@ def test_mrclam_survey_of_data_set_1_has_two_subjects_exchanged():
     path = folder("mrclam1")
     subject_of = {b: int(s) for s, b in raw(path / "Barcodes.dat")}
     as_is = datasets.mrclam(path, 1, errata=False)
-    corrected = datasets.mrclam(path, 1)
+    corrected = mrclam(1)
     assert as_is.corrections == ()
     assert corrected.corrections == ("the surveyed positions of subjects 11 and 17 were exchanged",)
     other = [i for i, name in enumerate(as_is.tags) if name not in EXCHANGED]
@@ -695,7 +705,7 @@ def test_ekf_maps_bonn():
 @pytest.mark.parametrize(("robot", "rmse", "nis"), [(1, 0.0731, 0.775), (3, 0.1124, 0.921)])
 def test_ekf_maps_mrclam(robot, rmse, nis):
     """Within 5 % of what was measured when the noise was chosen; 0.5 m was asked for."""
-    data = datasets.mrclam(folder("mrclam1"), robot)
+    data = mrclam(robot)
     info, path, final, _ = run(data)
     assert np.all(np.isfinite(path))
     assert final.alive.all()
