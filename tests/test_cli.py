@@ -188,7 +188,15 @@ def test_no_command_exits_with_2(capsys):
 
 
 def test_the_module_runs_as_a_program_in_float32(tmp_path):
-    arguments = [*QUICK, "--dtype", "float32", "--out", str(tmp_path)]
+    arguments = [
+        *QUICK,
+        "--filters",
+        "dead_reckoning",
+        "--dtype",
+        "float32",
+        "--out",
+        str(tmp_path),
+    ]
     done = subprocess.run(
         [sys.executable, "-m", "jaxslam", *arguments], capture_output=True, text=True, check=False
     )

@@ -17,22 +17,22 @@ from jaxslam.monte_carlo import campaign as campaign_module
 from jaxslam.monte_carlo.block import Programs
 from jaxslam.monte_carlo.candidates import fitting_block
 
-SHORT = worlds.ring(steps=12)
-
-
-EKF = worlds.ekf(SHORT)
+WORLD = worlds.ring()
+EKF = worlds.ekf(WORLD)
+LARGE = 100
+"""A block as large as those of `lineup`, whose programs it shares; the others are of four runs."""
 
 
 @pytest.fixture(scope="module")
 def in_fours():
     """Runs 0 to 3, 4 to 7, 8 and 9; one device, one worker."""
-    return campaign_of({"ekf": EKF, "again": worlds.ekf(SHORT)}, block=4, workers=1)
+    return campaign_of({"ekf": EKF, "again": worlds.ekf(WORLD)}, workers=1)
 
 
-def campaign_of(candidates=None, *, devices=1, **options):
+def campaign_of(candidates=None, *, devices=1, block=4, bound=True, **options):
     candidates = candidates or {"ekf": EKF}
-    here = jax.devices()[:devices]
-    return monte_carlo(SHORT, candidates, 10, worlds.key(), devices=here, bound=True, **options)
+    options |= {"devices": jax.devices()[:devices], "block": block, "bound": bound}
+    return monte_carlo(WORLD, candidates, 10, worlds.key(), **options)
 
 
 def identical(a, b):
@@ -58,7 +58,7 @@ def test_blocks_follow_the_memory_of_an_accelerator():
     def fits(platform, memory):
         stats = None if memory is None else {"bytes_limit": memory}
         device = SimpleNamespace(platform=platform, memory_stats=lambda: stats)
-        return fitting_block(SHORT, {"ekf": worlds.ekf(SHORT)}, device)
+        return fitting_block(WORLD, {"ekf": worlds.ekf(WORLD)}, device)
 
     assert fits("cpu", None) == 16
     assert fits("gpu", None) == 1024
@@ -72,7 +72,6 @@ def test_blocks_follow_the_memory_of_an_accelerator():
 def test_workers_do_not_change_a_bit_and_devices_what_rounding_does(in_fours, devices, workers):
     heard = []
     campaign = campaign_of(
-        block=4,
         devices=devices,
         workers=workers,
         progress=lambda done, total: heard.append((done, total)),
@@ -83,7 +82,7 @@ def test_workers_do_not_change_a_bit_and_devices_what_rounding_does(in_fours, de
     assert sorted(done for done, _ in heard)[-1] == 10
 
 
-@pytest.mark.parametrize("block", [3, 16])
+@pytest.mark.parametrize("block", [3, LARGE])
 def test_other_blocks_change_what_rounding_does(in_fours, block):
     same(campaign_of(block=block).filters["ekf"], in_fours.filters["ekf"])
 
@@ -123,17 +122,17 @@ def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_fours):
             raise KeyboardInterrupt
 
     with pytest.raises(Interrupted, match="of 10 runs done") as stopped:
-        campaign_of(block=4, workers=1, keep=first, progress=stop)
+        campaign_of(workers=1, keep=first, progress=stop)
     so_far = stopped.value.campaign
     assert so_far.runs == sum(runs for _, runs in first.saved) < 10
     assert so_far.filters["ekf"].counts["runs"] == so_far.runs
 
     second = Spy(store.resume(tmp_path), fails=[True])
     with pytest.raises(OSError, match="no space"):
-        campaign_of(block=4, workers=1, keep=second)
+        campaign_of(workers=1, keep=second)
 
     third = Spy(store.resume(tmp_path))
-    campaign = campaign_of(block=4, devices=2, keep=third)
+    campaign = campaign_of(devices=2, keep=third)
     identical(campaign.filters["ekf"], in_fours.filters["ekf"])
     pieces = sorted(first.saved + second.saved + third.saved)
     assert [run for at, runs in pieces for run in range(at, at + runs)] == list(range(10))
@@ -162,14 +161,14 @@ def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_fours):
 
     def little_memory(programs, *arguments):
         tried.append(programs.wide)
-        if programs.wide > 2:
+        if programs.wide > 4:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
         compile_programs(programs, *arguments)
 
     monkeypatch.setattr(campaign_module, "compile_programs", little_memory)
     with pytest.warns(UserWarning, match="going on with block=") as warned:
-        campaign = campaign_of(block=9)
-    assert (tried, len(warned)) == ([9, 4, 2], 2)
+        campaign = campaign_of(block=18)
+    assert (tried, len(warned)) == ([18, 9, 4], 2)
     same(campaign.filters["ekf"], in_fours.filters["ekf"])
 
 
@@ -188,13 +187,12 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
 
     monkeypatch.setattr(campaign_module, "compile_programs", broken)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
-        campaign_of(block=4)
+        campaign_of()
 
 
 def test_a_first_block_tells_of_each_filter_before_the_campaign_is_done(in_fours):
     told = []
     campaign = campaign_of(
-        block=2,
         workers=1,
         glimpse=lambda *told_of: told.append(("glimpse", *told_of)),
         progress=lambda *done: told.append(("progress", *done)),
@@ -202,9 +200,9 @@ def test_a_first_block_tells_of_each_filter_before_the_campaign_is_done(in_fours
     same(campaign.filters["ekf"], in_fours.filters["ekf"])
     names = list(campaign.filters)
     assert [(what, name, runs) for what, name, runs, *_ in told[: len(names)]] == [
-        ("glimpse", name, 2) for name in names
+        ("glimpse", name, 4) for name in names
     ]
-    assert [what for what, *_ in told[len(names) :]] == ["progress"] * 5
+    assert [what for what, *_ in told[len(names) :]] == ["progress"] * 3
     for what, name, runs, nees in told[: len(names)]:
         per_run = campaign.filters[name].per_run["nees_pose"][:runs]
         assert nees.value == pytest.approx(per_run.mean(), rel=1e-12), what
@@ -216,14 +214,7 @@ def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it(
         raise ValueError("no filter for this truth")
 
     with pytest.raises(ValueError, match="no filter for this truth"):
-        monte_carlo(
-            SHORT,
-            {"ekf": worlds.ekf(SHORT), "broken": broken},
-            10,
-            worlds.key(),
-            block=1,
-            workers=2,
-        )
+        campaign_of({"ekf": EKF, "broken": broken}, workers=2)
 
 
 def test_steps_are_timed_while_nothing_is_compiled():
@@ -238,13 +229,13 @@ def test_every_filter_gets_the_same_draws(in_fours):
 
 
 def test_a_campaign_is_the_loop_over_its_runs(in_fours):
-    ekf, square, nees = worlds.ekf(SHORT), [], []
-    world = jax.jit(partial(simulate, SHORT))
+    square, nees = [], []
+    world = jax.jit(partial(simulate, WORLD))
     for i in range(10):
         key_world, key_filter = jax.random.split(jax.random.fold_in(worlds.key(), i))
         truth, log = world(key_world)
-        trace = run(ekf, log, SHORT.pose, SHORT.pose_cov, key_filter)
-        error = np.array(truth.pose - trace.estimate.pose)
+        trace = run(EKF, log, WORLD.pose, WORLD.pose_cov, key_filter)
+        error = np.asarray(truth.pose) - np.asarray(trace.estimate.pose)
         error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
         square.append((error[:, :2] ** 2).sum(1).mean())
         cov = np.asarray(trace.estimate.pose_cov)[1:]  # after one step P is singular
@@ -257,20 +248,33 @@ def test_a_campaign_is_the_loop_over_its_runs(in_fours):
 
 
 def test_another_seed_is_another_campaign(in_fours):
-    other = monte_carlo(SHORT, {"ekf": worlds.ekf(SHORT)}, 10, worlds.key(1))
+    other = monte_carlo(WORLD, {"ekf": EKF}, 10, worlds.key(1), block=4, bound=True)
     ours = in_fours.filters["ekf"].measures["rmse_position"].value
     assert abs(other.filters["ekf"].measures["rmse_position"].value / ours - 1) > 1e-3
 
 
+def test_another_key_noise_map_or_more_runs_compile_nothing():
+    def campaign(there, runs, seed):
+        tried = {"ekf": worlds.ekf(there), "ideal": family.ideal(there)}
+        more = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
+        return monte_carlo(there, tried, runs, jax.random.key(seed), **more)
+
+    same, other = worlds.scaled(1.0, WORLD.steps), worlds.scaled(1.07, WORLD.steps)
+    first = campaign(same, 3, 0)
+    with worlds.compilations() as count:
+        for there, runs, seed in ((same, 3, 1), (same, 40, 0), (other, 3, 0)):
+            found = campaign(there, runs, seed)
+            assert found.runs == runs
+            assert found.filters["ekf"].measures != first.filters["ekf"].measures
+        assert count() == 0
+
+
 def test_functions_of_the_truth_and_estimators_run_too(in_fours):
-    ekf = worlds.ekf(SHORT)
-
     def estimator(truth):
-        return lambda log, key: run(ekf, log, SHORT.pose, SHORT.pose_cov, key)
+        return lambda log, key: run(EKF, log, WORLD.pose, WORLD.pose_cov, key)
 
-    campaign = monte_carlo(
-        SHORT, {"ideal": family.ideal(SHORT), "estimator": estimator}, 10, worlds.key(), block=10
-    )
+    candidates = {"ideal": family.ideal(WORLD), "estimator": estimator}
+    campaign = campaign_of(candidates)
     same(campaign.filters["estimator"], in_fours.filters["ekf"])
     assert campaign.filters["ideal"].measures["nees_pose"].value > 0
 
@@ -280,19 +284,19 @@ def test_blocks_share_one_trace():
 
     def counted(pose, u, w):
         traces.append(1)
-        return SHORT.motion.step(pose, u, w)
+        return WORLD.motion.step(pose, u, w)
 
-    watched = dataclasses.replace(SHORT.motion, step=counted)
-    ekf = filters.ekf_slam(watched, SHORT.sensor, 6)
+    watched = dataclasses.replace(WORLD.motion, step=counted)
+    ekf = filters.ekf_slam(watched, WORLD.sensor, 6)
     counts = []
-    for runs in (2, 6):
-        monte_carlo(SHORT, {"ekf": ekf}, runs, worlds.key(), block=2)
+    for runs in (4, 10):
+        monte_carlo(WORLD, {"ekf": ekf}, runs, worlds.key(), block=4, bound=True)
         counts.append(len(traces))
     assert counts[0] == counts[1] > 0  # the second campaign traces nothing
 
 
 def test_float32_sees_the_worlds_of_float64(in_fours):
-    campaign = campaign_of({"ekf": EKF}, block=4, dtype=jnp.float32)
+    campaign = campaign_of({"ekf": EKF}, dtype=jnp.float32)
     assert (campaign.dtype, in_fours.dtype) == ("float32", "float64")
     single, double = campaign.filters["ekf"].per_run, in_fours.filters["ekf"].per_run
     np.testing.assert_allclose(single["square_position"], double["square_position"], rtol=0.02)
@@ -301,28 +305,26 @@ def test_float32_sees_the_worlds_of_float64(in_fours):
 
 
 def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
-    ekf = worlds.ekf(SHORT)
-
     def poisoned(joint, scan, key):
-        joint, info = ekf.update(joint, scan, key)
+        joint, info = EKF.update(joint, scan, key)
         # A scan that starts with a long range in about half of the runs.
         bad = scan.z[0, 0] > jnp.where(joint.alive.all(), 3.9, jnp.inf)
         return joint._replace(pose=jnp.where(bad, jnp.nan, joint.pose)), info
 
     candidates = {
-        "ekf": ekf,
-        "poisoned": dataclasses.replace(ekf, update=poisoned),
-        "small": filters.ekf_slam(SHORT.motion, SHORT.sensor, 4),
+        "ekf": EKF,
+        "poisoned": dataclasses.replace(EKF, update=poisoned),
+        "small": filters.ekf_slam(WORLD.motion, WORLD.sensor, 4),
         "always lost": dataclasses.replace(
-            ekf, predict=lambda joint, u, key: joint._replace(pose=joint.pose * jnp.nan)
+            EKF, predict=lambda joint, u, key: joint._replace(pose=joint.pose * jnp.nan)
         ),
     }
-    campaign = monte_carlo(SHORT, candidates, 10, worlds.key())
+    campaign = campaign_of(candidates)
     same(campaign.filters["ekf"], in_fours.filters["ekf"])
     poisoned = campaign.filters["poisoned"]
     assert poisoned.counts["runs"] + poisoned.counts["not_finite"] == 10
     assert all(np.isfinite(m.value) for m in poisoned.measures.values())
-    assert campaign.filters["small"].counts["overflow"] == 10 * 12 * 2
+    assert campaign.filters["small"].counts["overflow"] == 10 * WORLD.steps * 2
     lost = campaign.filters["always lost"]
     assert lost.verdict == "diverged"
     assert lost.counts["not_finite"] == 10
@@ -330,23 +332,22 @@ def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
 
 def test_a_world_without_noise_does_not_diverge():
     still = dataclasses.replace(
-        SHORT,
+        WORLD,
         motion=motion.increment(np.zeros((2, 2))),
     )
-    campaign = monte_carlo(still, {"ekf": worlds.ekf(still)}, 3, worlds.key())
+    campaign = monte_carlo(still, {"ekf": worlds.ekf(still)}, 3, worlds.key(), block=4)
     assert campaign.filters["ekf"].verdict == "undecided"
     assert campaign.filters["ekf"].counts["divergent"] == 0
 
 
 @pytest.fixture(scope="module")
 def lineup():
-    world = worlds.ring()
     candidates = {
-        "ekf": worlds.ekf(world),
-        "right_invariant": family.FILTERS["right_invariant"](world),
-        "ideal": family.ideal(world),
-    } | {name: make(world) for name, make in worlds.WRONG.items()}
-    return monte_carlo(world, candidates, 200, worlds.key(), block=100).filters
+        "ekf": EKF,
+        "right_invariant": family.FILTERS["right_invariant"](WORLD),
+        "ideal": family.ideal(WORLD),
+    } | {name: make(WORLD) for name, make in worlds.WRONG.items()}
+    return monte_carlo(WORLD, candidates, 200, worlds.key(), block=LARGE).filters
 
 
 @pytest.mark.parametrize("name", ["ekf", "right_invariant", "ideal"])
@@ -379,12 +380,12 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"filters": family.FILTERS}, "ekf is a factory that was not called"),
         ({"filters": {"fej": family.FILTERS["fej"]}}, "what it returns, fej(world, …)"),
         (
-            {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), SHORT.sensor, 2)}},
+            {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), WORLD.sensor, 2)}},
             "size 3",
         ),
     ],
 )
 def test_bad_arguments_are_refused(change, message):
-    arguments = {"filters": {"ekf": worlds.ekf(SHORT)}, "runs": 2, "key": worlds.key()} | change
+    arguments = {"filters": {"ekf": worlds.ekf(WORLD)}, "runs": 2, "key": worlds.key()} | change
     with pytest.raises(ValueError, match=re.escape(message)):
-        monte_carlo(SHORT, **arguments)
+        monte_carlo(WORLD, **arguments)

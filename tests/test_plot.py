@@ -9,10 +9,9 @@ import worlds
 
 from jaxslam import plot, run, simulate
 from jaxslam.consistency import LAGS, LEVELS
-from jaxslam.monte_carlo import monte_carlo
 from jaxslam.plot.style import logarithmic, panels_of
 
-WORLD = worlds.ring(steps=15)
+WORLD = worlds.ring()
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 3.0])
@@ -84,7 +83,7 @@ def test_errors_are_drawn_within_their_claimed_bounds(drive):
 @pytest.fixture(scope="module")
 def campaign():
     """A filter and another like it; the first as if it had been watched."""
-    found = monte_carlo(WORLD, {"a": worlds.ekf(WORLD)}, 4, worlds.key(), bound=True)
+    found = worlds.campaign(WORLD, {"a": worlds.ekf(WORLD)}, 4)
     a = found.filters["a"]
     watched = {"rotation_information": np.linspace(0.0, 9.0, WORLD.steps)}
     b = dataclasses.replace(
@@ -228,10 +227,10 @@ def test_cost_is_drawn_against_error_and_nees(campaign):
 
 def test_information_gained_is_drawn_for_watched_filters_and_zeros_are_nothing(campaign):
     there = campaign.filters["a"]
-    gained = np.array([0.0, -1e-20, 1e-30, 1e-3, np.nan, *np.linspace(1, 50, 10)])
+    gained = np.array([0.0, -1e-20, 1e-30, 1e-3, np.nan, *np.linspace(1, 50, WORLD.steps - 5)])
     filters = {
         name: dataclasses.replace(there, curves=there.curves | {"rotation_information": values})
-        for name, values in (("learns", gained), ("honest", np.zeros(15)))
+        for name, values in (("learns", gained), ("honest", np.zeros(WORLD.steps)))
     } | {"b": campaign.filters["b"]}
     figure = plot.gained_figure(dataclasses.replace(campaign, filters=filters))
     assert named(figure) == ["learns", "honest"]
@@ -282,8 +281,8 @@ def test_filters_without_a_number_and_single_steps_can_be_drawn(campaign, draw):
     )
     once = dataclasses.replace(there, curves={n: curve[2:3] for n, curve in there.curves.items()})
     for steps, filters in (
-        (15, {"$lost_": lost}),
-        (15, {"_a$": lost, "b": there}),
+        (WORLD.steps, {"$lost_": lost}),
+        (WORLD.steps, {"_a$": lost, "b": there}),
         (1, {"a": once}),
     ):
         tiny = dataclasses.replace(campaign, steps=steps, filters=filters)

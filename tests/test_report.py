@@ -10,15 +10,14 @@ import pytest
 import worlds
 
 from jaxslam import report
-from jaxslam.monte_carlo import monte_carlo
 
-WORLD = worlds.ring(steps=6)
+WORLD = worlds.ring()
 
 
 @pytest.fixture(scope="module")
 def campaign():
     candidates = {"ekf": worlds.ekf(WORLD), "other": worlds.no_cross_covariance(WORLD)}
-    return monte_carlo(WORLD, candidates, 3, worlds.key())
+    return worlds.campaign(WORLD, candidates, 3)
 
 
 def test_the_table_shows_every_measure_and_verdict(campaign):

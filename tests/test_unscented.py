@@ -1,16 +1,15 @@
 """The unscented transform against its textbook sums, and the UKF's limits."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import worlds
-from test_family import draw, drive
+from test_family import around, drive_watched
 
-from jaxslam import charts, linearize
+from jaxslam import linearize
 from jaxslam.linearize.unscented import by_variables, regress
-from jaxslam.run import run
-from jaxslam.simulate import simulate
 
 
 def curved(xi):
@@ -56,31 +55,13 @@ def test_of_an_affine_function_nothing_is_left_over():
     np.testing.assert_allclose(out.rest, 0, atol=1e-15)
 
 
-@pytest.mark.parametrize("chart", list(charts.REGISTRY))
-def test_with_points_close_together_it_is_the_ekf_of_the_same_chart(chart):
-    """Slopes are then derivatives; what stays is the mean's second order, which is of size P."""
-    drawn = draw(worlds.ring(steps=20))
-    options = {"chart": charts.REGISTRY[chart](), "update": "joint"}
-    first = drive(drawn, "ekf", **options)
-    fitted = drive(drawn, "ekf", linearize=linearize.unscented(1e-3), **options)
-    np.testing.assert_allclose(fitted.estimate.pose, first.estimate.pose, atol=2e-3)
-    np.testing.assert_allclose(
-        fitted.estimate.pose_cov, first.estimate.pose_cov, rtol=0.02, atol=1e-7
-    )
-    assert np.abs(fitted.estimate.pose - first.estimate.pose).max() > 1e-9
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_pose_known_exactly_and_both_dtypes(dtype):
-    world = worlds.ring(steps=20)  # P0 = 0
-    _, log = simulate(world, jax.random.key(1))
+    world, truth, log = around(noise=0.01)
     log = jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, log)
-    filter = worlds.ekf(world, linearize=linearize.unscented(), update="joint")
-    trace = jax.jit(lambda log: run(filter, log, world.pose, world.pose_cov, jax.random.key(0)))(
-        log
-    )
-    first = worlds.ekf(world, update="joint")
-    usual = run(first, log, world.pose, world.pose_cov, jax.random.key(0))
+    drawn = dataclasses.replace(world, pose_cov=np.zeros((3, 3))), truth, log
+    trace = drive_watched(drawn, "ukf")
+    usual = drive_watched(drawn, "ekf")
     assert trace.estimate.pose.dtype == dtype
     assert np.isfinite(trace.estimate.pose_cov).all()
     np.testing.assert_allclose(trace.estimate.pose, usual.estimate.pose, atol=5e-3)

@@ -1,5 +1,6 @@
 """Small worlds and deliberately wrong filters that several tests share."""
 
+import contextlib
 import dataclasses
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import filters, linearize, motion, sensors
+from jaxslam.monte_carlo import monte_carlo
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.stats import t_quantile
 from jaxslam.types import Status
@@ -25,6 +27,42 @@ def ring(steps: int = 100, seed: int = 3) -> Scenario:
         landmarks=points,
         controls=np.tile([0.125, 4 * np.pi / steps], (steps, 1)),
     )
+
+
+def scaled(scale: float, steps: int = 20) -> Scenario:
+    """The ring with other noises, mount, map, controls and start: every number times the scale."""
+    there = ring(steps)
+    return dataclasses.replace(
+        there,
+        motion=motion.increment(np.diag([0.01, 0.01]) ** 2 * scale),
+        sensor=sensors.range_bearing(
+            np.diag([0.05, 0.02]) ** 2 * scale, mount=(0.1 * scale, -0.05, 0.3)
+        ),
+        landmarks=np.asarray(there.landmarks) * scale,
+        controls=np.asarray(there.controls) * scale,
+        pose=(0.1 * scale, 0.2, 0.3),
+        pose_cov=np.diag([0.1, 0.1, 0.01]) * scale,
+    )
+
+
+def campaign(scenario, candidates, runs):
+    """In blocks of four, on one device, with the bound: by the programs of `test_monte_carlo`, where
+    the scenario is the ring of 100 steps."""
+    options = {"block": 4, "devices": jax.devices()[:1], "bound": True}
+    return monte_carlo(scenario, candidates, runs, key(), **options)
+
+
+@contextlib.contextmanager
+def compilations():
+    """How many programs XLA has compiled, or read from the disk, so far: as a function."""
+    count = [0]
+
+    def listen(event, seconds, **_):
+        count[0] += event == "/jax/core/compile/backend_compile_duration"
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield lambda: count[0]
+    jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def ekf(scenario, **options):
