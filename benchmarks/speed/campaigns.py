@@ -23,26 +23,33 @@ campaign = monte_carlo(
 )
 begin = marks[min(len(marks) // 4, 8)]
 rate = (marks[-1][1] - begin[1]) / (marks[-1][0] - begin[0])
-print(json.dumps([rate, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024]))
+memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+alone = 0.0
+if sys.argv[2] == "pinned":
+    from benchmarks.speed.single import RUNS, filter_alone
+    alone = RUNS / filter_alone(world)
+print(json.dumps([rate, memory, alone]))
 """
 
 
-def campaign(runs: int, where: str = "free") -> tuple[float, float]:
-    """Runs a second once compiled, and peak memory [MB] of the process."""
+def campaign(runs: int, where: str = "free") -> tuple[float, float, float]:
+    """Runs a second once compiled, peak memory [MB] of the process; and on one core ("pinned") also
+    the runs a second of its filter alone."""
     command = [sys.executable, "-c", MEASURE, str(runs), where]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    rate, memory = json.loads(done.stdout.splitlines()[-1])
-    return rate, memory
+    rate, memory, alone = json.loads(done.stdout.splitlines()[-1])
+    return rate, memory, alone
 
 
 def processes(count: int, runs: int) -> float:
-    """Seconds from the first block kept to the last, of processes with a core each."""
+    """Seconds a piece of a campaign takes processes with a core each, from the first that each of
+    them keeps on, before which it compiled."""
     cores = sorted(os.sched_getaffinity(0))[:count]
     with tempfile.TemporaryDirectory() as folder, socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
         free.close()
-        ask = ["consistency", "--scenario", "cloister", "--no-bound", "--runs", str(runs)]
+        ask = ["consistency", "--scenario", "cloister", "--runs", str(runs)]
         ask += ["--devices", "1", "--out", folder]
         if count > 1:
             ask += ["--coordinator", address, "--processes", str(count)]
@@ -54,6 +61,12 @@ def processes(count: int, runs: int) -> float:
         for process in started:
             if process.wait() != 0:
                 raise RuntimeError(f"process {process.args} failed")
-        times = sorted(p.stat().st_mtime for p in (Path(folder) / "blocks").glob("*.npz"))
-    # The first block of each process holds its compilation.
-    return (times[-1] - times[count - 1]) / (len(times) - count)
+        kept = sorted((Path(folder) / "blocks").glob("*.npz"))
+        # The pieces go to the processes in turn.
+        rates = [_rate([p.stat().st_mtime for p in kept[i::count]]) for i in range(count)]
+    return 1 / sum(rates)
+
+
+def _rate(times: list[float]) -> float:
+    """Pieces a second from the first on."""
+    return (len(times) - 1) / (max(times) - min(times))

@@ -22,6 +22,7 @@ from jaxslam.filters.ekf_slam import ekf_slam
 from jaxslam.run import run
 from jaxslam.scenarios import cloister
 from jaxslam.simulate import simulate
+from jaxslam.staging import hot_options
 
 RUNS, PEERS_RUNS = 32, 4
 VISIBLE = 20
@@ -40,10 +41,24 @@ def final_pose(filter, scenario):
     return go
 
 
+def filter_alone(scenario):
+    """Seconds of the EKF over a batch of runs, with all that a campaign takes of it."""
+    filter = FILTERS["ekf"](scenario)
+    keys, logs = logs_of(scenario, RUNS)
+
+    def go(log, key):
+        trace = run(filter, log, scenario.pose, scenario.pose_cov, key)
+        return trace.estimate, trace.info
+
+    call = compiled(jax.vmap(go), logs, keys)[0]
+    return together({"alone": call})["alone"]
+
+
 def compiled(function, *arguments):
-    """A call of the program, seconds to trace and compile it, those of its first call, itself."""
+    """A call of the program as `run` compiles it, seconds to trace and compile it, those of its
+    first call, itself."""
     began = time.perf_counter()
-    program = jax.jit(function).lower(*arguments).compile()
+    program = jax.jit(function).lower(*arguments).compile(hot_options(jax.default_backend()))
     built = time.perf_counter() - began
     began = time.perf_counter()
     jax.block_until_ready(program(*arguments))
