@@ -12,7 +12,7 @@ from jaxslam import programs
 from jaxslam.linalg import check_covariance, check_key, is_concrete
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Status, Trace, check_log
-from jaxslam.validation import state_and_info
+from jaxslam.validation import check_record, state_and_info
 
 
 def run(
@@ -46,6 +46,8 @@ def run(
         ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN in controls
             or valid measurements, tags repeated within a scan, or a bad pose_cov.
     """
+    check_record("run", "filter", filter, Filter)
+    check_record("run", "log", log, Log)
     check_run(filter, log, pose, pose_cov)
     check_key("run", key)
     return programs.call(_drive, (filter, probe), log, pose, pose_cov, key)

@@ -17,6 +17,7 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Part, Suite
 from jaxslam.spurious import Spurious, spoil
 from jaxslam.types import Log, Scan, Truth
+from jaxslam.validation import check_record
 
 
 def everywhere(pose: jax.Array, landmark: jax.Array) -> jax.Array:
@@ -94,6 +95,7 @@ def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
     trace it is compiled once for a structure, as `run` is. The filters of a campaign all get the
     same draws.
     """
+    check_record("simulate", "scenario", scenario, Scenario)
     check_key("simulate", key)
     return programs.call(_simulate, (scenario,), key)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from jaxslam import association, charts, filters, life, linearize, motion, senso
 from jaxslam.filters import merging, reporting
 from jaxslam.filters.closing import _OPTIONS, closing
 from jaxslam.protocols import Free, Sensor
+from jaxslam.types import Log, Scan
 from jaxslam.validation import check_models, state_and_info
 
 MOVE = motion.pose_increment(np.diag([1e-4, 1e-4, 1e-6]))
@@ -232,3 +234,32 @@ def test_closing_checks_its_options_when_it_is_made():
 
 def test_calibration_is_reached_from_the_package():
     assert "calibration" in jaxslam.__all__ and callable(jaxslam.calibration.calibrate)
+
+
+KEY = jax.random.key(0)
+WORLD = jaxslam.scenarios.circle(steps=3)
+EKF = filters.ekf_slam(WORLD.motion, WORLD.sensor, 2)
+LOG = Log(np.zeros((3, 3)), Scan(np.zeros((3, 1, 2)), np.zeros((3, 1), int), np.ones((3, 1), bool)))
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: jaxslam.simulate(jaxslam.scenarios.circle, KEY), "call it, circle"),
+        (lambda: jaxslam.simulate(KEY, WORLD), "scenario to be a Scenario"),
+        (lambda: jaxslam.run(WORLD, LOG, np.zeros(3), np.eye(3), KEY), "filter to be a Filter"),
+        (lambda: jaxslam.run(EKF, WORLD, np.zeros(3), np.eye(3), KEY), "log to be a Log, got Scen"),
+        (
+            lambda: jaxslam.monte_carlo(jaxslam.scenarios.circle, {"ekf": EKF}, 2, KEY),
+            "call it, circle",
+        ),
+        (
+            lambda: jaxslam.monte_carlo(WORLD, {"ekf": EKF}, 2, KEY, devices=99),
+            r"devices as of jax.local_devices\(\), got 99",
+        ),
+    ],
+)
+def test_what_drives_a_filter_says_what_it_expected(call, told):
+    with pytest.raises(ValueError, match=told) as e:
+        call()
+    one_line(e)

@@ -110,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
         "--block",
         type=int,
         help="runs computed together on each device, of which a CPU has one a core; sets memory "
-        "(default: 32 on a CPU, on an accelerator by its memory)",
+        "(default: 16 on a CPU, on an accelerator by its memory)",
     )
     judge.add_argument(
         "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'

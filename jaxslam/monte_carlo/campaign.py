@@ -29,6 +29,7 @@ from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
 from jaxslam.simulate import Scenario
 from jaxslam.types import Estimate, Truth
+from jaxslam.validation import check_record
 
 
 @dataclass(frozen=True)
@@ -140,12 +141,17 @@ def monte_carlo(
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
         if value is not None:
             check_count(f"monte_carlo: {name}", value)
+    check_record("monte_carlo", "scenario", scenario, Scenario)
     check_key("monte_carlo", key)
     if not isinstance(filters, Mapping) or not filters:
         raise ValueError("monte_carlo: expected filters by name, at least one")
     for name, candidate in filters.items():
         check_fits(name, candidate, scenario)
     check_noise(scenario)
+    if devices is not None and not isinstance(devices, Sequence):
+        raise ValueError(
+            f"monte_carlo: expected devices as of jax.local_devices(), got {devices!r}"
+        )
     devices = jax.local_devices() if devices is None else list(devices)
     if not devices:
         raise ValueError("monte_carlo: expected at least one device")
