@@ -96,6 +96,6 @@ def _drive(
         return state, (filter.estimate(state), info, () if probe is None else probe(state))
 
     # What a scan runs cannot be merged with its own recomputation, so no barrier is needed.
-    again = jax.checkpoint(step, prevent_cse=False)
-    final, (estimate, info, probed) = jax.lax.scan(again, start, (log, keys))
+    body = jax.checkpoint(step, prevent_cse=False)
+    final, (estimate, info, probed) = jax.lax.scan(body, start, (log, keys))
     return Trace(estimate, info, final, probed)

@@ -9,8 +9,8 @@ _INSTRUCTION = re.compile(r"\s+(ROOT )?%([\w.\-]+) = (\([^=]*?\)|\S+) ([\w\-]+)\
 
 
 def wrong_layouts():
-    """Of all programs that are kept: a call with another layout than its computation's is a wrong
-    number (jaxlib 0.12)."""
+    """Calls in the kept programs with another layout than their computation was compiled for, which
+    give wrong numbers (jaxlib 0.12)."""
     texts = (kept.result().as_text() for kept in programs._BY_TEXT._found.values())
     return [one for text in texts for one in mismatches(text)[0]]
 
