@@ -74,8 +74,9 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     here = devices.chosen(options.devices)
     keep = _keep(options, out, asked, block)
     known = library.identity(asked, here[0].platform)
-    # What draws is imported while filters run, and needed when they have.
-    threading.Thread(target=_prepare_drawing, daemon=True).start()
+    # What draws is imported while filters run, and needed when they have. No daemon: the end of the
+    # interpreter would pull Matplotlib's compiled code from under it.
+    threading.Thread(target=_prepare_drawing).start()
     try:
         with (
             Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress,
