@@ -1,5 +1,6 @@
 """Strictness of the whole suite (never of the package), and the oracles that many tests share."""
 
+import gc
 import importlib.metadata
 import os
 from pathlib import Path
@@ -24,6 +25,7 @@ from spending import Spending
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 4)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+gc.set_threshold(100_000, 20, 50)  # tracing allocates much and frees little: a tenth of the suite
 
 PROGRAMS = Path(__file__).parents[1] / ".cache"
 KEPT = 2**29
