@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gate import Metric, alone
-from jaxslam import family, monte_carlo, run, simulate
+from jaxslam import catalog, monte_carlo, run, simulate
 from jaxslam.filters import mapping
-from jaxslam.linalg import mahalanobis_squared
-from jaxslam.scenarios import circle
-from jaxslam.stats import chi2_band
+from jaxslam.math.linalg import mahalanobis_squared
+from jaxslam.math.stats import chi2_band
+from jaxslam.simulation.scenarios import circle
 
 
 def map_nees(world, runs):
@@ -41,7 +41,7 @@ def map_nees(world, runs):
 
 def measure(runs=1000):
     world = circle()
-    filters = {name: make(world) for name, make in family.BASELINES.items()}
+    filters = {name: make(world) for name, make in catalog.BASELINES.items()}
     campaign = monte_carlo(world, filters, runs, jax.random.key(0))
     metrics = []
     for name, summary in campaign.filters.items():

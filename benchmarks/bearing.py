@@ -30,8 +30,8 @@ from jaxslam import monte_carlo, sensors
 from jaxslam.charts import right_invariant
 from jaxslam.filters import ekf_slam
 from jaxslam.linearize import unscented
-from jaxslam.scenarios import circle, cloister
-from jaxslam.stats import chi2_band
+from jaxslam.math.stats import chi2_band
+from jaxslam.simulation.scenarios import circle, cloister
 
 SIGMA = np.deg2rad(1.0)
 # The range 5 m ± 2.5 m, and the inverse distance from d_min = 1 m: both hold all distances that

@@ -10,15 +10,15 @@ from pathlib import Path
 import jax
 
 from benchmarks.gate import Metric, alone
-from jaxslam import family, monte_carlo, plot
-from jaxslam.scenarios import SCENARIOS
+from jaxslam import catalog, monte_carlo, plot
+from jaxslam.simulation.scenarios import SCENARIOS
 
 FIGURE = Path(__file__).parent / "figures" / "comparison.png"
 
 
 def measure(runs: int = 16, scenario: str = "cloister", out: Path | None = None) -> list[Metric]:
     world = SCENARIOS[scenario]()
-    filters = {each: make(world) for each, make in family.ALL.items()}
+    filters = {each: make(world) for each, make in catalog.ALL.items()}
     campaign = monte_carlo(world, filters, runs, jax.random.key(0), workers=1)
     print(f"{world.name}, {runs} runs of {world.steps} steps")
     print(f"{'':24}{'µs a step':>12}{'RMSE [m]':>12}{'pose NEES':>12}  verdict")

@@ -19,14 +19,14 @@ import numpy as np
 
 from benchmarks.delayed import named
 from benchmarks.gate import Metric, alone
-from jaxslam import family, life, motion, programs, sensors, smoothing, team
+from jaxslam import catalog, life, motion, programs, sensors, smoothing, team
 from jaxslam.filters import ekf_slam, team_slam
-from jaxslam.filters.merging import duplicates
+from jaxslam.filters.map_management.merging import duplicates
 from jaxslam.protocols import Filter
 from jaxslam.run import run
-from jaxslam.scenarios import circle
 from jaxslam.sensors import Part, suite
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.scenarios import circle
+from jaxslam.simulation.worlds import Scenario, simulate
 
 GATE, DELAYED_GATE = 8.0, 10.0
 STEPS = 20
@@ -63,7 +63,7 @@ def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
     def of_family(name: str) -> Callable[[float], tuple[Scenario, Any]]:
         def make(scale: float) -> tuple[Scenario, Any]:
             there = world(scale)
-            return there, family.ALL[name](there, gate=9.21 * scale)
+            return there, catalog.ALL[name](there, gate=9.21 * scale)
 
         return make
 
@@ -93,7 +93,7 @@ def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
 
         return of
 
-    return {name: of_family(name) for name in family.ALL} | {
+    return {name: of_family(name) for name in catalog.ALL} | {
         "delayed_slam": delayed,
         "team_slam": crew,
         "life and merging": managed,

@@ -26,13 +26,13 @@ import numpy as np
 import jaxslam
 from benchmarks.gate import Metric, alone
 from jaxslam import motion, sensors
-from jaxslam.angles import wrap
 from jaxslam.association import nearest
 from jaxslam.filters import delayed_slam, ekf_slam
-from jaxslam.linalg import mahalanobis_squared
-from jaxslam.scenarios import cloister
-from jaxslam.simulate import Scenario
-from jaxslam.stats import chi2_quantile
+from jaxslam.math.angles import wrap
+from jaxslam.math.linalg import mahalanobis_squared
+from jaxslam.math.stats import chi2_quantile
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.worlds import Scenario
 
 SIGMA = np.deg2rad(1.0)
 FALSE = 1.0

@@ -28,8 +28,8 @@ import numpy as np
 from benchmarks.gate import Metric, report
 from jaxslam import monte_carlo, motion, run, sensors, simulate
 from jaxslam.filters import ekf_slam, fastslam
-from jaxslam.scenarios import webmap
-from jaxslam.simulate import Scenario
+from jaxslam.simulation.scenarios import webmap
+from jaxslam.simulation.worlds import Scenario
 
 FIGURE = Path(__file__).parent / "figures" / "fastslam_nees.png"
 PARTICLES = (10, 50, 100, 500)

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gate import Metric, report
-from jaxslam.filters.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.motion.ackermann import ackermann
 from jaxslam.run import run
-from jaxslam.scenarios import cloister
 from jaxslam.sensors.range_bearing import range_bearing
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.worlds import simulate
 
 ROUNDS = 15
 WHEELBASE, SPEED, DT = 0.5, 1.0, 0.1

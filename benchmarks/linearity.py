@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxslam import sensors
-from jaxslam.linearity import sensor_linearity
+from jaxslam.verify.linearity import sensor_linearity
 
 NEAREST = 1.0
 RHO, SIGMA = 0.5 / NEAREST, 0.25 / NEAREST

@@ -24,9 +24,10 @@ import numpy as np
 
 from benchmarks.gate import Metric, alone
 from jaxslam import run, sensors, simulate
-from jaxslam.filters import cloud, localization, particle_localization
-from jaxslam.scenarios import circle
-from jaxslam.stats import chi2_quantile
+from jaxslam.filters import localization, particle_localization
+from jaxslam.filters.particles import pose_state
+from jaxslam.math.stats import chi2_quantile
+from jaxslam.simulation.scenarios import circle
 
 FIGURE = Path(__file__).parent / "figures" / "monte_carlo_localization.png"
 BOX = np.array([[-14.0, -4.0], [14.0, 23.0]])
@@ -48,7 +49,7 @@ def carried(world, key):
 def filters_of(world, particles):
     """Filter, and what it is told of the start, by name."""
     blunt = sensors.relative_position(0.5**2 * np.eye(2))
-    anywhere = cloud.box_moments(jnp.asarray(BOX))
+    anywhere = pose_state.box_moments(jnp.asarray(BOX))
     known = jnp.array([0.0, 0.5 / np.deg2rad(1.5), np.pi]), jnp.zeros((3, 3))
     models = world.motion, world.sensor, world.landmarks
     gate = chi2_quantile(0.999, 2)

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gate import Metric, alone
-from jaxslam import filters, linalg, motion, run, sensors
+from jaxslam import filters, motion, run, sensors
+from jaxslam.math import linalg
 from jaxslam.resampling import systematic
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate
 
 MOTION = motion.increment(np.diag([0.01, 0.01]) ** 2)
 SENSOR = sensors.range_bearing(np.diag([0.1, 0.03]) ** 2)

@@ -173,7 +173,7 @@ def measure(out: Path | None = None) -> list[Metric]:
 def draw(found, powers, out):
     import matplotlib.pyplot as plt
 
-    from jaxslam.plot import COLORS
+    from jaxslam.results.plot import COLORS
 
     plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
     figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")

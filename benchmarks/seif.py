@@ -19,11 +19,11 @@ import numpy as np
 
 from benchmarks.gate import Metric, report
 from jaxslam import datasets, filters
-from jaxslam.filters.blankets import marginals, whole_marginals
-from jaxslam.linalg import mahalanobis_squared
-from jaxslam.scenarios import circle, cloister
-from jaxslam.scenarios.view import between_ranges
-from jaxslam.simulate import simulate
+from jaxslam.filters.information.marginals import marginals, whole_marginals
+from jaxslam.math.linalg import mahalanobis_squared
+from jaxslam.simulation.scenarios import circle, cloister
+from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)

@@ -32,7 +32,7 @@ import numpy as np
 from benchmarks.gate import Metric, report
 from jaxslam import datasets, monte_carlo
 from jaxslam.filters import ekf_slam
-from jaxslam.scenarios import circle, cloister
+from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.smoothing import batch_map, smooth
 from jaxslam.smoothing.batch_map import Ending
 

@@ -11,41 +11,35 @@ from typing import Any
 from jaxslam import (
     association,
     calibration,
+    catalog,
     charts,
     consistency,
-    family,
     filters,
-    frames,
     life,
-    linearity,
     linearize,
     motion,
     programs,
     resampling,
-    scenarios,
-    se2,
     sensors,
     slots,
     smoothing,
-    spurious,
-    stats,
-    team,
 )
-from jaxslam.linearity import linearity_index
+from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.run import run
-from jaxslam.simulate import Scenario, simulate
-from jaxslam.verify import verify_jacobians
+from jaxslam.simulation import scenarios, spurious, team
+from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.verify import linearity, verify_jacobians
+from jaxslam.verify.linearity import linearity_index
 
 __all__ = [
     "Scenario",
     "association",
     "calibration",
+    "catalog",
     "charts",
     "consistency",
-    "family",
     "filters",
-    "frames",
     "life",
     "linearity",
     "linearity_index",
@@ -64,14 +58,18 @@ __all__ = [
     "spurious",
     "stats",
     "team",
+    "uncertain_poses",
     "verify_jacobians",
 ]
 
-_ON_DEMAND = ("datasets", "page", "plot", "report", "store")
+_ON_DEMAND = {
+    "datasets": "jaxslam.datasets",
+    **{name: f"jaxslam.results.{name}" for name in ("page", "plot", "report", "store")},
+}
 
 
 def __getattr__(name: str) -> Any:
     """What reads files or draws is imported when it is first asked for."""
     if name in _ON_DEMAND:
-        return importlib.import_module(f"jaxslam.{name}")
+        return importlib.import_module(_ON_DEMAND[name])
     raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxslam import linalg, programs
-from jaxslam.linalg import check_count
+from jaxslam import programs
+from jaxslam.math import linalg
+from jaxslam.math.linalg import check_count
 from jaxslam.types import Info, Status
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
-from jaxslam.linalg import check_covariance, check_key, is_concrete
+from jaxslam.math.linalg import check_covariance, check_key, is_concrete
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Status, Trace, check_log
 from jaxslam.validation import check_record, state_and_info

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam.linalg import cholesky, matmul, symmetrize, total, triangular_root
-from jaxslam.staging import settle
+from jaxslam.math.linalg import cholesky, matmul, symmetrize, total, triangular_root
+from jaxslam.math.xla import settle
 
 
 class Joint(NamedTuple):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.linalg import is_concrete
+from jaxslam.math.linalg import is_concrete
 
 
 class Status(IntEnum):

@@ -2,7 +2,7 @@
 
 import re
 
-from jaxslam import programs
+from jaxslam.programs import cache
 
 _COMPUTATION = re.compile(r"(?:ENTRY )?%?([\w.\-]+) \(.*\) -> .*\{$")
 _INSTRUCTION = re.compile(r"\s+(ROOT )?%([\w.\-]+) = (\([^=]*?\)|\S+) ([\w\-]+)\((.*)$")
@@ -11,7 +11,7 @@ _INSTRUCTION = re.compile(r"\s+(ROOT )?%([\w.\-]+) = (\([^=]*?\)|\S+) ([\w\-]+)\
 def wrong_layouts():
     """Calls in the kept programs with another layout than their computation was compiled for, which
     give wrong numbers (jaxlib 0.12)."""
-    texts = (kept.result().as_text() for kept in programs._BY_TEXT._found.values())
+    texts = (kept.result().as_text() for kept in cache._BY_TEXT._found.values())
     return [one for text in texts for one in mismatches(text)[0]]
 
 

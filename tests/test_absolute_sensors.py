@@ -10,7 +10,7 @@ import scipy.stats
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.run import run
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Log, Scan, Status, check_log
 
 KEY = jax.random.key(0)

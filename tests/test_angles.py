@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam.angles import sinc, sinc_slope, wrap
+from jaxslam.math.angles import sinc, sinc_slope, wrap
 
 DTYPES = [np.float32, np.float64]
 

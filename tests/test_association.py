@@ -10,9 +10,9 @@ import pytest
 import scipy.optimize
 
 from jaxslam import association
-from jaxslam.assignment import assign
+from jaxslam.math.assignment import assign
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Association, Pairs, Prediction
-from jaxslam.stats import chi2_quantile
 from jaxslam.types import Scan
 
 METHODS = {

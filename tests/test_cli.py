@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_family import three_parameters
 
-from jaxslam import cli, family, report, store
+from jaxslam import catalog, cli, report, store
 from jaxslam.cli import asking
 from jaxslam.consistency import Measure
 from jaxslam.monte_carlo import Interrupted
@@ -138,7 +138,7 @@ def test_particles_are_named_as_any_filter_and_all_spans_them(tmp_path, monkeypa
 
     monkeypatch.setattr(cli.campaign, "monte_carlo", begun)
     assert cli.main([*QUICK, "--filters", asked, "--out", str(tmp_path / "out")]) == 130
-    assert seen == (list(family.ALL) if asked == "all" else list(family.PARTICLES))
+    assert seen == (list(catalog.ALL) if asked == "all" else list(catalog.PARTICLES))
 
 
 def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, capsys, monkeypatch):

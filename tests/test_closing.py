@@ -9,8 +9,8 @@ import pytest
 
 from jaxslam import association, charts, motion, programs, sensors, slots
 from jaxslam.filters import eif_slam, ekf_slam
-from jaxslam.filters.closing import close_loop, closing
-from jaxslam.filters.merging import merge
+from jaxslam.filters.map_management.closing import close_loop, closing
+from jaxslam.filters.map_management.merging import merge
 from jaxslam.life import recency
 from jaxslam.life.recency import Recency
 from jaxslam.protocols import Pairs, Prediction

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam import datasets, linalg, se2
+from jaxslam import datasets, se2
 from jaxslam.datasets.lines import TextFile
 from jaxslam.datasets.mrclam import EXCHANGED, white_noise
 from jaxslam.filters import ekf_slam
+from jaxslam.math import linalg
 from jaxslam.types import Status
 
 DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))

@@ -12,10 +12,12 @@ from worlds import draw, judged
 import jaxslam
 from jaxslam import Scenario, motion, sensors
 from jaxslam.association import nearest
-from jaxslam.filters import delayed_slam, ekf_slam, hypotheses, placing
-from jaxslam.filters.meeting import circles, meeting_of, rays
-from jaxslam.filters.waiting import Layout
-from jaxslam.stats import chi2_quantile
+from jaxslam.filters import delayed_slam, ekf_slam
+from jaxslam.filters.delayed import hypotheses
+from jaxslam.filters.delayed.initialization import add_landmark, initial_estimate
+from jaxslam.filters.delayed.state import Layout
+from jaxslam.filters.delayed.triangulation import circles, meeting_of, rays
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Status
 
 CAMERA = sensors.bearing_only([[0.01**2]])
@@ -119,8 +121,8 @@ FORM = jax.jit(hypotheses.form, static_argnums=(1, 2))
 MISSES = jax.jit(hypotheses.misses, static_argnums=1)
 CONSTRAINTS = jax.jit(hypotheses.constraints)
 MOVE = jax.jit(hypotheses.move_hypotheses, static_argnums=1)
-FIT = jax.jit(placing.fit, static_argnums=1)
-ENTER = jax.jit(placing.enter)
+FIT = jax.jit(initial_estimate, static_argnums=1)
+ENTER = jax.jit(add_landmark)
 NEAR = jax.jit(hypotheses.near, static_argnums=0)
 
 
@@ -493,8 +495,8 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward(kind):
         part = found.value[:, 0], found.by_point[:, 0], found.by_sight[:, 0]
         constraint = hypotheses.constraints(new, slots, jnp.array([6, 6]), *part)
         moved = hypotheses.move_hypotheses(new, LAYOUT, constraint, born)
-        fit = placing.fit(start, KINDS[kind], jnp.array([1.1, 5.1]), sightings, use)
-        entered = placing.enter(start, fit, jnp.asarray(1), sightings)
+        fit = initial_estimate(start, KINDS[kind], jnp.array([1.1, 5.1]), sightings, use)
+        entered = add_landmark(start, fit, jnp.asarray(1), sightings)
         parts = [(x.landmarks**2).sum() + (x.cov**2).sum() for x in (moved, entered)]
         return sum(parts) + fit.nis
 

@@ -13,8 +13,8 @@ from jaxslam import charts, motion, sensors, slots
 from jaxslam.filters import ekf_slam
 from jaxslam.protocols import Free
 from jaxslam.run import run
-from jaxslam.scenarios import cloister
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Log, Scan, Status
 
 Q, R = np.diag([0.05, 0.03]) ** 2, np.diag([0.1, 0.05]) ** 2

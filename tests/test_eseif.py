@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from jaxslam import filters, motion, sensors
-from jaxslam.filters import blankets, sparsification
-from jaxslam.filters.eseif import fixes_pose, tied, without_pose
-from jaxslam.filters.recovery import relaxed
-from jaxslam.scenarios import cloister
-from jaxslam.scenarios.view import between_ranges
-from jaxslam.simulate import simulate
+from jaxslam.filters.information import sparsification
+from jaxslam.filters.information.eseif import fixes_pose, tied, without_pose
+from jaxslam.filters.information.marginals import information_of
+from jaxslam.filters.information.mean_recovery import relaxed
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)
@@ -69,7 +70,7 @@ def rows(run=0, upto=STEPS):
         yield log.control[t], jax.tree.map(lambda leaf: leaf[t], log.scan)
 
 
-dense = jax.jit(lambda state: blankets.information_of(state, jnp.arange(COUNT)))
+dense = jax.jit(lambda state: information_of(state, jnp.arange(COUNT)))
 
 
 def at(slots, robot=True):

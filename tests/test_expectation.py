@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxslam import charts, linearize, sensors
-from jaxslam.filters.correction import correct
-from jaxslam.filters.expectation import prediction_of
+from jaxslam.filters.ekf.predicted_measurements import prediction_of
+from jaxslam.filters.ekf.update import correct
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
 

@@ -10,12 +10,12 @@ import pytest
 import worlds
 from layouts import wrong_layouts
 
-from jaxslam import charts, family, linearize, motion, programs, sensors
+from jaxslam import catalog, charts, linearize, motion, programs, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.protocols import Filter, Here
 from jaxslam.run import run
-from jaxslam.scenarios import SCENARIOS, loop, stationary
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import SCENARIOS, loop, stationary
+from jaxslam.simulation.worlds import simulate
 
 KEY = jax.random.key(0)
 CURES = ["ideal", "fej", "oc", "right_invariant", "robocentric", "ukf_right"]
@@ -30,7 +30,7 @@ def draw(world):
 def drive(drawn, name, probe=None, **options):
     """One run of a variant: its trace."""
     world, truth, log = drawn
-    candidate = family.ALL[name](world, **options)
+    candidate = catalog.ALL[name](world, **options)
     filter = candidate
     if not isinstance(candidate, Filter):
         filter = candidate(jax.tree.map(jnp.asarray, truth))
@@ -38,7 +38,7 @@ def drive(drawn, name, probe=None, **options):
 
 
 def test_the_family_is_known_to_these_tests():
-    assert sorted(CURES + VICTIMS) == sorted(family.FILTERS)
+    assert sorted(CURES + VICTIMS) == sorted(catalog.FILTERS)
 
 
 @pytest.mark.parametrize("scenario", ["circle", "loop_bearing", "stationary"])
@@ -48,11 +48,11 @@ def test_what_draws_instead_of_linearizing_fits_scenarios(scenario):
     truth, log = jax.eval_shape(partial(simulate, world), jax.random.key(0))
 
     def go(name, truth, log):
-        candidate = family.PARTICLES[name](world, watch=True)
+        candidate = catalog.PARTICLES[name](world, watch=True)
         filter = candidate if isinstance(candidate, Filter) else candidate(truth)
         return run(filter, log, world.pose, world.pose_cov, KEY)
 
-    for name in family.PARTICLES:
+    for name in catalog.PARTICLES:
         trace = jax.eval_shape(partial(go, name), truth, log)
         assert trace.estimate.pose.shape == (3, 3)
         assert trace.info.invalid.shape == (3,)
@@ -115,7 +115,7 @@ def watch_of(state):
     return getattr(state, "watch", ())
 
 
-@pytest.mark.parametrize("name", family.ALL)
+@pytest.mark.parametrize("name", catalog.ALL)
 def test_other_numbers_run_what_is_there(name):
     first, second, compiled, wrong_layouts = around_and_still(name)
     assert (compiled, wrong_layouts) == (0, [])
@@ -191,7 +191,7 @@ def test_linearization_points_solve_the_constrained_least_squares():
     """Against a general solver of min |p* - p̂|² + Σ|l*_i - l̂_i|², l*_i - p* = d_i."""
     world, rng = loop(steps=2), np.random.default_rng(0)
     oc = linearize.observability()
-    joint = family.FILTERS["oc"](world).init(jnp.array([1.0, 2.0, 0.3]), jnp.eye(3) * 0.01)
+    joint = catalog.FILTERS["oc"](world).init(jnp.array([1.0, 2.0, 0.3]), jnp.eye(3) * 0.01)
     alive = np.arange(20) < 3
     landmarks = np.where(alive[:, None], rng.normal(size=(20, 2)) * 3, 0.0)
     arms = np.where(alive[:, None], landmarks + rng.normal(size=(20, 2)) * 0.3, 0.0)
@@ -246,7 +246,7 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly(name):
             "motion": motion.increment(jnp.diag(sigma[:2]) ** 2),
             "sensor": sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
         }
-        filter = family.FILTERS[name](dataclasses.replace(world, **models), update="joint")
+        filter = catalog.FILTERS[name](dataclasses.replace(world, **models), update="joint")
         trace = run(filter, log, world.pose, world.pose_cov, KEY)
         return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()
 
@@ -292,7 +292,7 @@ def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
     single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, log)
     smallest = {}
     for square_root in (False, True):
-        filter = family.variant(world, square_root=square_root)
+        filter = catalog.variant(world, square_root=square_root)
         trace = jax.jit(
             lambda log, f=filter: run(
                 f, log, world.pose, world.pose_cov, KEY, probe=lambda s: s.cov
@@ -312,7 +312,7 @@ def test_information_filters_stand_beside_the_family():
     """All active, they are the EKF by other numbers; what they do not know of is left out."""
     plain = around_and_still("ekf")[0]
     for name in ("eif_slam", "seif", "eseif"):
-        assert family.CANONICAL[name](worlds.ring(steps=2)).name == name
+        assert catalog.CANONICAL[name](worlds.ring(steps=2)).name == name
         trace = around_and_still(name)[0]
         np.testing.assert_allclose(trace.estimate.pose, plain.estimate.pose, atol=1e-8)
         np.testing.assert_allclose(trace.estimate.pose_cov, plain.estimate.pose_cov, atol=1e-8)
@@ -332,7 +332,7 @@ def three_parameters():
 @pytest.mark.parametrize("name", ["fej", "oc", "right_invariant", "left_invariant", "robocentric"])
 def test_variants_for_points_refuse_other_landmarks(name):
     with pytest.raises(ValueError, match=r"range_bearing_signature"):
-        family.FILTERS[name](three_parameters())
+        catalog.FILTERS[name](three_parameters())
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,9 @@ import pytest
 import worlds
 
 from jaxslam import association, life, monte_carlo, motion, programs, resampling, sensors
-from jaxslam.filters import fastslam, particles
-from jaxslam.filters.particles import Particles
+from jaxslam.filters import fastslam
+from jaxslam.filters.particles import slam_state
+from jaxslam.filters.particles.slam_state import Particles
 from jaxslam.run import run
 from jaxslam.types import Scan, Status
 
@@ -117,7 +118,7 @@ def test_moments_of_the_pose_against_plain_arithmetic():
     state = cloud(np.random.default_rng(0))
     w = np.exp(state.log_weight)
     assert np.ptp(state.pose[:, 2]) > 6  # a plain mean of headings would be far off
-    mean, cov = jax.jit(particles.pose_moments)(state)
+    mean, cov = jax.jit(slam_state.pose_moments)(state)
     theta = np.angle((w * np.exp(1j * state.pose[:, 2])).sum())
     np.testing.assert_allclose(mean, [*(w @ state.pose[:, :2]), theta], atol=1e-12)
     d = state.pose - np.asarray(mean)
@@ -133,7 +134,7 @@ def test_the_covariance_is_the_mean_square_of_truth_minus_mean():
     root = np.diag([0.3, 0.1, 0.05])
     draws = rng.normal(size=(20000, 7, 3)) @ root
     start = cloud(rng, 6)._replace(log_weight=np.full(6, -np.log(6)))
-    one = jax.jit(jax.vmap(lambda poses: particles.pose_moments(start._replace(pose=poses))))
+    one = jax.jit(jax.vmap(lambda poses: slam_state.pose_moments(start._replace(pose=poses))))
     mean, cov = one(jnp.asarray(draws[:, :6]))
     error = draws[:, 6] - np.asarray(mean)
     np.testing.assert_allclose(np.asarray(cov).mean(0).diagonal(), error.var(0), rtol=0.04)
@@ -151,7 +152,7 @@ def test_the_map_is_a_mixture_by_slot_where_tags_agree():
     state.alive[other[1], 0], state.tag[other[1], 0] = False, -1
     state.tag[:, 1] = -1  # unknown: the most likely particle's own
     state.alive[best, 2], state.tag[best, 2] = False, -1
-    out = jax.jit(partial(particles.moments, sensor=worlds.ring(1).sensor))(state)
+    out = jax.jit(partial(slam_state.moments, sensor=worlds.ring(1).sensor))(state)
     keep = np.array([p not in other[:2] for p in range(7)])
     w = np.exp(state.log_weight) * keep
     w = w / w.sum()
@@ -170,7 +171,7 @@ def test_headings_that_cancel_have_no_mean_and_no_nan():
     state = cloud(np.random.default_rng(0), 2)._replace(log_weight=np.log([0.5, 0.5]))
     state.pose[:, 2] = [0.0, np.pi]
     mean, slope = jax.jit(
-        jax.value_and_grad(lambda pose: particles.pose_moments(state._replace(pose=pose))[0].sum())
+        jax.value_and_grad(lambda pose: slam_state.pose_moments(state._replace(pose=pose))[0].sum())
     )(state.pose)
     assert np.isfinite(mean)
     assert np.all(np.isfinite(slope))

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from jaxslam.filters import ekf_slam
-from jaxslam.linalg import is_positive_definite
+from jaxslam.math.linalg import is_positive_definite
 from jaxslam.run import run
-from jaxslam.scenarios import circle
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import circle
+from jaxslam.simulation.worlds import simulate
 
 
 @pytest.fixture(scope="module")

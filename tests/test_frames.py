@@ -7,11 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxslam import frames, se2
-from jaxslam.frames import Frame
+from jaxslam import se2
+from jaxslam.math import uncertain_poses
+from jaxslam.math.uncertain_poses import Frame
 
-compound, merge, reverse = map(jax.jit, (frames.compound, frames.merge, frames.reverse))
-bhattacharyya = jax.jit(frames.bhattacharyya)
+compound, merge, reverse = map(
+    jax.jit, (uncertain_poses.compound, uncertain_poses.merge, uncertain_poses.reverse)
+)
+bhattacharyya = jax.jit(uncertain_poses.bhattacharyya)
 numbers = st.floats(0.01, 100.0)
 
 
@@ -65,27 +68,27 @@ def test_cross_terms_are_those_of_monte_carlo():
     mean = se2.compose(a.pose, b.pose)
     poses = jax.vmap(lambda e: se2.compose(a.pose + e[:3], b.pose + e[3:]) - mean)(draws)
     found = np.cov(np.asarray(poses).T)
-    with_cross = frames.compound(a, b, jnp.asarray(both[:3, 3:])).cov
+    with_cross = uncertain_poses.compound(a, b, jnp.asarray(both[:3, 3:])).cov
     scale = np.abs(found).max()
     np.testing.assert_allclose(with_cross, found, atol=0.02 * scale)
-    assert np.abs(frames.compound(a, b).cov - found).max() > 0.1 * scale
+    assert np.abs(uncertain_poses.compound(a, b).cov - found).max() > 0.1 * scale
 
 
 def test_merging_across_the_seam_of_the_heading():
     a = Frame(jnp.array([0.0, 0.0, np.pi - 0.1]), jnp.eye(3))
     b = Frame(jnp.array([0.0, 0.0, -np.pi + 0.1]), jnp.eye(3))
     assert abs(abs(float(merge(a, b)[0].pose[2])) - np.pi) < 1e-12
-    np.testing.assert_allclose(frames.mahalanobis_squared(a, b)[0], 0.2**2 / 2)
+    np.testing.assert_allclose(uncertain_poses.mahalanobis_squared(a, b)[0], 0.2**2 / 2)
 
 
 def test_a_cross_covariance_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"cross of shape \(3, 3\)"):
-        frames.compound(some(1), some(2), jnp.ones(3))
+        uncertain_poses.compound(some(1), some(2), jnp.ones(3))
 
 
 def test_distances():
     a, b = some(1), some(2)
-    near, regular = frames.mahalanobis_squared(a, b)
+    near, regular = uncertain_poses.mahalanobis_squared(a, b)
     delta = np.asarray(a.pose - b.pose)
     np.testing.assert_allclose(near, delta @ np.linalg.solve(a.cov + b.cov, delta))
     assert regular
@@ -107,7 +110,7 @@ def test_certain_frames():
     same, regular = merge(exact, exact)
     assert not regular
     np.testing.assert_array_equal(same.pose, exact.pose)
-    distance, regular = frames.bhattacharyya(exact, exact)
+    distance, regular = uncertain_poses.bhattacharyya(exact, exact)
     assert not regular
     assert distance == 0
     slopes = jax.grad(lambda cov: merge(Frame(exact.pose, cov), exact)[0].pose.sum())(exact.cov)
@@ -118,10 +121,10 @@ def test_certain_frames():
 def test_batches_and_dtypes(dtype):
     a = jax.tree.map(lambda *x: jnp.stack(x).astype(dtype), some(1), some(2))
     b = jax.tree.map(lambda *x: jnp.stack(x).astype(dtype), some(3), some(4))
-    both = jax.vmap(frames.compound)(a, b)
+    both = jax.vmap(uncertain_poses.compound)(a, b)
     assert both.cov.dtype == dtype
     first = jax.tree.map(lambda x: x[0], (a, b))
-    np.testing.assert_allclose(both.cov[0], frames.compound(*first).cov, rtol=1e-4)
+    np.testing.assert_allclose(both.cov[0], uncertain_poses.compound(*first).cov, rtol=1e-4)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

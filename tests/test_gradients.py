@@ -9,10 +9,10 @@ import pytest
 
 from jaxslam import motion, sensors
 from jaxslam.filters import ekf_slam
+from jaxslam.math.stats import sigma_gate
 from jaxslam.run import run
-from jaxslam.scenarios import cloister
-from jaxslam.simulate import simulate
-from jaxslam.stats import sigma_gate
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxslam import lapack, linalg
+from jaxslam.math import batched_linalg, linalg
 
 UNROLLED, LAPACK = [1, 2, 3, 4, 5, 6, 7, 8], [9, 20]
 ROWS = 20
@@ -341,11 +341,11 @@ def test_slopes_of_slopes_equal_differences():
 
 
 def test_no_batch_reaches_the_librarys_kernels_on_a_cpu():
-    # There they wait for threads that they hold themselves: see `lapack`.
+    # There they wait for threads that they hold themselves: see `batched_linalg`.
     a, b = random_covariances(20, count=4), np.ones((4, 20, 3))
     slope = jax.grad(lambda a, b: everything(a, b)[0].sum(), (0, 1))
-    for f in (everything, slope, lapack.eigenvalues):
-        arguments = (a, b) if f is not lapack.eigenvalues else (a,)
+    for f in (everything, slope, batched_linalg.eigenvalues):
+        arguments = (a, b) if f is not batched_linalg.eigenvalues else (a,)
         program = jax.jit(jax.vmap(f)).lower(*arguments).compile().as_text()
         calls = [
             line for line in program.splitlines() if "lapack" in line and "custom-call(" in line

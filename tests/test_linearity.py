@@ -7,7 +7,7 @@ import pytest
 
 import jaxslam
 from jaxslam import motion, sensors
-from jaxslam.linearity import motion_linearity, sensor_linearity
+from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 
 DTYPES = [np.float32, np.float64]
 

@@ -11,8 +11,8 @@ from worlds import draw, ring
 
 from jaxslam import association, charts, linearize, monte_carlo, run, sensors
 from jaxslam.filters import dead_reckoning, ekf_slam, localization
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors import Part, suite
-from jaxslam.stats import chi2_quantile
 from jaxslam.types import Log, Status
 
 KEY = jax.random.key(0)

@@ -11,8 +11,8 @@ from worlds import draw, ring
 
 from jaxslam import association, charts, linearize, motion, run, sensors, simulate
 from jaxslam.filters import ekf_slam, mapping
-from jaxslam.filters.mapping import as_prior
-from jaxslam.stats import chi2_band, chi2_quantile
+from jaxslam.filters.known.mapping import as_prior
+from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)

@@ -12,7 +12,7 @@ from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
 from jaxslam import charts, consistency, motion, sensors
 from jaxslam.consistency.nees import block_nees
-from jaxslam.simulate import simulate
+from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.filters import ekf_slam
-from jaxslam.filters.merging import closest_pair, duplicates, merge
+from jaxslam.filters.map_management.merging import closest_pair, duplicates, merge
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
 

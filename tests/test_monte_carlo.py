@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import family, filters, motion, run, simulate, store
+from jaxslam import catalog, filters, motion, run, simulate, store
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
 from jaxslam.monte_carlo.block import Programs
@@ -255,7 +255,7 @@ def test_another_seed_is_another_campaign(in_fours):
 
 def test_another_key_noise_map_or_more_runs_compile_nothing():
     def campaign(there, runs, seed):
-        tried = {"ekf": worlds.ekf(there), "ideal": family.ideal(there)}
+        tried = {"ekf": worlds.ekf(there), "ideal": catalog.ideal(there)}
         more = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
         return monte_carlo(there, tried, runs, jax.random.key(seed), **more)
 
@@ -273,7 +273,7 @@ def test_functions_of_the_truth_and_estimators_run_too(in_fours):
     def estimator(truth):
         return lambda log, key: run(EKF, log, WORLD.pose, WORLD.pose_cov, key)
 
-    candidates = {"ideal": family.ideal(WORLD), "estimator": estimator}
+    candidates = {"ideal": catalog.ideal(WORLD), "estimator": estimator}
     campaign = campaign_of(candidates)
     same(campaign.filters["estimator"], in_fours.filters["ekf"])
     assert campaign.filters["ideal"].measures["nees_pose"].value > 0
@@ -344,8 +344,8 @@ def test_a_world_without_noise_does_not_diverge():
 def lineup():
     candidates = {
         "ekf": EKF,
-        "right_invariant": family.FILTERS["right_invariant"](WORLD),
-        "ideal": family.ideal(WORLD),
+        "right_invariant": catalog.FILTERS["right_invariant"](WORLD),
+        "ideal": catalog.ideal(WORLD),
     } | {name: make(WORLD) for name, make in worlds.WRONG.items()}
     return monte_carlo(WORLD, candidates, 200, worlds.key(), block=LARGE).filters
 
@@ -377,8 +377,8 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
         ({"filters": {"x": filters.ekf_slam}}, "x is a factory that was not called"),
         ({"filters": {"x": filters.dead_reckoning}}, "what it returns, x(motion, …)"),
-        ({"filters": family.FILTERS}, "ekf is a factory that was not called"),
-        ({"filters": {"fej": family.FILTERS["fej"]}}, "what it returns, fej(world, …)"),
+        ({"filters": catalog.FILTERS}, "ekf is a factory that was not called"),
+        ({"filters": {"fej": catalog.FILTERS["fej"]}}, "what it returns, fej(world, …)"),
         (
             {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), WORLD.sensor, 2)}},
             "size 3",

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from jaxslam import plot
+from jaxslam.catalog import ALL, KINDS
 from jaxslam.consistency import DOF, LAGS, LEVELS
 from jaxslam.consistency.summary import Summary
-from jaxslam.family import ALL, KINDS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.plot.nees import kinds_of
+from jaxslam.results.plot.nees import kinds_of
 
 STEPS, RUNS = 200, 32
 

@@ -9,7 +9,7 @@ import pytest
 from jaxslam import plot, report
 from jaxslam.consistency import DOF, LEVELS, Measure, Summary
 from jaxslam.monte_carlo import Campaign
-from jaxslam.page import VERDICTS, page
+from jaxslam.results.page import VERDICTS, page
 
 STEPS, RUNS = 7, 30
 EVIL = "<script>alert(1)</script>&\"'"

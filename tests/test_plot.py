@@ -9,7 +9,7 @@ import worlds
 
 from jaxslam import plot, run, simulate
 from jaxslam.consistency import LAGS, LEVELS
-from jaxslam.plot.style import logarithmic, panels_of
+from jaxslam.results.plot.style import logarithmic, panels_of
 
 WORLD = worlds.ring()
 

@@ -10,7 +10,8 @@ import pytest
 import worlds
 from layouts import wrong_layouts
 
-from jaxslam import family, filters, programs, run, simulate, smoothing
+from jaxslam import catalog, filters, programs, run, simulate, smoothing
+from jaxslam.programs import cache
 from jaxslam.types import Status
 
 
@@ -35,7 +36,7 @@ def test_other_numbers_run_what_is_there_place_by_place(name, compilations):
     def trace(scale, seed):
         there = worlds.scaled(scale)
         _, log = simulate(there, jax.random.key(seed))
-        method = family.FILTERS[name](there, gate=9.0 * scale)
+        method = catalog.FILTERS[name](there, gate=9.0 * scale)
         return run(method, log, there.pose, there.pose_cov, jax.random.key(seed))
 
     programs.clear()
@@ -175,7 +176,7 @@ def test_what_says_how_large_something_is_stays():
 
 
 def test_the_least_recently_used_is_dropped():
-    kept, made = programs.Kept(2), []
+    kept, made = cache.Kept(2), []
 
     def get(key):
         return kept.get(key, lambda: made.append(key) or key)
@@ -189,7 +190,7 @@ def test_the_least_recently_used_is_dropped():
 
 
 def test_who_comes_second_waits_and_an_error_is_not_kept():
-    kept, began, go = programs.Kept(2), threading.Event(), threading.Event()
+    kept, began, go = cache.Kept(2), threading.Event(), threading.Event()
     made, found = [], []
 
     def slow():

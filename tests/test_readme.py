@@ -45,4 +45,4 @@ def test_every_public_factory_is_in_the_reference():
         package = getattr(jaxslam, module)
         for name in getattr(package, "__all__", []):
             if name != "REGISTRY":
-                assert (f"jaxslam.{module}", name) in listed
+                assert (package.__name__, name) in listed

@@ -11,7 +11,7 @@ import pytest
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.charts import right_invariant
 from jaxslam.filters import compressed_ekf_slam, ekf_slam
-from jaxslam.filters.reduction import ready, reduce
+from jaxslam.filters.ekf.to_points import ready, reduce
 from jaxslam.linearize import unscented
 from jaxslam.protocols import Basis
 from jaxslam.types import Log, Scan, Status

@@ -10,11 +10,17 @@ import pytest
 
 from jaxslam import charts, motion, se2, sensors
 from jaxslam.filters import ekf_slam
-from jaxslam.filters.correction import correct
-from jaxslam.filters.relocalization import lost, map_of, relocalize, relocated, seen_points
+from jaxslam.filters.ekf.update import correct
+from jaxslam.filters.map_management.relocalization import (
+    lost,
+    map_of,
+    relocalize,
+    relocated,
+    seen_points,
+)
 from jaxslam.linearize import at_estimate, first_estimate
+from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.slots import Joint
-from jaxslam.stats import chi2_band, chi2_quantile
 from jaxslam.types import Scan, Status
 
 SENSOR = sensors.range_bearing(np.diag([0.05, 0.01]) ** 2, mount=(0.2, 0.1, 0.3))

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam.scenarios import (
+from jaxslam.simulation.scenarios import (
     SCENARIOS,
     cloister_noisy,
     explore,
@@ -15,7 +15,7 @@ from jaxslam.scenarios import (
     loop_landmarks,
     stationary,
 )
-from jaxslam.simulate import simulate
+from jaxslam.simulation.worlds import simulate
 
 
 def draw(world, seed=0):

@@ -10,11 +10,18 @@ import pytest
 from worlds import draw
 
 from jaxslam import filters, sensors
-from jaxslam.filters import blankets, sparse_map, sparsification
-from jaxslam.filters.recovery import relaxed
+from jaxslam.filters.information import sparse_state, sparsification
+from jaxslam.filters.information.marginals import (
+    information_of,
+    local_cov,
+    marginals,
+    whole_information,
+    whole_mean,
+)
+from jaxslam.filters.information.mean_recovery import relaxed
 from jaxslam.run import run
-from jaxslam.scenarios import cloister
-from jaxslam.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)
@@ -59,7 +66,7 @@ def rows(upto=40):
 
 @jax.jit
 def dense(state):
-    return blankets.information_of(state, jnp.arange(state.own.shape[0]))
+    return information_of(state, jnp.arange(state.own.shape[0]))
 
 
 def canonical(state):
@@ -197,7 +204,7 @@ def test_with_all_active_it_is_the_eif():
 
 def test_mean_recovery_converges_to_the_whole_mean():
     state = driven()
-    pose, landmarks = blankets.whole_mean(state)
+    pose, landmarks = whole_mean(state)
     f, _, update = made(passive=COUNT)
     _, scan = next(rows(1))
     nothing = scan._replace(valid=np.zeros_like(scan.valid))
@@ -211,15 +218,15 @@ def test_mean_recovery_converges_to_the_whole_mean():
 
 def test_whole_map_and_blankets():
     state = driven()
-    omega = blankets.whole_information(state).toarray()
+    omega = whole_information(state).toarray()
     np.testing.assert_allclose(omega, dense(state), atol=1e-12 * np.abs(omega).max())
     cov = np.linalg.inv(omega)
-    found = np.asarray(jax.jit(blankets.marginals)(state)[1])
-    local_cov, chosen = jax.jit(blankets.local_cov), set(np.asarray(state.slot))
+    found = np.asarray(jax.jit(marginals)(state)[1])
+    cov_of, chosen = jax.jit(local_cov), set(np.asarray(state.slot))
     neighbours = np.asarray(state.neighbours)
     for slot in np.flatnonzero(state.alive):
         at = [0, 1, 2, 3 + 2 * slot, 4 + 2 * slot]
-        local = np.asarray(local_cov(state, slot))
+        local = np.asarray(cov_of(state, slot))
         # given more, it is less: never above the marginal covariance
         assert np.linalg.eigvalsh(cov[np.ix_(at, at)] - local)[0] > -1e-9
         np.testing.assert_allclose(found[slot], local[3:, 3:], atol=1e-12)
@@ -290,7 +297,7 @@ def test_springs():
 @pytest.mark.parametrize("conservative", [False, True])
 def test_a_full_list_drops_its_weakest_link(conservative):
     """Three links enter a list of two: the weakest goes, on both sides, and Ω̃ ⪰ Ω, or ⪯."""
-    state = jax.jit(lambda: sparse_map.empty(jnp.zeros(3), jnp.eye(3), 5, 1, 2))()
+    state = jax.jit(lambda: sparse_state.empty(jnp.zeros(3), jnp.eye(3), 5, 1, 2))()
     state = state._replace(own=100.0 * np.asarray(state.own))
     enter = jax.jit(functools.partial(sparsification.linked, conservative=conservative))
     link = np.array([[-2.0, 0.5], [0.1, -1.0]])
@@ -327,7 +334,7 @@ def test_few_links_stay_definite_and_are_counted():
     state = driven(links=8)
     assert int(state.counts.dropped) > 0
     assert int(state.counts.broken) == 0
-    omega = blankets.whole_information(state).toarray()
+    omega = whole_information(state).toarray()
     np.testing.assert_array_equal(omega, omega.T)
     assert np.linalg.eigvalsh(omega)[0] > 0
 

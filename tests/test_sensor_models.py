@@ -8,7 +8,7 @@ import pytest
 from jaxslam import motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.run import run
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate
 
 MOUNT = np.array([0.4, -0.3, 0.9])
 VARIANCE = np.array([[0.02**2]])

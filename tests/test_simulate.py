@@ -14,14 +14,14 @@ import pytest
 import scipy.stats
 
 from jaxslam import motion, sensors
-from jaxslam.scenarios import (
+from jaxslam.simulation.scenarios import (
     SCENARIOS,
     between_ranges,
     circle,
     cloister,
     cloister_landmarks,
 )
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import check_log
 
 Q = np.array([[0.002, 0.0005], [0.0005, 0.001]])

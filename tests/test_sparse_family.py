@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import family, scenarios
+from jaxslam import catalog, scenarios
 from jaxslam.charts import euclidean
 from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Filter
@@ -17,7 +17,7 @@ from jaxslam.types import Scan
 def test_fewer_landmarks_are_active_than_the_map_has(name, scenario, active):
     world = scenarios.SCENARIOS[scenario](20)
     count = len(world.landmarks)
-    filter = family.CANONICAL[name](world)
+    filter = catalog.CANONICAL[name](world)
     pose, cov = jnp.zeros(3), jnp.eye(3)
     state = jax.eval_shape(filter.init, pose, cov)
     assert state.slot.shape == (active,) and active < count
@@ -33,7 +33,7 @@ def test_a_scan_in_pieces_loses_and_moves_nothing():
         info = nothing_of(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
         return state + jnp.where(scan.valid, scan.z[:, 0], 0.0).sum(), info
 
-    seen = family.in_pieces(
+    seen = catalog.in_pieces(
         Filter("toy", 3, 2, lambda p, c: p[0], lambda s, u, k: s, update, lambda s: s, euclidean()),
         3,
     )

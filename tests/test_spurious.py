@@ -12,7 +12,7 @@ import worlds
 from jaxslam import association, life, monte_carlo, sensors
 from jaxslam.consistency.associations import associations, identities
 from jaxslam.filters import ekf_slam
-from jaxslam.spurious import Spurious, spoil
+from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Estimate, Info, Scan, Status, Trace
 
 SENSOR = sensors.range_bearing(np.diag([0.1, 0.02]) ** 2)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.staging import anywhere, apart, hot_options, quick_jit, settle, where_any
+from jaxslam.math.xla import anywhere, apart, hot_options, quick_jit, settle, where_any
 
 
 def test_settle_is_the_identity_under_every_transformation():

@@ -11,10 +11,10 @@ from worlds import draw, ring
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
-from jaxslam.scenarios import between_ranges
 from jaxslam.sensors import Part, suite
-from jaxslam.simulate import Scenario
-from jaxslam.spurious import Spurious
+from jaxslam.simulation.scenarios import between_ranges
+from jaxslam.simulation.spurious import Spurious
+from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Status
 
 EYES = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))

@@ -12,10 +12,11 @@ from worlds import draw, judged, nees, ring
 
 import jaxslam
 from jaxslam import charts, filters, motion, sensors, team
-from jaxslam.filters import ekf_slam, entering, team_slam
-from jaxslam.scenarios import between_ranges
+from jaxslam.filters import ekf_slam, team_slam
+from jaxslam.filters.multi_robot import pose_initialization
 from jaxslam.sensors import Part, suite
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import between_ranges
+from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Log, Scan, Status
 
 Q = np.diag([0.01, 0.01]) ** 2
@@ -243,13 +244,13 @@ def test_a_way_in_is_exact_without_noise(way):
 
     cov = np.eye(2) * 1e-4
     if way == "mutual":
-        found = jax.jit(entering.by_mutual_sight)(
+        found = jax.jit(pose_initialization.by_mutual_sight)(
             a, np.eye(3, 9), np.eye(3), (to(a, b[:2]), cov), (to(b, a[:2]), cov)
         )
     else:
         points = np.array([[0.0, 0.5], [3.0, -1.0]])
         seen = np.stack([to(b, point) for point in points])
-        found = jax.jit(entering.by_two_landmarks)(
+        found = jax.jit(pose_initialization.by_two_landmarks)(
             points, np.eye(4, 9), np.eye(4), seen, np.stack([cov, cov])
         )
     np.testing.assert_allclose(found[0], b, rtol=0, atol=1e-12)

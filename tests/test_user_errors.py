@@ -9,8 +9,9 @@ import pytest
 
 import jaxslam
 from jaxslam import association, charts, filters, life, linearize, motion, sensors, smoothing, team
-from jaxslam.filters import merging, reporting
-from jaxslam.filters.closing import _OPTIONS, closing
+from jaxslam.filters import reporting
+from jaxslam.filters.map_management import merging
+from jaxslam.filters.map_management.closing import _OPTIONS, closing
 from jaxslam.protocols import Free, Sensor
 from jaxslam.types import Log, Scan
 from jaxslam.validation import check_models, state_and_info

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxslam import userfile
 from jaxslam.cli import main
+from jaxslam.verify import user_files
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -205,4 +205,4 @@ def test_neighbours_can_be_imported_and_nothing_stays_behind(verify, tmp_path):
 
 
 def test_a_path_with_a_name_is_split():
-    assert userfile._split(str(EXAMPLES / "notes_velocity.py") + ":move")[1] == "move"
+    assert user_files._split(str(EXAMPLES / "notes_velocity.py") + ":move")[1] == "move"

@@ -13,7 +13,7 @@ from jaxslam.consistency import judge, lopsided, positive_interval, power_of
 from jaxslam.consistency.intervals import Measure, spread
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.monte_carlo.candidates import check_noise
-from jaxslam.simulate import Scenario
+from jaxslam.simulation.worlds import Scenario
 
 SENSOR = sensors.range_bearing(np.eye(2))
 

@@ -10,8 +10,8 @@ import pytest
 from jaxslam import motion, run
 from jaxslam.filters import ekf_slam
 from jaxslam.motion.substeps import substeps
-from jaxslam.scenarios.webmap import webmap
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios.webmap import webmap
+from jaxslam.simulation.worlds import simulate
 
 Q = np.array([[0.04, 0.003], [0.003, 0.01]])
 COUNT = 3

@@ -9,8 +9,8 @@ import pytest
 
 from jaxslam import association, life, motion, run, sensors
 from jaxslam.filters import ekf_slam
-from jaxslam.filters.merging import duplicates
-from jaxslam.stats import chi2_quantile
+from jaxslam.filters.map_management.merging import duplicates
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Log, Scan, Status
 
 STEPS, PLACES = 1000, 4

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import filters, linearize, motion, sensors
+from jaxslam.math.stats import t_quantile
 from jaxslam.monte_carlo import monte_carlo
-from jaxslam.simulate import Scenario, simulate
-from jaxslam.stats import t_quantile
+from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Status
 
 

@@ -15,12 +15,12 @@ import jaxslam
 from jaxslam import association, charts, motion, plot, sensors
 from jaxslam.consistency.associations import identities
 from jaxslam.filters import ekf_slam
-from jaxslam.filters.closing import closing
+from jaxslam.filters.map_management.closing import closing
 from jaxslam.life import recency
-from jaxslam.scenarios import between_ranges
-from jaxslam.simulate import Scenario, simulate
-from jaxslam.spurious import Spurious
-from jaxslam.stats import chi2_quantile
+from jaxslam.math.stats import chi2_quantile
+from jaxslam.simulation.scenarios import between_ranges
+from jaxslam.simulation.spurious import Spurious
+from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Status
 
 RUNS, BLOCK = 50, 10

@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from jaxslam import association, motion, plot
 from jaxslam.filters import ekf_slam
 from jaxslam.life import existence
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.monte_carlo import monte_carlo
-from jaxslam.scenarios import cloister
-from jaxslam.spurious import Spurious
-from jaxslam.stats import chi2_quantile
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.spurious import Spurious
 
 RUNS = 32
 REACH = 4.0

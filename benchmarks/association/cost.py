@@ -14,11 +14,12 @@ import numpy as np
 from benchmarks.speed.timing import together
 from jaxslam import association, life, run
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters import correction, ekf_slam
-from jaxslam.filters.expectation import prediction_of
-from jaxslam.filters.merging import duplicates
+from jaxslam.filters import ekf_slam
+from jaxslam.filters.ekf.predicted_measurements import prediction_of
+from jaxslam.filters.ekf.update import correct_in_turn
+from jaxslam.filters.map_management.merging import duplicates
 from jaxslam.linearize.at_estimate import at_estimate
-from jaxslam.scenarios import cloister
+from jaxslam.simulation.scenarios import cloister
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
 
@@ -60,7 +61,7 @@ def measure():
     models = {"sensor": sensor, "chart": euclidean(), "linearize": at_estimate()}
 
     def correct(joint, scan):
-        return correction.correct_in_turn(joint, scan.z, scan.tag, scan.valid, **models)[0]
+        return correct_in_turn(joint, scan.z, scan.tag, scan.valid, **models)[0]
 
     def find(method):
         return lambda joint, scan: tuple(method(prediction_of(joint, **models), scan))

@@ -13,14 +13,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxslam import association, plot
-from jaxslam.angles import wrap
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.expectation import prediction_of
-from jaxslam.linalg import root_psd
+from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.math.angles import wrap
+from jaxslam.math.linalg import root_psd
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors import range_bearing
 from jaxslam.slots import Joint
-from jaxslam.stats import chi2_quantile
 from jaxslam.types import Scan
 
 COUNT, SEEN, DRAWS = 14, 8, 500

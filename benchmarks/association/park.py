@@ -38,7 +38,7 @@ from jaxslam import association, charts, datasets, motion, plot, sensors
 from jaxslam.calibration import calibrate
 from jaxslam.filters import ekf_slam
 from jaxslam.life import recency
-from jaxslam.stats import chi2_quantile
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Status
 
 CAPACITY, LOCAL, PATIENCE = 200, 16, 30

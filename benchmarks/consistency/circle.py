@@ -9,11 +9,11 @@ import numpy as np
 
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
+from jaxslam.catalog import FILTERS
 from jaxslam.consistency import Measure
-from jaxslam.family import FILTERS
+from jaxslam.math.stats import t_quantile
 from jaxslam.monte_carlo import monte_carlo
-from jaxslam.scenarios import circle
-from jaxslam.stats import t_quantile
+from jaxslam.simulation.scenarios import circle
 
 PUBLISHED_RUNS = 100
 NORMAL_99 = 2.5758

@@ -14,13 +14,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
+from jaxslam.catalog import FILTERS
 from jaxslam.consistency import own_error_of, score
-from jaxslam.family import FILTERS
-from jaxslam.plot import COLORS
 from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.results.plot import COLORS
 from jaxslam.run import run
-from jaxslam.scenarios import loop, loop_landmarks
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import loop, loop_landmarks
+from jaxslam.simulation.worlds import simulate
 
 _Model = TypeVar("_Model", Motion, Sensor)
 

@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
-from jaxslam.family import FILTERS
+from jaxslam.catalog import FILTERS
 from jaxslam.monte_carlo import Campaign, monte_carlo
-from jaxslam.plot import COLORS
 from jaxslam.protocols import Candidate
-from jaxslam.scenarios import stationary
+from jaxslam.results.plot import COLORS
+from jaxslam.simulation.scenarios import stationary
 
 PRIOR = math.radians(5.0)
 """σ of the heading at the start, rad."""

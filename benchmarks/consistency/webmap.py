@@ -6,10 +6,10 @@ from matplotlib.figure import Figure
 
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
-from jaxslam.family import FILTERS
+from jaxslam.catalog import FILTERS
 from jaxslam.monte_carlo import monte_carlo
-from jaxslam.plot import nees_figure
-from jaxslam.scenarios import webmap
+from jaxslam.results.plot import nees_figure
+from jaxslam.simulation.scenarios import webmap
 
 NAMES = ("ekf", "ideal", "right_invariant")
 LOOPS = 3

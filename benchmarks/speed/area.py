@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.speed.timing import best
 from jaxslam.filters import compressed_ekf_slam, ekf_slam
-from jaxslam.filters.compressed_ekf_slam import opened
+from jaxslam.filters.ekf.compressed_ekf_slam import opened
 from jaxslam.slots import Joint
 
 AREA = 40

@@ -17,12 +17,12 @@ from benchmarks.speed import roofline
 from benchmarks.speed.area import compressed
 from benchmarks.speed.dense import dense_ekf
 from benchmarks.speed.peers import Mrpt, dynamax_ekf
-from jaxslam.family import FILTERS
-from jaxslam.filters.ekf_slam import ekf_slam
+from jaxslam.catalog import FILTERS
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.math.xla import hot_options
 from jaxslam.run import run
-from jaxslam.scenarios import cloister
-from jaxslam.simulate import simulate
-from jaxslam.staging import hot_options
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.worlds import simulate
 
 RUNS, PEERS_RUNS = 32, 4
 VISIBLE = 20

@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from jaxslam.linalg import is_concrete
+from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Associate, Association, Pairs, Prediction
 from jaxslam.types import Scan
 

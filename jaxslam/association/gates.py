@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.linalg import is_concrete
+from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Pairs, Prediction
 from jaxslam.types import Scan
 

@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 
-from jaxslam.assignment import assign
 from jaxslam.association.gates import check_gates, far_from_all
+from jaxslam.math.assignment import assign
 from jaxslam.protocols import Associate, Association, Prediction
 from jaxslam.types import Scan
 

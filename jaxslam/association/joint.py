@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import linalg
 from jaxslam.association.gates import check_gates, far_from_all
-from jaxslam.linalg import check_count
+from jaxslam.math import linalg
+from jaxslam.math.linalg import check_count
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Association, Pairs, Prediction
-from jaxslam.stats import chi2_quantile
 from jaxslam.types import Scan
 
 Array = jax.Array

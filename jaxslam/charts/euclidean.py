@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam.angles import wrap
+from jaxslam.math.angles import wrap
 from jaxslam.protocols import Chart
 
 

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam import se2
-from jaxslam.angles import wrap
+from jaxslam.math import se2
+from jaxslam.math.angles import wrap
 from jaxslam.protocols import Basis, Chart
 
 

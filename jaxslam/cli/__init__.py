@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 from threadpoolctl import threadpool_limits
 
+from jaxslam.catalog import ALL
 from jaxslam.cli import cache, devices
 from jaxslam.cli.asking import INTERRUPTED
 from jaxslam.cli.campaign import DEFAULTS, consistency
@@ -18,8 +19,7 @@ from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
 from jaxslam.cli.spent import Spent
 from jaxslam.datasets import READERS
-from jaxslam.family import ALL
-from jaxslam.scenarios import SCENARIOS
+from jaxslam.simulation.scenarios import SCENARIOS
 
 __all__ = ["main"]
 

@@ -11,17 +11,17 @@ from typing import Any
 
 import jax
 
-from jaxslam import report, store
+from jaxslam.catalog import ALL
 from jaxslam.cli import devices, library
 from jaxslam.cli.asking import INTERRUPTED, Progress, pick
-from jaxslam.family import ALL
-from jaxslam.linalg import check_count
+from jaxslam.math.linalg import check_count
 from jaxslam.monte_carlo import Campaign, Interrupted, missing, monte_carlo
 from jaxslam.monte_carlo.candidates import rounded
 from jaxslam.protocols import Candidate, Filter
+from jaxslam.results import report, store
 from jaxslam.run import run
-from jaxslam.scenarios import SCENARIOS
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.scenarios import SCENARIOS
+from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Truth
 
 BLOCKS = "blocks"
@@ -122,7 +122,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
 
 
 def _prepare_drawing() -> None:
-    from jaxslam import page, plot  # noqa: F401
+    from jaxslam.results import page, plot  # noqa: F401
 
     plot.warm_up()
 
@@ -176,7 +176,7 @@ def _campaign_files(
     campaign: Campaign, scenario: Scenario, seed: int, bound: bool, command: str
 ) -> dict[str, str | Callable[[Path], object]]:
     """The campaign, and pictures of its first run under the first filter that makes a map."""
-    from jaxslam import page, plot  # matplotlib only once there is a result to draw
+    from jaxslam.results import page, plot  # matplotlib only once there is a result to draw
 
     mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
     name = next(iter(mapping or campaign.filters))

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import report, se2
 from jaxslam.cli.asking import Progress, pick
 from jaxslam.cli.driving import Driven, drive
 from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS
-from jaxslam.filters.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.math import se2
+from jaxslam.results import report
 from jaxslam.types import Status
 
 
@@ -65,7 +66,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         frame, summary["map RMSE after alignment [m]"] = align_map(last, data.landmarks)
         into_map = jax.vmap(se2.to_frame, (None, 0))
         surveyed = np.asarray(into_map(jnp.asarray(frame), jnp.asarray(data.landmarks)))
-    from jaxslam import plot  # matplotlib only once there is a result to draw
+    from jaxslam.results import plot  # matplotlib only once there is a result to draw
 
     at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive")}
     figure = plot.map_figure(driven.path._replace(**at_end), true_points=surveyed, title=data.name)

@@ -14,8 +14,8 @@ from typing import Any
 
 import jax
 
-from jaxslam import report
 from jaxslam.cli import cache
+from jaxslam.results import report
 
 
 def identity(asked: Mapping[str, Any], platform: str) -> dict[str, str]:

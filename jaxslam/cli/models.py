@@ -8,8 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
-from jaxslam import motion, report, sensors, userfile, verify
+from jaxslam import motion, sensors, verify
 from jaxslam.cli.asking import Progress
+from jaxslam.results import report
+from jaxslam.verify import user_files
 
 FAILED = 1
 
@@ -23,7 +25,7 @@ def verify_models(options: argparse.Namespace, command: str) -> int:
         reports = _verify_all(ask)
         print(verify.table(reports))
     else:
-        reports = userfile.verify_file(options.target, ask)
+        reports = user_files.verify_file(options.target, ask)
     details = reports if options.target else [r for r in reports if not r.passed]
     print("\n".join(["", *(str(r) for r in details)]) if details else "")
     passed = all(r.passed for r in reports)

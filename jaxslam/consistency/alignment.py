@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import se2
+from jaxslam.math import se2
 from jaxslam.types import Estimate
 
 

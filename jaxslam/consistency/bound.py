@@ -10,13 +10,13 @@ import numpy as np
 
 from jaxslam import derivatives
 from jaxslam.consistency.score import snapshot_steps
-from jaxslam.filters.ekf_slam import ekf_slam
-from jaxslam.linalg import root_psd
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.linearize.at_truth import at_truth
 from jaxslam.linearize.first_order import turned
+from jaxslam.math.linalg import root_psd
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
-from jaxslam.simulate import Scenario
+from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Estimate, Log, Truth
 
 

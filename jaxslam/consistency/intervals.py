@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.stats import t_quantile
+from jaxslam.math.stats import t_quantile
 
 LEVEL = 0.95
 """of every band and interval."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxslam.consistency.nees import DOF, Nees, block_nees, pose_error
 from jaxslam.consistency.statistics import Statistics
-from jaxslam.stats import chi2_quantile
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Info, Status, Trace, Truth
 
 LANDMARK_DOF = 2

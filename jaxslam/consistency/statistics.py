@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
 from jaxslam.consistency.associations import associations, identities
+from jaxslam.math import linalg
 from jaxslam.protocols import Sensor
 from jaxslam.types import Estimate, Info, Status, Trace, Truth
 

@@ -12,7 +12,7 @@ from jaxslam.consistency.nees import DOF
 from jaxslam.consistency.score import DROPS, EVENTS, KEPT
 from jaxslam.consistency.tally import Tally
 from jaxslam.consistency.verdict import judge
-from jaxslam.stats import chi2_quantile, chi2_quantiles, normal_quantile
+from jaxslam.math.stats import chi2_quantile, chi2_quantiles, normal_quantile
 
 NORMAL = normal_quantile(0.5 + LEVEL / 2)
 

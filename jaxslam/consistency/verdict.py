@@ -14,7 +14,7 @@ import numpy as np
 from jaxslam.consistency.intervals import LEVEL, Spread, spread
 from jaxslam.consistency.nees import DOF
 from jaxslam.consistency.score import DROPS, KEPT
-from jaxslam.stats import normal_quantile, truncated_chi2_mean
+from jaxslam.math.stats import normal_quantile, truncated_chi2_mean
 from jaxslam.types import Status
 
 TESTS = {"nees_pose": "pose NEES", "nis_per_dof": "NIS / dof"}

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxslam.datasets.dataset import Dataset, make_log
 from jaxslam.datasets.lines import TextFile
-from jaxslam.linalg import check_covariance
+from jaxslam.math.linalg import check_covariance
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import relative_position

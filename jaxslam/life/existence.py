@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import slots
-from jaxslam.linalg import check_count
+from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Life
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Status

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import derivatives
-from jaxslam.linalg import matmul
+from jaxslam.math.linalg import matmul
 from jaxslam.protocols import Here, Motion, Sensor
 
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
-from jaxslam.linalg import is_concrete
+from jaxslam.math import linalg
+from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 
 Array = jax.Array

@@ -19,8 +19,9 @@ from jax.experimental import serialize_executable
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxslam import programs
+from jaxslam.math.xla import hot_options, quick_options
 from jaxslam.monte_carlo.pieces import cores
-from jaxslam.staging import hot_options, quick_options
+from jaxslam.programs import cache
 
 
 class Library(Protocol):
@@ -55,7 +56,7 @@ class _Saved(NamedTuple):
     shapes: Any
 
 
-_MADE = programs.Kept(programs.ROOM)
+_MADE = cache.Kept(cache.ROOM)
 
 
 class Blockwise:
@@ -91,12 +92,12 @@ class Blockwise:
             axes: of each argument the axis that goes over runs, or None; or a prefix of its tree.
             out: that of the results.
             arguments: the arrays, or their shapes.
-            straight: see `staging.quick_options`.
+            straight: see `xla.quick_options`.
         """
         leaves, tree = jax.tree.flatten(arguments)
         shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
-        known = name, *map(programs.Same, objects)
-        key = (known, tree, shapes, self._wide, self._devices, programs.context())
+        known = name, *map(cache.Same, objects)
+        key = (known, tree, shapes, self._wide, self._devices, cache.context())
 
         def make() -> Made:
             label = f"{name}, {self._wide} runs, {len(self._devices)} devices, {shapes}"
@@ -149,7 +150,7 @@ class Blockwise:
         straight: bool,
     ) -> Callable[..., Any]:
         options = (quick_options if straight else hot_options)(self._devices[0].platform)
-        compiled: Any = programs.compiled(lowered, self._devices, options)
+        compiled: Any = cache.compiled(lowered, self._devices, options)
         keys = any(jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key) for x in numbers)
         if self._library is not None and not keys:
             executable, _, _ = serialize_executable.serialize(compiled)

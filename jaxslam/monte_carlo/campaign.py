@@ -18,7 +18,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Summary, Tally, summarize
-from jaxslam.linalg import check_count, check_key
+from jaxslam.math.linalg import check_count, check_key
 from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
 from jaxslam.monte_carlo.blockwise import Library
 from jaxslam.monte_carlo.candidates import check_dtype, check_fits, check_noise, fitting_block
@@ -27,7 +27,7 @@ from jaxslam.monte_carlo.pieces import cores, missing
 from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
-from jaxslam.simulate import Scenario
+from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Estimate, Truth
 from jaxslam.validation import check_record
 

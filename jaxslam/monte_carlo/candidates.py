@@ -11,11 +11,11 @@ import numpy as np
 
 from jaxslam import programs
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.linalg import check_covariance, is_concrete
+from jaxslam.math.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Log, Truth
 
 _T = TypeVar("_T")

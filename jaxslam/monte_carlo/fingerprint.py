@@ -33,7 +33,7 @@ from jaxslam.consistency import own_error_of
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.protocols import Candidate
 from jaxslam.sensors.suite import Suite
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate
 
 
 def fingerprint(

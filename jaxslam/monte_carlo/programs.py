@@ -28,7 +28,7 @@ from jaxslam.monte_carlo.block import Programs, numbers
 from jaxslam.monte_carlo.blockwise import Blockwise
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.protocols import Candidate
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Info, Log, Trace, Truth
 
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam import se2
-from jaxslam.linalg import is_concrete
+from jaxslam.math import se2
+from jaxslam.math.linalg import is_concrete
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 

@@ -2,7 +2,7 @@
 
 import jax
 
-from jaxslam import se2
+from jaxslam.math import se2
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 

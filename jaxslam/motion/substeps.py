@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam.linalg import check_count
+from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Motion
 
 _Rows = tuple[jax.Array, jax.Array]

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam import se2
+from jaxslam.math import se2
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 

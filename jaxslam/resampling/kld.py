@@ -5,8 +5,8 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxslam.linalg import is_concrete
-from jaxslam.stats import normal_quantile
+from jaxslam.math.linalg import is_concrete
+from jaxslam.math.stats import normal_quantile
 
 Array = jax.Array
 

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam.linalg import is_concrete
+from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Differentiable, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import even, normalized

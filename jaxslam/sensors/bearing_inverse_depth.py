@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam import se2
-from jaxslam.angles import wrap
-from jaxslam.linalg import is_concrete
+from jaxslam.math import se2
+from jaxslam.math.angles import wrap
+from jaxslam.math.linalg import is_concrete
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Reduced, Sensor
 from jaxslam.sensors.bearing_only import bearing_only

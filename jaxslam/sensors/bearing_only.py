@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from jaxslam import se2
-from jaxslam.angles import wrap
+from jaxslam.math import se2
+from jaxslam.math.angles import wrap
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting

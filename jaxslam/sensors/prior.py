@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.linalg import check_covariance, is_concrete
+from jaxslam.math.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Free
 
 FreeLike = Free | tuple[ArrayLike, ArrayLike]

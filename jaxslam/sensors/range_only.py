@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam import se2
+from jaxslam.math import se2
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting

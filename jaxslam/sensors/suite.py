@@ -7,7 +7,7 @@ from typing import Any, Literal, NoReturn
 import jax
 import jax.numpy as jnp
 
-from jaxslam.linalg import check_count
+from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Free, Sensor
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from jaxslam.linalg import check_count, is_concrete
+from jaxslam.math.linalg import check_count, is_concrete
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.smoothing import history as forward

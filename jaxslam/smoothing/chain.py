@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
+from jaxslam.math import linalg
 
 Array = jax.Array
 

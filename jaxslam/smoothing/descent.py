@@ -10,8 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
-from jaxslam.angles import wrap
+from jaxslam.math import linalg
+from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.smoothing.chain import Chain, Policy, Start, Step
 from jaxslam.smoothing.history import difference, whitened_rows

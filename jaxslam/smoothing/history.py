@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from jaxslam import derivatives, linalg, programs, validation
-from jaxslam.angles import wrap
-from jaxslam.filters.ekf_slam import ekf_slam
+from jaxslam import derivatives, programs, validation
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.math import linalg
+from jaxslam.math.angles import wrap
 from jaxslam.protocols import Associate, Estimator, Filter, Motion, Sensor
 from jaxslam.run import check_run, run
 from jaxslam.sensors.suite import Suite

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import linalg
+from jaxslam.math import linalg
 from jaxslam.smoothing.chain import Chain, Gain, Policy, Step
 
 Array = jax.Array

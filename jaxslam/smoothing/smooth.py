@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from jaxslam.angles import wrap
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.moments import moments
+from jaxslam.filters.ekf.beliefs import moments
+from jaxslam.math.angles import wrap
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.smoothing import history as forward

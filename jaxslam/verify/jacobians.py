@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxslam.staging import quick_jit
+from jaxslam.math.xla import quick_jit
 from jaxslam.verify.differences import Quotient, complex_step, quotients
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxslam.linalg import check_covariance
+from jaxslam.math.linalg import check_covariance
+from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.staging import quick_jit
 from jaxslam.verify.jacobians import Evaluated
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Sensor
-from jaxslam.staging import quick_jit
 from jaxslam.verify.subject import POSE, Argument
 
 Values = NDArray[np.float64]

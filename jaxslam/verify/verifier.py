@@ -10,12 +10,12 @@ import jax.experimental
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.linearity import motion_linearity, sensor_linearity
+from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.staging import quick_jit
 from jaxslam.verify import properties, samples, subject
 from jaxslam.verify.jacobians import Evaluated, evaluate
 from jaxslam.verify.judge import judge
+from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 from jaxslam.verify.record import Check, Report
 from jaxslam.verify.samples import Samples
 from jaxslam.verify.trouble import told

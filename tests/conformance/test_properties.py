@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from jaxslam import angles, charts, motion, se2, sensors
+from jaxslam import charts, motion, se2, sensors
+from jaxslam.math import angles
 from jaxslam.verify import build
 
 law = settings(max_examples=60, deadline=None, derandomize=True)

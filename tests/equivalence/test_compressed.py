@@ -10,10 +10,10 @@ import pytest
 
 from jaxslam import charts, linearize, sensors
 from jaxslam.filters import compressed_ekf_slam, ekf_slam
-from jaxslam.filters.compressed_ekf_slam import opened, up_to_date
+from jaxslam.filters.ekf.compressed_ekf_slam import opened, up_to_date
 from jaxslam.run import run
-from jaxslam.scenarios import cloister
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Scan, Status
 
 KEY = jax.random.key(4)

@@ -12,7 +12,7 @@ from jaxslam import charts, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.protocols import Free, Motion, Sensor
 from jaxslam.run import run
-from jaxslam.simulate import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.slots import Joint
 from jaxslam.types import Scan, Status
 

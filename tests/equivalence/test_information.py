@@ -11,8 +11,8 @@ from worlds import draw
 
 from jaxslam import filters, motion, sensors
 from jaxslam.run import run
-from jaxslam.scenarios import cloister
-from jaxslam.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.types import Scan, Status
 
 KEY = jax.random.key(0)

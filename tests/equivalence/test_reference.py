@@ -10,8 +10,8 @@ from reference import ekf_slam as plain
 
 from jaxslam.filters import ekf_slam
 from jaxslam.run import run
-from jaxslam.scenarios import circle, cloister
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import circle, cloister
+from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Status
 
 MODELS = {

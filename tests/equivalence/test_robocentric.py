@@ -4,10 +4,10 @@ import jax
 import numpy as np
 from reference.robocentric import Robocentric
 
-from jaxslam.family import FILTERS
+from jaxslam.catalog import FILTERS
 from jaxslam.run import run
-from jaxslam.scenarios import loop
-from jaxslam.simulate import simulate
+from jaxslam.simulation.scenarios import loop
+from jaxslam.simulation.worlds import simulate
 
 
 def test_a_run_is_that_of_the_plain_filter():

@@ -1,0 +1,210 @@
+"""The family: every variant of the one EKF-SLAM by name, set up for a scenario, and what to hold
+beside it.
+
+A variant is a chart, a linearizer or an option, given in one line; `monte_carlo` and the command
+line run them side by side.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.charts.left_invariant import left_invariant
+from jaxslam.charts.right_invariant import right_invariant
+from jaxslam.charts.robocentric import robocentric
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.information.eif_slam import eif_slam
+from jaxslam.filters.information.eseif import eseif
+from jaxslam.filters.information.seif import seif
+from jaxslam.filters.known.dead_reckoning import dead_reckoning
+from jaxslam.filters.known.localization import localization
+from jaxslam.filters.particles.fastslam import fastslam
+from jaxslam.filters.particles.particle_localization import particle_localization
+from jaxslam.linearize.at_truth import at_truth
+from jaxslam.linearize.first_estimate import first_estimate
+from jaxslam.linearize.observability import observability
+from jaxslam.linearize.unscented import unscented
+from jaxslam.protocols import Candidate, Filter
+from jaxslam.simulation.worlds import Scenario
+from jaxslam.types import Info, Scan, Truth
+
+
+def variant(scenario: Scenario, **options: Any) -> Filter:
+    """EKF-SLAM set up as the scenario says, but for these arguments of `filters.ekf_slam`."""
+    capacity = int(np.shape(scenario.landmarks)[0])
+    return ekf_slam(
+        scenario.motion, scenario.sensor, capacity, **(scenario.filter_options | options)
+    )
+
+
+def ideal(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
+    """The EKF with Jacobians at the truth: a function of the truth that returns a filter."""
+    return lambda truth: variant(scenario, linearize=at_truth(truth), **options)
+
+
+def without_measurements(scenario: Scenario, **options: Any) -> Filter:
+    """Dead reckoning in a scenario; options of `ekf_slam` say nothing of it."""
+    return dead_reckoning(scenario.motion, scenario.sensor)
+
+
+def in_a_known_map(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
+    """Localization in the true map; of the options of `ekf_slam`, those that concern it."""
+    asked = scenario.filter_options | options
+    mine = {name: asked[name] for name in ("update", "gate", "iterations") if name in asked}
+    return lambda truth: localization(scenario.motion, scenario.sensor, truth.landmarks, **mine)
+
+
+def by_particles(
+    scenario: Scenario, proposal: Literal["motion", "measurement"], **options: Any
+) -> Filter:
+    """FastSLAM of 50 particles; of the options of `ekf_slam`, those that it has too."""
+    asked = scenario.filter_options | options
+    mine = {name: asked[name] for name in ("gate", "associate", "births", "life") if name in asked}
+    capacity = int(np.shape(scenario.landmarks)[0])
+    return fastslam(
+        scenario.motion, scenario.sensor, capacity, SLAM_PARTICLES, proposal=proposal, **mine
+    )
+
+
+def by_particles_in_a_known_map(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
+    """Monte-Carlo localization in the true map, of 300 particles; options as above."""
+    asked = scenario.filter_options | options
+    mine = {name: asked[name] for name in ("gate", "associate") if name in asked}
+    count = LOCALIZATION_PARTICLES
+    return lambda truth: particle_localization(
+        scenario.motion,
+        scenario.sensor,
+        truth.landmarks,
+        count,
+        least=count,
+        threshold=0.5,
+        **mine,
+    )
+
+
+SLAM_PARTICLES = 50
+"""of FastSLAM in the family: few, so that a campaign of all does not wait for it."""
+
+LOCALIZATION_PARTICLES = 300
+"""of Monte-Carlo localization in the family, in every step"""
+
+
+def in_canonical_form(
+    scenario: Scenario, make: Callable[..., Filter], sparse: bool = True, **options: Any
+) -> Filter:
+    """An information filter in a scenario; of the options of `ekf_slam`, the gate.
+
+    A sparse one has half the map active, 8 landmarks at least and 20 at most, all links, and
+    reports the covariance of its whole Ω: the campaign is to judge what it believes, and what
+    sparseness costs, not blankets. With all of the map active it would be `eif_slam` by definition;
+    a scan of more places than half of what is active, as in `cloister`, where all 36 columns are
+    measured in every step, is taken in pieces (`in_pieces`), since what a scan measures has to be
+    active at once.
+    """
+    count = int(np.shape(scenario.landmarks)[0])
+    asked = scenario.filter_options | options
+    mine: dict[str, Any] = {name: asked[name] for name in ("gate",) if name in asked}
+    if not sparse:
+        return make(scenario.motion, scenario.sensor, count, **mine)
+    active = min(max(min(LARGEST_AREA, count // 2), LEAST_AREA), count)
+    mine |= {"active": active, "links": max(1, count - 1), "whole": True}
+    filter = make(scenario.motion, scenario.sensor, count, **mine)
+    return filter if active == count else in_pieces(filter, active // 2)
+
+
+LEAST_AREA, LARGEST_AREA = 8, 20
+"""active landmarks of the sparse information filters in the family"""
+
+
+def in_pieces(filter: Filter, places: int) -> Filter:
+    """The filter, to which a scan of more places comes as several of so many, one after the other.
+
+    Place i is in piece i mod their number. What is said of a scan as a whole is the sum of theirs,
+    or whether it is so of any.
+    """
+
+    def update(state: Any, scan: Scan, key: jax.Array) -> tuple[Any, Info]:
+        m = scan.tag.shape[0]
+        if m <= places:
+            return filter.update(state, scan, key)
+        pieces = -(-m // places)
+
+        def dealt(leaf: jax.Array) -> jax.Array:
+            wide = jnp.pad(leaf, [(0, pieces * places - m), *[(0, 0)] * (leaf.ndim - 1)])
+            return wide.reshape(places, pieces, *leaf.shape[1:]).swapaxes(0, 1)
+
+        def one(state: Any, piece: tuple[Scan, jax.Array]) -> tuple[Any, Info]:
+            return filter.update(state, *piece)
+
+        each = jax.tree.map(dealt, scan), jax.random.split(key, pieces)
+        state, infos = jax.lax.scan(one, state, each)
+
+        def whole(leaf: jax.Array) -> jax.Array:
+            if leaf.ndim == 1:  # of a scan, not of its places
+                return leaf.any() if leaf.dtype == bool else leaf.sum()
+            return leaf.swapaxes(0, 1).reshape(places * pieces, *leaf.shape[2:])[:m]
+
+        info: Info = jax.tree.map(whole, infos)
+        return state, info
+
+    return dataclasses.replace(filter, update=update)
+
+
+FILTERS: dict[str, Callable[..., Candidate]] = {
+    "ekf": variant,
+    "ideal": ideal,
+    "iterated": lambda world, **more: variant(world, iterations=3, **more),
+    "fej": lambda world, **more: variant(world, linearize=first_estimate(), **more),
+    "oc": lambda world, **more: variant(world, linearize=observability(), **more),
+    "right_invariant": lambda world, **more: variant(world, chart=right_invariant(), **more),
+    "left_invariant": lambda world, **more: variant(world, chart=left_invariant(), **more),
+    "robocentric": lambda world, **more: variant(world, chart=robocentric(), **more),
+    "ukf": lambda world, **more: variant(world, linearize=unscented(), **more),
+    "ukf_right": lambda world, **more: variant(
+        world, chart=right_invariant(), linearize=unscented(), **more
+    ),
+    "ukf_left": lambda world, **more: variant(
+        world, chart=left_invariant(), linearize=unscented(), **more
+    ),
+    "square_root": lambda world, **more: variant(world, square_root=True, **more),
+}
+"""By name; each takes a scenario, and further options of `ekf_slam`, and returns what `monte_carlo`
+runs on it."""
+
+BASELINES: dict[str, Callable[..., Candidate]] = {
+    "dead_reckoning": without_measurements,
+    "localization": in_a_known_map,
+}
+"""What no SLAM filter should be worse, or can be better, than; as FILTERS."""
+
+PARTICLES: dict[str, Callable[..., Candidate]] = {
+    "fastslam1": lambda world, **more: by_particles(world, "motion", **more),
+    "fastslam2": lambda world, **more: by_particles(world, "measurement", **more),
+    "particle_localization": by_particles_in_a_known_map,
+}
+"""What draws instead of linearizing; as FILTERS."""
+
+CANONICAL: dict[str, Callable[..., Candidate]] = {
+    "eif_slam": lambda world, **more: in_canonical_form(world, eif_slam, sparse=False, **more),
+    "seif": lambda world, **more: in_canonical_form(world, seif, **more),
+    "eseif": lambda world, **more: in_canonical_form(world, eseif, **more),
+}
+"""The information filters, exact and sparse; as FILTERS."""
+
+KINDS: dict[str, tuple[str, ...]] = {
+    "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
+    "consistent Jacobians": ("fej", "oc"),
+    "error coordinates": ("right_invariant", "left_invariant", "robocentric"),
+    "unscented": ("ukf", "ukf_right", "ukf_left"),
+    "information": ("eif_slam", "seif", "eseif"),
+    "particles": ("fastslam1", "fastslam2", "particle_localization"),
+    "baselines": ("dead_reckoning", "localization"),
+}
+"""Their names by what is particular to them; figures of many filters are divided so."""
+
+ALL = FILTERS | CANONICAL | PARTICLES | BASELINES
+"""Every one of them: what the command line knows, and runs for `--filters all`."""

@@ -1,0 +1,1 @@
+"""EKF-SLAM with sensors that see a landmark in part, initialized late."""

@@ -1,0 +1,269 @@
+"""EKF-SLAM that works in a small area of its map and postpones what that means for all the rest."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import slots, validation
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.math import linalg
+from jaxslam.math.linalg import check_count
+from jaxslam.math.xla import where_any
+from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.slots import Joint
+from jaxslam.types import Estimate, Info, Scan
+
+# The tag of places that are no landmark: not -1, which is the tag of a measurement without one.
+_NONE = -2
+
+
+class Compressed(NamedTuple):
+    """A map, and the area of it that a filter has worked in since it was last brought up to date.
+
+    With A the errors of the robot and the K landmarks of the area, B those of all others, and
+    index 0 for the time at which the area was opened, the map is now (Guivant & Nebot 2001)
+
+        P_AB = Φ P_AB,0,   P_BB = P_BB,0 - P_BA,0 Ψ P_AB,0,   x_B = x_B,0 + P_BA,0 θ.
+
+    A motion does Φ ← F Φ. A correction with V = L⁻¹ H P_AA and U = L⁻¹ H Φ does P_AA ← P_AA - VᵀV,
+    Φ ← Φ - VᵀU, Ψ ← Ψ + UᵀU, θ ← θ + Uᵀ L⁻¹ ν: so [P_AA Φ; Φᵀ -Ψ] behaves as the covariance of
+    a robot, K landmarks and 3 + K·L further variables with mean θ, and any filter on a `Joint`
+    carries them along as landmarks that nobody sees.
+    """
+
+    whole: Joint
+    """all of the map as it was when the area was opened; tags and living slots are those of now"""
+    area: Joint
+    """robot, K landmarks, and the places of Φ, Ψ and θ"""
+    slot: jax.Array
+    """(K,) which slot of the map each place of the area is, ascending"""
+
+
+def compressed_ekf_slam(
+    motion: Motion, sensor: Sensor, capacity: int, *, area: int, **options: Any
+) -> Filter:
+    """`ekf_slam`, with the same result, at a cost a step that follows the area, not the map.
+
+    A step costs O(K²) for K = area landmarks; only when a scan asks for a landmark outside the area
+    is the map brought up to date, O(K·N²), and a new area chosen: the landmarks of the scan, room
+    for new ones, and the landmarks nearest to the robot. J. E. Guivant, E. M. Nebot, "Optimization
+    of the simultaneous localization and map-building algorithm for real-time implementation", IEEE
+    T-RA 17(3), 2001. Landmarks are associated by their tags.
+
+    The state is a `Compressed`. `estimate` gives the moments of all landmarks, O(K²·N); what of
+    them is not used costs nothing under `jit`. `up_to_date` gives the whole map as a `Joint`, and
+    `opened` makes a state of one.
+
+    Args:
+        area: landmarks K that are worked on; at least the places of a scan.
+        options: those of `ekf_slam` in the Euclidean chart, whose landmarks stand still, with a
+            linearizer that remembers nothing (at_estimate, unscented), but for associate, watch,
+            square_root, life and merge.
+    Raises:
+        ValueError: as `ekf_slam`; on an area below 1, an option that is not for this filter; and,
+            when a scan has more places than the area, from `update`.
+    """
+    validation.check_models("compressed_ekf_slam", motion, sensor)
+    check_count("compressed_ekf_slam: capacity", capacity)
+    check_count("compressed_ekf_slam: area", area)
+    for name in ("associate", "watch", "square_root", "life", "merge"):
+        if options.get(name):
+            raise ValueError(f"compressed_ekf_slam: does not take {name}")
+    if sensor.reduced is not None:
+        raise ValueError(
+            f"compressed_ekf_slam: the landmarks of {sensor.name} become points, which is not "
+            "for this filter"
+        )
+    whole = ekf_slam(motion, sensor, capacity, **options)
+    size, own = len(sensor.landmark), min(area, capacity)
+    if size == 0:
+        raise ValueError(f"compressed_ekf_slam: the sensor {sensor.name} has no landmarks")
+    if whole.places:
+        raise ValueError("compressed_ekf_slam: expected one sensor, not a suite")
+    if whole.chart.basis is not None:
+        raise ValueError(
+            f"compressed_ekf_slam: in the chart {whole.chart.name} a motion changes what is known "
+            "of every landmark; it needs the chart euclidean"
+        )
+    local = ekf_slam(motion, sensor, own + _more(own, size), **options)
+    most = options.get("births")
+
+    def init(pose: jax.Array, pose_cov: jax.Array) -> Compressed:
+        joint = whole.init(pose, pose_cov)
+        if jax.tree.leaves(joint.lin):
+            linearizer = options["linearize"].name
+            raise ValueError(
+                f"compressed_ekf_slam: the linearizer {linearizer} remembers where landmarks were"
+            )
+        return opened(joint, own)
+
+    def predict(state: Compressed, u: jax.Array, key: jax.Array) -> Compressed:
+        return state._replace(area=local.predict(state.area, u, key))
+
+    def update(state: Compressed, scan: Scan, key: jax.Array) -> tuple[Compressed, Info]:
+        if len(scan.tag) > area:
+            raise ValueError(
+                f"compressed_ekf_slam: a scan has {len(scan.tag)} places, the area {area}"
+            )
+        joint = state.whole
+        tagged = scan.valid & (scan.tag >= 0)
+        slot, found = slots.find(joint.tag, joint.alive, scan.tag)
+        seen = jnp.zeros(capacity, bool).at[slot].max(tagged & found)
+        new = jnp.minimum((tagged & ~found).sum(), scan.tag.shape[0] if most is None else most)
+        room, room_anywhere = (~state.area.alive).sum(), (~joint.alive).sum()
+        outside = seen & ~jnp.zeros(capacity, bool).at[state.slot].set(True)
+        leave = outside.any() | ((new > room) & (room_anywhere > room))
+
+        def anew(state: Compressed) -> Compressed:
+            joint = up_to_date(state)
+            # What a run has must not depend on the runs beside it.
+            other = _opened_at(joint, _chosen(joint, own, sensor, seen, new))
+            both: Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
+            return both
+
+        state = where_any(leave, anew, lambda state: state, state)
+        inside, info = local.update(state.area, scan, key)
+        joint = state.whole
+        joint = joint._replace(
+            alive=joint.alive.at[state.slot].set(inside.alive[:own]),
+            tag=joint.tag.at[state.slot].set(inside.tag[:own]),
+        )
+        in_map = jnp.where(info.slot >= 0, state.slot[jnp.maximum(info.slot, 0)], -1)
+        return state._replace(whole=joint, area=inside), info._replace(slot=in_map)
+
+    def estimate(state: Compressed) -> Estimate:
+        def one(*of_landmark: jax.Array) -> Estimate:
+            landmark, alive, tag, own, with_robot = of_landmark
+            cov = jnp.block([[robot, with_robot], [with_robot.T, own]])
+            place = state.area.pose, landmark[None], cov, alive[None], tag[None]
+            return whole.estimate(Joint(*place, ()))
+
+        robot, joint = state.area.cov[:3, :3], state.whole
+        each = jax.vmap(one)(_moved_map(state), joint.alive, joint.tag, *_marginals(state))
+        return Estimate(
+            pose=state.area.pose,
+            pose_cov=robot,
+            points=each.points[:, 0],
+            point_covs=each.point_covs[:, 0],
+            alive=joint.alive,
+            tag=joint.tag,
+        )
+
+    return Filter(
+        name="compressed_ekf_slam",
+        control_size=whole.control_size,
+        measurement_size=whole.measurement_size,
+        init=init,
+        predict=predict,
+        update=update,
+        estimate=estimate,
+        chart=whole.chart,
+    )
+
+
+def opened(joint: Joint, area: int) -> Compressed:
+    """A state of `compressed_ekf_slam` of a map, the area (min(area, N)) at its first slots."""
+    return _opened_at(joint, jnp.arange(min(area, joint.landmarks.shape[0]), dtype=jnp.int32))
+
+
+def up_to_date(state: Compressed) -> Joint:
+    """The map with all that was postponed, O(K·N²)."""
+    joint = state.whole
+    at = _rows(state.slot, joint.landmarks.shape[1])
+    before = joint.cov[at]
+    phi, psi, _ = _postponed(state)
+    cov = joint.cov - linalg.symmetrize(before.T @ (psi @ before))
+    now = (phi @ before).at[:, at].set(state.area.cov[: len(at), : len(at)])
+    return joint._replace(
+        pose=state.area.pose,
+        landmarks=_moved_map(state),
+        cov=cov.at[at].set(now).at[:, at].set(now.T),
+    )
+
+
+def _moved_map(state: Compressed) -> jax.Array:
+    """The landmarks (N, L) of now."""
+    landmarks, own = state.whole.landmarks, state.slot.shape[0]
+    theta = _postponed(state)[2]
+    moved = (theta @ state.whole.cov[_rows(state.slot, landmarks.shape[1])])[3:]
+    return (
+        (landmarks + moved.reshape(landmarks.shape)).at[state.slot].set(state.area.landmarks[:own])
+    )
+
+
+def _marginals(state: Compressed) -> tuple[jax.Array, jax.Array]:
+    """P of each landmark with itself (N, L, L) and with the robot (N, 3, L), of now."""
+    capacity, size = state.whole.landmarks.shape
+    own, at = state.slot.shape[0], _rows(state.slot, size)
+
+    def by_landmark(rows: jax.Array) -> jax.Array:
+        return rows[:, 3:].reshape(len(rows), -1, size).transpose(1, 0, 2)
+
+    def with_itself(cov: jax.Array, count: int) -> jax.Array:
+        every = jnp.arange(count)
+        return cov[3:, 3:].reshape(count, size, count, size)[every, :, every]
+
+    phi, psi, _ = _postponed(state)
+    before, inside = state.whole.cov[at], state.area.cov[: len(at), : len(at)]
+    lost = jnp.einsum("nal,nak->nlk", by_landmark(before), by_landmark(psi @ before))
+    alone = with_itself(state.whole.cov, capacity) - lost
+    with_robot = by_landmark(phi[:3] @ before)
+    return (
+        alone.at[state.slot].set(with_itself(inside, own)),
+        with_robot.at[state.slot].set(by_landmark(inside[:3])),
+    )
+
+
+def _postponed(state: Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Φ, Ψ (W, W) and θ (W,), W = 3 + K·L."""
+    area, own = state.area, state.slot.shape[0]
+    width = 3 + own * area.landmarks.shape[1]
+    theta = area.landmarks[own:].reshape(-1)[:width]
+    return (
+        area.cov[:width, width : 2 * width],
+        -area.cov[width : 2 * width, width : 2 * width],
+        theta,
+    )
+
+
+def _opened_at(joint: Joint, slot: jax.Array) -> Compressed:
+    """A state with nothing postponed, and the landmarks of slots (K,) as its area."""
+    own, size = slot.shape[0], joint.landmarks.shape[1]
+    at, more = _rows(slot, size), _more(own, size)
+    inside = joint.cov[at][:, at]
+    living = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive[slot], size)])
+    phi = jnp.diag(living.astype(inside.dtype))
+    cov = jnp.zeros((len(at) + more * size,) * 2, inside.dtype)
+    cov = cov.at[: 2 * len(at), : 2 * len(at)].set(jnp.block([[inside, phi], [phi, 0 * phi]]))
+    area = Joint(
+        pose=joint.pose,
+        landmarks=jnp.concatenate([joint.landmarks[slot], jnp.zeros((more, size), inside.dtype)]),
+        cov=cov,
+        alive=jnp.concatenate([joint.alive[slot], jnp.ones(more, bool)]),
+        tag=jnp.concatenate([joint.tag[slot], jnp.full(more, _NONE, joint.tag.dtype)]),
+        lin=joint.lin,
+    )
+    return Compressed(joint, area, slot)
+
+
+def _chosen(joint: Joint, own: int, sensor: Sensor, seen: jax.Array, new: jax.Array) -> jax.Array:
+    """Slots (own,), ascending: those seen, the first free ones, those nearest to the robot."""
+    points = jax.vmap(sensor.position)(joint.landmarks)
+    distance = ((points - joint.pose[None, :2]) ** 2).sum(axis=1)
+    # A quarter of the area is kept for landmarks to come: each may else ask for another area.
+    spare = jnp.cumsum(~joint.alive) <= jnp.maximum(new, own // 4)
+    rank = jnp.select([seen, ~joint.alive & spare, joint.alive], [0, 1, 2], 3)
+    distance = jnp.where(joint.alive, distance, 0.0)
+    return jnp.sort(jnp.lexsort((distance, rank))[:own]).astype(jnp.int32)
+
+
+def _rows(slot: jax.Array, size: int) -> jax.Array:
+    """Those of the robot and of the landmarks in slots (K,), (3 + K·L,)."""
+    of_landmarks = 3 + slot[:, None] * size + jnp.arange(size)[None, :]
+    return jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
+
+
+def _more(own: int, size: int) -> int:
+    """How many landmarks' places hold 3 + own·size variables."""
+    return -(-(3 + own * size) // size)

@@ -1,0 +1,193 @@
+"""EKF-SLAM: the one Kalman-type SLAM filter, of which the published variants are arguments."""
+
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import slots, validation
+from jaxslam.association.known import known as known_association
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.filters.ekf import to_points
+from jaxslam.filters.ekf.beliefs import moments
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import in_order, part_updates
+from jaxslam.filters.ekf.settings import check_chart, check_map_manager, check_numbers, check_parts
+from jaxslam.filters.map_management.merging import Duplicates, find_duplicate, told_apart
+from jaxslam.filters.map_management.merging import merge as merge_pair
+from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.math import linalg
+from jaxslam.math.xla import where_any
+from jaxslam.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
+from jaxslam.sensors.suite import Suite
+from jaxslam.slots import Joint
+from jaxslam.types import Estimate, Info, Scan
+
+
+def ekf_slam(
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    *,
+    chart: Chart | None = None,
+    linearize: Linearizer | None = None,
+    associate: Associate | None = None,
+    update: Literal["sequential", "joint"] = "sequential",
+    gate: float | None = None,
+    iterations: int = 1,
+    joseph: bool = False,
+    births: int | None = None,
+    square_root: bool = False,
+    watch: bool = False,
+    life: Life | None = None,
+    merge: Duplicates | None = None,
+) -> Filter:
+    """Extended Kalman filter SLAM in a map of fixed capacity (Solà 2).
+
+    Each step propagates the robot (14)-(17); each scan corrects (26)-(30), then starts its new
+    landmarks (31)-(38). The state is a `slots.Joint`; `slots.remove` deletes landmarks from it.
+
+    Every valid measurement of an absolute sensor (L = 0: compass, position fix) corrects the robot,
+    whatever its tag, and has slot -1; `associate` and `births` do not apply, and the map is empty.
+
+    Several sensors are one `sensors.suite`, whose parts have their turn one after the other.
+
+    Args:
+        motion, sensor: the models; Jacobians come from `jax.jacfwd`.
+        capacity: landmark slots N. A new landmark that finds the map full is dropped and marked
+            `Status.OVERFLOW`.
+        chart: the error P is the covariance of; default `charts.euclidean()`.
+        linearize: where Jacobians are taken; default `linearize.at_estimate()`.
+        associate: default `association.known()`.
+        update: "sequential" corrects place by place, linearizing anew each time, as the guide does;
+            "joint" corrects by the whole scan at once.
+        gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
+            The guide's 3 σ is `stats.sigma_gate(3)`, and `stats.chi2_quantile` gives a probability.
+        iterations: passes of the iterated EKF, each from the same prior; 1 is the plain EKF.
+        joseph: Joseph's form of the covariance update; dearer, and safer in float32.
+        births: at most so many new landmarks a scan, the rest `Status.DEFERRED`; the guide starts
+            one. Default no limit.
+        square_root: hold a root X of P = X Xᵀ instead of P, in which float32 goes as far as float64
+            does in P; the same filter, dearer (the prediction is O(N³)).
+        life: which landmarks stay in the map (`jaxslam.life`); default all.
+        merge: take two landmarks for one (`filters.merging.duplicates`); default never.
+        watch: keep a `slots.Watch` in the state, which campaigns report.
+    Raises:
+        ValueError: on models, charts, linearizers or associations that are none or of wrong sizes
+            (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
+            update, a chart or linearizer that does not fit the sensor's landmarks or one another,
+            a life that is none, Joseph's form of a square root, several iterations of a statistical
+            linearizer, or a linearizer of landmarks for a suite with an absolute sensor.
+    """
+    validation.check_models("ekf_slam", motion, sensor)
+    validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
+    chart = chart or euclidean()
+    linearize = linearize or at_estimate()
+    associate = associate or known_association()
+    check_numbers("ekf_slam", capacity, update, gate, iterations, births)
+    check_chart(sensor, chart)
+    check_parts(sensor, chart, linearize, iterations, joseph, square_root)
+    check_map_manager(sensor, life, merge)
+    size_l, size_z = len(sensor.landmark), len(sensor.measurements)
+    move = partial(
+        propagate,
+        motion=motion,
+        chart=chart,
+        linearize=linearize,
+        square_root=square_root,
+    )
+
+    def init(pose: jax.Array, pose_cov: jax.Array) -> Joint:
+        ground = jnp.zeros((capacity, size_l), pose.dtype)
+        turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
+        if chart.basis is not None:
+            undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
+            pose_cov, turn = undo @ pose_cov @ undo.T, undo @ turn
+        lin = linearize.init(pose, ground)
+        joint = slots.empty(
+            pose,
+            pose_cov,
+            capacity,
+            size_l,
+            lin,
+            square_root=square_root,
+            turn=turn if watch else None,
+            motion_apart=chart.motion_apart,
+        )
+        if sensor.reduced is not None:
+            joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
+        if merge is not None:
+            joint = joint._replace(apart=jnp.zeros((capacity, capacity), bool))
+        return joint if life is None else joint._replace(life=life.init(pose, joint.landmarks))
+
+    def without(joint: Joint, dead: jax.Array) -> Joint:
+        def removed(joint: Joint) -> Joint:
+            # A root is made triangular anew; a run without a removal keeps its own to the bit.
+            less = slots.remove(joint, dead, square_root=square_root)
+            both: Joint = jax.tree.map(lambda a, b: jnp.where(dead.any(), a, b), less, joint)
+            return both
+
+        return where_any(dead.any(), removed, lambda joint: joint, joint)
+
+    options: dict[str, Any] = {
+        "associate": associate,
+        "update": update,
+        "births": births,
+        "life": life,
+        "without": without,
+        "chart": chart,
+        "linearize": linearize,
+        "square_root": square_root,
+        "options": {"gate": gate, "iterations": iterations, "joseph": joseph},
+    }
+    parts = part_updates(sensor, size_l, **options)
+    places = sensor.places if isinstance(sensor, Suite) else ()
+
+    def predict(joint: Joint, u: jax.Array, key: jax.Array) -> Joint:
+        return move(joint, u)
+
+    def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
+        joint, info, given_up = in_order(joint, scan, parts)
+        if merge is not None:
+            joint = joint._replace(apart=told_apart(joint, info, places))
+            kept, gone, same = find_duplicate(joint, chart, merge, square_root=square_root)
+
+            def merged(joint: Joint) -> Joint:
+                one = merge_pair(joint, chart, kept, gone, square_root=square_root)
+                both: Joint = jax.tree.map(lambda a, b: jnp.where(same, a, b), one, joint)
+                return both
+
+            joint = where_any(same, merged, lambda joint: joint, joint)
+            pair = jnp.where(same, jnp.stack([kept, gone]), -1).astype(jnp.int32)
+            info = info._replace(merged=pair)
+        if sensor.reduced is not None:
+            which = to_points.ready(joint, sensor, square_root)
+
+            def reduced(joint: Joint) -> Joint:
+                return to_points.reduce(joint, which, sensor, square_root)
+
+            joint = where_any(which.any(), reduced, lambda joint: joint, joint)
+            info = info._replace(reduced=which)
+        if life is not None:
+            memory, dead = life.after(joint, info, lambda: estimate(joint))
+            joint = without(joint._replace(life=memory), dead)
+            info = info._replace(removed=dead | given_up)
+        return joint, info
+
+    def estimate(joint: Joint) -> Estimate:
+        cov = joint.cov @ joint.cov.T if square_root else joint.cov
+        return moments(joint._replace(cov=cov), sensor, chart)
+
+    return Filter(
+        name="ekf_slam",
+        control_size=len(motion.controls),
+        measurement_size=size_z,
+        init=init,
+        predict=predict,
+        update=update_map,
+        estimate=estimate,
+        chart=chart,
+        places=places,
+        square_root=square_root,
+    )

@@ -1,0 +1,133 @@
+"""The prediction of a Kalman-type SLAM filter on a `Joint`, whatever chart and linearizer."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import slots
+from jaxslam.math import linalg, se2
+from jaxslam.math.xla import settle
+from jaxslam.protocols import Basis, Chart, Here, Linearizer, Motion
+from jaxslam.slots import Joint, Last
+
+
+def propagate(
+    joint: Joint,
+    u: jax.Array,
+    *,
+    motion: Motion,
+    chart: Chart,
+    linearize: Linearizer,
+    square_root: bool = False,
+) -> Joint:
+    """Robot motion, O(N) in a chart whose landmarks stand still: Solà (14)-(17).
+
+    pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the error of
+    the landmarks moves too, with A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block. Of
+    a square root X, P = X Xᵀ, A X is taken, and the noise's root beside it made part of it; O(N³).
+    """
+    robot = slots.robot_cov(joint, square_root)
+    here = Here(joint, chart, joint.pose, robot)
+    pose, by_pose, noise, lin = linearize.motion(motion, u, here)
+    if chart.basis is None:
+        moved = Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
+    else:
+        over_map = jax.vmap(chart.basis, in_axes=(None, 0))
+        before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
+        moved = in_charts(by_pose, before, after, joint.alive)
+    if square_root:
+        size = joint.cov.shape[0]
+        added = moved.lift(size) @ linalg.cholesky(noise)[0]
+        cov = linalg.triangular_root(jnp.concatenate([moved.times(joint.cov), added], axis=1))
+    else:
+        cov = moved_cov(joint.cov, moved, noise)
+    watch = joint.watch
+    if watch:
+        watch = watch._replace(directions=moved.times(watch.directions))
+    last = joint.last
+    if chart.motion_apart:
+        back = se2.adjoint(jnp.stack([0 * pose[0], 0 * pose[1], joint.pose[2]])).T
+        cov_last = linalg.matmul(back @ noise, moved.lift(joint.cov.shape[0]).T)
+        last = Last(joint.pose[2], cov_last, back @ noise @ back.T)
+    return joint._replace(pose=pose, cov=cov, lin=lin, watch=watch, last=last)
+
+
+class Transition(NamedTuple):
+    """How errors move: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise by way of dx]."""
+
+    robot: jax.Array
+    """(3, 3) A"""
+    cross: jax.Array | None
+    """(N, L, 3) a_i; None where landmarks stand still"""
+    landmark: jax.Array | None
+    """(N, L, L) B_i; None where they are the identity"""
+    noise: jax.Array
+    """(3, 3) noise of the pose's coordinates, to dx"""
+    cross_noise: jax.Array | None
+    """(N, L, 3) the same, to dl_i"""
+
+    def times(self, matrix: jax.Array) -> jax.Array:
+        """The transition matrix times a matrix (D, k)."""
+        robot = linalg.matmul(self.robot, matrix[:3])
+        if self.cross is None:
+            return matrix.at[:3].set(robot)
+        turned = self.turn(matrix)[3:]
+        by_robot = linalg.matmul(self.cross.reshape(turned.shape[0], 3), matrix[:3])
+        return jnp.concatenate([robot, by_robot + turned])
+
+    def turn(self, matrix: jax.Array) -> jax.Array:
+        """The matrix (D, k) with B_i applied to the landmarks' rows."""
+        if self.landmark is None:
+            return matrix
+        capacity, size = self.landmark.shape[:2]
+        rows = matrix[3:].reshape(capacity, size, -1)
+        turned = linalg.total(
+            self.landmark[:, :, k, None] * rows[:, k, None, :] for k in range(size)
+        )
+        return jnp.concatenate([matrix[:3], turned.reshape(capacity * size, -1)])
+
+    def lift(self, size: int) -> jax.Array:
+        """(D, 3): what noise of the pose's coordinates does to all errors."""
+        rest = jnp.zeros((size - 3, 3), self.noise.dtype)
+        if self.cross_noise is not None:
+            rest = self.cross_noise.reshape(size - 3, 3)
+        return jnp.concatenate([self.noise, rest])
+
+
+def in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array) -> Transition:
+    """E(x')⁻¹ F E(x) and E(x')⁻¹ by blocks, dead slots standing still."""
+    undo = linalg.inverse(after.pose[0])
+    robot = undo @ by_pose @ before.pose[0]
+    cross = before.cross - after.cross @ robot
+    cross_noise = -after.cross @ undo
+    landmark = None
+    if before.landmark is not None and after.landmark is not None:
+        own = jax.vmap(linalg.inverse)(after.landmark)
+        still = jnp.eye(own.shape[-1], dtype=own.dtype)
+        landmark = jnp.where(alive[:, None, None], own @ before.landmark, still)
+        cross, cross_noise = own @ cross, own @ cross_noise
+    cross, cross_noise = (jnp.where(alive[:, None, None], m, 0.0) for m in (cross, cross_noise))
+    return settle(Transition(robot, cross, landmark, undo, cross_noise))
+
+
+def moved_cov(cov: jax.Array, moved: Transition, noise: jax.Array | None) -> jax.Array:
+    """A P Aᵀ + G N Gᵀ, each entry of P written once or twice."""
+    if moved.cross is None:
+        robot = linalg.matmul(moved.robot, cov[:3])
+        own = linalg.matmul(robot[:, :3], moved.robot.T)
+        own = linalg.symmetrize(own if noise is None else own + noise)
+        # Kept apart from P, which it is made of, so that P is written in place.
+        robot = settle(jnp.concatenate([own, robot[:, 3:]], axis=1))
+        return cov.at[:3].set(robot).at[:, :3].set(robot.T)
+    if moved.landmark is not None:
+        cov = linalg.symmetrize(moved.turn(moved.turn(cov).T))
+    # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.
+    b = jnp.concatenate([moved.robot - jnp.eye(3, dtype=cov.dtype), moved.cross.reshape(-1, 3)])
+    half = cov[:3] + 0.5 * linalg.matmul(cov[:3, :3], b.T)
+    left, right = [b.T, half], [half, b.T]
+    if noise is not None:
+        added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
+        left, right = [*left, added], [*right, added]
+    change = linalg.gram(*settle((jnp.concatenate(left), jnp.concatenate(right))))
+    return linalg.symmetrize(cov + change)

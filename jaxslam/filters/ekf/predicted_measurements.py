@@ -1,0 +1,123 @@
+"""What a filter on a `Joint` expects to measure of every landmark: what association looks at."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.filters.ekf.to_points import at_slot
+from jaxslam.math import linalg
+from jaxslam.math.xla import settle
+from jaxslam.protocols import Basis, Chart, Here, Linearizer, Pairs, Prediction, Sensor
+from jaxslam.slots import Joint
+from jaxslam.types import Scan
+
+
+def prediction_of(
+    joint: Joint,
+    *,
+    sensor: Sensor,
+    chart: Chart,
+    linearize: Linearizer,
+    square_root: bool = False,
+) -> Prediction:
+    """The map as an association may see it; what it does not ask for is not computed."""
+
+    capacity, size = joint.landmarks.shape
+
+    def slopes() -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """ẑ (N, Z), H by errors of pose (N, Z, 3) and landmark (N, Z, L), H P Hᵀ of each alone."""
+        every = jnp.arange(capacity)
+        robot, cross, own = settle(_blocks(joint, square_root))
+        top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
+        bottom = jnp.concatenate([cross.transpose(0, 2, 1), own], axis=2)
+        local = jnp.concatenate([top, bottom], axis=1)
+        expected, by_pose, by_landmark, rest = jax.vmap(
+            lambda slot, landmark, cov: linearize.observe(
+                at_slot(sensor, joint, slot), Here(joint, chart, joint.pose, cov, slot, landmark)
+            )
+        )(every, joint.landmarks, local)
+        if chart.basis is not None:
+            by_pose, by_landmark = in_chart(
+                chart, joint.pose, joint.landmarks, by_pose, by_landmark
+            )
+        expected, by_pose, by_landmark, rest = settle((expected, by_pose, by_landmark, rest))
+        h = jnp.concatenate([by_pose, by_landmark], axis=2)
+        hp = settle(linalg.total(h[:, :, k, None] * local[:, None, k] for k in range(3 + size)))
+        alone = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in range(3 + size))
+        return expected, by_pose, by_landmark, settle(alone + rest)
+
+    def pairs(scan: Scan) -> Pairs:
+        expected, _, _, own = slopes()
+        noise = jax.vmap(sensor.noise_cov)(scan.z)
+        over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
+        innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
+        cov = own[None] + noise[:, None]
+
+        def weigh(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            factor, positive = linalg.cholesky(cov)
+            pivots = jnp.diagonal(factor)
+            log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
+            return (linalg.solve_lower(factor, nu) ** 2).sum(), log_det, positive
+
+        distance, log_det, positive = jax.vmap(jax.vmap(weigh))(innovation, cov)
+        possible = scan.valid[:, None] & joint.alive[None, :] & positive
+        return Pairs(innovation, cov, distance, log_det, possible)
+
+    def cross() -> jax.Array:
+        _, by_pose, by_landmark, _ = slopes()
+        cov = joint.cov @ joint.cov.T if square_root else joint.cov
+        rows = cov[3:].reshape(capacity, size, cov.shape[1])
+        hp = linalg.total(by_pose[:, :, k, None] * cov[None, None, k] for k in range(3))
+        for k in range(size):
+            hp = hp + by_landmark[:, :, k, None] * rows[:, None, k]
+        return innovation_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
+
+    return Prediction(joint.tag, joint.alive, pairs, cross)
+
+
+def _blocks(joint: Joint, square_root: bool) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """P of the robot (3, 3), of it with each landmark (N, 3, L), and of each landmark (N, L, L)."""
+    capacity, size = joint.landmarks.shape
+    if square_root:
+        robot, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size, -1)
+        cross = jnp.einsum("ik,nlk->nil", robot, rows)
+        return robot @ robot.T, cross, jnp.einsum("nlk,nmk->nlm", rows, rows)
+    every = jnp.arange(capacity)
+    own = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[every, :, every]
+    cross = joint.cov[:3, 3:].reshape(3, capacity, size).transpose(1, 0, 2)
+    return joint.cov[:3, :3], cross, own
+
+
+def in_chart(
+    chart: Chart,
+    pose: jax.Array,
+    landmarks: jax.Array,
+    by_pose: jax.Array,
+    by_landmark: jax.Array,
+    moved: tuple[jax.Array, jax.Array] | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """Chain Jacobians (m, Z, ·) with the derivative of retract(pose, l, ·), at zero or moved."""
+    assert chart.basis is not None
+    if moved is None:
+        basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
+    else:
+        by_dx, by_dl = jax.vmap(
+            jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
+        )(pose, landmarks, *moved)
+        basis = Basis(by_dx[0], by_dl[0], by_dl[1])
+    by_chart = by_pose @ basis.pose + by_landmark @ basis.cross
+    return by_chart, by_landmark if basis.landmark is None else by_landmark @ basis.landmark
+
+
+def innovation_cov(
+    hp: jax.Array, by_pose: jax.Array, by_landmark: jax.Array, slot: jax.Array, capacity: int
+) -> jax.Array:
+    """H P Hᵀ (m, Z, m, Z) of HP (m, Z, D): only the robot's and the seen landmarks' columns."""
+    m, size_z, size_l = by_landmark.shape
+    own = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
+    if size_l == 0:
+        return own
+    by_slot = hp[:, :, 3 : 3 + capacity * size_l].reshape(m, size_z, capacity, size_l)
+    at_landmark = by_slot[:, :, slot]
+    return own + linalg.total(
+        at_landmark[..., k, None] * by_landmark[None, None, :, :, k] for k in range(size_l)
+    )

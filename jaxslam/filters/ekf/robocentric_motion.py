@@ -1,0 +1,68 @@
+"""The last motion as a variable of its own, for charts that keep it apart (`Chart.motion_apart`).
+
+The errors of the map are e = e_rest + g δ, with δ the error of the last motion and g its lever. A
+correction moves the map by what it says of e_rest, then composes it with the corrected motion.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.filters.ekf.predict import in_charts, moved_cov
+from jaxslam.linearize.first_order import turned
+from jaxslam.math import linalg, se2
+from jaxslam.math.angles import wrap
+from jaxslam.protocols import Chart
+from jaxslam.slots import Joint
+
+
+def lever_of_motion(joint: Joint, chart: Chart) -> jax.Array:
+    """g (D, 3): what an error of the last motion, in its own frame, does to all errors."""
+    assert chart.basis is not None
+    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
+    robot = linalg.inverse(basis.pose[0]) @ out_of(joint.last.frame)
+    own = -basis.cross @ robot
+    if basis.landmark is not None:
+        own = jnp.einsum("nij,njk->nik", jax.vmap(linalg.inverse)(basis.landmark), own)
+    own = jnp.where(joint.alive[:, None, None], own, 0.0)
+    return jnp.concatenate([robot, own.reshape(-1, 3)])
+
+
+def moved_anew(
+    joint: Joint, turn: jax.Array, step: jax.Array, lever: jax.Array, chart: Chart
+) -> Joint:
+    """The map, corrected but for the last motion, composed with that motion changed by step (3,).
+
+    With T the transition of e_rest and h = g' - T g, P ← T P Tᵀ + h C Tᵀ + (h C Tᵀ)ᵀ + h Q hᵀ,
+    C = cov(δ, e) and Q = cov(δ), all after the correction.
+
+    Args:
+        turn: () by which the frame the motion began from has turned.
+        lever: g (D, 3) as it was before the correction.
+    """
+    assert chart.basis is not None
+    frame = joint.last.frame + turn
+    change = out_of(frame) @ step
+    pose = joint.pose + change
+    pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
+    over_map = jax.vmap(chart.basis, in_axes=(None, 0))
+    before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
+    still = jnp.eye(3, dtype=pose.dtype)
+    moved = in_charts(turned(still, change[:2]), before, after, joint.alive)
+    composed = joint._replace(pose=pose, last=joint.last._replace(frame=frame))
+    h = (lever_of_motion(composed, chart) - moved.times(lever)).T
+    cov_last = moved.times(joint.last.cov.T).T
+    half = cov_last + 0.5 * linalg.matmul(joint.last.own, h)
+    change_cov = linalg.gram(jnp.concatenate([h, half]), jnp.concatenate([half, h]))
+    watch = joint.watch
+    if watch:
+        watch = watch._replace(directions=moved.times(watch.directions))
+    return composed._replace(
+        cov=linalg.symmetrize(moved_cov(joint.cov, moved, None) + change_cov),
+        watch=watch,
+        last=composed.last._replace(cov=cov_last + linalg.matmul(joint.last.own, h)),
+    )
+
+
+def out_of(frame: jax.Array) -> jax.Array:
+    """Steps in a frame of that heading as steps in the map, (3, 3)."""
+    return se2.adjoint(jnp.stack([jnp.zeros_like(frame), jnp.zeros_like(frame), frame]))

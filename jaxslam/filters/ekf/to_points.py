@@ -1,0 +1,87 @@
+"""Landmarks that become points: fewer parameters, once a first-order filter can do with them."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam import slots
+from jaxslam.math import linalg
+from jaxslam.protocols import Sensor
+from jaxslam.slots import Joint
+
+Array = jax.Array
+
+
+def seen_as(sensor: Sensor, reduced: Array | tuple[()]) -> Sensor:
+    """The sensor as it sees the landmark of a slot that is reduced () or not: l, or (x, y, …)."""
+    if sensor.reduced is None or isinstance(reduced, tuple):
+        return sensor
+    of_points = sensor.reduced.sensor
+
+    def observe(pose: Array, landmark: Array) -> Array:
+        as_point = of_points.observe(pose, landmark[:2])
+        return jnp.where(reduced, as_point, sensor.observe(pose, landmark))
+
+    def position(landmark: Array) -> Array:
+        return jnp.where(reduced, landmark[:2], sensor.position(landmark))
+
+    return dataclasses.replace(sensor, observe=observe, position=position)
+
+
+def at_slot(sensor: Sensor, joint: Joint, slot: Array) -> Sensor:
+    """The sensor as it sees the landmark of a slot () of the map."""
+    return sensor if isinstance(joint.reduced, tuple) else seen_as(sensor, joint.reduced[slot])
+
+
+def ready(joint: Joint, sensor: Sensor, square_root: bool) -> Array:
+    """Which landmarks (N,) may become points now."""
+    assert sensor.reduced is not None
+    every = jnp.arange(joint.landmarks.shape[0])
+    covs = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(every)[:, 3:, 3:]
+    linear = jax.vmap(sensor.reduced.ready, (None, 0, 0))(joint.pose, joint.landmarks, covs)
+    good: Array = linear & joint.alive & ~joint.reduced
+    return good
+
+
+def reduce(joint: Joint, which: Array, sensor: Sensor, square_root: bool) -> Joint:
+    """Turn the landmarks of the slots which (N,) bool into points.
+
+    With J = ∂position/∂l (2, L), l ← position(l) and, of all errors, e_l ← J e_l, in rows and
+    columns of P. The other L - 2 coordinates become padding. In a chart whose landmarks have errors
+    of their own beside a motion of the whole (`Basis.landmark` None), J is by these.
+    """
+    capacity, size = joint.landmarks.shape
+    points = jax.vmap(sensor.position)(joint.landmarks)
+    by_landmark = jax.vmap(jax.jacfwd(sensor.position))(joint.landmarks)
+    still = jnp.eye(size, dtype=points.dtype)
+    freed = jnp.pad(by_landmark, [(0, 0), (0, size - 2), (0, 0)])
+    gain = jnp.where(which[:, None, None], freed, still)
+
+    def turned(matrix: Array) -> Array:
+        """The matrix (D, k) with J applied to the rows of landmarks."""
+        rows = matrix[3:].reshape(capacity, size, -1)
+        rows = linalg.total(gain[:, :, k, None] * rows[:, k, None, :] for k in range(size))
+        return jnp.concatenate([matrix[:3], rows.reshape(capacity * size, -1)])
+
+    padding = jnp.concatenate(
+        [jnp.zeros(3, bool), (which[:, None] & (jnp.arange(size) >= 2)[None, :]).reshape(-1)]
+    )
+    unit = jnp.diag(padding.astype(points.dtype))
+    if square_root:
+        cov = linalg.triangular_root(jnp.concatenate([turned(joint.cov), unit], axis=1))
+    else:
+        cov = linalg.symmetrize(turned(turned(joint.cov).T)) + unit
+    # The same to the bit for a run that another run of the batch makes come here.
+    cov = jnp.where(which.any(), cov, joint.cov)
+    watch = joint.watch
+    if watch:
+        watch = watch._replace(directions=turned(watch.directions))
+    landmarks = jnp.pad(points, [(0, 0), (0, size - 2)])
+    return joint._replace(
+        landmarks=jnp.where(which[:, None], landmarks, joint.landmarks),
+        cov=cov,
+        watch=watch,
+        reduced=joint.reduced | which,
+    )

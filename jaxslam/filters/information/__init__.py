@@ -1,0 +1,1 @@
+"""Information filters: the exact one, and two that keep the information matrix sparse."""

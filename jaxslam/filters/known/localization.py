@@ -1,0 +1,243 @@
+"""EKF localization: where the robot is in a map that is known."""
+
+import dataclasses
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam import slots, validation
+from jaxslam.association.known import known as known_association
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import in_order, left_alone, scan_update
+from jaxslam.filters.ekf.settings import check_numbers
+from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.math import linalg
+from jaxslam.math.linalg import is_concrete
+from jaxslam.protocols import (
+    Associate,
+    Association,
+    Basis,
+    Chart,
+    Filter,
+    Free,
+    Here,
+    Linearizer,
+    Motion,
+    Prediction,
+    Sensor,
+)
+from jaxslam.sensors.suite import Part, Suite
+from jaxslam.slots import Joint
+from jaxslam.types import Estimate, Info, Scan
+
+Array = jax.Array
+
+
+def localization(
+    motion: Motion,
+    sensor: Sensor,
+    landmarks: ArrayLike,
+    *,
+    tags: ArrayLike | None = None,
+    chart: Chart | None = None,
+    linearize: Linearizer | None = None,
+    associate: Associate | None = None,
+    update: Literal["sequential", "joint"] = "sequential",
+    gate: float | None = None,
+    iterations: int = 1,
+    joseph: bool = False,
+) -> Filter:
+    """Extended Kalman filter of the pose alone, in a map without error (Williams; the Notes).
+
+    The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the pose only, P (3, 3). A step
+    costs what its scan does, but for finding tags among N (0.09 ms a step with 10,000); association
+    other than by tags looks at all landmarks. With a `sensors.suite`, absolute sensors (compass,
+    position fix) correct in the same update.
+
+    The state is a `slots.Joint` whose landmarks have no parameters. A measurement of no landmark of
+    the map is `Status.UNMATCHED`.
+
+    Args:
+        motion, sensor: as for `ekf_slam`.
+        landmarks: (N, L) the map, in the sensor's parameters.
+        tags: (N,) int, different; default the row numbers.
+        chart: the error P is of; its pose part. Default `charts.euclidean()`.
+        linearize: one without a memory of landmarks (at_estimate, unscented).
+        associate, update, gate, iterations, joseph: as for `ekf_slam`.
+    Raises:
+        ValueError: on a map that is not finite (N, L), tags that are not N different numbers from 0
+            on, a chart or linearizer that needs the landmarks' errors, and as `ekf_slam` does.
+    """
+    validation.check_models("localization", motion, sensor)
+    validation.check_parts("localization", chart=chart, linearize=linearize, associate=associate)
+    points, names = checked_map("localization", sensor, landmarks, tags)
+    capacity = points.shape[0]
+    chart = _of_pose(chart or euclidean())
+    linearize = linearize or at_estimate()
+    check_numbers("localization", capacity, update, gate, iterations, None)
+    if linearize.euclidean or linearize.name == "at_truth":
+        raise ValueError(f"localization: the linearizer {linearize.name} is for maps with errors")
+    if linearize.name == "unscented" and iterations > 1:
+        raise ValueError("localization: the linearizer unscented does not iterate")
+    options: dict[str, Any] = {
+        "associate": _never_new(associate or known_association()),
+        "update": update,
+        "births": 0,
+        "life": None,
+        "without": lambda joint, dead: joint,
+        "chart": chart,
+        "square_root": False,
+        "options": {"gate": gate, "iterations": iterations, "joseph": joseph},
+    }
+
+    def update_by(one: Sensor) -> Any:
+        absolute = not one.landmark
+        at = linearize if absolute else _on_map(linearize, one, points)
+        return scan_update(_without_landmark(one), absolute=absolute, linearize=at, **options)
+
+    def part_update(part: Part) -> Any:
+        if part.sees == "robots":
+            return left_alone
+        of_part, size = update_by(part.sensor), len(part.sensor.measurements)
+        return lambda joint, scan: of_part(joint, scan._replace(z=scan.z[:, :size]))
+
+    places: tuple[int, ...] = ()
+    parts: list[Any] = []
+    if isinstance(sensor, Suite):
+        places = sensor.places
+        parts = [(part.places, part_update(part)) for part in sensor.parts]
+    else:
+        parts = [(-1, update_by(sensor))]
+    move = partial(propagate, motion=motion, chart=chart, linearize=linearize)
+
+    def init(pose: Array, pose_cov: Array) -> Joint:
+        ground = jnp.zeros((capacity, 0), pose.dtype)
+        if chart.basis is not None:
+            undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
+            pose_cov = undo @ pose_cov @ undo.T
+        joint = slots.empty(pose, pose_cov, capacity, 0, linearize.init(pose, ground))
+        return joint._replace(alive=jnp.ones(capacity, bool), tag=jnp.asarray(names))
+
+    def predict(joint: Joint, u: Array, key: Array) -> Joint:
+        return move(joint, u)
+
+    def update_pose(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        joint, info, _ = in_order(joint, scan, parts)
+        return joint, info
+
+    def estimate(joint: Joint) -> Estimate:
+        cov = joint.cov
+        if chart.basis is not None:
+            basis = chart.basis(joint.pose, joint.landmarks[0]).pose
+            cov = basis @ cov @ basis.T
+        where = jax.vmap(sensor.position)(jnp.asarray(points, joint.pose.dtype))
+        return Estimate(
+            pose=joint.pose,
+            pose_cov=cov,
+            points=where,
+            point_covs=jnp.zeros((capacity, 2, 2), cov.dtype),
+            alive=joint.alive,
+            tag=joint.tag,
+        )
+
+    return Filter(
+        name="localization",
+        control_size=len(motion.controls),
+        measurement_size=len(sensor.measurements),
+        init=init,
+        predict=predict,
+        update=update_pose,
+        estimate=estimate,
+        chart=chart,
+        places=places,
+    )
+
+
+def _on_map(linearize: Linearizer, sensor: Sensor, points: Any) -> Linearizer:
+    """The linearizer, for which the landmark of a slot is a constant of the sensor."""
+
+    def observe(flat: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        landmark = jnp.asarray(points, here.pose.dtype)[here.slot]
+        seen = dataclasses.replace(flat, observe=lambda pose, _: sensor.observe(pose, landmark))
+        return linearize.observe(seen, here)
+
+    return dataclasses.replace(linearize, observe=observe)
+
+
+def _without_landmark(sensor: Sensor) -> Sensor:
+    """A sensor whose landmarks have no parameters."""
+    none = jnp.zeros(0)
+    return Sensor(
+        name=sensor.name,
+        measurements=sensor.measurements,
+        landmark=(),
+        observe=sensor.observe,
+        residual=sensor.residual,
+        noise_cov=sensor.noise_cov,
+        invert=lambda pose, z, s: jnp.zeros(0, pose.dtype),
+        position=lambda landmark: jnp.zeros(2, landmark.dtype),
+        embed=lambda pose, point: jnp.zeros(0, pose.dtype),
+        free=Free(none, jnp.zeros((0, 0))),
+    )
+
+
+def _of_pose(chart: Chart) -> Chart:
+    """The chart's part of the pose, beside landmarks without parameters."""
+    if chart.motion_apart:
+        raise ValueError(f"localization: the chart {chart.name} composes a map with the motion")
+    whole_basis = chart.basis
+    dummy = 4 if chart.name.endswith("rays") else 2
+
+    def ground(landmark: Array) -> Array:
+        return jnp.zeros(dummy, landmark.dtype)
+
+    def retract(pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
+        at = ground(landmark)
+        return chart.retract(pose, at, dx, at)[0], landmark
+
+    def local(pose0: Array, landmark0: Array, pose: Array, landmark: Array) -> tuple[Array, Array]:
+        at = ground(landmark)
+        return chart.local(pose0, at, pose, at)[0], jnp.zeros(0, landmark.dtype)
+
+    def basis(pose: Array, landmark: Array) -> Basis:
+        assert whole_basis is not None
+        by_pose = whole_basis(pose, ground(landmark)).pose
+        return Basis(by_pose, jnp.zeros((0, 3), pose.dtype), None)
+
+    return Chart(chart.name, retract, local, None if whole_basis is None else basis)
+
+
+def _never_new(associate: Associate) -> Associate:
+    def within(prediction: Prediction, scan: Scan) -> Association:
+        found = Association(*associate(prediction, scan))
+        return found._replace(is_new=jnp.zeros_like(found.is_new))
+
+    return within
+
+
+def checked_map(
+    name: str, sensor: Sensor, landmarks: ArrayLike, tags: ArrayLike | None
+) -> tuple[Any, np.ndarray]:
+    """The landmarks and their tags (N,) int32, or a ValueError that begins with a filter's name."""
+    size = len(sensor.landmark)
+    if np.ndim(landmarks) != 2 or np.shape(landmarks)[1] != size or np.shape(landmarks)[0] == 0:
+        raise ValueError(
+            f"{name}: expected landmarks of shape (at least 1, {size}), got {np.shape(landmarks)}"
+        )
+    if not np.issubdtype(jnp.result_type(landmarks), np.number) or jnp.iscomplexobj(landmarks):
+        raise ValueError(f"{name}: the map is not of real numbers")
+    if is_concrete(landmarks) and not np.isfinite(np.asarray(landmarks)).all():
+        raise ValueError(f"{name}: the map is not finite")
+    count = np.shape(landmarks)[0]
+    names: np.ndarray = np.arange(count) if tags is None else np.asarray(tags)
+    good = names.shape == (count,) and np.issubdtype(names.dtype, np.integer)
+    most = np.iinfo(np.int32).max
+    if not good or len(set(names.tolist())) != count or not 0 <= names.min() <= names.max() <= most:
+        raise ValueError(f"{name}: expected {count} different tags from 0 to {most}, got {tags!r}")
+    points = landmarks if hasattr(landmarks, "shape") else np.asarray(landmarks)
+    return points, names.astype(np.int32)

@@ -1,0 +1,1 @@
+"""What keeps a map in order: duplicates merged, loops closed, a lost robot found again."""

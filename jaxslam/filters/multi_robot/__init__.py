@@ -1,0 +1,1 @@
+"""EKF-SLAM of several robots in one joint state."""

@@ -1,0 +1,1 @@
+"""Mathematics that knows nothing of robots' maps: angles, SE(2), linear algebra, statistics."""

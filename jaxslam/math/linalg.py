@@ -1,0 +1,413 @@
+"""Small linear algebra: factors of the few-by-few matrices of a filter, and checks of covariances.
+
+A landmark update factors a 2×2 to 6×6 matrix, millions of times, under `vmap`. The library call
+behind `jnp.linalg.cholesky` costs more there than the arithmetic, and hides a non-positive pivot
+behind NaN; hence the unrolled factor below, which reports it and stays finite.
+"""
+
+import functools
+import operator
+from collections.abc import Callable, Iterable
+from numbers import Integral
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam.math import batched_linalg
+
+_T = TypeVar("_T")
+
+# Up to this many rows a product AᵀB is written as outer products, which XLA fuses into one pass
+# over the result; beyond, as one matrix product.
+_OUTER_PRODUCTS = 16
+
+# Up to this size factors are unrolled into fused elementwise code; beyond it see `batched_linalg`.
+_UNROLLED = 8
+
+
+def _tolerance(matrix: jax.Array) -> float:
+    """Of a pivot, as a share of its diagonal entry: what rounding alone leaves of zero."""
+    return matrix.shape[-1] * float(jnp.finfo(matrix.dtype).eps)
+
+
+def total(terms: Iterable[jax.Array]) -> jax.Array:
+    """The sum of at least one array; written out, it fuses into one elementwise kernel."""
+    return functools.reduce(operator.add, terms)
+
+
+def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
+    """The function, of which reverse mode keeps the arguments and not each entry that it takes.
+
+    What is written out entry by entry would otherwise leave an array of the whole loop for each.
+    """
+    # Within a scan or a batch nothing merges the recomputation with what it repeats.
+    return jax.checkpoint(function, prevent_cse=False)
+
+
+def gram(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Aᵀ B of A (k, D), B (k, E), for small k."""
+    if a.shape[0] > _OUTER_PRODUCTS or a.shape[0] == 0:
+        # Not a.T @ b, of which a gradient would keep a transposed copy of A.
+        return jax.lax.dot_general(a, b, (((0,), (0,)), ((), ())))
+    return _outer_products(a, b)
+
+
+@kept_whole
+def _outer_products(a: jax.Array, b: jax.Array) -> jax.Array:
+    return total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
+
+
+@jax.custom_jvp
+def square(a: jax.Array) -> jax.Array:
+    """Aᵀ A of A (k, D), k of any size; one product in a gradient, where `gram` takes two."""
+    return gram(a, a)
+
+
+@square.defjvp
+def _square_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    half = gram(tangents[0], primals[0])
+    return square(*primals), half + half.T
+
+
+def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A B of A (n, k), B (k, D), for small k."""
+    return gram(a.T, b)
+
+
+def symmetrize(matrix: jax.Array) -> jax.Array:
+    """(A + Aᵀ)/2 over the last two axes."""
+    return 0.5 * (matrix + jnp.swapaxes(matrix, -1, -2))
+
+
+def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lower L (n, n) with L Lᵀ = A, and whether A is numerically positive definite, ().
+
+    A pivot not above n·eps times its diagonal entry counts as zero: its column of L is zero and the
+    flag is False, so that a positive *semi*-definite A still gets a usable square root, and nothing
+    becomes NaN (beyond 8×8, L is then zero as a whole). Only the lower
+    triangle is read. Non-finite input gives False.
+    """
+    n = matrix.shape[-1]
+    if n == 0:
+        return matrix, jnp.asarray(True)
+    return _cholesky_beyond(matrix) if n > _UNROLLED else _cholesky(matrix)
+
+
+@jax.custom_jvp
+def _cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    zero = jnp.zeros((), matrix.dtype)
+    rows: list[list[jax.Array]] = [[zero] * n for _ in range(n)]
+    positive = jnp.asarray(True)
+    for j in range(n):
+        pivot = matrix[j, j] - sum((rows[j][k] ** 2 for k in range(j)), zero)
+        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        positive = positive & good
+        root = jnp.sqrt(jnp.where(good, pivot, 1.0))
+        rows[j][j] = jnp.where(good, root, 0.0)
+        for i in range(j + 1, n):
+            rest = matrix[i, j] - sum((rows[i][k] * rows[j][k] for k in range(j)), zero)
+            rows[i][j] = jnp.where(good, rest / root, 0.0)
+    return jnp.stack([jnp.stack(row) for row in rows]), positive
+
+
+@_cholesky.defjvp
+def _cholesky_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """dL = L Φ(L⁻¹ dA L⁻ᵀ); where a pivot is zero, its column stays zero, and 1 stands for it."""
+    factor, positive = _cholesky(*primals)
+    good = jnp.diagonal(factor) > 0
+    regular = factor + jnp.diag((~good).astype(factor.dtype))
+    inner = solve_lower(regular, solve_lower(regular, _mirrored(tangents[0])).T)
+    slope = regular @ jnp.where(good, _lower_half(inner), 0.0)
+    return (factor, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
+
+
+def _mirrored(matrix: jax.Array) -> jax.Array:
+    """The symmetric matrix of a lower triangle."""
+    return jnp.tril(matrix) + jnp.tril(matrix, -1).T
+
+
+def _lower_half(matrix: jax.Array) -> jax.Array:
+    """Φ: the lower triangle with half of the diagonal."""
+    return jnp.tril(matrix) - 0.5 * jnp.diag(jnp.diagonal(matrix))
+
+
+def _cholesky_beyond(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    factor = _factor(_mirrored(matrix))
+    return factor, factor[0, 0] > 0
+
+
+@jax.custom_jvp
+def _factor(matrix: jax.Array) -> jax.Array:
+    """Lower L with L Lᵀ = A of a symmetric A, zero where a pivot is."""
+    factor = jnp.tril(batched_linalg.factor(matrix))
+    positive = jnp.all(
+        jnp.diagonal(factor) ** 2 > _tolerance(matrix) * jnp.abs(jnp.diagonal(matrix))
+    )
+    return jnp.where(positive, factor, 0.0)
+
+
+@_factor.defjvp
+def _factor_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    """dL = L Φ(L⁻¹ dA L⁻ᵀ), where Φ keeps the lower triangle and half of the diagonal."""
+    factor = _factor(*primals)
+    regular = factor[0, 0] > 0
+    safe = jnp.where(regular, factor, jnp.eye(len(factor), dtype=factor.dtype))
+    inner = batched_linalg.solve_lower(safe, batched_linalg.solve_lower(safe, tangents[0]).T)
+    slope = safe @ _lower_half(inner)
+    return factor, jnp.where(regular, slope, 0.0)
+
+
+def root_psd(matrix: jax.Array) -> jax.Array:
+    """Lower L (n, n) with L Lᵀ = A for a positive semi-definite A of any size, singular or not.
+
+    Cholesky column by column; a pivot that is rounding next to its diagonal entry gives a column of
+    zeros. Gradients are finite.
+    """
+    n = matrix.shape[-1]
+    if n == 0:
+        return matrix
+    floor = n * float(jnp.finfo(matrix.dtype).eps) * jnp.abs(jnp.diagonal(matrix))
+
+    def column(rest: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pivot = rest[j, j]
+        good = pivot > floor[j]
+        root = jnp.sqrt(jnp.where(good, pivot, 1.0))
+        own = jnp.where(good & (jnp.arange(n) >= j), rest[:, j] / root, 0.0)
+        return rest - own[:, None] * own[None, :], own
+
+    return jax.lax.scan(column, matrix, jnp.arange(n))[1].T
+
+
+def triangular_root(wide: jax.Array) -> jax.Array:
+    """Lower L (n, n) with L Lᵀ = A Aᵀ and a diagonal not below zero, of A (n, m), m >= n.
+
+    Householder reflections from the right, row by row; nothing is squared, so half the digits of a
+    covariance suffice. A may lack rank, and gradients are finite there.
+    """
+    n, m = wide.shape
+
+    def reflect(rest: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
+        ahead = jnp.where(jnp.arange(m) >= i, rest[i], 0.0)
+        square = jnp.sum(ahead**2)
+        there = square > 0
+        length = jnp.sqrt(jnp.where(there, square, 1.0))
+        # To -sign(a_i)·length, away from where a_i - length would cancel; then the sign is turned.
+        sign = jnp.where(ahead[i] >= 0, 1.0, -1.0).astype(rest.dtype)
+        axis = ahead.at[i].add(sign * length)
+        scale = jnp.where(there, 1.0 / (length * (length + jnp.abs(ahead[i]))), 0.0)
+        rest = rest - (rest @ axis * scale)[:, None] * axis[None, :]
+        return rest.at[:, i].multiply(jnp.where(there, -sign, 1.0)), None
+
+    return jnp.tril(jax.lax.scan(reflect, wide, jnp.arange(n))[0][:, :n])
+
+
+def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
+    """L⁻¹ B for lower L (n, n) and B (n, …); rows whose pivot is zero come out zero."""
+    n = factor.shape[-1]
+    if n == 0:
+        return rhs
+    if n > _UNROLLED:
+        singular = jnp.diagonal(factor) == 0
+        safe = factor + jnp.diag(singular.astype(factor.dtype))
+        out = batched_linalg.solve_lower(safe, rhs.reshape(n, -1))
+        return jnp.where(singular[:, None], 0.0, out).reshape(rhs.shape)
+
+    def lower(x: jax.Array) -> jax.Array:
+        return jnp.tensordot(jnp.tril(factor), x, 1)
+
+    solution: jax.Array = jax.lax.custom_linear_solve(
+        lower,
+        rhs,
+        lambda _, b: _substituted(factor, b),
+        transpose_solve=lambda _, b: _substituted(factor[::-1, ::-1].T, b[::-1])[::-1],
+    )
+    return solution
+
+
+def _substituted(factor: jax.Array, rhs: jax.Array) -> jax.Array:
+    """L⁻¹ B, row after row written out."""
+    rows: list[jax.Array] = []
+    for i in range(len(factor)):
+        rest = rhs[i] - sum((factor[i, k] * rows[k] for k in range(i)), jnp.zeros_like(rhs[i]))
+        pivot = factor[i, i]
+        rows.append(rest * jnp.where(pivot > 0, 1.0 / jnp.where(pivot > 0, pivot, 1.0), 0.0))
+    return jnp.stack(rows)
+
+
+@jax.custom_jvp
+def whitener(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lower W = L⁻¹ (n, n), so W A Wᵀ = I, for A = L Lᵀ of a few rows; and `cholesky`'s flag.
+
+    A pivot that counts as zero gives a row of zeros. One division and root a pivot, where
+    `cholesky` and `solve_lower` take three: for a matrix that whitens many columns, millions of
+    times.
+    """
+    n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    zero = jnp.zeros((), matrix.dtype)
+    factor = [[zero] * n for _ in range(n)]
+    rows = [[zero] * n for _ in range(n)]
+    positive = jnp.asarray(True)
+    for j in range(n):
+        pivot = matrix[j, j] - sum((factor[j][k] ** 2 for k in range(j)), zero)
+        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        positive = positive & good
+        rows[j][j] = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        for k in range(j):
+            rows[j][k] = -rows[j][j] * total(factor[j][i] * rows[i][k] for i in range(k, j))
+        for i in range(j + 1, n):
+            rest = matrix[i, j] - sum((factor[i][k] * factor[j][k] for k in range(j)), zero)
+            factor[i][j] = jnp.where(good, rest * rows[j][j], 0.0)
+    return jnp.stack([jnp.stack(row) for row in rows]), positive
+
+
+@whitener.defjvp
+def _whitener_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """dW = -Φ(W dA Wᵀ) W, with rows and columns of zeros where a pivot is zero."""
+    white, positive = whitener(*primals)
+    slope = -_lower_half(white @ _mirrored(tangents[0]) @ white.T) @ white
+    return (white, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
+
+
+def whitener_by_rows(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`whitener` as a loop over rows: little to compile, for what is factored once a step.
+
+    Beyond 8×8 by `cholesky`, zero as a whole where a pivot is.
+    """
+    n, tolerance = matrix.shape[-1], _tolerance(matrix)
+    if n == 0:
+        return matrix, jnp.asarray(True)
+    if n > _UNROLLED:
+        factor, positive = cholesky(matrix)
+        return solve_lower(factor, jnp.eye(n, dtype=matrix.dtype)), positive
+    every = jnp.arange(n)
+
+    def row(carry: Any, j: jax.Array) -> tuple[Any, Any]:
+        rest, ahead = carry
+        pivot = rest[j, j]
+        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        scale = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        below, own = jnp.where(every > j, rest[:, j] * scale, 0.0), ahead[j] * scale
+        return (
+            rest - below[:, None] * below[None, :],
+            ahead - below[:, None] * own[None, :],
+        ), (own, good)
+
+    rows, good = jax.lax.scan(row, (matrix, jnp.eye(n, dtype=matrix.dtype)), every)[1]
+    return rows, good.all()
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """A⁻¹ of a regular (n, n) matrix: by cofactors up to 3×3, which fuses; by LU beyond."""
+    n = matrix.shape[-1]
+    a = matrix
+    if n == 1:
+        return jnp.reciprocal(a)
+    if n == 2:
+        det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+        return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])]) / det
+    if n == 3:
+        cofactors = jnp.stack(
+            [jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])], axis=1
+        )
+        return cofactors / jnp.dot(a[0], cofactors[:, 0])
+    return batched_linalg.inverse(a)
+
+
+def solve_psd(matrix: jax.Array, rhs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A⁻¹ B for a positive definite A (n, n) and B (n, …), and whether A was positive definite."""
+    factor, positive = cholesky(matrix)
+    reverse = factor[::-1, ::-1].T
+    return solve_lower(reverse, solve_lower(factor, rhs)[::-1])[::-1], positive
+
+
+def inverse_psd(matrix: jax.Array) -> jax.Array:
+    """A⁻¹ of a positive definite A (n, n), symmetric as it stands; zero where A is not (n > 8)."""
+    return square(whitener_by_rows(matrix)[0])
+
+
+def mahalanobis_squared(error: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """eᵀ P⁻¹ e and whether P (n, n) is numerically regular; 0 and False where it is not.
+
+    P is judged in units of each coordinate's own standard deviation, so that metres, radians and a
+    covariance of 1e-30 are judged alike. Regular means that each Cholesky pivot exceeds 100 n·eps,
+    i.e. no direction is known exactly, and that e is finite.
+    """
+    n, variance = cov.shape[-1], jnp.diagonal(cov)
+    spread = variance > 0  # the square root's slope at a zero variance is infinite, hence the 1.0
+    unit = jnp.where(spread, 1.0 / jnp.sqrt(jnp.where(spread, variance, 1.0)), 0.0)
+    factor = cholesky(cov * unit[:, None] * unit[None, :])[0]
+    known = jnp.isfinite(error)
+    squares = solve_lower(factor, jnp.where(known, error, 0.0) * unit) ** 2
+    regular = jnp.all(jnp.diagonal(factor) ** 2 > 100 * n * jnp.finfo(cov.dtype).eps)
+    regular = regular & jnp.all(known)
+    return jnp.where(regular, jnp.sum(squares), 0.0), regular
+
+
+def is_positive_definite(matrix: jax.Array) -> jax.Array:
+    """Whether a symmetric (n, n) matrix is positive definite: its Cholesky factor is finite, ()."""
+    return jnp.all(jnp.isfinite(batched_linalg.factor(matrix)))
+
+
+def is_concrete(*values: Any) -> bool:
+    """Whether values can be looked at, i.e. no leaf is a tracer."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+        raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
+
+
+def check_key(name: str, key: Any) -> None:
+    """Raise ValueError unless key is one PRNG key: of `jax.random.key`, or the raw numbers of one.
+
+    A tracer of one will do.
+    """
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
+    if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        if shape != ():
+            raise ValueError(f"{name}: expected one PRNG key, got keys of shape {shape}")
+    elif dtype != np.uint32 or shape is None or len(shape) != 1:
+        shown = repr(key) if dtype is None else f"an array of {dtype} of shape {shape}"
+        raise ValueError(f"{name}: expected a PRNG key, as of jax.random.key(0), got {shown}")
+
+
+def check_gate(name: str, gate: Any) -> None:
+    """Raise ValueError unless the gate is None, a tracer, or above 0."""
+    if gate is not None and is_concrete(gate) and not gate > 0:
+        raise ValueError(f"{name}: expected a gate above 0, got {gate}")
+
+
+def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
+    """Raise ValueError unless cov is real, finite, symmetric, positive semi-definite (size, size).
+
+    Values are looked at only where they are concrete; a tracer is checked for its shape alone.
+    """
+    shape = np.shape(cov)
+    if shape != (size, size):
+        raise ValueError(f"{name}: expected a covariance of shape ({size}, {size}), got {shape}")
+    if not is_concrete(cov):
+        return
+    values = np.asarray(cov)
+    if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+        raise ValueError(f"{name}: expected real numbers, got dtype {values.dtype}")
+    values = values.astype(np.float64)
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"{name}: the covariance has a NaN or an infinity")
+    scale = np.max(np.abs(values), initial=0.0)
+    if np.max(np.abs(values - values.T), initial=0.0) > 1e-6 * scale:
+        raise ValueError(f"{name}: the covariance is not symmetric")
+    if np.min(np.diagonal(values), initial=0.0) < 0:
+        raise ValueError(
+            f"{name}: the covariance is not positive semi-definite (negative variance)"
+        )
+    smallest = np.min(np.linalg.eigvalsh(values), initial=np.inf)
+    if smallest < -1e-6 * scale:
+        raise ValueError(
+            f"{name}: the covariance is not positive semi-definite (eigenvalue {smallest:.3g})"
+        )

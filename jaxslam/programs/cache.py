@@ -1,0 +1,216 @@
+"""Compiled programs, kept: one for each structure, its numbers as arguments.
+
+`call` runs a function of records of functions (a filter, a scenario) and arrays. Within a trace it
+is the plain call. Outside, three steps lead to the program, and each is left out where it can:
+
+1. The same objects and the same shapes as before: the program is known. Nothing is traced.
+2. The function is traced to a jaxpr. What a factory closed over (noises, maps, mounts, gates,
+   priors) stands in it as constants and literals; `hoisting` makes inputs of them. What is left is
+   the structure.
+3. The structure is lowered. Of a text that has been compiled before, the program is taken as it is;
+   else XLA compiles it.
+
+So another noise, map or gate of the same shapes costs tracing alone. An integer, and a number that
+`hoisting` leaves in the structure (0, ±1, ±π …), costs one compilation for each value.
+
+The programs least recently used are dropped beyond `ROOM`; `clear` drops all. Threads may call at
+once: whoever comes second waits for a program that is being compiled, and compiles nothing.
+"""
+
+import functools
+import hashlib
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Future
+from typing import Any, NamedTuple, TypeVar, cast
+
+import jax
+import jax.numpy as jnp
+from jax._src import config as jax_config
+from jax._src import core as jax_core
+
+from jaxslam.math.xla import hot_options
+from jaxslam.programs.hoisting import hoisted
+
+_T = TypeVar("_T")
+
+ROOM = 256
+"""Programs, and sets of objects that lead to one, that are kept."""
+
+
+_ALL: "weakref.WeakSet[Kept]" = weakref.WeakSet()
+
+
+class Kept:
+    """Results by key, each made once, the least recently used dropped beyond `room`."""
+
+    def __init__(self, room: int) -> None:
+        _ALL.add(self)
+        self._room = room
+        self._lock = threading.Lock()
+        self._found: OrderedDict[Hashable, Future[Any]] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], _T]) -> _T:
+        """What `make` returned for the key, calling it where nothing has; an error is not kept."""
+        with self._lock:
+            promise = self._found.get(key)
+            mine = promise is None
+            if promise is None:
+                promise = self._found[key] = Future()
+                while len(self._found) > self._room:
+                    self._found.popitem(last=False)
+            else:
+                self._found.move_to_end(key)
+        if mine:
+            try:
+                promise.set_result(make())
+            except BaseException as error:
+                with self._lock:
+                    if self._found.get(key) is promise:
+                        del self._found[key]
+                promise.set_exception(error)
+        return cast(_T, promise.result())
+
+    def drop(self, key: Hashable) -> None:
+        """Forget what was made for a key."""
+        with self._lock:
+            self._found.pop(key, None)
+
+    def clear(self) -> None:
+        """Drop everything."""
+        with self._lock:
+            self._found.clear()
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+
+_BY_OBJECTS = Kept(ROOM)
+_BY_TEXT = Kept(ROOM)
+
+
+def clear() -> None:
+    """Drop every program that is kept here; what runs goes on."""
+    for kept in list(_ALL):
+        kept.clear()
+
+
+class Same:
+    """An object as a key: equal to itself alone, and kept alive."""
+
+    def __init__(self, what: Any) -> None:
+        self._what = what
+
+    def __hash__(self) -> int:
+        return id(self._what)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Same) and self._what is other._what
+
+
+def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any) -> _T:
+    """function(*objects, *arguments), by a program that is compiled once for its structure.
+
+    Within a trace, or where JIT is disabled, the plain call.
+
+    Args:
+        function: pure; not a lambda made anew at each call, which would be traced anew.
+        objects: what the function takes first: records of functions, options. The same objects are
+            not traced again; they are kept alive.
+        arguments: trees of arrays.
+    """
+    if not outside(arguments) or jax_config.disable_jit.value:
+        return function(*objects, *arguments)
+    leaves, tree = jax.tree.flatten(arguments)
+    leaves = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves]
+    shapes = tuple(map(_shape_of, leaves))
+    key = (Same(function), *map(Same, objects), tree, shapes, context())
+    run, numbers, out = _BY_OBJECTS.get(
+        key, lambda: _program(functools.partial(function, *objects), tree, shapes)
+    )
+    if numbers is None:  # it closes over tracers after all
+        return function(*objects, *arguments)
+    return cast(_T, jax.tree.unflatten(out, run(numbers, *leaves)))
+
+
+def outside(*values: Any) -> bool:
+    """Whether no trace is going on, and no leaf is of one."""
+    return jax_core.trace_state_clean() and not any(
+        isinstance(leaf, jax_core.Tracer) for leaf in jax.tree.leaves(values)
+    )
+
+
+def context() -> Hashable:
+    """What else a trace depends on: precision, promotion, the default device."""
+    return jax_config.trace_context(), jax_config.default_device.value
+
+
+class Shape(NamedTuple):
+    """Of one array: what a program is compiled for."""
+
+    shape: tuple[int, ...]
+    dtype: Any
+    weak_type: bool
+    sharding: Any
+    """where it is committed to devices, else None"""
+
+
+def _shape_of(leaf: jax.Array) -> Shape:
+    committed = getattr(leaf, "committed", False)
+    weak = getattr(leaf, "weak_type", False)  # a typed key has no such thing
+    return Shape(leaf.shape, leaf.dtype, weak, leaf.sharding if committed else None)
+
+
+def _program(
+    function: Callable[..., Any], tree: Any, shapes: Sequence[Shape]
+) -> tuple[Any, list[Any] | None, Any]:
+    structs = [
+        jax.ShapeDtypeStruct(s.shape, s.dtype, weak_type=s.weak_type, sharding=s.sharding)
+        for s in shapes
+    ]
+    traced = trace(function, *jax.tree.unflatten(tree, structs))
+    if traced is None:
+        return None, None, None
+    lowered = jax.jit(traced.call).lower(traced.numbers, *structs)
+    numbers = [jnp.asarray(number) for number in traced.numbers]
+    where = tuple(s.sharding for s in shapes), jax_config.default_device.value
+    options = hot_options(jax.default_backend())
+    return compiled(lowered, where, options), numbers, traced.out
+
+
+class Traced(NamedTuple):
+    """A function without its numbers."""
+
+    call: Callable[..., list[Any]]
+    """(numbers, *leaves of the arguments) -> leaves of the result"""
+    numbers: list[Any]
+    out: Any
+    """the tree of the result"""
+    shapes: Any
+    """the result as `jax.ShapeDtypeStruct`s"""
+
+
+def trace(function: Callable[..., Any], *arguments: Any) -> Traced | None:
+    """The function with every number it closes over as an argument; None if one is a tracer."""
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    flat, numbers = hoisted(closed)
+    if any(isinstance(number, jax_core.Tracer) for number in numbers):
+        return None
+
+    def program(numbers: list[Any], *leaves: Any) -> list[Any]:
+        return cast(list[Any], flat(*numbers, *leaves))
+
+    return Traced(program, numbers, jax.tree.structure(shapes), shapes)
+
+
+def compiled(
+    lowered: jax.stages.Lowered, where: Hashable, options: dict[str, Any] | None = None
+) -> Callable[..., Any]:
+    """The program of a lowered text, compiled unless the same has been for the same devices."""
+    text = hashlib.sha256(lowered.as_text().encode()).digest()
+    # Arguments that nothing reads are not in the text.
+    told = tuple(sorted(options.items())) if options else ()
+    key = (text, where, lowered.in_tree, str(lowered.in_avals), told)
+    return _BY_TEXT.get(key, lambda: cast(Callable[..., Any], lowered.compile(options)))

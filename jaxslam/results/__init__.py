@@ -1,0 +1,1 @@
+"""Results of campaigns: text, files, figures, a page, and the folder that keeps finished runs."""

@@ -1,0 +1,1 @@
+"""Simulated worlds: scenarios, sensor faults, several robots, and the logs they record."""

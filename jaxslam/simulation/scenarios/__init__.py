@@ -1,0 +1,39 @@
+"""Named, published experiments with their parameters and figures, one a file."""
+
+from collections.abc import Callable
+
+from jaxslam.simulation.scenarios.circle import circle
+from jaxslam.simulation.scenarios.cloister import cloister, cloister_landmarks, cloister_noisy
+from jaxslam.simulation.scenarios.explore import explore
+from jaxslam.simulation.scenarios.loop import loop, loop_bearing, loop_landmarks
+from jaxslam.simulation.scenarios.stationary import stationary
+from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.webmap import webmap
+from jaxslam.simulation.worlds import Scenario
+
+SCENARIOS: dict[str, Callable[..., Scenario]] = {
+    "circle": circle,
+    "cloister": cloister,
+    "cloister_noisy": cloister_noisy,
+    "explore": explore,
+    "loop": loop,
+    "loop_bearing": loop_bearing,
+    "stationary": stationary,
+    "webmap": webmap,
+}
+"""By name; each takes the number of steps, and has the published one as default."""
+
+__all__ = [
+    "SCENARIOS",
+    "between_ranges",
+    "circle",
+    "cloister",
+    "cloister_landmarks",
+    "cloister_noisy",
+    "explore",
+    "loop",
+    "loop_bearing",
+    "loop_landmarks",
+    "stationary",
+    "webmap",
+]

@@ -1,0 +1,28 @@
+"""A robot that does not move, and a landmark: whoever learns its heading there is mistaken."""
+
+import numpy as np
+
+from jaxslam.math.linalg import check_count
+from jaxslam.motion.unicycle import unicycle
+from jaxslam.sensors.range_bearing import range_bearing
+from jaxslam.simulation.worlds import Scenario
+
+
+def stationary(steps: int = 300) -> Scenario:
+    """A robot stands still and measures one landmark, 10 m away, again and again.
+
+    It knows its pose to (0.5 m, 0.5 m, 5°), ranges and bearings to (0.5 m, 5°), and has no process
+    noise. Nothing tells it more about the pose, so its covariance must stay what it was; a filter
+    that linearizes at each new estimate shrinks it. After Julier & Uhlmann, "A counter example to
+    the theory of simultaneous localization and map building", ICRA 2001; the figures are ours.
+    """
+    check_count("steps", steps)
+    return Scenario(
+        name="stationary",
+        motion=unicycle(np.zeros((2, 2))),
+        sensor=range_bearing(np.diag([0.5, np.deg2rad(5.0)]) ** 2),
+        landmarks=[[8.0, 6.0]],
+        controls=np.tile([0.0, 0.0, 1.0], (steps, 1)),
+        pose_cov=np.diag([0.5, 0.5, np.deg2rad(5.0)]) ** 2,
+        source="after Julier & Uhlmann, ICRA 2001; parameters ours",
+    )

@@ -1,0 +1,277 @@
+"""The world generator: a scenario and a key give a truth and the log a robot would record in it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam import programs
+from jaxslam.math.angles import wrap
+from jaxslam.math.linalg import check_covariance, check_key, is_concrete, root_psd
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.sensors.suite import Part, Suite
+from jaxslam.simulation.spurious import Spurious, spoil
+from jaxslam.types import Log, Scan, Truth
+from jaxslam.validation import check_record
+
+
+def everywhere(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+    """Every landmark is seen from every pose."""
+    return jnp.asarray(True)
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """An experiment: models, world, controls, and how the filters under test are set up.
+
+    Arrays are held on the host in float64 and enter a simulation in the dtype JAX is set to.
+    Raises ValueError on inconsistent shapes or values that are not finite.
+    """
+
+    name: str
+    motion: Motion
+    sensor: Sensor
+    landmarks: ArrayLike
+    """(N, L) true landmarks; the tag of one is its row. May be traced: maps vary under `vmap`."""
+    controls: ArrayLike
+    """(T, U) nominal controls."""
+    pose: ArrayLike = (0.0, 0.0, 0.0)
+    """(3,) what a filter is told of the pose before the first control."""
+    pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    """(3, 3) how far from there, by a Gaussian draw, the robot truly starts."""
+    noise_on: Literal["robot", "odometry"] = "robot"
+    """"robot": the noise moves the true robot, and the log holds the nominal control. "odometry":
+    the true robot follows the nominal control, and the noise is on the control in the log."""
+    visible: Callable[[jax.Array, jax.Array], jax.Array] = everywhere
+    """(pose, l) -> (): whether the sensor reports the landmark from there."""
+    places: int | None = None
+    """M measurement places a scan; default N. The lowest tags first get a place, and the landmarks
+    in view beyond M are counted in `Truth.missed`."""
+    spurious: Spurious | None = None
+    """clutter, misses, outliers and wrong labels; where given, if only as `Spurious()`, the truth
+    says which landmark each measurement is of, and associations are scored."""
+    filter_options: dict[str, Any] = field(default_factory=dict)
+    """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
+    draw: Callable[["Scenario", jax.Array], tuple[Truth, Log]] | None = None
+    """(scenario, key) -> truth, log: a world of another kind (`team.world`); None for `simulate`'s
+    own."""
+    published: dict[str, dict[str, float]] = field(default_factory=dict)
+    """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
+    source: str = ""
+    """where the experiment is published."""
+
+    def __post_init__(self) -> None:
+        size_l, size_u = len(self.sensor.landmark), len(self.motion.controls)
+        _check_table(f"{self.name}: landmarks", self.landmarks, size_l)
+        _check_table(f"{self.name}: controls", self.controls, size_u)
+        _check_table(f"{self.name}: pose", np.reshape(self.pose, (1, -1)), 3)
+        check_covariance(f"{self.name}: pose_cov", self.pose_cov, 3)
+        if self.noise_on not in ("robot", "odometry"):
+            raise ValueError(f'{self.name}: noise_on must be "robot" or "odometry"')
+        if self.noise_on == "odometry" and self.motion.perturb is None:
+            raise ValueError(f"{self.name}: noise on the odometry needs a motion with `perturb`")
+        if self.places is not None and self.places < 1:
+            raise ValueError(f"{self.name}: expected places >= 1, got {self.places}")
+        if isinstance(self.sensor, Suite) and (self.places or self.spurious) is not None:
+            raise ValueError(
+                f"{self.name}: the sensors of a suite have places of their own, nothing spurious"
+            )
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return int(np.shape(self.controls)[0])
+
+
+def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
+    """Draw one world history: true poses and the log of noisy controls or motion, and noisy scans.
+
+    Traceable, so `jax.vmap(partial(simulate, scenario))(keys)` draws a batch. Called outside a
+    trace it is compiled once for a structure, as `run` is. The filters of a campaign all get the
+    same draws.
+    """
+    check_record("simulate", "scenario", scenario, Scenario)
+    check_key("simulate", key)
+    return programs.call(_simulate, (scenario,), key)
+
+
+def _simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
+    if scenario.draw is not None:
+        return scenario.draw(scenario, key)
+    dtype = jnp.result_type(float)
+    controls = jnp.asarray(scenario.controls, dtype)
+    landmarks = jnp.asarray(scenario.landmarks, dtype)
+    if scenario.spurious is None:
+        key_motion, key_scan, key_start = jax.random.split(key, 3)
+    else:
+        key_motion, key_scan, key_start, key_spoil = jax.random.split(key, 4)
+    start = drawn_near(jnp.asarray(scenario.pose, dtype), scenario.pose_cov, key_start)
+    poses, logged = drive(scenario.motion, start, controls, key_motion, scenario.noise_on)
+    if isinstance(scenario.sensor, Suite):
+        tags = jnp.arange(landmarks.shape[0])
+        seen = {"landmarks": (landmarks, tags), "robots": (landmarks[:0], tags[:0])}
+        scans = [
+            part_scan(part, scenario.visible, poses, *seen[part.sees], part_key)
+            for part, part_key in zip(
+                scenario.sensor.parts,
+                jax.random.split(key_scan, len(scenario.sensor.parts)),
+                strict=True,
+            )
+        ]
+        scan, missed = side_by_side(scans, len(scenario.sensor.measurements))
+        return Truth(poses, landmarks, missed, start), Log(logged, scan)
+    places = scenario.places or landmarks.shape[0]
+    scan, missed = scans_of(
+        scenario.sensor, scenario.visible, places, poses, landmarks, None, key_scan
+    )
+    truth = Truth(poses, landmarks, missed, start)
+    if scenario.spurious is not None:
+        wrong = partial(spoil, scenario.spurious, scenario.sensor)
+        scan, origin = jax.vmap(wrong)(poses, scan, jax.random.split(key_spoil, scenario.steps))
+        truth = truth._replace(origin=origin)
+    return truth, Log(logged, scan)
+
+
+def scans_of(
+    sensor: Sensor,
+    visible: Callable[[jax.Array, jax.Array], jax.Array],
+    places: int,
+    poses: jax.Array,
+    targets: jax.Array,
+    on: jax.Array | None,
+    key: jax.Array,
+) -> tuple[Scan, jax.Array]:
+    """Scans with leading T of one sensor, and how many targets in view had no place, (T,).
+
+    poses (T, 3); targets (C, L), or (T, C, L) where they move; tags are their rows. on: (T,) bool,
+    when it measures, None for always.
+    """
+    count = targets.shape[-2]
+    places = min(places, count)
+    by_time = None if targets.ndim == 2 else 0
+    seen = jax.vmap(jax.vmap(visible, (None, 0)), (0, by_time))(poses, targets)
+    if on is not None:
+        seen = seen & on[:, None]
+    if places < count:
+        tag = jnp.argsort(~seen, axis=1, stable=True)[:, :places]
+        valid = jnp.take_along_axis(seen, tag, axis=1)
+    else:
+        tag, valid = jnp.broadcast_to(jnp.arange(count), seen.shape), seen
+    keys = jax.random.split(key, poses.shape[0])
+
+    def measure(pose: jax.Array, tags: jax.Array, targets: jax.Array, key: jax.Array) -> jax.Array:
+        exact = jax.vmap(sensor.observe, (None, 0))(pose, targets[tags])
+        noise = jax.vmap(_draw)(jax.vmap(sensor.noise_cov)(exact), _normals(key, exact))
+        return jax.vmap(sensor.residual)(exact + noise, jnp.zeros_like(exact))
+
+    z = jax.vmap(measure, (0, 0, by_time, 0))(poses, tag, targets, keys)
+    scan = Scan(
+        z=jnp.where(valid[:, :, None], z, 0.0),
+        tag=jnp.where(valid, tag, -1).astype(jnp.int32),
+        valid=valid,
+    )
+    return scan, seen.sum(axis=1) - valid.sum(axis=1)
+
+
+def part_scan(
+    part: Part,
+    visible: Callable[[jax.Array, jax.Array], jax.Array],
+    poses: jax.Array,
+    targets: jax.Array,
+    tags: jax.Array,
+    key: jax.Array,
+) -> tuple[Scan, jax.Array]:
+    """`scans_of` the sensor of a part, in its places and at its rate; tags (C,) of the targets.
+
+    An absolute sensor has no tag. Without targets nothing is measured.
+    """
+    step = jnp.arange(poses.shape[0])
+    if targets.shape[-2] == 0:
+        z = jnp.zeros((len(poses), part.places, len(part.sensor.measurements)), poses.dtype)
+        none = jnp.zeros(z.shape[:2], bool)
+        return Scan(z, jnp.full(none.shape, -1, jnp.int32), none), jnp.zeros_like(step)
+    on = (step >= part.start) & ((step - part.start) % part.every == 0)
+    if part.absolute:
+        nothing = jnp.zeros((1, 0), poses.dtype)
+        scan, missed = scans_of(part.sensor, everywhere, 1, poses, nothing, on, key)
+        return scan._replace(tag=jnp.full_like(scan.tag, -1)), missed
+    field = visible if part.visible is None else part.visible
+    scan, missed = scans_of(part.sensor, field, part.places, poses, targets, on, key)
+    tag = jnp.where(scan.valid, tags[jnp.maximum(scan.tag, 0)], -1).astype(jnp.int32)
+    spare = part.places - tag.shape[1]
+    if spare > 0:  # more places than there are targets
+        scan = Scan(
+            z=jnp.pad(scan.z, [(0, 0), (0, spare), (0, 0)]),
+            tag=jnp.pad(tag, [(0, 0), (0, spare)], constant_values=-1),
+            valid=jnp.pad(scan.valid, [(0, 0), (0, spare)]),
+        )
+        return scan, missed
+    return scan._replace(tag=tag), missed
+
+
+def side_by_side(scans: list[tuple[Scan, jax.Array]], size_z: int) -> tuple[Scan, jax.Array]:
+    """One scan of all places, z padded with zeros to size_z; what had no place, added up."""
+    z = [jnp.pad(s.z, [(0, 0), (0, 0), (0, size_z - s.z.shape[2])]) for s, _ in scans]
+    scan = Scan(
+        z=jnp.concatenate(z, axis=1),
+        tag=jnp.concatenate([s.tag for s, _ in scans], axis=1),
+        valid=jnp.concatenate([s.valid for s, _ in scans], axis=1),
+    )
+    return scan, jnp.stack([missed for _, missed in scans]).sum(axis=0)
+
+
+def drawn_near(pose: jax.Array, cov: ArrayLike, key: jax.Array) -> jax.Array:
+    """A pose (3,) from the normal distribution of that mean and covariance (3, 3)."""
+    start = pose + _draw(jnp.asarray(cov, pose.dtype), _normals(key, pose))
+    return start.at[2].set(wrap(start[2]))
+
+
+def drive(
+    motion: Motion,
+    start: jax.Array,
+    controls: jax.Array,
+    key: jax.Array,
+    noise_on: str = "robot",
+) -> tuple[jax.Array, jax.Array]:
+    """True poses (T, 3) and the controls (T, U) that the robot's log shows."""
+    normals = _normals(key, jnp.zeros((controls.shape[0], len(motion.noises)), controls.dtype))
+
+    def step(
+        pose: jax.Array, row: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        u, normal = row
+        w = _draw(motion.noise_cov(pose, u), normal)
+        if noise_on == "robot":
+            pose = motion.step(pose, u, w)
+            return pose, (pose, u)
+        assert motion.perturb is not None
+        pose = motion.step(pose, u, jnp.zeros_like(w))
+        return pose, (pose, motion.perturb(u, w))
+
+    _, history = jax.lax.scan(step, start, (controls, normals))
+    return history
+
+
+def _normals(key: jax.Array, like: jax.Array) -> jax.Array:
+    return jax.random.normal(key, like.shape, like.dtype)
+
+
+def _draw(cov: jax.Array, normal: jax.Array) -> jax.Array:
+    """N(0, cov) from standard normals; cov may be singular or zero."""
+    return root_psd(cov) @ normal
+
+
+def _check_table(name: str, values: ArrayLike, columns: int) -> None:
+    shape = np.shape(values)
+    if len(shape) == 2 and shape[1] == columns and shape[0] > 0 and not is_concrete(values):
+        return  # a tracer, as when maps are drawn under vmap
+    table = np.asarray(values)
+    if table.ndim != 2 or table.shape[1] != columns or table.shape[0] == 0:
+        raise ValueError(f"{name}: expected shape (at least 1, {columns}), got {table.shape}")
+    if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
+        raise ValueError(f"{name}: expected finite numbers")

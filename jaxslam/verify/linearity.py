@@ -1,0 +1,184 @@
+"""How far a model bends where its input may lie: second order, since that is where EKFs fail."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam.math.linalg import check_covariance, is_concrete, root_psd
+from jaxslam.protocols import Motion, Sensor
+
+_DIRECTIONS = 64
+_RADII = (1.0, 0.5)
+
+
+class Linearity(NamedTuple):
+    """0 is linear; 1 bends as far as it rises; inf bends where it has no (finite) slope."""
+
+    hessian: jax.Array
+    """() the worst output, to second order"""
+    sampled: jax.Array
+    """() the worst output, by trying points of the region"""
+    hessian_rows: jax.Array
+    """(m,) one an output"""
+    sampled_rows: jax.Array
+    """(m,)"""
+
+
+def linearity_index(
+    f: Callable[[jax.Array], jax.Array],
+    x: ArrayLike,
+    cov: ArrayLike,
+    *,
+    sigmas: float = 3.0,
+    residual: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
+    noise_cov: ArrayLike | None = None,
+) -> Linearity:
+    """How far f: (n,) -> (m,) departs from its linearization within n_σ sigmas of x ~ N(x, P).
+
+    With P = L Lᵀ, the region |ξ| <= n_σ of x + Lξ (Solà's probability concentration region, 2.3.5
+    and fig. 6), Jacobian J and Hessians H_i at x, an output's index is its largest bend over its
+    largest linear change,
+
+        index_i = sup |f_i(x + Lξ) - f_i(x) - J_i Lξ| / (n_σ √(J_i P J_iᵀ + R_ii)),
+
+    the supremum once to second order, (n_σ²/2)‖Lᵀ H_i L‖₂, and once as the maximum over points of
+    the region: along ± each axis and ± each eigenvector of Lᵀ H_i L, and in 64 fixed random
+    directions, at n_σ and n_σ/2. It has no unit, and changing those of x changes nothing. R, where
+    given, is the noise that is added to f: a bend below it does no harm. (Civera, Davison & Montiel
+    2008 use a related index, along the line of sight.)
+
+    Traceable: wrap it in `jax.jit`, or in `jax.vmap` over states.
+
+    Args:
+        f: the function; called with (n,).
+        x: (n,) the state.
+        cov: (n, n) P, may be singular.
+        sigmas: n_σ.
+        residual: (y, y0) -> y ⊖ y0, where an output is on a circle.
+        noise_cov: (m, m) R.
+    Raises:
+        ValueError: if cov or noise_cov is no covariance of the right size, or sigmas not above 0.
+    """
+    point = _vector("linearity_index: state", x)
+    if is_concrete(point) and not np.all(np.isfinite(np.asarray(point))):
+        raise ValueError("linearity_index: the state is not finite")
+    check_covariance("linearity_index: cov", cov, point.shape[0])
+    shape = jax.eval_shape(f, point).shape
+    if len(shape) != 1:
+        raise ValueError(f"linearity_index: expected f to return (m,), got shape {shape}")
+    if is_concrete(sigmas) and not 0 < sigmas < np.inf:
+        raise ValueError(f"linearity_index: expected sigmas above 0, got {sigmas}")
+    root = root_psd(jnp.asarray(cov, point.dtype))
+
+    def g(xi: jax.Array) -> jax.Array:
+        return f(point + root @ xi)
+
+    zero = jnp.zeros_like(point)
+    jacobian, bend = jax.jacfwd(f)(point), jax.jacfwd(jax.jacfwd(g))(zero)
+    slope = jacobian @ root
+    rows = slope.shape[0]
+    reach2 = jnp.sum(slope**2, axis=1)
+    if noise_cov is not None:
+        check_covariance("linearity_index: noise_cov", noise_cov, rows)
+        reach2 = reach2 + jnp.diagonal(jnp.asarray(noise_cov, point.dtype))
+    smooth = jnp.isfinite(bend).all(axis=(1, 2))
+    values, vectors = jnp.linalg.eigh(jnp.where(smooth[:, None, None], bend, 0.0))  # (m, n, n)
+    by_hessian = sigmas**2 / 2 * jnp.max(jnp.abs(values), axis=1, initial=0.0)
+    by_hessian = jnp.where(smooth, by_hessian, jnp.inf)
+
+    axes = jnp.concatenate([jnp.eye(len(zero), dtype=point.dtype), _fixed(len(zero), point.dtype)])
+    own = jnp.swapaxes(jax.lax.stop_gradient(vectors), 1, 2).reshape(-1, len(zero))
+    directions = jnp.concatenate([axes, own])
+    tries = jnp.concatenate([sign * r * directions for r in _RADII for sign in (1, -1)]) * sigmas
+    centre, difference = g(zero), residual or jnp.subtract
+    away = jax.vmap(lambda xi: difference(g(xi), centre) - slope @ xi)(tries)
+    if residual is not None:  # a change by more than half a turn is one the other way round
+        away = jax.vmap(lambda gap: difference(gap, jnp.zeros_like(gap)))(away)
+    by_sampling = jnp.max(jnp.abs(away), axis=0, initial=0.0)
+    # What rounding of f, and of the points themselves, can do is no bend.
+    moved = jnp.abs(centre) + jnp.abs(tries @ slope.T).max(axis=0)
+    rounding = 16 * jnp.finfo(point.dtype).eps * (moved + jnp.abs(jacobian) @ jnp.abs(point))
+    by_sampling = jnp.where(by_sampling <= rounding, 0.0, by_sampling)
+
+    index, sampled = (_over(part, sigmas, reach2) for part in (by_hessian, by_sampling))
+    return Linearity(index.max(initial=0.0), sampled.max(initial=0.0), index, sampled)
+
+
+def motion_linearity(
+    motion: Motion, pose: ArrayLike, u: ArrayLike, pose_cov: ArrayLike, *, sigmas: float = 3.0
+) -> Linearity:
+    """`linearity_index` of `step` by pose and noise, covariance blockdiag(pose_cov, Q(pose, u))."""
+    at = _vector("motion_linearity: pose", pose, 3)
+    control = _vector("motion_linearity: u", u, len(motion.controls)).astype(at.dtype)
+    check_covariance("motion_linearity: pose_cov", pose_cov, 3)
+    noise = motion.noise_cov(at, control)
+    cov = jax.scipy.linalg.block_diag(jnp.asarray(pose_cov, at.dtype), noise)
+    x = jnp.concatenate([at, jnp.zeros(noise.shape[0], at.dtype)])
+
+    def heading_wrapped(y: jax.Array, y0: jax.Array) -> jax.Array:
+        turn = 2 * np.pi
+        off = y - y0
+        return off.at[2].add(-turn * jnp.round(off[2] / turn))
+
+    return linearity_index(
+        lambda x: motion.step(x[:3], control, x[3:]),
+        x,
+        cov,
+        sigmas=sigmas,
+        residual=heading_wrapped,
+    )
+
+
+def sensor_linearity(
+    sensor: Sensor,
+    pose: ArrayLike,
+    landmark: ArrayLike,
+    cov: ArrayLike,
+    *,
+    sigmas: float = 3.0,
+    with_noise: bool = False,
+) -> Linearity:
+    """`linearity_index` of `observe` by pose and landmark, covariance cov (3+L, 3+L).
+
+    with_noise: whether a bend below the sensor's own noise counts as none (R in the reach).
+    """
+    at = _vector("sensor_linearity: pose", pose, 3)
+    own = _vector("sensor_linearity: landmark", landmark, len(sensor.landmark))
+    x = jnp.concatenate([at, own.astype(at.dtype)])
+    noise = sensor.noise_cov(sensor.observe(x[:3], x[3:])) if with_noise else None
+    return linearity_index(
+        lambda x: sensor.observe(x[:3], x[3:]),
+        x,
+        cov,
+        sigmas=sigmas,
+        residual=sensor.residual,
+        noise_cov=noise,
+    )
+
+
+def _vector(name: str, value: ArrayLike, size: int | None = None) -> jax.Array:
+    """As floating point, (n,); ValueError where it is not."""
+    out = jnp.asarray(value)
+    if out.ndim != 1 or size not in (None, out.shape[0]):
+        expected = "(n,)" if size is None else f"({size},)"
+        raise ValueError(f"{name}: expected shape {expected}, got {out.shape}")
+    return out.astype(jnp.result_type(out, float))
+
+
+def _over(bend: jax.Array, sigmas: float, reach2: jax.Array) -> jax.Array:
+    """bend / (n_σ √reach²); 0/0 = 0, and inf where there is a bend alone or f is not finite."""
+    defined = jnp.isfinite(bend) & jnp.isfinite(reach2)
+    flat = defined & (reach2 == 0)
+    bend, reach2 = jnp.where(defined, bend, 0.0), jnp.where(defined & ~flat, reach2, 1.0)
+    ratio = jnp.where(flat & (bend > 0), jnp.inf, bend / (sigmas * jnp.sqrt(reach2)))
+    return jnp.where(defined, jnp.where(flat & (bend == 0), 0.0, ratio), jnp.inf)
+
+
+def _fixed(n: int, dtype: Any) -> jax.Array:
+    """Directions (64, n), the same every time."""
+    draws = np.random.default_rng(0).normal(size=(_DIRECTIONS, n))
+    return jnp.asarray(draws / np.linalg.norm(draws, axis=1, keepdims=True), dtype)
