@@ -25,13 +25,26 @@ ROOM = 0.8, 1.3
 after a test."""
 
 HEAVY = tuple(
-    f"tests/{name}.py"
-    for name in (
-        *("test_monte_carlo", "test_delayed", "test_team", "test_family", "test_fastslam"),
-        *("test_programs", "test_cli", "equivalence/test_information", "test_gradients"),
-        *("test_suite", "test_seif", "test_eseif", "test_spurious", "test_wild", "test_reduction"),
-        *("equivalence/test_ekf", "test_particle_localization", "test_smoothing", "test_readme"),
+    f"tests/{folder}/test_{name}.py"
+    for folder, names in (
+        ("monte_carlo", "monte_carlo"),
+        ("filters/delayed", "delayed_slam"),
+        ("filters/multi_robot", "team_slam"),
+        ("consistency", "catalog"),
+        ("filters/particles", "fastslam"),
+        ("programs", "programs"),
+        ("cli", "cli"),
+        ("equivalence", "information"),
+        ("filters/ekf", "gradients"),
+        ("models", "suite"),
+        ("filters/information", "seif eseif"),
+        ("simulation", "spurious"),
+        ("filters/ekf", "wild to_points"),
+        ("equivalence", "ekf"),
+        ("filters/particles", "particle_localization"),
+        ("smoothing", "smoothing"),
     )
+    for name in names.split()
 )
 """Files in the order in which they start; what is not here comes afterwards, as collected."""
 

@@ -45,6 +45,14 @@ def scaled(scale: float, steps: int = 20) -> Scenario:
     )
 
 
+def three_parameters():
+    """A world whose landmarks are (x, y, signature)."""
+    world = ring(steps=5)
+    landmarks = np.concatenate([world.landmarks, np.ones((6, 1))], axis=1)
+    sensor = sensors.range_bearing_signature(np.eye(3) * 0.01)
+    return dataclasses.replace(world, sensor=sensor, landmarks=landmarks)
+
+
 def campaign(scenario, candidates, runs):
     """In blocks of four, on one device, with the bound: by the programs of `test_monte_carlo`, where
     the scenario is the ring of 100 steps."""

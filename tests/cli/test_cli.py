@@ -7,7 +7,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from test_family import three_parameters
+from worlds import three_parameters
 
 from jaxslam import catalog, cli, report, store
 from jaxslam.cli import asking

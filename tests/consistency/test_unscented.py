@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_family import around, drive_watched
+from test_catalog import around, drive_watched
 
 from jaxslam import linearize
 from jaxslam.linearize.unscented import by_variables, regress

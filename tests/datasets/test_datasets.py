@@ -19,7 +19,7 @@ from jaxslam.filters import ekf_slam
 from jaxslam.math import linalg
 from jaxslam.types import Status
 
-DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
 def folder(name):

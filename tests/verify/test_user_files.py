@@ -9,7 +9,7 @@ import pytest
 from jaxslam.cli import main
 from jaxslam.verify import user_files
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture

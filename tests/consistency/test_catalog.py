@@ -321,18 +321,10 @@ def test_information_filters_stand_beside_the_family():
 # --- refusals -----------------------------------------------------------------------------------
 
 
-def three_parameters():
-    """A world whose landmarks are (x, y, signature)."""
-    world = worlds.ring(steps=5)
-    landmarks = np.concatenate([world.landmarks, np.ones((6, 1))], axis=1)
-    sensor = sensors.range_bearing_signature(np.eye(3) * 0.01)
-    return dataclasses.replace(world, sensor=sensor, landmarks=landmarks)
-
-
 @pytest.mark.parametrize("name", ["fej", "oc", "right_invariant", "left_invariant", "robocentric"])
 def test_variants_for_points_refuse_other_landmarks(name):
     with pytest.raises(ValueError, match=r"range_bearing_signature"):
-        catalog.FILTERS[name](three_parameters())
+        catalog.FILTERS[name](worlds.three_parameters())
 
 
 @pytest.mark.parametrize(

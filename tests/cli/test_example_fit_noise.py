@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "fit_noise.py"
-MRCLAM = Path(__file__).parents[2] / "shared" / "data" / "mrclam1"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "fit_noise.py"
+MRCLAM = Path(__file__).parents[3] / "shared" / "data" / "mrclam1"
 
 
 @pytest.fixture(scope="module")
