@@ -143,6 +143,8 @@ class Info(NamedTuple):
     that is lost."""
     capped: Any = ()
     """() bool: the wanted number of particles was above the capacity."""
+    extra: dict[str, Any] | None = None
+    """what one family, or one wrapper of a filter, alone says: its record by its name."""
 
     @property
     def overflow(self) -> jax.Array:

@@ -142,8 +142,36 @@ def nothing_of(scan: Scan) -> Info:
     )
 
 
+def joined(infos: list[Info], size_z: int) -> Info:
+    """One info of all places; innovations and their covariances padded with zeros to size_z."""
+
+    def together(name: str, padded_axes: int = 0) -> jax.Array:
+        values = [getattr(info, name) for info in infos]
+        wide = [
+            jnp.pad(value, [(0, 0)] + [(0, size_z - value.shape[-1])] * padded_axes)
+            for value in values
+        ]
+        return jnp.concatenate(wide)
+
+    return Info(
+        nis=together("nis"),
+        dof=together("dof"),
+        innovation=together("innovation", 1),
+        innovation_cov=together("innovation_cov", 2),
+        slot=together("slot"),
+        status=together("status"),
+        log_likelihood=jnp.stack([info.log_likelihood for info in infos]).sum(),
+        exhausted=jnp.stack([jnp.asarray(info.exhausted) for info in infos]).any(),
+    )
+
+
 def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
     """Whether the same non-negative tag occurs at an earlier place, (M,)."""
     earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
     same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
     return (same & earlier).any(axis=1)
+
+
+def with_extra(info: Info, name: str, record: Any) -> Info:
+    """The info with a record of what one family or wrapper alone says, by its name."""
+    return info._replace(extra={**(info.extra or {}), name: record})

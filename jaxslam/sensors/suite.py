@@ -1,6 +1,7 @@
 """Several sensors on one robot, each with its own model, mount, rate and places of a scan."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NoReturn
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 
 from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Free, Sensor
+from jaxslam.types import Scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +119,20 @@ def _part(given: Any) -> Part:
     if not isinstance(given, tuple) or len(given) != 2:
         raise ValueError(f"suite: expected a Part or (sensor, places), got {given!r}")
     return Part(*given)
+
+
+def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
+    """The scan (M,) divided into the places of each sensor, in order.
+
+    Raises ValueError unless the scan has as many places as the sensors together.
+    """
+    if sum(places) != scan.tag.shape[0]:
+        raise ValueError(f"expected places {tuple(places)} of a scan, got {scan.tag.shape[0]}")
+    ends = list(itertools.accumulate(places))
+    return [
+        jax.tree.map(lambda leaf, first=end - count, end=end: leaf[first:end], scan)
+        for end, count in zip(ends, places, strict=True)
+    ]
 
 
 def on_ground(sensor: Sensor, size: int) -> Sensor:

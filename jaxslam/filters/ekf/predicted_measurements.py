@@ -3,12 +3,12 @@
 import jax
 import jax.numpy as jnp
 
+from jaxslam.association.predicted import predicted
 from jaxslam.filters.ekf.to_points import at_slot
 from jaxslam.math import linalg
 from jaxslam.math.xla import settle
-from jaxslam.protocols import Basis, Chart, Here, Linearizer, Pairs, Prediction, Sensor
+from jaxslam.protocols import Basis, Chart, Here, Linearizer, Prediction, Sensor
 from jaxslam.slots import Joint
-from jaxslam.types import Scan
 
 
 def prediction_of(
@@ -45,22 +45,9 @@ def prediction_of(
         alone = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in range(3 + size))
         return expected, by_pose, by_landmark, settle(alone + rest)
 
-    def pairs(scan: Scan) -> Pairs:
+    def measurements() -> tuple[jax.Array, jax.Array]:
         expected, _, _, own = slopes()
-        noise = jax.vmap(sensor.noise_cov)(scan.z)
-        over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
-        innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
-        cov = own[None] + noise[:, None]
-
-        def weigh(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            factor, positive = linalg.cholesky(cov)
-            pivots = jnp.diagonal(factor)
-            log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
-            return (linalg.solve_lower(factor, nu) ** 2).sum(), log_det, positive
-
-        distance, log_det, positive = jax.vmap(jax.vmap(weigh))(innovation, cov)
-        possible = scan.valid[:, None] & joint.alive[None, :] & positive
-        return Pairs(innovation, cov, distance, log_det, possible)
+        return expected, own
 
     def cross() -> jax.Array:
         _, by_pose, by_landmark, _ = slopes()
@@ -71,7 +58,7 @@ def prediction_of(
             hp = hp + by_landmark[:, :, k, None] * rows[:, None, k]
         return innovation_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
 
-    return Prediction(joint.tag, joint.alive, pairs, cross)
+    return predicted(sensor, joint.tag, joint.alive, measurements, cross)
 
 
 def _blocks(joint: Joint, square_root: bool) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -11,10 +11,10 @@ from jaxslam import slots
 from jaxslam.filters.ekf.augmentation import augment
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.update import correct, correct_in_turn
-from jaxslam.filters.reporting import info_of, nothing_of, seen_before, status_of
+from jaxslam.filters.reporting import info_of, joined, nothing_of, seen_before, status_of
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Association, Chart, Life, Linearizer, Sensor
-from jaxslam.sensors.suite import Part, Suite, on_ground
+from jaxslam.sensors.suite import Part, Suite, on_ground, split_scan
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
 
@@ -196,38 +196,10 @@ def in_order(
     """
     if len(parts) == 1 and parts[0][0] == -1:
         return parts[0][1](joint, scan)
-    if sum(places for places, _ in parts) != scan.tag.shape[0]:
-        wanted = tuple(places for places, _ in parts)
-        raise ValueError(f"expected places {wanted} of a scan, got {scan.tag.shape[0]}")
-    infos, at = [], 0
-    given_up = jnp.zeros_like(joint.alive)
-    for places, update in parts:
-        own: Scan = jax.tree.map(lambda leaf, a=at, n=places: leaf[a : a + n], scan)
+    infos, given_up = [], jnp.zeros_like(joint.alive)
+    places = [count for count, _ in parts]
+    for own, (_, update) in zip(split_scan(scan, places), parts, strict=True):
         joint, info, gone = update(joint, own)
         infos.append(info)
         given_up = given_up | gone
-        at += places
     return joint, joined(infos, scan.z.shape[1]), given_up
-
-
-def joined(infos: list[Info], size_z: int) -> Info:
-    """One info of all places; innovations and their covariances padded with zeros to size_z."""
-
-    def together(name: str, padded_axes: int = 0) -> jax.Array:
-        values = [getattr(info, name) for info in infos]
-        wide = [
-            jnp.pad(value, [(0, 0)] + [(0, size_z - value.shape[-1])] * padded_axes)
-            for value in values
-        ]
-        return jnp.concatenate(wide)
-
-    return Info(
-        nis=together("nis"),
-        dof=together("dof"),
-        innovation=together("innovation", 1),
-        innovation_cov=together("innovation_cov", 2),
-        slot=together("slot"),
-        status=together("status"),
-        log_likelihood=jnp.stack([info.log_likelihood for info in infos]).sum(),
-        exhausted=jnp.stack([jnp.asarray(info.exhausted) for info in infos]).any(),
-    )

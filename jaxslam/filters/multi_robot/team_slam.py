@@ -12,9 +12,10 @@ from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import ScanUpdate, in_order, joined, part_update
+from jaxslam.filters.ekf.scan import ScanUpdate, in_order, part_update
 from jaxslam.filters.multi_robot.joining import SIZE, best_way, entered, points_seen, sees_in_full
 from jaxslam.filters.multi_robot.pose_initialization import Entry
+from jaxslam.filters.reporting import joined
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap

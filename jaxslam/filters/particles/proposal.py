@@ -4,21 +4,20 @@ Everything here acts on one particle, pose (3,), landmarks (N, L) and their cova
 `filters.fastslam` vmaps it.
 """
 
-import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxslam import derivatives
+from jaxslam.association.predicted import predicted
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Associate, Association, Pairs, Prediction, Sensor
+from jaxslam.math.gaussians import LOG_2PI, log_det_of
+from jaxslam.protocols import Associate, Association, Prediction, Sensor
 from jaxslam.types import Scan
 
 Array = jax.Array
-
-_LOG_2PI = math.log(2 * math.pi)
 
 
 class Sight(NamedTuple):
@@ -102,8 +101,8 @@ def look(
         x = jnp.concatenate([x[:2], wrap(x[2:])])
         p = p - linalg.gram(v, v)
         clipped = nis if gate is None else jnp.where(inside, nis, gate)
-        seen = -0.5 * (clipped + _log_det(factor) + len(nu) * _LOG_2PI)
-        other = -0.5 * (edge + _log_det(linalg.cholesky(noise)[0]) + len(nu) * _LOG_2PI)
+        seen = -0.5 * (clipped + log_det_of(factor) + len(nu) * LOG_2PI)
+        other = -0.5 * (edge + log_det_of(linalg.cholesky(noise)[0]) + len(nu) * LOG_2PI)
         of_map = matched & positive
         fit = fit + jnp.where(of_map, seen, 0.0)
         rest = rest + jnp.where(valid & ~of_map, other, 0.0)
@@ -135,11 +134,6 @@ def look(
     return pose, pose_cov, fit, rest, sight
 
 
-def _log_det(factor: Array) -> Array:
-    pivots = jnp.diagonal(factor)
-    return 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
-
-
 def _prediction(
     pose: Array,
     pose_cov: Array,
@@ -161,21 +155,10 @@ def _prediction(
 
         return jax.vmap(one)(landmarks, covs)
 
-    def pairs(scan: Scan) -> Pairs:
+    def measurements() -> tuple[Array, Array]:
         expected, by_pose, own = slopes()
         robot = jax.vmap(lambda h: linalg.matmul(linalg.matmul(h, pose_cov), h.T))(by_pose)
-        noise = jax.vmap(sensor.noise_cov)(scan.z)
-        over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
-        innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
-        cov = linalg.symmetrize((robot + own)[None] + noise[:, None])
-
-        def weigh(nu: Array, cov: Array) -> tuple[Array, Array, Array]:
-            factor, positive = linalg.cholesky(cov)
-            return (linalg.solve_lower(factor, nu) ** 2).sum(), _log_det(factor), positive
-
-        distance, log_det, positive = jax.vmap(jax.vmap(weigh))(innovation, cov)
-        possible = scan.valid[:, None] & alive[None, :] & positive
-        return Pairs(innovation, cov, distance, log_det, possible)
+        return expected, linalg.symmetrize(robot + own)
 
     def cross() -> Array:
         _, by_pose, own = slopes()
@@ -183,4 +166,4 @@ def _prediction(
         every = jnp.arange(alive.shape[0])
         return shared.at[every, :, every, :].add(own)
 
-    return Prediction(tag, alive, pairs, cross)
+    return predicted(sensor, tag, alive, measurements, cross)
