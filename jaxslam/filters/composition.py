@@ -52,12 +52,11 @@ def moved_anew(
     h = (lever_of_motion(composed, chart) - moved.times(lever)).T
     cov_last = moved.times(joint.last.cov.T).T
     half = cov_last + 0.5 * linalg.matmul(joint.last.own, h)
-    change_cov = linalg.gram(jnp.concatenate([h, half]), jnp.concatenate([half, h]))
     watch = joint.watch
     if watch:
         watch = watch._replace(directions=moved.times(watch.directions))
     return composed._replace(
-        cov=linalg.symmetrize(moved_cov(joint.cov, moved, None) + change_cov),
+        cov=moved_cov(joint.cov, moved, None, (h, half)),
         watch=watch,
         last=composed.last._replace(cov=cov_last + linalg.matmul(joint.last.own, h)),
     )

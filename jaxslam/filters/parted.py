@@ -16,6 +16,7 @@ from jaxslam.filters.weighing import Correction, view_of, weigh
 from jaxslam.linearize.first_order import turned
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint, Last
+from jaxslam.staging import settle
 
 Retract = Callable[[Chart, Joint, jax.Array], tuple[jax.Array, jax.Array]]
 
@@ -55,9 +56,9 @@ def part(joint: Joint, chart: Chart) -> Parted:
     last, lever = joint.last, lever_of_motion(joint, chart).T
     shared = linalg.matmul(last.own, lever)
     half = last.cov - 0.5 * shared
-    change = linalg.gram(jnp.concatenate([lever, half]), jnp.concatenate([half, lever]))
+    change = linalg.gram_both(*settle((lever, half)))
     cross = last.cov - shared
-    top = jnp.concatenate([linalg.symmetrize(joint.cov - change), cross.T], axis=1)
+    top = jnp.concatenate([joint.cov - change, cross.T], axis=1)
     bottom = jnp.concatenate([cross, last.own], axis=1)
     rest = joint._replace(cov=jnp.concatenate([top, bottom]), last=())
     return Parted(rest, last.frame, jnp.zeros_like(joint.pose))
@@ -86,13 +87,12 @@ def whole(parted: Parted, chart: Chart) -> Joint:
     cross = found.moved.times(rest.cov[size:, :size].T).T
     shared = linalg.matmul(own, lever)
     half = cross + 0.5 * shared
-    change = linalg.gram(jnp.concatenate([lever, half]), jnp.concatenate([half, lever]))
-    cov = moved_cov(rest.cov[:size, :size], found.moved, None) + change
+    cov = moved_cov(rest.cov[:size, :size], found.moved, None, (lever, half))
     watch = rest.watch
     if watch:
         watch = watch._replace(directions=found.moved.times(watch.directions))
     last = Last(parted.frame, cross + shared, own)
-    return rest._replace(pose=found.pose, cov=linalg.symmetrize(cov), watch=watch, last=last)
+    return rest._replace(pose=found.pose, cov=cov, watch=watch, last=last)
 
 
 def correct_one(
