@@ -128,11 +128,10 @@ def correct_in_turn(
     measurement at a time, for forms of the update that need all of P.
     """
     whole = joseph or square_root
-    one_by_one = whole or chart.motion_apart
     m, size_l = z.shape[0], joint.landmarks.shape[1]
     size = joint.cov.shape[1]
     cached = size <= _CACHED
-    group = 1 if one_by_one else max(1, min(_GROUP if cached else _GROUP_BEYOND, m))
+    group = 1 if whole else max(1, min(_GROUP if cached else _GROUP_BEYOND, m))
     groups = -(-m // group)
 
     def padded(part: jax.Array) -> jax.Array:
@@ -199,7 +198,7 @@ def correct_in_turn(
     if whole:
         return in_groups(one_of_all, joint)
     if chart.motion_apart and joint.last:
-        work = partial(parted.correct_one, chart=chart, retracted=retracted, **options)
+        work = partial(parted.correct_group, chart=chart, retracted=retracted, **options)
 
         def with_motion(joint: Joint) -> tuple[Joint, Correction]:
             rest, done = in_groups(work, parted.part(joint, chart))
