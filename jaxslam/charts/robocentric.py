@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from jaxslam import se2
 from jaxslam.angles import wrap
+from jaxslam.linalg import matmul
 from jaxslam.protocols import Basis, Chart
 
 
@@ -36,6 +37,6 @@ def robocentric() -> Chart:
     def basis(pose: jax.Array, landmark: jax.Array) -> Basis:
         (by_origin,) = se2.inverse_jacobians(se2.inverse(pose))
         by_frame, by_point = se2.from_frame_jacobians(pose, se2.to_frame(pose, landmark))
-        return Basis(pose=by_origin, cross=by_frame @ by_origin, landmark=by_point)
+        return Basis(pose=by_origin, cross=matmul(by_frame, by_origin), landmark=by_point)
 
     return Chart(name="robocentric", retract=retract, local=local, basis=basis, motion_apart=True)

@@ -19,10 +19,10 @@ def lever_of_motion(joint: Joint, chart: Chart) -> jax.Array:
     """g (D, 3): what an error of the last motion, in its own frame, does to all errors."""
     assert chart.basis is not None
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
-    robot = linalg.inverse(basis.pose[0]) @ out_of(joint.last.frame)
-    own = -basis.cross @ robot
+    robot = linalg.matmul(linalg.inverse(basis.pose[0]), out_of(joint.last.frame))
+    own = -jax.vmap(linalg.matmul, in_axes=(0, None))(basis.cross, robot)
     if basis.landmark is not None:
-        own = jnp.einsum("nij,njk->nik", jax.vmap(linalg.inverse)(basis.landmark), own)
+        own = jax.vmap(linalg.matmul)(jax.vmap(linalg.inverse)(basis.landmark), own)
     own = jnp.where(joint.alive[:, None, None], own, 0.0)
     return jnp.concatenate([robot, own.reshape(-1, 3)])
 
@@ -41,7 +41,7 @@ def moved_anew(
     """
     assert chart.basis is not None
     frame = joint.last.frame + turn
-    change = out_of(frame) @ step
+    change = linalg.matmul(out_of(frame), step[:, None])[:, 0]
     pose = joint.pose + change
     pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))

@@ -69,7 +69,7 @@ def compose(parted: Parted, chart: Chart) -> Composition:
     """The motion with its step, put behind the rest."""
     assert chart.basis is not None
     rest, frame = parted.rest, parted.frame
-    change = out_of(frame) @ parted.step
+    change = linalg.matmul(out_of(frame), parted.step[:, None])[:, 0]
     pose = rest.pose + change
     pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))

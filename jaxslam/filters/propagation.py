@@ -96,16 +96,18 @@ class Transition(NamedTuple):
 
 def in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array) -> Transition:
     """E(x')⁻¹ F E(x) and E(x')⁻¹ by blocks, dead slots standing still."""
+    times = jax.vmap(linalg.matmul, in_axes=(0, None))
+    each = jax.vmap(linalg.matmul)
     undo = linalg.inverse(after.pose[0])
-    robot = undo @ by_pose @ before.pose[0]
-    cross = before.cross - after.cross @ robot
-    cross_noise = -after.cross @ undo
+    robot = linalg.matmul(linalg.matmul(undo, by_pose), before.pose[0])
+    cross = before.cross - times(after.cross, robot)
+    cross_noise = -times(after.cross, undo)
     landmark = None
     if before.landmark is not None and after.landmark is not None:
         own = jax.vmap(linalg.inverse)(after.landmark)
         still = jnp.eye(own.shape[-1], dtype=own.dtype)
-        landmark = jnp.where(alive[:, None, None], own @ before.landmark, still)
-        cross, cross_noise = own @ cross, own @ cross_noise
+        landmark = jnp.where(alive[:, None, None], each(own, before.landmark), still)
+        cross, cross_noise = each(own, cross), each(own, cross_noise)
     cross, cross_noise = (jnp.where(alive[:, None, None], m, 0.0) for m in (cross, cross_noise))
     return settle(Transition(robot, cross, landmark, undo, cross_noise))
 
