@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxslam import linalg
 from jaxslam.angles import wrap
-from jaxslam.filters.composition import lever_of_motion, out_of
+from jaxslam.filters.composition import lever_by, lever_of_motion, out_of
 from jaxslam.filters.propagation import Transition, in_charts, moved_cov
 from jaxslam.filters.watching import informed
 from jaxslam.filters.weighing import Correction, view_of, weigh
@@ -75,9 +75,8 @@ def compose(parted: Parted, chart: Chart) -> Composition:
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before, after = over_map(rest.pose, rest.landmarks), over_map(pose, rest.landmarks)
     by_pose = turned(jnp.eye(3, dtype=pose.dtype), change[:2])
-    last = Last(frame, rest.cov[-3:], rest.cov[-3:, -3:])
-    lever = lever_of_motion(rest._replace(pose=pose, last=last), chart)
-    return Composition(pose, in_charts(by_pose, before, after, rest.alive), lever)
+    moved = in_charts(by_pose, before, after, rest.alive)
+    return Composition(pose, moved, lever_by(moved, frame))
 
 
 def whole(parted: Parted, chart: Chart) -> Joint:
