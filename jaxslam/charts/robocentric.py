@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxslam import se2
 from jaxslam.angles import wrap
 from jaxslam.protocols import Basis, Chart
+from jaxslam.staging import settle
 
 
 def robocentric() -> Chart:
@@ -23,7 +24,7 @@ def robocentric() -> Chart:
     def retract(
         pose: jax.Array, landmark: jax.Array, dx: jax.Array, dl: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        moved = se2.inverse(se2.inverse(pose) + dx)
+        moved = settle(se2.inverse(se2.inverse(pose) + dx))
         return moved, se2.from_frame(moved, se2.to_frame(pose, landmark) + dl)
 
     def local(
@@ -34,7 +35,7 @@ def robocentric() -> Chart:
         return jnp.concatenate([dx[:2], wrap(dx[2:])]), dl
 
     def basis(pose: jax.Array, landmark: jax.Array) -> Basis:
-        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+        c, s = settle((jnp.cos(pose[2]), jnp.sin(pose[2])))
         one = jnp.ones_like(c)
         # With l = R(m - b), R = R(θ) and θ = -b_θ; and the same of t = -R b.
         turn = jnp.stack([c, -s, s, c]).reshape(2, 2)

@@ -71,7 +71,7 @@ def compose(parted: Parted, chart: Chart) -> Composition:
     rest, frame = parted.rest, parted.frame
     change = linalg.matmul(out_of(frame), parted.step[:, None])[:, 0]
     pose = rest.pose + change
-    pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
+    pose = settle(jnp.concatenate([pose[:2], wrap(pose[2:])]))
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before, after = over_map(rest.pose, rest.landmarks), over_map(pose, rest.landmarks)
     by_pose = turned(jnp.eye(3, dtype=pose.dtype), change[:2])

@@ -32,6 +32,7 @@ def propagate(
     if chart.basis is None:
         moved = Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
     else:
+        pose = settle(pose)
         over_map = jax.vmap(chart.basis, in_axes=(None, 0))
         before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
         moved = in_charts(by_pose, before, after, joint.alive)
