@@ -201,7 +201,8 @@ def correct_in_turn(
         work = partial(parted.correct_group, chart=chart, retracted=retracted, **options)
 
         def with_motion(joint: Joint) -> tuple[Joint, Correction]:
-            rest, done = in_groups(work, parted.part(joint, chart))
+            columns = size + 3 + (-(size + 3) % _LANES if cached else 0)
+            rest, done = in_groups(work, parted.part(joint, chart, columns))
             # A run without a measurement must keep its map to the bit.
             after = parted.whole(rest, chart)
             kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)

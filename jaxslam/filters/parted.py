@@ -30,7 +30,7 @@ class Parted(NamedTuple):
     """
 
     rest: Joint
-    """pose and landmarks without the step; cov (D + 3, ·), of x and then δ"""
+    """pose and landmarks without the step; cov (D + 3, ·), of x and then δ, and columns of zeros"""
     frame: jax.Array
     """() heading of the frame the motion began from"""
     step: jax.Array
@@ -52,15 +52,19 @@ class Composition(NamedTuple):
         return self.moved.times(rows[:-3]) + linalg.matmul(self.lever, rows[-3:])
 
 
-def part(joint: Joint, chart: Chart) -> Parted:
-    """x = e - g δ: cov(x) = P - g C - (g C)ᵀ + g Q gᵀ, C = cov(δ, e), Q = cov(δ)."""
+def part(joint: Joint, chart: Chart, columns: int) -> Parted:
+    """x = e - g δ: cov(x) = P - g C - (g C)ᵀ + g Q gᵀ, C = cov(δ, e), Q = cov(δ).
+
+    columns: of the P of (x, δ), D + 3 or more; what is beyond is zero.
+    """
     last, lever = joint.last, lever_of_motion(joint, chart).T
     shared = linalg.matmul(last.own, lever)
     half = last.cov - 0.5 * shared
     change = linalg.gram_both(*settle((lever, half)))
     cross = last.cov - shared
-    top = jnp.concatenate([joint.cov - change, cross.T], axis=1)
-    bottom = jnp.concatenate([cross, last.own], axis=1)
+    beyond = [(0, 0), (0, columns - len(change) - 3)]
+    top = jnp.concatenate([joint.cov - change, jnp.pad(cross.T, beyond)], axis=1)
+    bottom = jnp.concatenate([cross, jnp.pad(last.own, beyond)], axis=1)
     rest = joint._replace(cov=jnp.concatenate([top, bottom]), last=())
     return Parted(rest, last.frame, jnp.zeros_like(joint.pose))
 
@@ -83,7 +87,7 @@ def whole(parted: Parted, chart: Chart) -> Joint:
     """The map again: P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ, C = cov(δ, x)."""
     found, rest = compose(parted, chart), parted.rest
     size = rest.cov.shape[0] - 3
-    own, lever = rest.cov[size:, size:], found.lever.T
+    own, lever = rest.cov[size:, size : size + 3], found.lever.T
     cross = found.moved.times(rest.cov[size:, :size].T).T
     shared = linalg.matmul(own, lever)
     half = cross + 0.5 * shared
