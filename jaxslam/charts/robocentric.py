@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Basis, Chart
+from jaxslam.staging import settle
 
 
 def robocentric() -> Chart:
@@ -23,7 +24,7 @@ def robocentric() -> Chart:
     def retract(
         pose: jax.Array, landmark: jax.Array, dx: jax.Array, dl: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        moved = se2.inverse(se2.inverse(pose) + dx)
+        moved = settle(se2.inverse(se2.inverse(pose) + dx))
         return moved, se2.from_frame(moved, se2.to_frame(pose, landmark) + dl)
 
     def local(
@@ -34,8 +35,12 @@ def robocentric() -> Chart:
         return jnp.concatenate([dx[:2], wrap(dx[2:])]), dl
 
     def basis(pose: jax.Array, landmark: jax.Array) -> Basis:
-        (by_origin,) = se2.inverse_jacobians(se2.inverse(pose))
-        by_frame, by_point = se2.from_frame_jacobians(pose, se2.to_frame(pose, landmark))
-        return Basis(pose=by_origin, cross=by_frame @ by_origin, landmark=by_point)
+        c, s = settle((jnp.cos(pose[2]), jnp.sin(pose[2])))
+        one = jnp.ones_like(c)
+        # With l = R(m - b), R = R(θ) and θ = -b_θ; and the same of t = -R b.
+        turn = jnp.stack([c, -s, s, c]).reshape(2, 2)
+        by_pose = jnp.stack([-c, s, pose[1], -s, -c, -pose[0], 0 * one, 0 * one, -one])
+        cross = jnp.stack([-c, s, landmark[1], -s, -c, -landmark[0]])
+        return Basis(pose=by_pose.reshape(3, 3), cross=cross.reshape(2, 3), landmark=turn)
 
     return Chart(name="robocentric", retract=retract, local=local, basis=basis, motion_apart=True)

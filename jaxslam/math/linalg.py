@@ -72,6 +72,11 @@ def _square_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     return square(*primals), half + half.T
 
 
+def gram_both(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Aᵀ B + Bᵀ A of A, B (k, D), for small k; symmetric to the bit."""
+    return gram(a, b) + gram(b, a)
+
+
 def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     """A B of A (n, k), B (k, D), for small k."""
     return gram(a.T, b)

@@ -217,4 +217,6 @@ def _half_cot(x: jax.Array) -> jax.Array:
 
 def _rows(*rows: list[jax.Array | float]) -> jax.Array:
     dtype = jnp.result_type(*(entry for row in rows for entry in row))
-    return jnp.stack([jnp.stack([jnp.asarray(entry, dtype) for entry in row]) for row in rows])
+    # One array, and so one kernel and not one a row.
+    entries = jnp.stack([jnp.asarray(entry, dtype) for row in rows for entry in row])
+    return entries.reshape(len(rows), -1)

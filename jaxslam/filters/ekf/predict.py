@@ -33,6 +33,7 @@ def propagate(
     if chart.basis is None:
         moved = Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
     else:
+        pose = settle(pose)
         over_map = jax.vmap(chart.basis, in_axes=(None, 0))
         before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
         moved = in_charts(by_pose, before, after, joint.alive)
@@ -97,22 +98,32 @@ class Transition(NamedTuple):
 
 def in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array) -> Transition:
     """E(x')⁻¹ F E(x) and E(x')⁻¹ by blocks, dead slots standing still."""
+    times = jax.vmap(linalg.matmul, in_axes=(0, None))
+    each = jax.vmap(linalg.matmul)
     undo = linalg.inverse(after.pose[0])
-    robot = undo @ by_pose @ before.pose[0]
-    cross = before.cross - after.cross @ robot
-    cross_noise = -after.cross @ undo
+    robot = linalg.matmul(linalg.matmul(undo, by_pose), before.pose[0])
+    cross = before.cross - times(after.cross, robot)
+    cross_noise = -times(after.cross, undo)
     landmark = None
     if before.landmark is not None and after.landmark is not None:
         own = jax.vmap(linalg.inverse)(after.landmark)
         still = jnp.eye(own.shape[-1], dtype=own.dtype)
-        landmark = jnp.where(alive[:, None, None], own @ before.landmark, still)
-        cross, cross_noise = own @ cross, own @ cross_noise
+        landmark = jnp.where(alive[:, None, None], each(own, before.landmark), still)
+        cross, cross_noise = each(own, cross), each(own, cross_noise)
     cross, cross_noise = (jnp.where(alive[:, None, None], m, 0.0) for m in (cross, cross_noise))
     return settle(Transition(robot, cross, landmark, undo, cross_noise))
 
 
-def moved_cov(cov: jax.Array, moved: Transition, noise: jax.Array | None) -> jax.Array:
-    """A P Aᵀ + G N Gᵀ, each entry of P written once or twice."""
+def moved_cov(
+    cov: jax.Array,
+    moved: Transition,
+    noise: jax.Array | None,
+    shared: tuple[jax.Array, jax.Array] | None = None,
+) -> jax.Array:
+    """A P Aᵀ + G N Gᵀ, each entry of P written once or twice.
+
+    shared: (k, D) each, of which Sᵀ T + Tᵀ S is added; in another chart than the Euclidean.
+    """
     if moved.cross is None:
         robot = linalg.matmul(moved.robot, cov[:3])
         own = linalg.matmul(robot[:, :3], moved.robot.T)
@@ -121,13 +132,17 @@ def moved_cov(cov: jax.Array, moved: Transition, noise: jax.Array | None) -> jax
         robot = settle(jnp.concatenate([own, robot[:, 3:]], axis=1))
         return cov.at[:3].set(robot).at[:, :3].set(robot.T)
     if moved.landmark is not None:
-        cov = linalg.symmetrize(moved.turn(moved.turn(cov).T))
+        # In memory before it is transposed: each entry would be computed twice.
+        cov = settle(moved.turn(moved.turn(cov).T))
+    cov = linalg.symmetrize(cov)
     # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.
     b = jnp.concatenate([moved.robot - jnp.eye(3, dtype=cov.dtype), moved.cross.reshape(-1, 3)])
     half = cov[:3] + 0.5 * linalg.matmul(cov[:3, :3], b.T)
-    left, right = [b.T, half], [half, b.T]
+    left, right = [b.T], [half]
+    if shared is not None:
+        left, right = [*left, shared[0]], [*right, shared[1]]
+    change = linalg.gram_both(*settle((jnp.concatenate(left), jnp.concatenate(right))))
     if noise is not None:
         added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
-        left, right = [*left, added], [*right, added]
-    change = linalg.gram(*settle((jnp.concatenate(left), jnp.concatenate(right))))
-    return linalg.symmetrize(cov + change)
+        change = change + linalg.square(settle(added))
+    return cov + change

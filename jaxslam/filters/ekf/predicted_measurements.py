@@ -91,8 +91,9 @@ def in_chart(
             jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
         )(pose, landmarks, *moved)
         basis = Basis(by_dx[0], by_dl[0], by_dl[1])
-    by_chart = by_pose @ basis.pose + by_landmark @ basis.cross
-    return by_chart, by_landmark if basis.landmark is None else by_landmark @ basis.landmark
+    each = jax.vmap(linalg.matmul)
+    by_chart = each(by_pose, basis.pose) + each(by_landmark, basis.cross)
+    return by_chart, by_landmark if basis.landmark is None else each(by_landmark, basis.landmark)
 
 
 def innovation_cov(

@@ -7,7 +7,7 @@ correction moves the map by what it says of e_rest, then composes it with the co
 import jax
 import jax.numpy as jnp
 
-from jaxslam.filters.ekf.predict import in_charts, moved_cov
+from jaxslam.filters.ekf.predict import Transition, in_charts, moved_cov
 from jaxslam.linearize.first_order import turned
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
@@ -18,13 +18,16 @@ from jaxslam.slots import Joint
 def lever_of_motion(joint: Joint, chart: Chart) -> jax.Array:
     """g (D, 3): what an error of the last motion, in its own frame, does to all errors."""
     assert chart.basis is not None
+    still = jnp.eye(3, dtype=joint.pose.dtype)
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
-    robot = linalg.inverse(basis.pose[0]) @ out_of(joint.last.frame)
-    own = -basis.cross @ robot
-    if basis.landmark is not None:
-        own = jnp.einsum("nij,njk->nik", jax.vmap(linalg.inverse)(basis.landmark), own)
-    own = jnp.where(joint.alive[:, None, None], own, 0.0)
-    return jnp.concatenate([robot, own.reshape(-1, 3)])
+    return lever_by(in_charts(still, basis, basis, joint.alive), joint.last.frame)
+
+
+def lever_by(moved: Transition, frame: jax.Array) -> jax.Array:
+    """g (D, 3), of a transition to the charts of now and the heading the last motion began from."""
+    assert moved.cross_noise is not None
+    size = 3 + moved.cross_noise[..., 0].size
+    return linalg.matmul(moved.lift(size), out_of(frame))
 
 
 def moved_anew(
@@ -41,7 +44,7 @@ def moved_anew(
     """
     assert chart.basis is not None
     frame = joint.last.frame + turn
-    change = out_of(frame) @ step
+    change = linalg.matmul(out_of(frame), step[:, None])[:, 0]
     pose = joint.pose + change
     pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
@@ -49,15 +52,14 @@ def moved_anew(
     still = jnp.eye(3, dtype=pose.dtype)
     moved = in_charts(turned(still, change[:2]), before, after, joint.alive)
     composed = joint._replace(pose=pose, last=joint.last._replace(frame=frame))
-    h = (lever_of_motion(composed, chart) - moved.times(lever)).T
+    h = (lever_by(moved, frame) - moved.times(lever)).T
     cov_last = moved.times(joint.last.cov.T).T
     half = cov_last + 0.5 * linalg.matmul(joint.last.own, h)
-    change_cov = linalg.gram(jnp.concatenate([h, half]), jnp.concatenate([half, h]))
     watch = joint.watch
     if watch:
         watch = watch._replace(directions=moved.times(watch.directions))
     return composed._replace(
-        cov=linalg.symmetrize(moved_cov(joint.cov, moved, None) + change_cov),
+        cov=moved_cov(joint.cov, moved, None, (h, half)),
         watch=watch,
         last=composed.last._replace(cov=cov_last + linalg.matmul(joint.last.own, h)),
     )

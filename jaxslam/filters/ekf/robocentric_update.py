@@ -2,6 +2,7 @@
 of the scan (`Chart.motion_apart`)."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,10 +11,11 @@ import jax.numpy as jnp
 from jaxslam.filters.ekf.innovation import Correction, view_of, weigh
 from jaxslam.filters.ekf.observability import informed
 from jaxslam.filters.ekf.predict import Transition, in_charts, moved_cov
-from jaxslam.filters.ekf.robocentric_motion import lever_of_motion, out_of
+from jaxslam.filters.ekf.robocentric_motion import lever_by, lever_of_motion, out_of
 from jaxslam.linearize.first_order import turned
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
+from jaxslam.math.xla import apart, settle
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint, Last
 
@@ -28,7 +30,7 @@ class Parted(NamedTuple):
     """
 
     rest: Joint
-    """pose and landmarks without the step; cov (D + 3, ·), of x and then δ"""
+    """pose and landmarks without the step; cov (D + 3, ·), of x and then δ, and columns of zeros"""
     frame: jax.Array
     """() heading of the frame the motion began from"""
     step: jax.Array
@@ -50,15 +52,19 @@ class Composition(NamedTuple):
         return self.moved.times(rows[:-3]) + linalg.matmul(self.lever, rows[-3:])
 
 
-def part(joint: Joint, chart: Chart) -> Parted:
-    """x = e - g δ: cov(x) = P - g C - (g C)ᵀ + g Q gᵀ, C = cov(δ, e), Q = cov(δ)."""
+def part(joint: Joint, chart: Chart, columns: int) -> Parted:
+    """x = e - g δ: cov(x) = P - g C - (g C)ᵀ + g Q gᵀ, C = cov(δ, e), Q = cov(δ).
+
+    columns: of the P of (x, δ), D + 3 or more; what is beyond is zero.
+    """
     last, lever = joint.last, lever_of_motion(joint, chart).T
     shared = linalg.matmul(last.own, lever)
     half = last.cov - 0.5 * shared
-    change = linalg.gram(jnp.concatenate([lever, half]), jnp.concatenate([half, lever]))
+    change = linalg.gram_both(*settle((lever, half)))
     cross = last.cov - shared
-    top = jnp.concatenate([linalg.symmetrize(joint.cov - change), cross.T], axis=1)
-    bottom = jnp.concatenate([cross, last.own], axis=1)
+    beyond = [(0, 0), (0, columns - len(change) - 3)]
+    top = jnp.concatenate([joint.cov - change, jnp.pad(cross.T, beyond)], axis=1)
+    bottom = jnp.concatenate([cross, jnp.pad(last.own, beyond)], axis=1)
     rest = joint._replace(cov=jnp.concatenate([top, bottom]), last=())
     return Parted(rest, last.frame, jnp.zeros_like(joint.pose))
 
@@ -67,59 +73,111 @@ def compose(parted: Parted, chart: Chart) -> Composition:
     """The motion with its step, put behind the rest."""
     assert chart.basis is not None
     rest, frame = parted.rest, parted.frame
-    change = out_of(frame) @ parted.step
+    change = linalg.matmul(out_of(frame), parted.step[:, None])[:, 0]
     pose = rest.pose + change
-    pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
+    pose = settle(jnp.concatenate([pose[:2], wrap(pose[2:])]))
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before, after = over_map(rest.pose, rest.landmarks), over_map(pose, rest.landmarks)
     by_pose = turned(jnp.eye(3, dtype=pose.dtype), change[:2])
-    last = Last(frame, rest.cov[-3:], rest.cov[-3:, -3:])
-    lever = lever_of_motion(rest._replace(pose=pose, last=last), chart)
-    return Composition(pose, in_charts(by_pose, before, after, rest.alive), lever)
+    moved = in_charts(by_pose, before, after, rest.alive)
+    return Composition(pose, moved, lever_by(moved, frame))
 
 
 def whole(parted: Parted, chart: Chart) -> Joint:
     """The map again: P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ, C = cov(δ, x)."""
     found, rest = compose(parted, chart), parted.rest
     size = rest.cov.shape[0] - 3
-    own, lever = rest.cov[size:, size:], found.lever.T
+    own, lever = rest.cov[size:, size : size + 3], found.lever.T
     cross = found.moved.times(rest.cov[size:, :size].T).T
     shared = linalg.matmul(own, lever)
     half = cross + 0.5 * shared
-    change = linalg.gram(jnp.concatenate([lever, half]), jnp.concatenate([half, lever]))
-    cov = moved_cov(rest.cov[:size, :size], found.moved, None) + change
+    cov = moved_cov(rest.cov[:size, :size], found.moved, None, (lever, half))
     watch = rest.watch
     if watch:
         watch = watch._replace(directions=found.moved.times(watch.directions))
     last = Last(parted.frame, cross + shared, own)
-    return rest._replace(pose=found.pose, cov=linalg.symmetrize(cov), watch=watch, last=last)
+    return rest._replace(pose=found.pose, cov=cov, watch=watch, last=last)
 
 
-def correct_one(
+def correct_group(
     parted: Parted,
-    place: tuple[jax.Array, jax.Array, jax.Array],
+    part: tuple[jax.Array, jax.Array, jax.Array],
     *,
     chart: Chart,
     retracted: Retract,
     **options: Any,
 ) -> tuple[Parted, Correction]:
-    """Correct x and δ by one measurement: z (1, Z), slot (1,), known (1,).
+    """Correct x and δ by g measurements in turn: z (g, Z), slot (g,), known (g,).
+
+    As `correction.correct_in_turn` does it: each corrects what the group sees of P, the rows P_I of
+    the robot, of its landmarks and of δ, and the whole P is read and written once.
+    """
+    rest, (_, slot, known) = parted.rest, part
+    size_l, size = rest.landmarks.shape[1], rest.cov.shape[0] - 3
+    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
+    at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1), size + jnp.arange(3)])
+    rows = rest.cov[at]
+    watch: Any = rest.watch
+    if watch:
+        watch = watch._replace(directions=watch.directions[at[:-3]])
+    # The local map, and beside its P the matrix that takes P_I of before to P_I of now.
+    local = rest._replace(
+        landmarks=rest.landmarks[slot],
+        cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
+        alive=rest.alive[slot],
+        tag=rest.tag[slot],
+        watch=watch,
+    )
+    one = partial(_correct_one, whole=rest, chart=chart, retracted=retracted, **options)
+    # A gradient keeps what each begins with, and computes the rest of these few rows again.
+    after, (reach, whitened, done) = jax.lax.scan(
+        jax.checkpoint(one, prevent_cse=False),
+        parted._replace(rest=local),
+        (jnp.arange(len(slot)), part),
+    )
+    v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
+    xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
+    landmarks = retracted(chart, rest, xi[:size])[1]
+    if watch:
+        watch = after.rest.watch._replace(directions=rest.watch.directions)
+    rest = rest._replace(
+        pose=after.rest.pose,
+        landmarks=jnp.where(known.any(), landmarks, rest.landmarks),  # a move by zero would round
+        cov=rest.cov - linalg.gram(v[:, : size + 3], v),
+        watch=watch,
+    )
+    return after._replace(rest=rest), done
+
+
+def _correct_one(
+    parted: Parted,
+    place: tuple[jax.Array, Any],
+    *,
+    whole: Joint,
+    chart: Chart,
+    retracted: Retract,
+    **options: Any,
+) -> tuple[Parted, tuple[jax.Array, jax.Array, Correction]]:
+    """Correct a local x and δ by a measurement of its landmark i (); the whole map's slot beside.
 
     It sees e of the robot and its landmark, E = [T g] of their rows of (x, δ). With P that of
-    (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V.
+    (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V. Returns V in the columns beside P
+    (Z, ·), and L⁻¹ ν (Z,).
     """
-    rest, (z, slot, known) = parted.rest, place
+    i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], place)
+    rest = parted.rest
     size_l, size = rest.landmarks.shape[1], rest.cov.shape[0] - 3
-    own = 3 + slot[0] * size_l + jnp.arange(size_l)
-    at = jnp.concatenate([jnp.arange(3), own, size + jnp.arange(3)])
+    at = jnp.concatenate(
+        [jnp.arange(3), 3 + i[0] * size_l + jnp.arange(size_l), size + jnp.arange(3)]
+    )
     watch: Any = rest.watch
     if watch:
         watch = watch._replace(directions=watch.directions[at[:-3]])
     local = rest._replace(
-        landmarks=rest.landmarks[slot],
+        landmarks=rest.landmarks[i],
         cov=rest.cov[at],
-        alive=rest.alive[slot],
-        tag=rest.tag[slot],
+        alive=rest.alive[i],
+        tag=rest.tag[i],
         watch=watch,
     )
     found = compose(parted._replace(rest=local), chart)
@@ -129,10 +187,11 @@ def correct_one(
         watch = watch._replace(directions=found.moved.times(watch.directions))
     cov = jnp.concatenate([among, against], axis=1)
     here = local._replace(pose=found.pose, cov=cov, watch=watch)
-    first = jnp.zeros_like(slot)
-    memory = rest._replace(pose=found.pose), slot
+    first = jnp.zeros_like(i)
+    memory = whole._replace(pose=found.pose), slot
     said = weigh(here, first, view_of(here, first), z, known, memory, chart=chart, **options)
-    v = said.v[:, len(among) :]
+    v = said.v[:, len(among) : len(among) + size + 3]
+    reach = said.v[:, len(among) + size + 3 :]
     xi = linalg.gram(v, said.whitened[:, None])[:, 0]
     pose, landmarks = retracted(chart, rest, xi[:size])
     pose = jnp.where(known[0], pose, rest.pose)  # a move by zero would round
@@ -143,8 +202,9 @@ def correct_one(
     rest = rest._replace(
         pose=pose,
         landmarks=jnp.where(known[0], landmarks, rest.landmarks),
-        cov=rest.cov - linalg.gram(v, v),
+        cov=rest.cov - linalg.gram(v, said.v[:, len(among) :]),
         watch=watch,
     )
     frame = parted.frame + (pose[2] - parted.rest.pose[2])
-    return Parted(rest, frame, parted.step + xi[size:]), said.correction
+    done = jax.tree.map(lambda leaf: leaf[0], said.correction)
+    return Parted(rest, frame, parted.step + xi[size:]), (reach, said.whitened, done)

@@ -128,11 +128,10 @@ def correct_in_turn(
     measurement at a time, for forms of the update that need all of P.
     """
     whole = joseph or square_root
-    one_by_one = whole or chart.motion_apart
     m, size_l = z.shape[0], joint.landmarks.shape[1]
     size = joint.cov.shape[1]
     cached = size <= _CACHED
-    group = 1 if one_by_one else max(1, min(_GROUP if cached else _GROUP_BEYOND, m))
+    group = 1 if whole else max(1, min(_GROUP if cached else _GROUP_BEYOND, m))
     groups = -(-m // group)
 
     def padded(part: jax.Array) -> jax.Array:
@@ -199,10 +198,13 @@ def correct_in_turn(
     if whole:
         return in_groups(one_of_all, joint)
     if chart.motion_apart and joint.last:
-        work = partial(robocentric_update.correct_one, chart=chart, retracted=retracted, **options)
+        work = partial(
+            robocentric_update.correct_group, chart=chart, retracted=retracted, **options
+        )
 
         def with_motion(joint: Joint) -> tuple[Joint, Correction]:
-            rest, done = in_groups(work, robocentric_update.part(joint, chart))
+            columns = size + 3 + (-(size + 3) % _LANES if cached else 0)
+            rest, done = in_groups(work, robocentric_update.part(joint, chart, columns))
             # A run without a measurement must keep its map to the bit.
             after = robocentric_update.whole(rest, chart)
             kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)
