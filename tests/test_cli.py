@@ -190,6 +190,8 @@ def test_no_command_exits_with_2(capsys):
 def test_the_module_runs_as_a_program_in_float32(tmp_path):
     arguments = [
         *QUICK,
+        "--steps",
+        "1",  # of which there is no pose NEES
         "--filters",
         "dead_reckoning",
         "--dtype",
