@@ -156,6 +156,13 @@ def monte_carlo(
     if not devices:
         raise ValueError("monte_carlo: expected at least one device")
     dtype = check_dtype(dtype)
+    if keep is not None and not all(
+        callable(getattr(keep, name, None)) for name in ("claim", "save", "blocks")
+    ):
+        raise ValueError(
+            "monte_carlo: expected keep as of jaxslam.store.create(folder) or .resume(folder), "
+            f"got {keep!r}"
+        )
     began = time.perf_counter()
     runs = int(runs)
     if workers is None:
