@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
-from jaxslam.math.linalg import check_covariance, check_key, is_concrete
+from jaxslam.math.linalg import check_covariance, check_key, is_concrete, shape_told
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Status, Trace, check_log
 from jaxslam.validation import check_record, state_and_info
@@ -48,24 +48,30 @@ def run(
     """
     check_record("run", "filter", filter, Filter)
     check_record("run", "log", log, Log)
-    check_run(filter, log, pose, pose_cov)
+    check_run("run", filter, log, pose, pose_cov)
     check_key("run", key)
     return programs.call(_drive, (filter, probe), log, pose, pose_cov, key)
 
 
-def check_run(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
-    """Raise ValueError unless a log and a start are what `run` takes."""
+def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
+    """Raise ValueError, which begins with the caller's name, unless a log and a start are what
+    `run` takes."""
     check_log(
+        name,
         log,
         control_size=filter.control_size,
         measurement_size=filter.measurement_size,
         parts=filter.places,
     )
-    if np.shape(pose) != (3,):
-        raise ValueError(f"run: expected a pose of shape (3,), got {np.shape(pose)}")
-    if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
-        raise ValueError("run: the initial pose is not finite")
-    check_covariance("run: pose_cov", pose_cov, 3)
+    if (got := shape_told(pose)) != "(3,)":
+        raise ValueError(f"{name}: expected a pose (x, y, θ) of shape (3,), got {got}")
+    if is_concrete(pose):
+        values = np.asarray(pose)
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"{name}: expected a pose of real numbers, got {pose!r}")
+        if not np.all(np.isfinite(values)):
+            raise ValueError(f"{name}: the initial pose is not finite, got {values.tolist()}")
+    check_covariance(f"{name}: pose_cov", pose_cov, 3)
 
 
 def _drive(

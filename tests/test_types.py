@@ -16,7 +16,7 @@ def good_log(steps=4, places=3):
 
 
 def check(log):
-    return check_log(log, control_size=3, measurement_size=2)
+    return check_log("drive", log, control_size=3, measurement_size=2)
 
 
 def changed(field, row, value):
@@ -38,23 +38,32 @@ def test_a_good_log_passes():
 BAD_VALUES = {
     "control nan": (changed("control", (2, 1), np.nan), r"log.control is not finite \(row 2\)"),
     "control inf": (changed("control", (3, 0), np.inf), r"log.control is not finite \(row 3\)"),
-    "z nan": (changed("z", (1, 2, 0), np.nan), r"a valid measurement is not finite \(row 1\)"),
-    "z inf": (changed("z", (0, 0, 1), -np.inf), r"a valid measurement is not finite \(row 0\)"),
-    "tag -2": (changed("tag", (3, 1), -2), r"a tag is below -1 \(row 3\)"),
+    "z nan": (
+        changed("z", (1, 2, 0), np.nan),
+        r"log.scan.z: a valid measurement is not finite \(row 1, place 2\)",
+    ),
+    "z inf": (
+        changed("z", (0, 0, 1), -np.inf),
+        r"log.scan.z: a valid measurement is not finite \(row 0, place 0\)",
+    ),
+    "tag -2": (changed("tag", (3, 1), -2), r"log.scan.tag: a tag is below -1 \(row 3, place 1\)"),
     "tag 2**32": (
         good_log()._replace(
             scan=good_log().scan._replace(tag=good_log().scan.tag.astype(np.int64) + 2**32)
         ),
-        r"a tag is beyond int32 \(row 0\)",
+        r"log.scan.tag: a tag is beyond int32 \(row 0, place 0\)",
     ),
-    "repeated": (changed("tag", 2, [5, 6, 5]), r"a tag repeats within the scan \(row 2\)"),
+    "repeated": (
+        changed("tag", 2, [5, 6, 5]),
+        r"log.scan.tag: a tag repeats within the scan \(row 2\)",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", BAD_VALUES)
 def test_bad_values_are_refused_with_their_row(case):
     log, message = BAD_VALUES[case]
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"^drive: .*{message}"):
         check(log)
 
 
@@ -79,9 +88,12 @@ def test_padding_may_hold_anything_and_unknown_tags_may_repeat():
 BAD_SHAPES = {
     "control size": (
         good_log()._replace(control=np.zeros((4, 2))),
-        r"log.control: expected shape \(4, 3\), got \(4, 2\)",
+        r"log.control: expected shape \(T, 3\), got \(4, 2\)",
     ),
-    "control rank": (good_log()._replace(control=np.zeros(3)), r"log.control: expected shape"),
+    "control rank": (
+        good_log()._replace(control=np.zeros(3)),
+        r"log.control: expected shape \(T, 3\), got \(3,\)",
+    ),
     "control kind": (
         good_log()._replace(control=np.zeros((4, 3), int)),
         r"log.control: expected floating values, got int64",
@@ -100,7 +112,12 @@ BAD_SHAPES = {
     ),
     "tag rank": (
         good_log()._replace(scan=good_log().scan._replace(tag=np.zeros(4, int))),
-        r"log.scan.z: expected shape|log.scan.tag: expected shape",
+        r"log.scan.tag: expected shape \(4, M\), got \(4,\)",
+    ),
+    "no scan": (good_log()._replace(scan=None), r"expected a Scan\(z, tag, valid\), got NoneType"),
+    "no array": (
+        good_log()._replace(scan=good_log().scan._replace(valid=None)),
+        r"log.scan.valid: expected shape \(4, 3\), got None",
     ),
     "tag kind": (
         good_log()._replace(scan=good_log().scan._replace(tag=np.zeros((4, 3)))),
@@ -121,7 +138,7 @@ BAD_SHAPES = {
 @pytest.mark.parametrize("case", BAD_SHAPES)
 def test_bad_shapes_and_kinds_are_refused_traced_or_not(case, traced):
     log, message = BAD_SHAPES[case]
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"^drive: .*{message}"):
         if traced:
             jax.eval_shape(check, log)
         else:

@@ -241,6 +241,11 @@ KEY = jax.random.key(0)
 WORLD = jaxslam.scenarios.circle(steps=3)
 EKF = filters.ekf_slam(WORLD.motion, WORLD.sensor, 2)
 LOG = Log(np.zeros((3, 3)), Scan(np.zeros((3, 1, 2)), np.zeros((3, 1), int), np.ones((3, 1), bool)))
+SMOOTH = smoothing.smooth(WORLD.motion, WORLD.sensor, 2, np.zeros(3), np.eye(3))
+
+
+def run_from(pose, pose_cov=WORLD.pose_cov):
+    return jaxslam.run(EKF, LOG, pose, pose_cov, KEY)
 
 
 @pytest.mark.parametrize(
@@ -257,6 +262,32 @@ LOG = Log(np.zeros((3, 3)), Scan(np.zeros((3, 1, 2)), np.zeros((3, 1), int), np.
         (
             lambda: jaxslam.monte_carlo(WORLD, {"ekf": EKF}, 2, KEY, devices=99),
             r"devices as of jax.local_devices\(\), got 99",
+        ),
+        (
+            lambda: jaxslam.monte_carlo(WORLD, {"ekf": EKF}, 2, KEY, keep="kk"),
+            r"^monte_carlo: expected keep as of jaxslam.store.create\(folder\).*got 'kk'",
+        ),
+        (
+            lambda: jaxslam.verify_jacobians(3),
+            "^verify_jacobians: expected a Motion, a Sensor or a function of vectors, got int",
+        ),
+        (
+            lambda: jaxslam.verify_jacobians(np.sin, 3),
+            "expected jacobian to be a function, got int",
+        ),
+        (lambda: run_from(None), r"^run: expected a pose \(x, y, θ\) of shape \(3,\), got None"),
+        (lambda: run_from("a"), r"^run: expected a pose .*, got 'a'"),
+        (lambda: run_from(LOG.scan), r"^run: expected a pose .*, got rows of unlike lengths"),
+        (lambda: run_from(["a", "b", "c"]), r"^run: expected a pose of real numbers, got \['a'"),
+        (lambda: run_from([0, 0, np.nan]), r"^run: the initial pose is not finite, got .*nan\]"),
+        (lambda: run_from(KEY), r"^run: expected a pose .*, got \(\)"),
+        (
+            lambda: run_from(np.zeros(3), None),
+            r"^run: pose_cov: expected a covariance of shape \(3, 3\), got None",
+        ),
+        (
+            lambda: SMOOTH(LOG._replace(control=np.zeros((3, 2))), KEY),
+            r"^smooth: log.control: expected shape \(T, 3\), got \(3, 2\)",
         ),
     ],
 )

@@ -14,11 +14,11 @@ from benchmarks.speed.timing import pin
 if sys.argv[2] == "pinned": pin()
 import time, jax
 jax.config.update("jax_enable_x64", True)
-from jaxslam import family, monte_carlo, scenarios
+from jaxslam import catalog, monte_carlo, scenarios
 world = scenarios.cloister()
 marks = []
 campaign = monte_carlo(
-    world, {"ekf": family.FILTERS["ekf"](world)}, int(sys.argv[1]), jax.random.key(0),
+    world, {"ekf": catalog.FILTERS["ekf"](world)}, int(sys.argv[1]), jax.random.key(0),
     progress=lambda done, total: marks.append((time.perf_counter(), done)),
 )
 begin = marks[min(len(marks) // 4, 8)]

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.xla import settle
 from jaxslam.protocols import Basis, Chart
-from jaxslam.staging import settle
 
 
 def robocentric() -> Chart:

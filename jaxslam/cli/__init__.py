@@ -6,15 +6,14 @@ import shlex
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from pathlib import Path
 
 import jax
 from threadpoolctl import threadpool_limits
 
 from jaxslam.catalog import ALL
 from jaxslam.cli import cache, devices
-from jaxslam.cli.asking import INTERRUPTED
-from jaxslam.cli.campaign import DEFAULTS, consistency
+from jaxslam.cli.asking import INTERRUPTED, as_folders
+from jaxslam.cli.campaign import DEFAULTS, OUT, consistency
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
 from jaxslam.cli.spent import Spent
@@ -34,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     try:
+        as_folders(options)
         if hasattr(options, "devices"):
             devices.prepare(options)
         else:
@@ -89,12 +89,11 @@ def _parser() -> argparse.ArgumentParser:
         help="(default: float64)",
     )
     judge.add_argument(
-        "--out", type=Path, default=Path("out"), help="folder for results (default: out)"
+        "--out", metavar="DIR", help=f"folder for results (default: {OUT}; with --resume, its own)"
     )
     there = judge.add_mutually_exclusive_group()
     there.add_argument(
         "--resume",
-        type=Path,
         metavar="DIR",
         help="go on with the campaign in a folder of results; with a larger --runs, extend it",
     )
@@ -165,13 +164,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     check.add_argument("--states", type=int, default=24, help="random states beside the hard ones")
     check.add_argument("--seed", type=int, default=0, help="of the random states")
-    check.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
+    check.add_argument("--out", metavar="DIR", default=str(OUT), help="folder for results")
     check.set_defaults(command=verify_models, dtype="float64")
 
     for command in (drive, check):
         cache.add_options(command)
     drive.add_argument("--dtype", default="float64", choices=["float32", "float64"])
-    drive.add_argument("--out", type=Path, default=Path("out"), help="folder for results")
+    drive.add_argument("--out", metavar="DIR", default=str(OUT), help="folder for results")
     return parser
 
 

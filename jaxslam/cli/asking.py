@@ -1,8 +1,10 @@
 """What the commands share: names that must be known, and a bar of progress."""
 
+import argparse
 import sys
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TypeVar
 
 from jaxslam.consistency import DOF, Measure
@@ -18,6 +20,20 @@ def pick(kind: str, name: str, known: Mapping[str, _T]) -> _T:
     if name not in known:
         raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(known)}")
     return known[name]
+
+
+def as_folders(options: argparse.Namespace) -> None:
+    """Make paths of the options that name folders; ValueError where a name is empty.
+
+    The path of an empty name would be the current folder.
+    """
+    for name in ("out", "resume", "cache"):
+        text = getattr(options, name, None)
+        if text is None:
+            continue
+        if not text.strip():
+            raise ValueError(f"--{name}: expected a folder, got {text!r}")
+        setattr(options, name, Path(text))
 
 
 class Progress:

@@ -35,7 +35,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
         "--cache",
-        type=Path,
         metavar="DIR",
         default=argparse.SUPPRESS,  # which a formatter that adds defaults does not print
         help="keep compiled programs there for the next time "

@@ -1,10 +1,12 @@
 """`jaxslam consistency`: a campaign, its table and its files."""
 
 import argparse
+import json
 import shutil
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,8 +29,20 @@ from jaxslam.types import Estimate, Truth
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
 
+OUT = Path("out")
+"""The folder of results, unless said otherwise."""
+
 RESULT = "consistency.json"
 """The file of results that tells of a campaign."""
+
+FILES = (
+    "report.html",
+    RESULT,
+    "consistency.csv",
+    *(f"{name}.png" for name in ("nees", "bound", "cost", "coverage", "whiteness", "gained")),
+    *("errors.png", "map.png"),
+)
+"""What a campaign writes."""
 
 DEFAULTS: dict[str, Any] = {
     "scenario": "circle",
@@ -48,13 +62,12 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     block: int | None = options.block
     if options.resume is not None:
         there = store.resume(options.resume / BLOCKS)
-        if "asked" not in there.settings:
-            raise ValueError(f"{options.resume} holds a campaign that no command began")
+        _check_same(options, there, asked)
         asked = there.settings["asked"] | {"runs": there.runs} | asked
         block = there.settings.get("block")  # other blocks would round differently
         options.block = block if options.block is None else options.block
     asked = DEFAULTS | asked
-    out = options.resume or options.out
+    out = options.resume or options.out or OUT
     # Worlds are drawn in float64 whatever filters compute in: both precisions see the same.
     jax.config.update("jax_enable_x64", True)
     devices.join(options)
@@ -62,6 +75,11 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     names = [name.strip() for name in asked["filters"].split(",")]
     if names == ["all"]:
         names = list(ALL)
+    if "" in names:
+        raise ValueError(
+            "--filters: expected names of filters with commas between them, or all, "
+            f"got {asked['filters']!r}"
+        )
     if len(set(names)) < len(names):
         raise ValueError(f"expected each filter once, got {asked['filters']!r}")
     filters = {name: _filter(name, scenario) for name in names}
@@ -74,9 +92,12 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     here = devices.chosen(options.devices)
     keep = _keep(options, out, asked, block)
     known = library.identity(asked, here[0].platform)
-    # What draws is imported while filters run, and needed when they have. No daemon: the end of the
-    # interpreter would pull Matplotlib's compiled code from under it.
-    threading.Thread(target=_prepare_drawing).start()
+    earlier = _earlier(out, keep)
+    written = earlier is not None and all((out / name).exists() for name in FILES)
+    if not written:
+        # What draws is imported while filters run, and needed when they have. No daemon: the end of
+        # the interpreter would pull Matplotlib's compiled code from under it.
+        threading.Thread(target=_prepare_drawing).start()
     try:
         with (
             Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress,
@@ -109,16 +130,69 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         print(f"jaxslam: {sentence}", file=sys.stderr)
     if jax.process_index() > 0:
         return 0
+    took = campaign.seconds
+    ran = took - campaign.compile_seconds
+    if earlier is not None and not keep.set_aside:  # else some runs were run again
+        times = {name: earlier[name] for name in _TIMES}
+        campaign, command = replace(campaign, **times), earlier["command"]
+        ran = 0.0
+        if written:
+            print(report.table(campaign))
+            print(
+                f"\n{out} holds this campaign, finished: nothing was run and nothing written; "
+                f"--runs above {campaign.runs} extends it"
+            )
+            return 0
     print(report.table(campaign))
     files = _campaign_files(campaign, scenario, asked["seed"], asked["bound"], command)
-    written = report.write_files(out, files)
-    compiling = campaign.compile_seconds
+    print("\nwrote " + ", ".join(str(path) for path in report.write_files(out, files)))
     print(
-        f"\ncampaign {campaign.seconds:.1f} s: {compiling:.1f} s until the last program was there, "
-        f"{campaign.seconds - compiling:.1f} s besides; wrote "
-        + ", ".join(str(path) for path in written)
+        f"results after {took:.1f} s"
+        + f"; once every program was there, the runs took {ran:.1f} s of them" * (ran > 0)
     )
     return 0
+
+
+_TIMES = ("seconds", "compile_seconds", "step_seconds")
+
+
+def _earlier(out: Path, keep: store.Store) -> dict[str, Any] | None:
+    """What the results in a folder say, where all runs are there and the results are of them."""
+    assert keep.runs is not None
+    if missing(keep.spans(), keep.runs, keep.runs):
+        return None
+    try:
+        found = json.loads((out / RESULT).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    whole = isinstance(found, dict) and found.get("runs") == keep.runs
+    return found if whole and {*_TIMES, "command"} <= found.keys() else None
+
+
+def _said(value: Any) -> str:
+    """An option's value, as its user would say it."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return "not given" if value is None else str(value)
+
+
+def _check_same(options: argparse.Namespace, there: store.Store, asked: Mapping[str, Any]) -> None:
+    """Raise ValueError unless what was asked for fits the campaign that is to be resumed."""
+    folder = options.resume
+    if options.out is not None and options.out.resolve() != folder.resolve():
+        raise ValueError(
+            f"--resume {folder} writes its results there: expected no --out, got {options.out}"
+        )
+    if "asked" not in there.settings:
+        raise ValueError(f"{folder} holds a campaign that no command began")
+    told = there.settings["asked"]
+    differences = [
+        f"--{name} is {_said(told[name])} there, {_said(value)} here"
+        for name, value in asked.items()
+        if name in told and told[name] != value
+    ]
+    if differences:
+        raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
 
 
 def _prepare_drawing() -> None:

@@ -12,14 +12,17 @@ from jaxslam.monte_carlo.pieces import cores
 
 
 def prepare(options: argparse.Namespace) -> None:
-    """Before JAX looks at its devices: as many CPU devices as asked for, by default as cores."""
+    """Before JAX looks at its devices: as many CPU devices as asked for, by default as cores.
+
+    No more than cores, or JAX would make them; `chosen` says then that there are too few.
+    """
     asked = options.devices
     count = cores() if asked in ("all", "cpu") else int(asked) if asked.isdecimal() else None
     if count is not None and count < 1:
         raise ValueError(f"expected at least 1 device, got {asked}")
     if count is not None:
         with contextlib.suppress(RuntimeError):  # JAX has been used before, as in a notebook
-            jax.config.update("jax_num_cpu_devices", count)
+            jax.config.update("jax_num_cpu_devices", min(count, cores()))
 
 
 def join(options: argparse.Namespace) -> None:
@@ -61,7 +64,11 @@ def chosen(asked: str) -> list[jax.Device]:
     if asked.isdecimal():
         there = jax.local_devices()
         if int(asked) > len(there):
-            raise ValueError(f"{asked} devices asked for; there are {len(there)}")
+            of = "each a core of the CPU" if there[0].platform == "cpu" else there[0].platform
+            raise ValueError(
+                f"--devices: expected at most {len(there)}, as many as there are here ({of}), "
+                f"got {asked}"
+            )
         return list(there[: int(asked)])
     try:
         return list(jax.local_devices(backend=asked))

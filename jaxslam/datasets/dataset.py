@@ -56,6 +56,7 @@ class Dataset:
 
     def __post_init__(self) -> None:
         check_log(
+            self.name,
             self.log,
             control_size=len(self.motion.controls),
             measurement_size=len(self.sensor.measurements),

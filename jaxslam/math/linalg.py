@@ -362,6 +362,18 @@ def is_concrete(*values: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
+def shape_told(value: Any) -> str:
+    """For a message: the shape of what should be an array, or what it is where it has none."""
+    try:
+        shape = np.shape(value)
+    except ValueError:
+        return "rows of unlike lengths"
+    if shape == () and not hasattr(value, "shape"):
+        plain = value is None or isinstance(value, str | int | float | complex)
+        return repr(value) if plain else f"a {type(value).__name__}"
+    return str(shape)
+
+
 def check_count(name: str, value: Any) -> None:
     """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
@@ -393,9 +405,9 @@ def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
 
     Values are looked at only where they are concrete; a tracer is checked for its shape alone.
     """
-    shape = np.shape(cov)
-    if shape != (size, size):
-        raise ValueError(f"{name}: expected a covariance of shape ({size}, {size}), got {shape}")
+    got = shape_told(cov)
+    if got != str((size, size)):
+        raise ValueError(f"{name}: expected a covariance of shape ({size}, {size}), got {got}")
     if not is_concrete(cov):
         return
     values = np.asarray(cov)

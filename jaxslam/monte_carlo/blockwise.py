@@ -8,6 +8,7 @@ process, without either.
 
 import functools
 import pickle
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
@@ -22,6 +23,9 @@ from jaxslam import programs
 from jaxslam.math.xla import hot_options, quick_options
 from jaxslam.monte_carlo.pieces import cores
 from jaxslam.programs import cache
+
+RESTORED = "/jaxslam/restore_program_duration"
+"""What `jax.monitoring` is told of a program that a library had, and for how long that took."""
 
 
 class Library(Protocol):
@@ -161,6 +165,7 @@ class Blockwise:
 
     def _restored(self, label: str) -> Made | None:
         """The program as the library has it."""
+        began = time.perf_counter()
         content = None if self._library is None else self._library.get(label)
         if content is None:
             return None
@@ -173,6 +178,7 @@ class Blockwise:
         )
         program: Future[Callable[..., Any]] = Future()
         program.set_result(self._with(compiled, saved.numbers, jax.tree.structure(saved.shapes)))
+        jax.monitoring.record_event_duration_secs(RESTORED, time.perf_counter() - began)
         return Made(program, saved.shapes)
 
     def _with(self, compiled: Any, numbers: list[Any], out: Any) -> Callable[..., Any]:

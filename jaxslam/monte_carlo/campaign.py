@@ -10,7 +10,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import jax
@@ -21,7 +21,13 @@ from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.math.linalg import check_count, check_key
 from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
 from jaxslam.monte_carlo.blockwise import Library
-from jaxslam.monte_carlo.candidates import check_dtype, check_fits, check_noise, fitting_block
+from jaxslam.monte_carlo.candidates import (
+    check_dtype,
+    check_fits,
+    check_noise,
+    fitting_block,
+    without_noise,
+)
 from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.pieces import cores, missing
 from jaxslam.monte_carlo.programs import compile_programs
@@ -156,6 +162,13 @@ def monte_carlo(
     if not devices:
         raise ValueError("monte_carlo: expected at least one device")
     dtype = check_dtype(dtype)
+    if keep is not None and not all(
+        callable(getattr(keep, name, None)) for name in ("claim", "save", "blocks")
+    ):
+        raise ValueError(
+            "monte_carlo: expected keep as of jaxslam.store.create(folder) or .resume(folder), "
+            f"got {keep!r}"
+        )
     began = time.perf_counter()
     runs = int(runs)
     if workers is None:
@@ -217,7 +230,9 @@ def monte_carlo(
             runs=done,
             dtype=str(limit.dtype),
             divergence_limit=float(limit),
-            filters={name: summarize(tallies[name], least) for name in filters},
+            filters=_qualified(
+                {name: summarize(tallies[name], least) for name in filters}, scenario
+            ),
             seconds=time.perf_counter() - began,
             compile_seconds=work.compile_seconds,
             step_seconds={
@@ -315,6 +330,28 @@ class _Work:
         self.first |= programs.first
         if stop is not None:
             raise stop
+
+
+def _qualified(found: dict[str, Summary], scenario: Scenario) -> dict[str, Summary]:
+    """With a doubt on those that an exact sensor left without a covariance to judge by."""
+    dropped = {name: one.counts.get("singular", 0) for name, one in found.items()}
+    exact = without_noise(scenario) if any(dropped.values()) else ""
+    if not exact:
+        return found
+    return {
+        name: replace(
+            one,
+            doubts=(
+                *one.doubts,
+                f"the sensor gives {exact} without noise, so innovation covariances were singular: "
+                f"{dropped[name]:,} measurements were dropped for it and others weighed by "
+                "rounding alone; a small noise makes the figures mean something",
+            ),
+        )
+        if dropped[name]
+        else one
+        for name, one in found.items()
+    }
 
 
 def _add(

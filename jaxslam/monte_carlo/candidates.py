@@ -76,28 +76,59 @@ def check_noise(scenario: Scenario) -> None:
     """
     if not is_concrete(scenario.controls, scenario.pose, scenario.landmarks):
         return
-    dtype = jnp.result_type(float)
-    pose, control, landmark = (
-        np.asarray(value, dtype)
-        for value in (scenario.pose, _first(scenario.controls), _first(scenario.landmarks))
-    )
-    motion, sensor = scenario.motion, scenario.sensor
+    motion = scenario.motion
+    pose, control = _number(scenario.pose), _number(scenario.controls)[0]
     _check_stated(
         motion.name, len(motion.noises), partial(programs.call, motion.noise_cov, (), pose, control)
     )
-    for model in [part.sensor for part in sensor.parts] if isinstance(sensor, Suite) else [sensor]:
-        size, seen = len(model.measurements), landmark[: len(model.landmark)]
+    for model in _sensors(scenario):
+        size, nothing = len(model.measurements), _number(np.zeros(len(model.measurements)))
         try:
-            _check_stated(
-                model.name, size, partial(programs.call, model.noise_cov, (), np.zeros(size, dtype))
-            )
+            _check_stated(model.name, size, partial(programs.call, model.noise_cov, (), nothing))
         except ValueError:
-            z = programs.call(model.observe, (), pose, seen)
-            _check_stated(model.name, size, model.noise_cov, z)
+            _check_stated(model.name, size, model.noise_cov, _seen_first(model, scenario))
 
 
-def _first(rows: Any) -> np.ndarray:
-    return np.asarray(np.asarray(rows)[0])
+def without_noise(scenario: Scenario) -> str:
+    """In words, what the scenario's sensors measure without noise; "" where there is none.
+
+    Looked at where `check_noise` looks; a noise that grows from 0 with z is one.
+    """
+    if not is_concrete(scenario.pose, scenario.landmarks):
+        return ""
+    found = []
+    for model in _sensors(scenario):
+        for z in (_number(np.zeros(len(model.measurements))), _seen_first(model, scenario)):
+            exact = _exact(model, np.asarray(programs.call(model.noise_cov, (), z), np.float64))
+            if not exact:
+                break
+        if exact:
+            found.append(f"{exact} of {model.name}")
+    return " and ".join(found)
+
+
+def _exact(sensor: Sensor, cov: np.ndarray) -> str:
+    """The measurements of variance 0; a combination of them where it is none of them alone."""
+    sigma = np.sqrt(np.diagonal(cov))
+    if (sigma == 0).any():
+        return ", ".join(n for n, one in zip(sensor.measurements, sigma, strict=True) if one == 0)
+    whole = np.linalg.eigvalsh(cov / np.outer(sigma, sigma))[:1].min(initial=1.0) > 1e-12
+    return "" if whole else f"a combination of {', '.join(sensor.measurements)}"
+
+
+def _sensors(scenario: Scenario) -> list[Sensor]:
+    sensor = scenario.sensor
+    return [part.sensor for part in sensor.parts] if isinstance(sensor, Suite) else [sensor]
+
+
+def _seen_first(sensor: Sensor, scenario: Scenario) -> jax.Array:
+    """(Z,) the first landmark as measured from the start."""
+    landmark = _number(scenario.landmarks)[0, : len(sensor.landmark)]
+    return programs.call(sensor.observe, (), _number(scenario.pose), landmark)
+
+
+def _number(values: Any) -> np.ndarray:
+    return np.asarray(values, jnp.result_type(float))
 
 
 def _check_stated(name: str, size: int, noise_cov: Callable[..., Any], *at: Any) -> None:

@@ -100,10 +100,11 @@ def filter_of(
 def compiled_once(
     filter: Filter, pose: ArrayLike, pose_cov: ArrayLike, solve: Estimator
 ) -> Estimator:
-    """The estimator that refuses what `run` refuses and calls `solve`, compiled as `run` is."""
+    """The estimator that refuses what `run` refuses, by its own name, and calls `solve`, compiled
+    as `run` is."""
 
     def estimator(log: Log, key: Array) -> Trace:
-        check_run(filter, log, pose, pose_cov)
+        check_run(filter.name, filter, log, pose, pose_cov)
         return programs.call(solve, (), log, key)
 
     return estimator

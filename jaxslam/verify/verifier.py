@@ -126,6 +126,15 @@ def examine(
         raise ValueError(f"verify_jacobians: expected count >= 2, got {count}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"verify_jacobians: expected a seed between 0 and 2³²-1, got {seed}")
+    if not (isinstance(model, Motion | Sensor) or callable(model)):
+        raise ValueError(
+            "verify_jacobians: expected a Motion, a Sensor or a function of vectors, got "
+            f"{type(model).__name__}"
+        )
+    if not (jacobian is None or callable(jacobian)):
+        raise ValueError(
+            f"verify_jacobians: expected jacobian to be a function, got {type(jacobian).__name__}"
+        )
     functions: tuple[subject.Function, ...]
     if isinstance(model, Motion):
         kind, name, functions = "motion", model.name, subject.motion_functions(model)

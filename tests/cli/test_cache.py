@@ -236,4 +236,4 @@ def test_commands_keep_programs_unless_told_not_to(
     said = capsys.readouterr()
     assert len(entries(tmp_path)) == kept
     assert len(said.err.splitlines()) == lines
-    assert "while programs were traced and compiled (1 program)" in said.out
+    assert "s of them to make 1 program: 1 compiled, 0 loaded from the cache" in said.out

@@ -1,8 +1,11 @@
 """The command: files, exit codes, and nothing left behind after bad input or an interrupt."""
 
 import json
+import re
 import subprocess
 import sys
+import threading
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -10,7 +13,7 @@ import pytest
 from worlds import three_parameters
 
 from jaxslam import catalog, cli, report, store
-from jaxslam.cli import asking
+from jaxslam.cli import asking, devices
 from jaxslam.consistency import Measure
 from jaxslam.monte_carlo import Interrupted
 
@@ -23,9 +26,17 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "verdict" in printed
     assert "published" not in printed  # of 2500 steps, and these are 8
-    assert "until the last program was there" in printed
-    assert "while programs were traced and compiled" in printed.splitlines()[-1]
+    wrote, results, last = printed.splitlines()[-3:]
+    assert wrote.startswith(f"wrote {out / 'report.html'}, ")
+    assert re.fullmatch(
+        r"results after .* s; once every program was there, the runs took .* s of them", results
+    )
+    assert re.fullmatch(
+        r".* s in all, .* s of them to make \d+ programs: \d+ compiled, \d+ loaded from the cache",
+        last,
+    )
     names = {path.name for path in out.iterdir()}
+    assert names == {"blocks", *cli.campaign.FILES}
     assert names == {
         "blocks",
         "report.html",
@@ -102,6 +113,11 @@ def test_a_first_result_does_not_wait_for_what_draws():
         (["--seed", "-1"], "seed"),
         (["--dtype", "float16"], "invalid choice"),
         (["--devices", "0"], "at least 1 device"),
+        (["--devices", "99"], "--devices: expected at most 4, as many as there are here (each a"),
+        (["--filters", ""], "--filters: expected names of filters with commas between them"),
+        (["--filters", "ekf,"], "or all, got 'ekf,'"),
+        (["--cache", ""], "--cache: expected a folder, got ''"),
+        (["--resume", " "], "--resume: expected a folder, got ' '"),
         (["--devices", "abacus"], "no device 'abacus' here; known: all, cpu"),
         (["--processes", "2"], "need --coordinator"),
         (["--coordinator", "here"], "expected --coordinator HOST:PORT"),
@@ -126,6 +142,14 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, capsys, change, mes
     assert cli.main([*QUICK, *change, "--out", str(out)]) == 2
     assert message in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_no_more_devices_are_made_than_there_are_cores(monkeypatch):
+    told = {}
+    monkeypatch.setattr(jax.config, "update", told.__setitem__)
+    for asked, made in (("99", devices.cores()), ("1", 1), ("all", devices.cores())):
+        devices.prepare(SimpleNamespace(devices=asked))
+        assert told == {"jax_num_cpu_devices": made}
 
 
 @pytest.mark.parametrize("asked", ["all", "fastslam1,fastslam2,particle_localization"])
@@ -182,6 +206,24 @@ def test_an_interrupt_exits_with_130_and_writes_nothing(tmp_path, capsys, monkey
     assert not list(tmp_path.rglob("*.*"))
 
 
+def test_an_interrupted_command_leaves_no_thread_that_would_be_torn_down(tmp_path, monkeypatch):
+    """At exit Python waits for threads, but for daemons, which crash in compiled code."""
+    ended = threading.Event()
+
+    def interrupted(*arguments, **options):
+        raise Interrupted(None, 3)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
+    monkeypatch.setattr(cli.campaign, "_prepare_drawing", ended.wait)
+    before = set(threading.enumerate())
+    try:
+        assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
+        begun = set(threading.enumerate()) - before
+        assert len(begun) == 1 and not any(thread.daemon for thread in begun)
+    finally:
+        ended.set()
+
+
 def test_no_command_exits_with_2(capsys):
     assert cli.main([]) == 2
     assert "usage" in capsys.readouterr().err
@@ -190,6 +232,8 @@ def test_no_command_exits_with_2(capsys):
 def test_the_module_runs_as_a_program_in_float32(tmp_path):
     arguments = [
         *QUICK,
+        "--steps",
+        "1",  # of which there is no pose NEES
         "--filters",
         "dead_reckoning",
         "--dtype",
@@ -285,10 +329,22 @@ def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys):
     whole, csv = results(out), (out / "consistency.csv").read_text()
     assert len(kept(out)) == 4
 
-    # A finished one prints its result; a lost block is computed again, a damaged one set aside.
-    capsys.readouterr()
+    # A finished one prints its result and stays as it is, files that were lost come back; a lost
+    # block is computed again, a damaged one set aside.
+    said = capsys.readouterr().out
+    at = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    text = (out / "consistency.json").read_text()
     assert cli.main(again) == 0
-    assert "verdict" in capsys.readouterr().out
+    table, _, rest = capsys.readouterr().out.partition("\n\n" + str(out))
+    assert table and said.startswith(table)  # with the time of a step
+    assert rest.startswith(" holds this campaign, finished: nothing was run and nothing written;")
+    assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == at
+    (out / "map.png").unlink()
+    assert cli.main(again) == 0
+    assert (out / "map.png").exists()
+    assert (out / "consistency.json").read_text() == text
+    assert cli.main([*again, "--out", str(tmp_path / "other")]) == 2
+    assert "expected no --out, got" in capsys.readouterr().err
     lost, damaged = sorted((out / "blocks").glob("*.npz"))[:2]
     lost.unlink()
     damaged.write_bytes(damaged.read_bytes()[:1000])
@@ -301,8 +357,7 @@ def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys):
 
     assert cli.main([*again, "--seed", "3", "--filters", "ekf"]) == 2
     message = capsys.readouterr().err
-    assert "asked.seed: 0 there, 3 here" in message
-    assert "asked.filters: ekf,dead_reckoning there, ekf here" in message
+    assert "--seed is 0 there, 3 here; --filters is ekf,dead_reckoning there, ekf here" in message
     assert cli.main(["consistency", "--resume", str(tmp_path)]) == 2
     assert "no campaign to resume" in capsys.readouterr().err
 

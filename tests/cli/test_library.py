@@ -5,6 +5,7 @@ import worlds
 
 from jaxslam import programs
 from jaxslam.cli import cache, library
+from jaxslam.cli.spent import Spent
 from jaxslam.monte_carlo import monte_carlo
 
 ASKED = {"scenario": "ring", "filters": "ekf", "seed": 0, "runs": 4, "bound": False}
@@ -50,8 +51,10 @@ def test_a_campaign_runs_from_what_another_has_compiled():
     }
     traced.clear()
     programs.clear()  # as in another process
-    second = campaign(watched, shelf)
+    with Spent() as spent:
+        second = campaign(watched, shelf)
     assert (traced, shelf.found) == ([], len(names))
+    assert len(names) <= spent.cached <= spent.programs  # a command counts them as loaded
     for name, values in first.per_run.items():
         np.testing.assert_array_equal(values, second.per_run[name])
 

@@ -252,7 +252,7 @@ def test_simulated_runs_have_an_honest_nees(name):
 
 def test_unknown_tags_may_repeat_within_a_scan():
     scan = Scan(np.zeros((2, 3, 1)), np.full((2, 3), -1, np.int32), np.ones((2, 3), bool))
-    check_log(Log(np.zeros((2, 2)), scan), control_size=2, measurement_size=1)
+    check_log("test", Log(np.zeros((2, 2)), scan), control_size=2, measurement_size=1)
 
 
 @pytest.mark.parametrize("name", R)

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import catalog, filters, motion, run, simulate, store
+from jaxslam import catalog, filters, motion, run, sensors, simulate, store
+from jaxslam.filters import reporting
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
 from jaxslam.monte_carlo.block import Programs
-from jaxslam.monte_carlo.candidates import fitting_block
+from jaxslam.monte_carlo.candidates import fitting_block, without_noise
+from jaxslam.types import Status
 
 WORLD = worlds.ring()
 EKF = worlds.ekf(WORLD)
@@ -338,6 +340,41 @@ def test_a_world_without_noise_does_not_diverge():
     campaign = monte_carlo(still, {"ekf": worlds.ekf(still)}, 3, worlds.key(), block=4)
     assert campaign.filters["ekf"].verdict == "undecided"
     assert campaign.filters["ekf"].counts["divergent"] == 0
+
+
+def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
+    """Nothing is wrong with it in dead reckoning, which takes no measurements."""
+    exact = sensors.range_bearing(np.diag([0.1, 0.0]))
+    still = dataclasses.replace(worlds.ring(2), sensor=exact)
+    reckoning = filters.dead_reckoning(still.motion, exact)
+
+    def singular(joint, scan, key):
+        info = reporting.nothing_of(scan)
+        return joint, info._replace(status=jnp.full_like(info.status, Status.SINGULAR))
+
+    candidates = {"a": reckoning, "b": dataclasses.replace(reckoning, update=singular)}
+    found = monte_carlo(still, candidates, 2, worlds.key(), block=2, devices=jax.devices()[:1])
+    a, b = (found.filters[name].doubts for name in candidates)
+    assert not any("without noise" in doubt for doubt in a)
+    assert "bearing [rad] of range_bearing without noise" in b[-1]
+    assert f"{2 * 2 * len(still.landmarks)} measurements were dropped for it" in b[-1]
+
+
+@pytest.mark.parametrize(
+    ("noise", "told"),
+    [
+        (np.diag([0.1, 1e-9]), ""),
+        (np.zeros((2, 2)), "range [m], bearing [rad] of range_bearing"),
+        (np.full((2, 2), 0.1), "a combination of range [m], bearing [rad] of range_bearing"),
+        (lambda z: jnp.diag(jnp.stack([z[0], 1.0])) ** 2, ""),  # grows with the range
+        (lambda z: jnp.diag(z * jnp.array([1.0, 0.0])), "bearing [rad] of range_bearing"),
+    ],
+)
+def test_measurements_without_noise_are_named(noise, told):
+    there = dataclasses.replace(WORLD, sensor=sensors.range_bearing(noise))
+    assert without_noise(there) == told
+    eyes = sensors.suite((sensors.compass(np.eye(1)), 1), (there.sensor, 6))
+    assert without_noise(dataclasses.replace(WORLD, sensor=eyes)) == told
 
 
 @pytest.fixture(scope="module")

@@ -278,6 +278,7 @@ def test_filters_without_a_number_and_single_steps_can_be_drawn(campaign, draw):
         coverage={block: np.full_like(share, np.nan) for block, share in there.coverage.items()},
         autocorrelation=np.full(LAGS, np.nan),
         counts=there.counts | {"runs": 0},
+        measures={},
     )
     once = dataclasses.replace(there, curves={n: curve[2:3] for n, curve in there.curves.items()})
     for steps, filters in (
@@ -285,7 +286,8 @@ def test_filters_without_a_number_and_single_steps_can_be_drawn(campaign, draw):
         (WORLD.steps, {"_a$": lost, "b": there}),
         (1, {"a": once}),
     ):
-        tiny = dataclasses.replace(campaign, steps=steps, filters=filters)
+        times = dict.fromkeys(filters, 1e-4)
+        tiny = dataclasses.replace(campaign, steps=steps, filters=filters, step_seconds=times)
         figure = draw(tiny)
         assert plot.png(figure, 40).startswith(b"\x89PNG")
         said = plot.describe(figure)

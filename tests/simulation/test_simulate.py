@@ -269,7 +269,7 @@ def test_a_scan_holds_what_is_in_view_lowest_tags_first(places):
         noise[:, 1] = wrap(noise[:, 1])
         assert np.all(np.abs(whiten(noise, R)) < 6)
     assert len(counts) > 2  # more and fewer landmarks in view than places
-    check_log(log, control_size=2, measurement_size=2)
+    check_log("simulate", log, control_size=2, measurement_size=2)
 
 
 def test_everything_is_in_view_by_default():

@@ -78,7 +78,8 @@ def cost_figure(campaign: Campaign) -> Figure:
     panels[-1].axhline(DOF["pose"], color=INK, lw=0.8, zorder=1.5)
     panels[-1].set(xlabel="time of a step [µs]")
     if np.isfinite(times).any():
-        panels[-1].set(xscale="log")
+        if any(np.isfinite(axes.dataLim.minposx) for axes in panels):  # else there is no mark
+            panels[-1].set(xscale="log")
         panels[-1].xaxis.set_major_formatter("{x:g}")
         near = np.nanmax(times) < 100 * np.nanmin(times)
         panels[-1].xaxis.set_minor_formatter(few_digits if near else "")

@@ -93,7 +93,9 @@ def plain(name: str) -> str:
 
 def logarithmic(axes: Axes) -> None:
     """A logarithmic ordinate with plain numbers, where the values span more than a decade;
-    minor ticks have numbers where decades are few."""
+    minor ticks have numbers where decades are few. Linear where no value is above 0."""
+    if not np.isfinite(axes.dataLim.minposy):
+        return  # Matplotlib would refuse to draw
     low, high = axes.get_ylim()
     if 0 < high < 10 * low:
         return
