@@ -1,10 +1,12 @@
 """The error of robocentric mapping: everything as the robot sees it."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Pose
 from jaxslam.math.xla import settle
 from jaxslam.protocols import Basis, Chart
 
@@ -22,19 +24,19 @@ def robocentric() -> Chart:
     """
 
     def retract(
-        pose: jax.Array, landmark: jax.Array, dx: jax.Array, dl: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+        pose: Pose, landmark: Float[Array, "L"], dx: Pose, dl: Float[Array, "L"]
+    ) -> tuple[Pose, Float[Array, "L"]]:
         moved = settle(se2.inverse(se2.inverse(pose) + dx))
         return moved, se2.from_frame(moved, se2.to_frame(pose, landmark) + dl)
 
     def local(
-        pose0: jax.Array, landmark0: jax.Array, pose: jax.Array, landmark: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+        pose0: Pose, landmark0: Float[Array, "L"], pose: Pose, landmark: Float[Array, "L"]
+    ) -> tuple[Pose, Float[Array, "L"]]:
         dx = se2.inverse(pose) - se2.inverse(pose0)
         dl = se2.to_frame(pose, landmark) - se2.to_frame(pose0, landmark0)
         return jnp.concatenate([dx[:2], wrap(dx[2:])]), dl
 
-    def basis(pose: jax.Array, landmark: jax.Array) -> Basis:
+    def basis(pose: Pose, landmark: Float[Array, "L"]) -> Basis:
         c, s = settle((jnp.cos(pose[2]), jnp.sin(pose[2])))
         one = jnp.ones_like(c)
         # With l = R(m - b), R = R(θ) and θ = -b_θ; and the same of t = -R b.

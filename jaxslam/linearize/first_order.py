@@ -1,16 +1,18 @@
 """What first-order linearizers share: a model and its Jacobians, each at a place of its own."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
 from jaxslam import derivatives
+from jaxslam.math.arrays import Pose, PoseMatrix
 from jaxslam.math.linalg import matmul
 from jaxslam.protocols import Here, Motion, Sensor
 
 
 def motion_at(
-    motion: Motion, pose: jax.Array, u: jax.Array, at: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+    motion: Motion, pose: Pose, u: Float[Array, "U"], at: Pose
+) -> tuple[Pose, PoseMatrix, PoseMatrix]:
     """f(pose, u, 0), and ∂f/∂pose (3, 3) and W Q Wᵀ (3, 3) with the Jacobians at another pose."""
     by_pose, by_noise = derivatives.motion_jacobians(motion, at, u)
     moved = motion.step(pose, u, jnp.zeros(by_noise.shape[1], pose.dtype))
@@ -19,8 +21,8 @@ def motion_at(
 
 
 def observe_at(
-    sensor: Sensor, here: Here, at_pose: jax.Array, at_landmark: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    sensor: Sensor, here: Here, at_pose: Pose, at_landmark: Float[Array, "L"]
+) -> tuple[Float[Array, "Z"], Float[Array, "Z 3"], Float[Array, "Z L"], Float[Array, "Z Z"]]:
     """h(pose, l), its Jacobians at another pose and landmark, and no added noise (Z, Z)."""
     by_pose, by_landmark = derivatives.observe_jacobians(sensor, at_pose, at_landmark)
     expected = sensor.observe(here.pose, here.landmark)
@@ -28,8 +30,8 @@ def observe_at(
 
 
 def invert_at(
-    sensor: Sensor, pose: jax.Array, z: jax.Array, at_pose: jax.Array, at_z: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+    sensor: Sensor, pose: Pose, z: Float[Array, "Z"], at_pose: Pose, at_z: Float[Array, "Z"]
+) -> tuple[Float[Array, "L"], Float[Array, "L 3"], Float[Array, "L L"]]:
     """g(pose, z, s̄), ∂g/∂pose (L, 3) and G_z R G_zᵀ + G_s S G_sᵀ (L, L), Jacobians elsewhere.
 
     The noise is that of z: Solà (32)-(38), with the prior's term of (44).
@@ -40,6 +42,6 @@ def invert_at(
     return sensor.invert(pose, z, mean), by_pose, own
 
 
-def turned(by_pose: jax.Array, offset: jax.Array) -> jax.Array:
+def turned(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> Float[Array, "L 3"]:
     """The derivative of a point by the pose (·, 3), the turn's lever longer by an offset (2,)."""
     return by_pose.at[:2, 2].add(jnp.stack([-offset[1], offset[0]]))

@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import batched_linalg
@@ -47,7 +49,7 @@ def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
     return jax.checkpoint(function, prevent_cse=False)
 
 
-def gram(a: jax.Array, b: jax.Array) -> jax.Array:
+def gram(a: Float[Array, "k D"], b: Float[Array, "k E"]) -> Float[Array, "D E"]:
     """Aᵀ B of A (k, D), B (k, E), for small k."""
     if a.shape[0] > _OUTER_PRODUCTS or a.shape[0] == 0:
         # Not a.T @ b, of which a gradient would keep a transposed copy of A.
@@ -56,12 +58,12 @@ def gram(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @kept_whole
-def _outer_products(a: jax.Array, b: jax.Array) -> jax.Array:
+def _outer_products(a: Float[Array, "k D"], b: Float[Array, "k E"]) -> Float[Array, "D E"]:
     return total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
 
 
 @jax.custom_jvp
-def square(a: jax.Array) -> jax.Array:
+def square(a: Float[Array, "k D"]) -> Float[Array, "D D"]:
     """Aᵀ A of A (k, D), k of any size; one product in a gradient, where `gram` takes two."""
     return gram(a, a)
 
@@ -72,22 +74,22 @@ def _square_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     return square(*primals), half + half.T
 
 
-def gram_both(a: jax.Array, b: jax.Array) -> jax.Array:
+def gram_both(a: Float[Array, "k D"], b: Float[Array, "k D"]) -> Float[Array, "D D"]:
     """Aᵀ B + Bᵀ A of A, B (k, D), for small k; symmetric to the bit."""
     return gram(a, b) + gram(b, a)
 
 
-def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
+def matmul(a: Float[Array, "n k"], b: Float[Array, "k D"]) -> Float[Array, "n D"]:
     """A B of A (n, k), B (k, D), for small k."""
     return gram(a.T, b)
 
 
-def symmetrize(matrix: jax.Array) -> jax.Array:
+def symmetrize(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     """(A + Aᵀ)/2 over the last two axes."""
     return 0.5 * (matrix + jnp.swapaxes(matrix, -1, -2))
 
 
-def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+def cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """Lower L (n, n) with L Lᵀ = A, and whether A is numerically positive definite, ().
 
     A pivot not above n·eps times its diagonal entry counts as zero: its column of L is zero and the
@@ -102,7 +104,7 @@ def cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @jax.custom_jvp
-def _cholesky(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
     zero = jnp.zeros((), matrix.dtype)
     rows: list[list[jax.Array]] = [[zero] * n for _ in range(n)]
@@ -130,23 +132,23 @@ def _cholesky_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return (factor, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
 
 
-def _mirrored(matrix: jax.Array) -> jax.Array:
+def _mirrored(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     """The symmetric matrix of a lower triangle."""
     return jnp.tril(matrix) + jnp.tril(matrix, -1).T
 
 
-def _lower_half(matrix: jax.Array) -> jax.Array:
+def _lower_half(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     """Φ: the lower triangle with half of the diagonal."""
     return jnp.tril(matrix) - 0.5 * jnp.diag(jnp.diagonal(matrix))
 
 
-def _cholesky_beyond(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _cholesky_beyond(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     factor = _factor(_mirrored(matrix))
     return factor, factor[0, 0] > 0
 
 
 @jax.custom_jvp
-def _factor(matrix: jax.Array) -> jax.Array:
+def _factor(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower L with L Lᵀ = A of a symmetric A, zero where a pivot is."""
     factor = jnp.tril(batched_linalg.factor(matrix))
     positive = jnp.all(
@@ -166,7 +168,7 @@ def _factor_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     return factor, jnp.where(regular, slope, 0.0)
 
 
-def root_psd(matrix: jax.Array) -> jax.Array:
+def root_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower L (n, n) with L Lᵀ = A for a positive semi-definite A of any size, singular or not.
 
     Cholesky column by column; a pivot that is rounding next to its diagonal entry gives a column of
@@ -187,7 +189,7 @@ def root_psd(matrix: jax.Array) -> jax.Array:
     return jax.lax.scan(column, matrix, jnp.arange(n))[1].T
 
 
-def triangular_root(wide: jax.Array) -> jax.Array:
+def triangular_root(wide: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """Lower L (n, n) with L Lᵀ = A Aᵀ and a diagonal not below zero, of A (n, m), m >= n.
 
     Householder reflections from the right, row by row; nothing is squared, so half the digits of a
@@ -210,7 +212,9 @@ def triangular_root(wide: jax.Array) -> jax.Array:
     return jnp.tril(jax.lax.scan(reflect, wide, jnp.arange(n))[0][:, :n])
 
 
-def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
+def solve_lower(
+    factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
+) -> Float[Array, "n *rest"]:
     """L⁻¹ B for lower L (n, n) and B (n, …); rows whose pivot is zero come out zero."""
     n = factor.shape[-1]
     if n == 0:
@@ -233,7 +237,9 @@ def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
     return solution
 
 
-def _substituted(factor: jax.Array, rhs: jax.Array) -> jax.Array:
+def _substituted(
+    factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
+) -> Float[Array, "n *rest"]:
     """L⁻¹ B, row after row written out."""
     rows: list[jax.Array] = []
     for i in range(len(factor)):
@@ -244,7 +250,7 @@ def _substituted(factor: jax.Array, rhs: jax.Array) -> jax.Array:
 
 
 @jax.custom_jvp
-def whitener(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """Lower W = L⁻¹ (n, n), so W A Wᵀ = I, for A = L Lᵀ of a few rows; and `cholesky`'s flag.
 
     A pivot that counts as zero gives a row of zeros. One division and root a pivot, where
@@ -277,7 +283,7 @@ def _whitener_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return (white, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
 
 
-def whitener_by_rows(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """`whitener` as a loop over rows: little to compile, for what is factored once a step.
 
     Beyond 8×8 by `cholesky`, zero as a whole where a pivot is.
@@ -305,7 +311,7 @@ def whitener_by_rows(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     return rows, good.all()
 
 
-def inverse(matrix: jax.Array) -> jax.Array:
+def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A⁻¹ of a regular (n, n) matrix: by cofactors up to 3×3, which fuses; by LU beyond."""
     n = matrix.shape[-1]
     a = matrix
@@ -322,19 +328,23 @@ def inverse(matrix: jax.Array) -> jax.Array:
     return batched_linalg.inverse(a)
 
 
-def solve_psd(matrix: jax.Array, rhs: jax.Array) -> tuple[jax.Array, jax.Array]:
+def solve_psd(
+    matrix: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
+) -> tuple[Float[Array, "n *rest"], Bool[Array, ""]]:
     """A⁻¹ B for a positive definite A (n, n) and B (n, …), and whether A was positive definite."""
     factor, positive = cholesky(matrix)
     reverse = factor[::-1, ::-1].T
     return solve_lower(reverse, solve_lower(factor, rhs)[::-1])[::-1], positive
 
 
-def inverse_psd(matrix: jax.Array) -> jax.Array:
+def inverse_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A⁻¹ of a positive definite A (n, n), symmetric as it stands; zero where A is not (n > 8)."""
     return square(whitener_by_rows(matrix)[0])
 
 
-def mahalanobis_squared(error: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
+def mahalanobis_squared(
+    error: Float[Array, "n"], cov: Float[Array, "n n"]
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """eᵀ P⁻¹ e and whether P (n, n) is numerically regular; 0 and False where it is not.
 
     P is judged in units of each coordinate's own standard deviation, so that metres, radians and a
@@ -352,7 +362,7 @@ def mahalanobis_squared(error: jax.Array, cov: jax.Array) -> tuple[jax.Array, ja
     return jnp.where(regular, jnp.sum(squares), 0.0), regular
 
 
-def is_positive_definite(matrix: jax.Array) -> jax.Array:
+def is_positive_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
     """Whether a symmetric (n, n) matrix is positive definite: its Cholesky factor is finite, ()."""
     return jnp.all(jnp.isfinite(batched_linalg.factor(matrix)))
 

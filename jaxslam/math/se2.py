@@ -10,50 +10,52 @@ increment is in the local frame) and `boxminus(a, b) = log(b⁻¹ ∘ a)`, so th
 `boxplus(b, boxminus(a, b)) = a`.
 """
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Num
 
 from jaxslam.math.angles import sinc, sinc_slope, wrap
+from jaxslam.math.arrays import Point, PointByPose, PointMatrix, Pose, PoseMatrix, Scalar
 
 
-def rotation(theta: jax.Array) -> jax.Array:
+def rotation(theta: Scalar) -> PointMatrix:
     """R(θ) = [cos θ, -sin θ; sin θ, cos θ], (2, 2) (Solà (54))."""
     c, s = jnp.cos(theta), jnp.sin(theta)
     return _rows([c, -s], [s, c])
 
 
-def compose(a: jax.Array, b: jax.Array) -> jax.Array:
+def compose(a: Pose, b: Pose) -> Pose:
     """a ∘ b = (t_a + R(θ_a) t_b, θ_a + θ_b): Williams' ⊕, Solà (59), (60)."""
     c, s = jnp.cos(a[2]), jnp.sin(a[2])
     return jnp.stack([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap(a[2] + b[2])])
 
 
-def compose_jacobians(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+def compose_jacobians(a: Pose, b: Pose) -> tuple[PoseMatrix, PoseMatrix]:
     """Derivatives of `compose` by a (3, 3) and by b (3, 3): Williams' J1 and J2."""
     c, s = jnp.cos(a[2]), jnp.sin(a[2])
     by_a = _rows([1, 0, -s * b[0] - c * b[1]], [0, 1, c * b[0] - s * b[1]], [0, 0, 1])
     return by_a, _rows([c, -s, 0], [s, c, 0], [0, 0, 1])
 
 
-def inverse(a: jax.Array) -> jax.Array:
+def inverse(a: Pose) -> Pose:
     """a⁻¹ = (-R(θ)ᵀ t, -θ), so that a ∘ a⁻¹ is the identity."""
     c, s = jnp.cos(a[2]), jnp.sin(a[2])
     return jnp.stack([-c * a[0] - s * a[1], s * a[0] - c * a[1], wrap(-a[2])])
 
 
-def inverse_jacobians(a: jax.Array) -> tuple[jax.Array]:
+def inverse_jacobians(a: Pose) -> tuple[PoseMatrix]:
     """Derivative of `inverse`, (3, 3)."""
     c, s = jnp.cos(a[2]), jnp.sin(a[2])
     return (_rows([-c, -s, s * a[0] - c * a[1]], [s, -c, c * a[0] + s * a[1]], [0, 0, -1]),)
 
 
-def between(a: jax.Array, b: jax.Array) -> jax.Array:
+def between(a: Pose, b: Pose) -> Pose:
     """a⁻¹ ∘ b: pose b seen from a."""
     p = to_frame(a, b[:2])
     return jnp.stack([p[0], p[1], wrap(b[2] - a[2])])
 
 
-def between_jacobians(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+def between_jacobians(a: Pose, b: Pose) -> tuple[PoseMatrix, PoseMatrix]:
     """Derivatives of `between` by a (3, 3) and by b (3, 3)."""
     by_frame, by_point = to_frame_jacobians(a, b[:2])
     by_a = jnp.concatenate([by_frame, _rows([0, 0, -1]).astype(by_frame.dtype)])
@@ -61,7 +63,7 @@ def between_jacobians(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]
     return by_a, by_b
 
 
-def exp(tau: jax.Array) -> jax.Array:
+def exp(tau: Pose) -> Pose:
     """The pose reached by the constant twist τ = (u, v, ω) in unit time: (V(ω)(u, v), ω).
 
     V(ω) = [sin ω/ω, -(1 - cos ω)/ω; (1 - cos ω)/ω, sin ω/ω], smooth through ω = 0.
@@ -70,14 +72,14 @@ def exp(tau: jax.Array) -> jax.Array:
     return jnp.stack([s * tau[0] - c * tau[1], c * tau[0] + s * tau[1], wrap(tau[2])])
 
 
-def exp_jacobians(tau: jax.Array) -> tuple[jax.Array]:
+def exp_jacobians(tau: Pose) -> tuple[PoseMatrix]:
     """Derivative of `exp`, (3, 3)."""
     u, v, w = tau[0], tau[1], tau[2]
     s, c, ds, dc = sinc(w), _cosc(w), sinc_slope(w), _cosc_slope(w)
     return (_rows([s, -c, ds * u - dc * v], [c, s, dc * u + ds * v], [0, 0, 1]),)
 
 
-def log(pose: jax.Array) -> jax.Array:
+def log(pose: Pose) -> Pose:
     """The twist τ with exp(τ) = pose, |ω| <= π: (V(θ)⁻¹ t, θ).
 
     V(θ)⁻¹ = [a, θ/2; -θ/2, a] with a = (θ/2) cot(θ/2).
@@ -87,7 +89,7 @@ def log(pose: jax.Array) -> jax.Array:
     return jnp.stack([a * pose[0] + h * pose[1], -h * pose[0] + a * pose[1], w])
 
 
-def log_jacobians(pose: jax.Array) -> tuple[jax.Array]:
+def log_jacobians(pose: Pose) -> tuple[PoseMatrix]:
     """Derivative of `log`, (3, 3)."""
     x, y, w = pose[0], pose[1], wrap(pose[2])
     a, h = _half_cot(w), w / 2
@@ -96,30 +98,30 @@ def log_jacobians(pose: jax.Array) -> tuple[jax.Array]:
     return (_rows([a, h, da * x + 0.5 * y], [-h, a, -0.5 * x + da * y], [0, 0, 1]),)
 
 
-def boxplus(pose: jax.Array, tau: jax.Array) -> jax.Array:
+def boxplus(pose: Pose, tau: Pose) -> Pose:
     """pose ⊞ τ = pose ∘ exp(τ)."""
     return compose(pose, exp(tau))
 
 
-def boxminus(a: jax.Array, b: jax.Array) -> jax.Array:
+def boxminus(a: Pose, b: Pose) -> Pose:
     """a ⊟ b = log(b⁻¹ ∘ a), the twist that leads from b to a."""
     return log(between(b, a))
 
 
-def adjoint(pose: jax.Array) -> jax.Array:
+def adjoint(pose: Pose) -> PoseMatrix:
     """Ad (3, 3) with pose ∘ exp(τ) = exp(Ad τ) ∘ pose: [R, (y, -x)ᵀ; 0, 1]."""
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     return _rows([c, -s, pose[1]], [s, c, -pose[0]], [0, 0, 1])
 
 
-def to_frame(frame: jax.Array, point: jax.Array) -> jax.Array:
+def to_frame(frame: Pose, point: Point) -> Point:
     """R(θ)ᵀ(p - t): a world point (2,) in the frame's coordinates (Solà (56))."""
     c, s = jnp.cos(frame[2]), jnp.sin(frame[2])
     dx, dy = point[0] - frame[0], point[1] - frame[1]
     return jnp.stack([c * dx + s * dy, -s * dx + c * dy])
 
 
-def to_frame_jacobians(frame: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:
+def to_frame_jacobians(frame: Pose, point: Point) -> tuple[PointByPose, PointMatrix]:
     """Derivatives of `to_frame` by the frame (2, 3) and by the point (2, 2)."""
     c, s = jnp.cos(frame[2]), jnp.sin(frame[2])
     dx, dy = point[0] - frame[0], point[1] - frame[1]
@@ -127,7 +129,7 @@ def to_frame_jacobians(frame: jax.Array, point: jax.Array) -> tuple[jax.Array, j
     return by_frame, _rows([c, s], [-s, c])
 
 
-def from_frame(frame: jax.Array, point: jax.Array) -> jax.Array:
+def from_frame(frame: Pose, point: Point) -> Point:
     """R(θ) p + t: a point (2,) of the frame in world coordinates (Solà (55))."""
     c, s = jnp.cos(frame[2]), jnp.sin(frame[2])
     return jnp.stack(
@@ -135,20 +137,20 @@ def from_frame(frame: jax.Array, point: jax.Array) -> jax.Array:
     )
 
 
-def from_frame_jacobians(frame: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:
+def from_frame_jacobians(frame: Pose, point: Point) -> tuple[PointByPose, PointMatrix]:
     """Derivatives of `from_frame` by the frame (2, 3) and by the point (2, 2)."""
     c, s = jnp.cos(frame[2]), jnp.sin(frame[2])
     by_frame = _rows([1, 0, -s * point[0] - c * point[1]], [0, 1, c * point[0] - s * point[1]])
     return by_frame, _rows([c, -s], [s, c])
 
 
-def polar(point: jax.Array) -> jax.Array:
+def polar(point: Point) -> Point:
     """(range, bearing) of a point (2,) (Solà (61)); at the origin (0, 0) with zero gradient."""
     x, y, away = _away_from_origin(point)
     return jnp.stack([jnp.where(away, jnp.sqrt(x * x + y * y), 0.0), jnp.arctan2(y, x)])
 
 
-def polar_in_frame(frame: jax.Array, point: jax.Array) -> jax.Array:
+def polar_in_frame(frame: Pose, point: Point) -> Point:
     """(range, bearing) of a world point (2,) in the frame: `polar` of `to_frame`, (Solà (63)).
 
     Without the frame's sine and cosine: (|p - t|, atan2(p - t) - θ); (0, 0) at the origin.
@@ -158,7 +160,7 @@ def polar_in_frame(frame: jax.Array, point: jax.Array) -> jax.Array:
     return jnp.where(away, jnp.stack([jnp.sqrt(x * x + y * y), bearing]), 0.0)
 
 
-def polar_jacobians(point: jax.Array) -> tuple[jax.Array]:
+def polar_jacobians(point: Point) -> tuple[PointMatrix]:
     """Derivative of `polar`, (2, 2): [x/r, y/r; -y/r², x/r²] (ERRATA, Solà C.1.2); 0 at r = 0."""
     x, y, away = _away_from_origin(point)
     r2 = x * x + y * y
@@ -166,20 +168,20 @@ def polar_jacobians(point: jax.Array) -> tuple[jax.Array]:
     return (jnp.where(away, _rows([x / r, y / r], [-y / r2, x / r2]), 0.0),)
 
 
-def rectangular(polar_point: jax.Array) -> jax.Array:
+def rectangular(polar_point: Point) -> Point:
     """(r cos φ, r sin φ) of (range, bearing) (Solà (62))."""
     r, phi = polar_point[0], polar_point[1]
     return jnp.stack([r * jnp.cos(phi), r * jnp.sin(phi)])
 
 
-def rectangular_jacobians(polar_point: jax.Array) -> tuple[jax.Array]:
+def rectangular_jacobians(polar_point: Point) -> tuple[PointMatrix]:
     """Derivative of `rectangular`, (2, 2)."""
     r, phi = polar_point[0], polar_point[1]
     c, s = jnp.cos(phi), jnp.sin(phi)
     return (_rows([c, -r * s], [s, r * c]),)
 
 
-def align(source: jax.Array, target: jax.Array) -> jax.Array:
+def align(source: Float[Array, "N 2"], target: Float[Array, "N 2"]) -> Pose:
     """The pose T that minimises Σ |T·source_i - target_i|² over SE(2) (no scale).
 
     source, target (N, 2). Closed form: θ = atan2(Σ s×t, Σ s·t) over the centred points, then the
@@ -192,7 +194,7 @@ def align(source: jax.Array, target: jax.Array) -> jax.Array:
     return jnp.stack([shift[0], shift[1], theta])
 
 
-def _away_from_origin(point: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _away_from_origin(point: Point) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
     """The point, replaced by (1, 0) at the origin, where sqrt and arctan2 have no derivative.
 
     The range is taken to be zero where x² + y² underflows, hence the test on the squares.
@@ -201,21 +203,21 @@ def _away_from_origin(point: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array
     return jnp.where(away, point[0], 1.0), jnp.where(away, point[1], 0.0), away
 
 
-def _cosc(x: jax.Array) -> jax.Array:
+def _cosc(x: Scalar) -> Scalar:
     """(1 - cos x)/x without cancellation: sin(x/2) sinc(x/2)."""
     return jnp.sin(x / 2) * sinc(x / 2)
 
 
-def _cosc_slope(x: jax.Array) -> jax.Array:
+def _cosc_slope(x: Scalar) -> Scalar:
     return 0.5 * (jnp.cos(x / 2) * sinc(x / 2) + jnp.sin(x / 2) * sinc_slope(x / 2))
 
 
-def _half_cot(x: jax.Array) -> jax.Array:
+def _half_cot(x: Scalar) -> Scalar:
     """(x/2) cot(x/2), 1 at 0."""
     return jnp.cos(x / 2) / sinc(x / 2)
 
 
-def _rows(*rows: list[jax.Array | float]) -> jax.Array:
+def _rows(*rows: list[Array | float]) -> Num[Array, "rows columns"]:
     dtype = jnp.result_type(*(entry for row in rows for entry in row))
     # One array, and so one kernel and not one a row.
     entries = jnp.stack([jnp.asarray(entry, dtype) for row in rows for entry in row])

@@ -1,9 +1,11 @@
 """Move forward, then turn: the guide's robot."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
 from jaxslam.math import se2
+from jaxslam.math.arrays import Pose, PoseMatrix
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 
@@ -19,16 +21,16 @@ def increment(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (2, 2) covariance.
     """
 
-    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
         d, turn = perturb(u, w)
         return se2.compose(pose, jnp.stack([d, jnp.zeros_like(d), turn]))
 
-    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
         return u + w
 
     def jacobians(
-        pose: jax.Array, u: jax.Array, w: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
+    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
         d = u[0] + w[0]
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         by_pose = jnp.eye(3, dtype=pose.dtype).at[0, 2].set(-d * s).at[1, 2].set(d * c)

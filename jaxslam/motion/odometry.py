@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Pose, PoseMatrix
 from jaxslam.noise import NoiseCov, check_alpha, noise_model
 from jaxslam.protocols import Motion
 
@@ -28,17 +30,17 @@ def odometry(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (3, 3) covariance.
     """
 
-    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
         rot1, trans, rot2 = perturb(u, w)
         facing = jnp.stack([pose[0], pose[1], pose[2] + rot1])
         return se2.compose(facing, jnp.stack([trans, jnp.zeros_like(trans), rot2]))
 
-    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
         return u + w
 
     def jacobians(
-        pose: jax.Array, u: jax.Array, w: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
+    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
         h, d = pose[2] + u[0] + w[0], u[1] + w[1]
         c, s = jnp.cos(h), jnp.sin(h)
         turned = jnp.stack([-d * s, d * c, jnp.ones_like(d)])  # by θ and by rot1 alike
@@ -58,7 +60,7 @@ def odometry(noise_cov: NoiseCov) -> Motion:
     )
 
 
-def odometry_noise(alpha: ArrayLike) -> Callable[[jax.Array, jax.Array], jax.Array]:
+def odometry_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
     """(pose, u) -> the diagonal (3, 3) covariance of `odometry`'s noise, from four constants.
 
         var rot1  = α1 rot1² + α2 trans²
@@ -75,7 +77,7 @@ def odometry_noise(alpha: ArrayLike) -> Callable[[jax.Array, jax.Array], jax.Arr
     """
     check_alpha("odometry_noise", alpha, 4)
 
-    def noise(pose: jax.Array, u: jax.Array) -> jax.Array:
+    def noise(pose: Pose, u: Float[Array, "U"]) -> Float[Array, "W W"]:
         a1, a2, a3, a4 = jnp.asarray(alpha, pose.dtype)
         rot1, trans, rot2 = u[0] ** 2, u[1] ** 2, u[2] ** 2
         return jnp.diag(
@@ -87,7 +89,7 @@ def odometry_noise(alpha: ArrayLike) -> Callable[[jax.Array, jax.Array], jax.Arr
     return noise
 
 
-def odometry_control(before: jax.Array, after: jax.Array) -> jax.Array:
+def odometry_control(before: Array, after: Array) -> Array:
     """The u = (rot1, trans, rot2) of `odometry` that leads from one pose to another: Notes 3.
 
         rot1  = wrap(atan2(y' - y, x' - x) - θ)

@@ -1,8 +1,10 @@
 """A relative pose, as odometry or scan matching reports it."""
 
-import jax
+from jax import Array
+from jaxtyping import Float
 
 from jaxslam.math import se2
+from jaxslam.math.arrays import Pose, PoseMatrix
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 
@@ -18,15 +20,15 @@ def pose_increment(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (3, 3) covariance.
     """
 
-    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
         return se2.compose(pose, perturb(u, w))
 
-    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
         return u + w
 
     def jacobians(
-        pose: jax.Array, u: jax.Array, w: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
+    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
         by_pose, by_increment = se2.compose_jacobians(pose, u + w)
         return by_pose, by_increment, by_increment
 

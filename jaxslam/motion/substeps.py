@@ -2,12 +2,15 @@
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
+from jaxslam.math.arrays import Pose, PoseMatrix
 from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Motion
 
-_Rows = tuple[jax.Array, jax.Array]
-_Jacobians = tuple[jax.Array, jax.Array, jax.Array]
+_Rows = tuple[Array, Array]
+_Jacobians = tuple[Array, Array, Array]
 
 
 def substeps(motion: Motion, count: int) -> Motion:
@@ -35,17 +38,17 @@ def substeps(motion: Motion, count: int) -> Motion:
     check_count("substeps: count", count)
     size_u, size_w = len(motion.controls), len(motion.noises)
 
-    def rows(u: jax.Array, w: jax.Array) -> _Rows:
+    def rows(u: Float[Array, "U"], w: Float[Array, "W"]) -> _Rows:
         return u.reshape(count, size_u), w.reshape(count, size_w)
 
-    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
-        def one(pose: jax.Array, row: _Rows) -> tuple[jax.Array, None]:
+    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
+        def one(pose: Pose, row: _Rows) -> tuple[Array, None]:
             return motion.step(pose, *row), None
 
         return jax.lax.scan(one, pose, rows(u, w))[0]
 
-    def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
-        def one(pose: jax.Array, row: _Rows) -> _Rows:
+    def noise_cov(pose: Pose, u: Float[Array, "U"]) -> Array:
+        def one(pose: Pose, row: _Rows) -> _Rows:
             u_k, none = row
             return motion.step(pose, u_k, none), motion.noise_cov(pose, u_k)
 
@@ -53,20 +56,20 @@ def substeps(motion: Motion, count: int) -> Motion:
         own = jnp.eye(count, dtype=blocks.dtype)[:, None, :, None]
         return (own * blocks[:, :, None, :]).reshape(count * size_w, count * size_w)
 
-    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
         assert motion.perturb is not None
         return jax.vmap(motion.perturb)(*rows(u, w)).ravel()
 
     def jacobians(
-        pose: jax.Array, u: jax.Array, w: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
+    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
         hand = motion.jacobians
         assert hand is not None
 
-        def forward(pose: jax.Array, row: _Rows) -> tuple[jax.Array, _Jacobians]:
+        def forward(pose: Pose, row: _Rows) -> tuple[Array, _Jacobians]:
             return motion.step(pose, *row), hand(pose, *row)
 
-        def backward(after: jax.Array, own: _Jacobians) -> tuple[jax.Array, _Rows]:
+        def backward(after: Array, own: _Jacobians) -> tuple[Array, _Rows]:
             by_pose, by_u, by_w = own
             return after @ by_pose, (after @ by_u, after @ by_w)  # after is F_n ⋯ F_{k+1}
 

@@ -1,9 +1,11 @@
 """Velocities held over an interval, integrated by one Euler step."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
 from jaxslam.math import se2
+from jaxslam.math.arrays import Pose, PoseMatrix
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 
@@ -21,16 +23,16 @@ def unicycle(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (2, 2) covariance.
     """
 
-    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
         v, omega, dt = perturb(u, w)
         return se2.compose(pose, jnp.stack([v * dt, jnp.zeros_like(dt), omega * dt]))
 
-    def perturb(u: jax.Array, w: jax.Array) -> jax.Array:
+    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
         return jnp.stack([u[0] + w[0], u[1] + w[1], u[2]])
 
     def jacobians(
-        pose: jax.Array, u: jax.Array, w: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
+    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
         v, omega, dt = u[0] + w[0], u[1] + w[1], u[2]
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         by_pose = jnp.eye(3, dtype=pose.dtype)

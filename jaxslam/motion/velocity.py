@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
+from jaxslam.math.arrays import Pose, PoseMatrix
 from jaxslam.noise import NoiseCov, check_alpha, noise_model
 from jaxslam.protocols import Motion
 
@@ -30,17 +32,17 @@ def velocity(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (3, 3) covariance.
     """
 
-    def twist_of(u: jax.Array, w: jax.Array) -> jax.Array:
+    def twist_of(u: Float[Array, "U"], w: Float[Array, "W"]) -> Array:
         v, omega, dt = u[0] + w[0], u[1] + w[1], u[2]
         return jnp.stack([v * dt, jnp.zeros_like(dt), omega * dt])
 
-    def step(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
         zero, final = jnp.zeros_like(u[2]), w[2] * u[2]
         return se2.compose(pose, se2.exp(twist_of(u, w)) + jnp.stack([zero, zero, final]))
 
     def jacobians(
-        pose: jax.Array, u: jax.Array, w: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
+    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
         twist, dt, zero = twist_of(u, w), u[2], jnp.zeros_like(u[2])
         by_pose, by_move = se2.compose_jacobians(pose, se2.exp(twist))
         (by_twist,) = se2.exp_jacobians(twist)
@@ -62,7 +64,7 @@ def velocity(noise_cov: NoiseCov) -> Motion:
     )
 
 
-def velocity_noise(alpha: ArrayLike) -> Callable[[jax.Array, jax.Array], jax.Array]:
+def velocity_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
     """(pose, u) -> the diagonal (3, 3) covariance of `velocity`'s noise, from six constants.
 
         var v = α1 v² + α2 ω²,   var ω = α3 v² + α4 ω²,   var γ = α5 v² + α6 ω²
@@ -77,7 +79,7 @@ def velocity_noise(alpha: ArrayLike) -> Callable[[jax.Array, jax.Array], jax.Arr
     """
     check_alpha("velocity_noise", alpha, 6)
 
-    def noise(pose: jax.Array, u: jax.Array) -> jax.Array:
+    def noise(pose: Pose, u: Float[Array, "U"]) -> Float[Array, "W W"]:
         a1, a2, a3, a4, a5, a6 = jnp.asarray(alpha, pose.dtype)
         v, omega = u[0] ** 2, u[1] ** 2
         return jnp.diag(jnp.stack([a1 * v + a2 * omega, a3 * v + a4 * omega, a5 * v + a6 * omega]))

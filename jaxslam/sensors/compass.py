@@ -1,10 +1,12 @@
 """The robot's heading in the map: a compass, a sun sensor."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Pose
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Free, Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
@@ -24,21 +26,23 @@ def compass(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     """
     sensor_pose, sensor_pose_jacobian = mounting("compass", mount)
 
-    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
         return sensor_pose(pose)[2:]
 
-    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
         return wrap(z - z_hat)
 
-    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
         return jnp.zeros(0, pose.dtype)
 
-    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def observe_jacobians(
+        pose: Pose, landmark: Float[Array, "L"]
+    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
         return sensor_pose_jacobian(pose)[2:], jnp.zeros((1, 0), pose.dtype)
 
     def invert_jacobians(
-        pose: jax.Array, z: jax.Array, s: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
+    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
         none = jnp.zeros((0, 3), pose.dtype)
         return none, none[:, :1], none[:, :0]
 

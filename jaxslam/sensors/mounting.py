@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
+from jaxslam.math.arrays import Pose
 from jaxslam.math.linalg import is_concrete
 
 NO_OFFSET = (0.0, 0.0, 0.0)
@@ -15,7 +16,7 @@ NO_OFFSET = (0.0, 0.0, 0.0)
 
 def mounting(
     name: str, mount: ArrayLike
-) -> tuple[Callable[[jax.Array], jax.Array], Callable[[jax.Array], jax.Array]]:
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """The functions pose -> pose ∘ mount and its derivative by the pose (3, 3).
 
     Raises ValueError unless mount is a finite (3,); a traced mount is checked for its shape alone.
@@ -27,12 +28,12 @@ def mounting(
 
     at_origin = is_concrete(mount) and not np.any(np.asarray(mount))
 
-    def sensor_pose(pose: jax.Array) -> jax.Array:
+    def sensor_pose(pose: Pose) -> Array:
         if at_origin:
             return pose
         return se2.compose(pose, jnp.asarray(mount, pose.dtype))
 
-    def jacobian(pose: jax.Array) -> jax.Array:
+    def jacobian(pose: Pose) -> Array:
         return se2.compose_jacobians(pose, jnp.asarray(mount, pose.dtype))[0]
 
     return sensor_pose, jacobian

@@ -1,9 +1,11 @@
 """The robot's position in the map: a satellite receiver, a total station."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.math.arrays import Pose
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Free, Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
@@ -23,21 +25,23 @@ def position_fix(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     """
     sensor_pose, sensor_pose_jacobian = mounting("position_fix", mount)
 
-    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
         return sensor_pose(pose)[:2]
 
-    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
         return z - z_hat
 
-    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
         return jnp.zeros(0, pose.dtype)
 
-    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def observe_jacobians(
+        pose: Pose, landmark: Float[Array, "L"]
+    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
         return sensor_pose_jacobian(pose)[:2], jnp.zeros((2, 0), pose.dtype)
 
     def invert_jacobians(
-        pose: jax.Array, z: jax.Array, s: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
+    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
         none = jnp.zeros((0, 3), pose.dtype)
         return none, none[:, :2], none[:, :0]
 

@@ -1,11 +1,13 @@
 """Distance and direction of a point landmark: a laser scanner's corner, a sonar's echo."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Pose
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Free, Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
@@ -25,24 +27,26 @@ def range_bearing(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     """
     sensor_pose, sensor_pose_jacobian = mounting("range_bearing", mount)
 
-    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
         return se2.polar_in_frame(sensor_pose(pose), landmark)
 
-    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
         return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1])])
 
-    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
         return se2.from_frame(sensor_pose(pose), se2.rectangular(z))
 
-    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def observe_jacobians(
+        pose: Pose, landmark: Float[Array, "L"]
+    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
         frame = sensor_pose(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
         (outer,) = se2.polar_jacobians(se2.to_frame(frame, landmark))
         return outer @ by_frame @ sensor_pose_jacobian(pose), outer @ by_point
 
     def invert_jacobians(
-        pose: jax.Array, z: jax.Array, s: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
+    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
         frame = sensor_pose(pose)
         by_frame, by_point = se2.from_frame_jacobians(frame, se2.rectangular(z))
         (inner,) = se2.rectangular_jacobians(z)

@@ -1,11 +1,13 @@
 """Distance and direction of a landmark that also shows a number: a reflectivity, a diameter."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Pose
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Free, Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
@@ -27,18 +29,20 @@ def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -
     """
     sensor_pose, sensor_pose_jacobian = mounting("range_bearing_signature", mount)
 
-    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
         seen = se2.polar(se2.to_frame(sensor_pose(pose), landmark[:2]))
         return jnp.concatenate([seen, landmark[2:]])
 
-    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
         return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1]), z[2] - z_hat[2]])
 
-    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
         point = se2.from_frame(sensor_pose(pose), se2.rectangular(z[:2]))
         return jnp.concatenate([point, z[2:]])
 
-    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def observe_jacobians(
+        pose: Pose, landmark: Float[Array, "L"]
+    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
         frame = sensor_pose(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark[:2])
         (outer,) = se2.polar_jacobians(se2.to_frame(frame, landmark[:2]))
@@ -47,8 +51,8 @@ def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -
         return by_pose, _beside_one(outer @ by_point)
 
     def invert_jacobians(
-        pose: jax.Array, z: jax.Array, s: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
+    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
         by_frame, by_point = se2.from_frame_jacobians(sensor_pose(pose), se2.rectangular(z[:2]))
         (inner,) = se2.rectangular_jacobians(z[:2])
         by_pose = jnp.zeros((3, 3), pose.dtype)
@@ -71,6 +75,6 @@ def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -
     )
 
 
-def _beside_one(block: jax.Array) -> jax.Array:
+def _beside_one(block: Array) -> Array:
     """diag(block, 1), (3, 3)."""
     return jnp.eye(3, dtype=block.dtype).at[:2, :2].set(block)

@@ -1,10 +1,12 @@
 """The position of a landmark in the sensor's own frame, Cartesian."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
+from jaxslam.math.arrays import Pose
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Free, Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
@@ -23,22 +25,24 @@ def relative_position(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sens
     """
     sensor_pose, sensor_pose_jacobian = mounting("relative_position", mount)
 
-    def observe(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
         return se2.to_frame(sensor_pose(pose), landmark)
 
-    def residual(z: jax.Array, z_hat: jax.Array) -> jax.Array:
+    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
         return z - z_hat
 
-    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
         return se2.from_frame(sensor_pose(pose), z)
 
-    def observe_jacobians(pose: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def observe_jacobians(
+        pose: Pose, landmark: Float[Array, "L"]
+    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
         by_frame, by_point = se2.to_frame_jacobians(sensor_pose(pose), landmark)
         return by_frame @ sensor_pose_jacobian(pose), by_point
 
     def invert_jacobians(
-        pose: jax.Array, z: jax.Array, s: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
+    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
         by_frame, by_point = se2.from_frame_jacobians(sensor_pose(pose), z)
         return by_frame @ sensor_pose_jacobian(pose), by_point, jnp.zeros((2, 0), pose.dtype)
 

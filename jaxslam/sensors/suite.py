@@ -7,7 +7,10 @@ from typing import Any, Literal, NoReturn
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
+from jaxslam.math.arrays import Point, Pose
 from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Free, Sensor
 from jaxslam.types import Scan
@@ -24,7 +27,7 @@ class Part:
     """in a simulation it measures every so many steps,"""
     start: int = 0
     """beginning with this one; a filter goes by `Scan.valid` alone"""
-    visible: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    visible: Callable[[Array, Array], Array] | None = None
     """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
     sees: Literal["landmarks", "robots"] = "landmarks"
     """what its places are for in a simulation. A filter of one robot leaves places for robots
@@ -146,10 +149,10 @@ def on_ground(sensor: Sensor, size: int) -> Sensor:
         return sensor
     kept = sensor.free.mean.shape[0]
 
-    def invert(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
         return jnp.concatenate([sensor.invert(pose, z, s[:kept]), s[kept:]])
 
-    def embed(pose: jax.Array, point: jax.Array) -> jax.Array:
+    def embed(pose: Pose, point: Point) -> Float[Array, "L"]:
         return jnp.concatenate([sensor.embed(pose, point), jnp.zeros(spare, pose.dtype)])
 
     dtype = sensor.free.mean.dtype
