@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Log, Scan, Trace, Truth
@@ -75,10 +76,8 @@ class Motion:
 class Free(NamedTuple):
     """The Gaussian prior of what a measurement cannot see (Solà 39)."""
 
-    mean: Array
-    """(K,)"""
-    cov: Array
-    """(K, K)"""
+    mean: Float[Array, "K"]
+    cov: Float[Array, "K K"]
 
 
 class Reduced(NamedTuple):
@@ -139,10 +138,10 @@ class Sensor:
 class Basis(NamedTuple):
     """The derivative of a chart's `retract` at zero, block lower triangular."""
 
-    pose: Array
-    """(3, 3) ∂pose/∂dx."""
-    cross: Array
-    """(L, 3) ∂l/∂dx."""
+    pose: Float[Array, "3 3"]
+    """∂pose/∂dx."""
+    cross: Float[Array, "L 3"]
+    """∂l/∂dx."""
     landmark: Array | None
     """(L, L) ∂l/∂dl; None says identity, without products."""
 
@@ -175,8 +174,8 @@ class Here(NamedTuple):
     joint: Joint
     """the filter's state, `joint.lin` being the linearizer's own memory"""
     chart: Chart
-    pose: Array
-    """(3,) estimate of the robot"""
+    pose: Float[Array, "3"]
+    """estimate of the robot"""
     cov: Array
     """P in the chart: of the robot (3, 3), or for `observe` of robot and landmark (3+L, 3+L)"""
     slot: Any = None
@@ -218,16 +217,16 @@ class Linearizer:
 class Pairs(NamedTuple):
     """How each of M measurements compares with each of N slots, every pair for itself."""
 
-    innovation: Array
-    """(M, N, Z) ν_ij = z_i ⊖ ẑ_j."""
-    cov: Array
-    """(M, N, Z, Z) S_ij = H_j P H_jᵀ + R_i."""
-    distance: Array
-    """(M, N) ν_ijᵀ S_ij⁻¹ ν_ij."""
-    log_det: Array
-    """(M, N) log |S_ij|."""
-    possible: Array
-    """(M, N) bool: measurement and landmark are there, and S_ij is positive definite."""
+    innovation: Float[Array, "M N Z"]
+    """ν_ij = z_i ⊖ ẑ_j."""
+    cov: Float[Array, "M N Z Z"]
+    """S_ij = H_j P H_jᵀ + R_i."""
+    distance: Float[Array, "M N"]
+    """ν_ijᵀ S_ij⁻¹ ν_ij."""
+    log_det: Float[Array, "M N"]
+    """log |S_ij|."""
+    possible: Bool[Array, "M N"]
+    """measurement and landmark are there, and S_ij is positive definite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,10 +236,9 @@ class Prediction:
     The functions compute what they return when they are called, within the trace.
     """
 
-    tag: Array
-    """(N,) tags of the slots, -1 where dead."""
-    alive: Array
-    """(N,) bool."""
+    tag: Int[Array, "N"]
+    """tags of the slots, -1 where dead."""
+    alive: Bool[Array, "N"]
     pairs: Callable[[Scan], Pairs]
     """(scan) -> every measurement against every slot."""
     cross: Callable[[], Array]
@@ -250,10 +248,10 @@ class Prediction:
 class Association(NamedTuple):
     """Which landmark each measurement of a scan is of."""
 
-    slot: Array
-    """(M,) int, -1 where none; no slot twice."""
-    is_new: Array
-    """(M,) bool: start a landmark. A valid measurement that is neither is left alone, and
+    slot: Int[Array, "M"]
+    """-1 where none; no slot twice."""
+    is_new: Bool[Array, "M"]
+    """start a landmark. A valid measurement that is neither is left alone, and
     counted."""
     exhausted: Array | bool = False
     """() bool: a search ended at its budget, with the best it had found."""

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.math.linalg import cholesky, matmul, symmetrize, total, triangular_root
 from jaxslam.math.xla import settle
@@ -17,17 +19,14 @@ from jaxslam.math.xla import settle
 class Joint(NamedTuple):
     """Robot and map (Solà (5), (6)); D = 3 + N·L, slot i owns rows 3 + i·L to 3 + (i+1)·L."""
 
-    pose: jax.Array
-    """(3,)"""
-    landmarks: jax.Array
-    """(N, L)"""
-    cov: jax.Array
-    """(D, D) covariance of the error in the filter's chart, robot first; of a square-root filter a
+    pose: Float[Array, "3"]
+    landmarks: Float[Array, "N L"]
+    cov: Float[Array, "D D"]
+    """covariance of the error in the filter's chart, robot first; of a square-root filter a
     root X of it, X Xᵀ = P"""
-    alive: jax.Array
-    """(N,) bool"""
-    tag: jax.Array
-    """(N,) int32, -1 where dead"""
+    alive: Bool[Array, "N"]
+    tag: Int[Array, "N"]
+    """-1 where dead"""
     lin: Any
     """the linearizer's memory"""
     watch: Any = ()
@@ -46,12 +45,12 @@ class Joint(NamedTuple):
 class Last(NamedTuple):
     """The error δ = (x, y, θ) of the last motion, in the frame it began from."""
 
-    frame: jax.Array
-    """() heading of that frame"""
-    cov: jax.Array
-    """(3, D) covariance of δ with all errors of the map, in the filter's chart"""
-    own: jax.Array
-    """(3, 3) covariance of δ"""
+    frame: Float[Array, ""]
+    """heading of that frame"""
+    cov: Float[Array, "3 D"]
+    """covariance of δ with all errors of the map, in the filter's chart"""
+    own: Float[Array, "3 3"]
+    """covariance of δ"""
 
 
 class Watch(NamedTuple):
@@ -62,19 +61,19 @@ class Watch(NamedTuple):
     sees it, and the directions that none sees are the unobservable subspace.
     """
 
-    directions: jax.Array
-    """(D, 3) in the filter's chart; rows of the robot begin as the unit matrix"""
-    information: jax.Array
-    """(3, 3) Σ (H n)ᵀ R⁻¹ (H n) of all corrections"""
-    scale: jax.Array
-    """(3,) Σ of the same with absolute values, what rounding is measured by"""
-    turn: jax.Array
-    """(3,) the combination of directions that turns everything about the origin by 1 rad"""
+    directions: Float[Array, "D 3"]
+    """in the filter's chart; rows of the robot begin as the unit matrix"""
+    information: Float[Array, "3 3"]
+    """Σ (H n)ᵀ R⁻¹ (H n) of all corrections"""
+    scale: Float[Array, "3"]
+    """Σ of the same with absolute values, what rounding is measured by"""
+    turn: Float[Array, "3"]
+    """the combination of directions that turns everything about the origin by 1 rad"""
 
 
 def empty(
-    pose: jax.Array,
-    pose_cov: jax.Array,
+    pose: Float[Array, "3"],
+    pose_cov: Float[Array, "3 3"],
     capacity: int,
     landmark_size: int,
     lin: Any = (),
@@ -107,12 +106,16 @@ def empty(
     )
 
 
-def find(tag: jax.Array, alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+def find(
+    tag: Int[Array, "N"], alive: Bool[Array, "N"], wanted: Int[Array, "M"]
+) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
     """The slot (M,) of each wanted tag (M,), 0 where none, and whether there is one (M,)."""
     return where_set((wanted[:, None] == tag[None, :]) & alive[None, :])
 
 
-def allocate(alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+def allocate(
+    alive: Bool[Array, "N"], wanted: Bool[Array, "M"]
+) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
     """A free slot for each place that wants one: the first wish gets the lowest, and so on.
 
     alive (N,) and wanted (M,) bool -> slot (M,) int32, 0 where none, and granted (M,) bool.
@@ -123,7 +126,7 @@ def allocate(alive: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]
     return where_set(rank_of_wish[:, None] == rank_of_slot[None, :])
 
 
-def where_set(match: jax.Array) -> tuple[jax.Array, jax.Array]:
+def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
     """The last column in which each row (M, N) bool is set, 0 where none, (M,) int32; and whether
     there is one (M,). In one pass, where an `argmax` and an `any` are two.
     """
@@ -133,24 +136,24 @@ def where_set(match: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.maximum(at, 0), at >= 0
 
 
-def concerned(slot: jax.Array, on: jax.Array, count: int) -> jax.Array:
+def concerned(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:
     """Which of count slots the places slot (M,) name, where on (M,); (count,) bool."""
     return jnp.zeros(count, bool).at[jnp.where(on, slot, count)].set(True, mode="drop")
 
 
-def gather(joint: Joint, slot: jax.Array) -> tuple[jax.Array, jax.Array]:
+def gather(joint: Joint, slot: Int[Array, ""]) -> tuple[Float[Array, "L"], Float[Array, "L D"]]:
     """The landmark (L,) in a slot () and its rows (L, D) of the covariance."""
     size = joint.landmarks.shape[1]
     landmark = jax.lax.dynamic_index_in_dim(joint.landmarks, slot, keepdims=False)
     return landmark, jax.lax.dynamic_slice_in_dim(joint.cov, 3 + slot * size, size)
 
 
-def robot_cov(joint: Joint, square_root: bool = False) -> jax.Array:
+def robot_cov(joint: Joint, square_root: bool = False) -> Float[Array, "3 3"]:
     """P of the robot, (3, 3)."""
     return joint.cov[:3] @ joint.cov[:3].T if square_root else joint.cov[:3, :3]
 
 
-def local_cov(joint: Joint, slot: jax.Array, square_root: bool = False) -> jax.Array:
+def local_cov(joint: Joint, slot: Int[Array, ""], square_root: bool = False) -> Float[Array, "K K"]:
     """P of the robot and the landmark of a slot (), (3+L, 3+L)."""
     size = joint.landmarks.shape[1]
     rows = jnp.concatenate([joint.cov[:3], gather(joint, slot)[1]])
@@ -159,7 +162,7 @@ def local_cov(joint: Joint, slot: jax.Array, square_root: bool = False) -> jax.A
     return local_block(rows, slot, size)
 
 
-def local_block(rows: jax.Array, slot: jax.Array, size: int) -> jax.Array:
+def local_block(rows: Float[Array, "k D"], slot: Int[Array, ""], size: int) -> Float[Array, "k K"]:
     """The columns of the robot and of the landmark (size L) of a slot (), of rows (k, D)."""
     own = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
     return jnp.concatenate([rows[:, :3], own], axis=1)
@@ -167,12 +170,12 @@ def local_block(rows: jax.Array, slot: jax.Array, size: int) -> jax.Array:
 
 def scatter(
     joint: Joint,
-    slot: jax.Array,
-    granted: jax.Array,
-    landmarks: jax.Array,
-    by_pose: jax.Array,
-    own_cov: jax.Array,
-    tag: jax.Array,
+    slot: Int[Array, "M"],
+    granted: Bool[Array, "M"],
+    landmarks: Float[Array, "M L"],
+    by_pose: Float[Array, "M L 3"],
+    own_cov: Float[Array, "M L L"],
+    tag: Int[Array, "M"],
     *,
     square_root: bool = False,
 ) -> Joint:
@@ -229,14 +232,14 @@ def scatter(
     )
 
 
-def _add_blocks(cov: jax.Array, blocks: jax.Array) -> jax.Array:
+def _add_blocks(cov: Float[Array, "D D"], blocks: Float[Array, "N L L"]) -> Float[Array, "D D"]:
     """P with blocks (N, L, L) added on the diagonal of the landmarks."""
     capacity, size = blocks.shape[:2]
     rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
     return cov.at[rows[:, :, None], rows[:, None, :]].add(blocks)
 
 
-def remove(joint: Joint, dead: jax.Array, *, square_root: bool = False) -> Joint:
+def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
     """Forget the landmarks of the slots dead (N,) bool: marginalize them out and free their slots.
 
     In covariance form the marginal is what is left when rows and columns are dropped (Solà Table 1,

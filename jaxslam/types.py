@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.math.linalg import is_concrete, shape_told
 
@@ -49,19 +51,18 @@ class Status(IntEnum):
 class Scan(NamedTuple):
     """The measurements of one step, padded to M places."""
 
-    z: jax.Array
-    """(M, Z) measurements; any finite number where not valid."""
-    tag: jax.Array
-    """(M,) int: landmark identity, -1 = unknown."""
-    valid: jax.Array
-    """(M,) bool."""
+    z: Float[Array, "M Z"]
+    """measurements; any finite number where not valid."""
+    tag: Int[Array, "M"]
+    """landmark identity, -1 = unknown."""
+    valid: Bool[Array, "M"]
 
 
 class Log(NamedTuple):
     """What a robot records. Row t: the control that led *to* pose t, and the scan taken there."""
 
-    control: jax.Array
-    """(T, U); the interval Δt, where a model needs one, is part of it."""
+    control: Float[Array, "T U"]
+    """the interval Δt, where a model needs one, is part of it."""
     scan: Scan
     """with leading T."""
 
@@ -69,14 +70,14 @@ class Log(NamedTuple):
 class Truth(NamedTuple):
     """What only a simulator knows."""
 
-    pose: jax.Array
-    """(T, 3) true pose at each scan [m, m, rad]."""
-    landmarks: jax.Array
-    """(N, L) true landmarks, in the order of their tags."""
-    missed: jax.Array
-    """(T,) int: landmarks in view for which the scan had no place."""
-    start: jax.Array
-    """(3,) true pose before the first control."""
+    pose: Float[Array, "T 3"]
+    """true pose at each scan [m, m, rad]."""
+    landmarks: Float[Array, "N L"]
+    """true landmarks, in the order of their tags."""
+    missed: Int[Array, "T"]
+    """landmarks in view for which the scan had no place."""
+    start: Float[Array, "3"]
+    """true pose before the first control."""
     origin: Any = ()
     """(T, M) int: the tag of the landmark each measurement is truly of, -1 of none; in a world with
     `spurious` data alone."""
@@ -85,38 +86,35 @@ class Truth(NamedTuple):
 class Estimate(NamedTuple):
     """What a filter believes, in map coordinates whatever its own error coordinates."""
 
-    pose: jax.Array
-    """(3,) x [m], y [m], θ [rad] in (-π, π]."""
-    pose_cov: jax.Array
-    """(3, 3)."""
-    points: jax.Array
-    """(N, 2) landmark positions [m]; 0 where not alive."""
-    point_covs: jax.Array
-    """(N, 2, 2)."""
-    alive: jax.Array
-    """(N,) bool."""
-    tag: jax.Array
-    """(N,) int, -1 where not alive."""
+    pose: Float[Array, "3"]
+    """x [m], y [m], θ [rad] in (-π, π]."""
+    pose_cov: Float[Array, "3 3"]
+    points: Float[Array, "N 2"]
+    """landmark positions [m]; 0 where not alive."""
+    point_covs: Float[Array, "N 2 2"]
+    alive: Bool[Array, "N"]
+    tag: Int[Array, "N"]
+    """-1 where not alive."""
 
 
 class Info(NamedTuple):
     """What one update did, place by place."""
 
-    nis: jax.Array
-    """(M,) normalized innovation squared of fused and rejected places, else 0. Within a joint
+    nis: Float[Array, "M"]
+    """normalized innovation squared of fused and rejected places, else 0. Within a joint
     update: of a place given the places before it, so that the sum is the joint NIS."""
-    dof: jax.Array
-    """(M,) int: Z where fused, else 0."""
-    innovation: jax.Array
-    """(M, Z) z ⊖ ẑ of places matched to a landmark (fused, rejected or singular), else 0."""
-    innovation_cov: jax.Array
-    """(M, Z, Z) S of the same places, else 0."""
-    slot: jax.Array
-    """(M,) int: the landmark slot corrected or born, -1 if none."""
-    status: jax.Array
-    """(M,) int, see `Status`."""
-    log_likelihood: jax.Array
-    """() Σ log N(innovation; 0, S) over fused places."""
+    dof: Int[Array, "M"]
+    """Z where fused, else 0."""
+    innovation: Float[Array, "M Z"]
+    """z ⊖ ẑ of places matched to a landmark (fused, rejected or singular), else 0."""
+    innovation_cov: Float[Array, "M Z Z"]
+    """S of the same places, else 0."""
+    slot: Int[Array, "M"]
+    """the landmark slot corrected or born, -1 if none."""
+    status: Int[Array, "M"]
+    """see `Status`."""
+    log_likelihood: Float[Array, ""]
+    """Σ log N(innovation; 0, S) over fused places."""
     exhausted: Any = ()
     """() bool: the search for the best association ended at its budget; or nothing."""
     removed: Any = ()
