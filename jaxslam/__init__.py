@@ -32,12 +32,14 @@ from jaxslam import (
     team,
 )
 from jaxslam.linearity import linearity_index
-from jaxslam.monte_carlo import monte_carlo
+from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.run import run
 from jaxslam.simulate import Scenario, simulate
 from jaxslam.verify import verify_jacobians
 
 __all__ = [
+    "Campaign",
+    "Interrupted",
     "Scenario",
     "association",
     "calibration",
