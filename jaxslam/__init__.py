@@ -25,7 +25,7 @@ from jaxslam import (
     smoothing,
 )
 from jaxslam.math import se2, stats, uncertain_poses
-from jaxslam.monte_carlo import monte_carlo
+from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.run import run
 from jaxslam.simulation import scenarios, spurious, team
 from jaxslam.simulation.worlds import Scenario, simulate
@@ -33,6 +33,8 @@ from jaxslam.verify import linearity, verify_jacobians
 from jaxslam.verify.linearity import linearity_index
 
 __all__ = [
+    "Campaign",
+    "Interrupted",
     "Scenario",
     "association",
     "calibration",

@@ -1,6 +1,7 @@
 """The README: its Python runs as it stands, and its reference names what there is."""
 
 import importlib
+import inspect
 import re
 from pathlib import Path
 
@@ -14,10 +15,15 @@ MODULES = {name for name in jaxslam.__all__ if hasattr(getattr(jaxslam, name), "
 
 def reference():
     """(module, name) pairs of the reference table."""
+    for module, row in rows():
+        for name in re.findall(r"`(\w+)`", row):
+            yield module, name
+
+
+def rows():
+    """(module, what it has) of the reference table."""
     table = README.split("## Reference")[1]
-    for row in re.findall(r"^\| `(jaxslam[.\w]*)` \|(.*)\|$", table, re.MULTILINE):
-        for name in re.findall(r"`(\w+)`", row[1]):
-            yield row[0], name
+    return re.findall(r"^\| `(jaxslam[.\w]*)` \|(.*)\|$", table, re.MULTILINE)
 
 
 @pytest.mark.filterwarnings("default")
@@ -37,6 +43,22 @@ def test_every_name_of_the_reference_exists_and_is_documented(module, name):
     assert hasattr(owner, name)
     if callable(getattr(owner, name)):
         assert getattr(owner, name).__doc__
+
+
+def test_what_is_not_reached_as_it_reads_says_how_to_import_it():
+    """`jaxslam.monte_carlo`, say, is a function, and so hides the module of that name."""
+    for module, row in rows():
+        importlib.import_module(module)
+        owner = jaxslam
+        for part in module.split(".")[1:]:
+            owner = getattr(owner, part)
+        if inspect.ismodule(owner) == (f"from {module} import" in row):
+            pytest.fail(f"{module}: {row}")
+
+
+def test_a_gradient_is_shown_compiled():
+    """Alone, it is traced and compiled anew at every call."""
+    assert README.count("jax.jit(jax.grad(cost))(0.1)") == 1
 
 
 def test_every_public_factory_is_in_the_reference():

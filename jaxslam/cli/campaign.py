@@ -44,6 +44,9 @@ FILES = (
 )
 """What a campaign writes."""
 
+_TIMES = ("seconds", "compile_seconds", "step_seconds")
+"""Of the results, what is known only when they are made."""
+
 DEFAULTS: dict[str, Any] = {
     "scenario": "circle",
     "filters": "dead_reckoning,ekf",
@@ -131,11 +134,10 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     if jax.process_index() > 0:
         return 0
     took = campaign.seconds
-    ran = took - campaign.compile_seconds
+    ran = took - campaign.compile_seconds if campaign.compile_seconds else 0.0
     if earlier is not None and not keep.set_aside:  # else some runs were run again
         times = {name: earlier[name] for name in _TIMES}
         campaign, command = replace(campaign, **times), earlier["command"]
-        ran = 0.0
         if written:
             print(report.table(campaign))
             print(
@@ -151,9 +153,6 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         + f"; once every program was there, the runs took {ran:.1f} s of them" * (ran > 0)
     )
     return 0
-
-
-_TIMES = ("seconds", "compile_seconds", "step_seconds")
 
 
 def _earlier(out: Path, keep: store.Store) -> dict[str, Any] | None:
