@@ -162,7 +162,8 @@ class Chart:
     """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
     motion_apart: bool = False
     """whether a correction splits off what it says of the last motion, and moves the robot by that
-    in a world that stands still: the way of a map that is composed with the motion afterwards."""
+    in a world that stands still: the way of a map that is composed with the motion afterwards. Its
+    moves must add up: retract by one error and then by another is retract by their sum."""
 
     def __post_init__(self) -> None:
         _check_fields(self, ("retract", "local"), optional=("basis",))
