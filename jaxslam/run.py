@@ -12,7 +12,7 @@ from jaxslam import programs
 from jaxslam.math.linalg import check_covariance, check_key, is_concrete, shape_told
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Status, Trace, check_log
-from jaxslam.validation import check_record, state_and_info
+from jaxslam.validation import check_record, checked_estimate, same_state, state_and_info
 
 
 def run(
@@ -87,19 +87,21 @@ def _drive(
     dtype = jnp.result_type(log.control, log.scan.z)
     log = Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))
     start = filter.init(jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype))
+    name = f"run: {filter.name}"
     keys = jax.random.split(key, (log.control.shape[0], 2))
 
     def step(state: Any, row: tuple[Log, jax.Array]) -> tuple[Any, Any]:
         (control, scan), (key_predict, key_update) = row
-        state = filter.predict(state, control, key_predict)
+        state = same_state(f"{name}: predict", state, filter.predict(state, control, key_predict))
         # Under jit nobody has looked for NaN, and one would go through the whole state.
         lost = scan.valid & ~jnp.isfinite(scan.z).all(axis=1)
         scan = scan._replace(valid=scan.valid & ~lost)
         found = filter.update(state, scan, key_update)
-        state, info = state_and_info(f"run: {filter.name}", found)
+        state, info = state_and_info(name, state, scan, found)
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        return state, (filter.estimate(state), info, () if probe is None else probe(state))
+        estimate = checked_estimate(name, filter.estimate(state))
+        return state, (estimate, info, () if probe is None else probe(state))
 
     # What a scan runs cannot be merged with its own recomputation, so no barrier is needed.
     body = jax.checkpoint(step, prevent_cse=False)

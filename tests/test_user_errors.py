@@ -14,7 +14,7 @@ from jaxslam.filters.map_management import merging
 from jaxslam.filters.map_management.closing import _OPTIONS, closing
 from jaxslam.protocols import Free, Sensor
 from jaxslam.types import Log, Scan
-from jaxslam.validation import check_models, state_and_info
+from jaxslam.validation import check_models, checked_estimate, state_and_info
 
 MOVE = motion.pose_increment(np.diag([1e-4, 1e-4, 1e-6]))
 SEES = sensors.range_bearing(np.diag([1e-2, 1e-4]))
@@ -197,10 +197,10 @@ def test_charts_linearizers_and_filters_hold_functions():
         dataclasses.replace(FACTORIES["ekf_slam"](MOVE, SEES), predict="predict")
 
 
-def test_an_update_that_returns_no_info_is_told():
+def test_what_a_filter_of_ones_own_returns_is_told():
     scan = jaxslam.types.Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))
-    info = reporting.nothing_of(scan)
-    assert state_and_info("run: mine", ("state", info)) == ("state", info)
+    info, state = reporting.nothing_of(scan), jnp.zeros(3)
+    assert state_and_info("run: mine", state, scan, (state, info)) == (state, info)
     for wrong, told in (
         ("state", "got str"),
         (("state", 1), r"got \(str, int\)"),
@@ -208,7 +208,25 @@ def test_an_update_that_returns_no_info_is_told():
         (info, "got Info"),
     ):
         with pytest.raises(ValueError, match=rf"^run: mine: expected update to return.*{told}"):
-            state_and_info("run: mine", wrong)
+            state_and_info("run: mine", state, scan, wrong)
+    for wrong, told in (
+        ((jnp.zeros(2), info), r"update: .*\(3,\) != \(2,\)"),
+        (({"pose": state}, info), "update: .*tree structs"),
+        ((state, info._replace(nis=jnp.zeros(2))), r"Info.nis: .*\(2,\)"),
+        ((state, info._replace(status=jnp.zeros(1))), "Info.status: .*float"),
+    ):
+        with pytest.raises(ValueError, match=rf"^run: mine: {told}"):
+            state_and_info("run: mine", state, scan, wrong)
+    believed = jaxslam.types.Estimate(
+        *(jnp.zeros(shape) for shape in [(3,), (3, 3), (2, 2), (2, 2, 2), (2,), (2,)])
+    )
+    assert checked_estimate("run: mine", believed) is believed
+    for wrong, told in (
+        (believed._replace(points=jnp.zeros((2, 3))), r"Estimate.points: .*\(2, 3\)"),
+        (state, "expected estimate to return an Estimate, got"),
+    ):
+        with pytest.raises(ValueError, match=rf"^run: mine: {told}"):
+            checked_estimate("run: mine", wrong)
 
 
 def test_localization_is_named_by_its_own_name():

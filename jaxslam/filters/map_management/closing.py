@@ -209,7 +209,7 @@ def closing(
 
     def update(state: Closed, scan: Scan, key: Array) -> tuple[Closed, Info]:
         found = filter.update(state.joint, scan, key)
-        joint, info = validation.state_and_info(f"closing: {filter.name}", found)
+        joint, info = validation.state_and_info(f"closing: {filter.name}", state.joint, scan, found)
         before = joint.alive
         due = (joint.life.now % every == 0) & scan.valid.any()
 
