@@ -9,12 +9,21 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import (
+    Control,
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Pose,
+    PoseMatrix,
+    Unmeasured,
+)
 from jaxslam.protocols import Motion, Sensor
 
 
 def motion_jacobians(
-    motion: Motion, pose: Pose, u: Float[Array, "U"]
+    motion: Motion, pose: Pose, u: Control
 ) -> tuple[PoseMatrix, Float[Array, "3 W"]]:
     """∂step/∂pose and ∂step/∂w at w = 0 (Solà (13))."""
     w = jnp.zeros(len(motion.noises), pose.dtype)
@@ -22,17 +31,13 @@ def motion_jacobians(
     return by_pose, by_noise
 
 
-def observe_jacobians(
-    sensor: Sensor, pose: Pose, landmark: Float[Array, "L"]
-) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
+def observe_jacobians(sensor: Sensor, pose: Pose, landmark: Landmark) -> ObserveJacobians:
     """∂observe/∂pose and ∂observe/∂l (Solà (25))."""
     by_pose, by_landmark = jax.jacfwd(sensor.observe, argnums=(0, 1))(pose, landmark)
     return by_pose, by_landmark
 
 
-def invert_jacobians(
-    sensor: Sensor, pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
-) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
+def invert_jacobians(sensor: Sensor, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
     """∂invert/∂pose, ∂invert/∂z and ∂invert/∂s (Solà (41)-(43))."""
     by_pose, by_z, by_s = jax.jacfwd(sensor.invert, argnums=(0, 1, 2))(pose, z, s)
     return by_pose, by_z, by_s

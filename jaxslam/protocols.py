@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.slots import Joint
@@ -80,6 +81,10 @@ class Free(NamedTuple):
     cov: Float[Array, "K K"]
 
 
+NOTHING_FREE = Free(np.zeros(0), np.zeros((0, 0)))  # type: ignore[arg-type]
+"""of a measurement that determines its landmark"""
+
+
 class Reduced(NamedTuple):
     """When a landmark's L parameters may become the point (x, y) where it stands, for good."""
 
@@ -101,8 +106,6 @@ class Sensor:
     name: str
     measurements: tuple[str, ...]
     """What z holds, with units; its length is Z."""
-    landmark: tuple[str, ...]
-    """What l holds, with units; its length is L, 0 for an absolute sensor."""
     observe: Callable[[Array, Array], Array]
     """(pose, l) -> z."""
     residual: Callable[[Array, Array], Array]
@@ -111,12 +114,15 @@ class Sensor:
     """(z) -> (Z, Z)."""
     invert: Callable[[Array, Array, Array], Array]
     """(pose, z, s) -> l, with observe(pose, invert(pose, z, s)) = z; a range is not negative."""
-    position: Callable[[Array], Array]
-    """(l) -> (2,) where the landmark stands."""
-    embed: Callable[[Array, Array], Array]
-    """(pose, point (2,)) -> l of a landmark that stands there, seen first from pose."""
-    free: Free
-    """the prior of s."""
+    landmark: tuple[str, ...] = ("x [m]", "y [m]")
+    """What l holds, with units; its length is L, 0 for an absolute sensor. Default a point."""
+    position: Callable[[Array], Array] = lambda landmark: landmark
+    """(l) -> (2,) where the landmark stands. Default that of a point."""
+    embed: Callable[[Array, Array], Array] = lambda pose, point: point
+    """(pose, point (2,)) -> l of a landmark that stands there, seen first from pose. Default that
+    of a point."""
+    free: Free = NOTHING_FREE
+    """the prior of s. Default that of a full measurement."""
     observe_jacobians: Callable[[Array, Array], tuple[Array, Array]] | None = None
     """(pose, l) -> by pose (Z, 3), by l (Z, L); hand-derived, to verify against."""
     invert_jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None

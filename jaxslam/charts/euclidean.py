@@ -2,24 +2,21 @@
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
 
 from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import Pose
+from jaxslam.math.arrays import Landmark, Pose
 from jaxslam.protocols import Chart
 
 
 def euclidean() -> Chart:
     """dx = (x, y, wrap θ) - (x, y, θ)₀ and dl = l - l₀: the error of Solà's EKF-SLAM (22)."""
 
-    def retract(
-        pose: Pose, landmark: Float[Array, "L"], dx: Pose, dl: Float[Array, "L"]
-    ) -> tuple[Pose, Float[Array, "L"]]:
+    def retract(pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark) -> tuple[Pose, Landmark]:
         return _wrap_heading(pose + dx), landmark + dl
 
     def local(
-        pose0: Pose, landmark0: Float[Array, "L"], pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Pose, Float[Array, "L"]]:
+        pose0: Pose, landmark0: Landmark, pose: Pose, landmark: Landmark
+    ) -> tuple[Pose, Landmark]:
         return _wrap_heading(pose - pose0), landmark - landmark0
 
     return Chart(name="euclidean", retract=retract, local=local)

@@ -1,12 +1,10 @@
 """The error of the left-invariant filter, in the robot's frame: the published counter-example."""
 
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import Pose
+from jaxslam.math.arrays import Landmark, Pose
 from jaxslam.protocols import Basis, Chart
 
 
@@ -19,20 +17,18 @@ def left_invariant() -> Chart:
     EKF. UKF-M (Brossard et al. 2020) shows that this choice is worse. Landmarks l = (x, y) only.
     """
 
-    def retract(
-        pose: Pose, landmark: Float[Array, "L"], dx: Pose, dl: Float[Array, "L"]
-    ) -> tuple[Pose, Float[Array, "L"]]:
+    def retract(pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark) -> tuple[Pose, Landmark]:
         shift = se2.exp(jnp.concatenate([dl, dx[2:]]))[:2]
         return se2.boxplus(pose, dx), landmark + se2.rotation(pose[2]) @ shift
 
     def local(
-        pose0: Pose, landmark0: Float[Array, "L"], pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Pose, Float[Array, "L"]]:
+        pose0: Pose, landmark0: Landmark, pose: Pose, landmark: Landmark
+    ) -> tuple[Pose, Landmark]:
         shift = se2.rotation(pose0[2]).T @ (landmark - landmark0)
         turn = wrap(pose[2:] - pose0[2:])
         return se2.boxminus(pose, pose0), se2.log(jnp.concatenate([shift, turn]))[:2]
 
-    def basis(pose: Pose, landmark: Float[Array, "L"]) -> Basis:
+    def basis(pose: Pose, landmark: Landmark) -> Basis:
         turn = se2.rotation(pose[2])
         return Basis(
             pose=jnp.eye(3, dtype=pose.dtype).at[:2, :2].set(turn),

@@ -1,12 +1,10 @@
 """The error of the right-invariant EKF: a turn of robot and map together is one direction."""
 
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import Pose
+from jaxslam.math.arrays import Landmark, Pose
 from jaxslam.protocols import Basis, Chart
 
 
@@ -26,9 +24,7 @@ def right_invariant(rays: bool = False) -> Chart:
     name = "right_invariant, rays" if rays else "right_invariant"
     size = 4 if rays else 2
 
-    def retract(
-        pose: Pose, landmark: Float[Array, "L"], dx: Pose, dl: Float[Array, "L"]
-    ) -> tuple[Pose, Float[Array, "L"]]:
+    def retract(pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark) -> tuple[Pose, Landmark]:
         if landmark.shape != (size,):
             raise ValueError(f"{name}: expected a landmark ({size},), got {landmark.shape}")
         moved = se2.exp(dx)
@@ -40,8 +36,8 @@ def right_invariant(rays: bool = False) -> Chart:
         return se2.compose(moved, pose), point
 
     def local(
-        pose0: Pose, landmark0: Float[Array, "L"], pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Pose, Float[Array, "L"]]:
+        pose0: Pose, landmark0: Landmark, pose: Pose, landmark: Landmark
+    ) -> tuple[Pose, Landmark]:
         turn = wrap(pose[2:] - pose0[2:])
         moved = se2.log(se2.compose(pose, se2.inverse(pose0)))
         offset = landmark[:2] - se2.rotation(turn[0]) @ landmark0[:2]
@@ -51,7 +47,7 @@ def right_invariant(rays: bool = False) -> Chart:
             error = jnp.concatenate([error, turned, landmark[3:] - landmark0[3:]])
         return moved, error
 
-    def basis(pose: Pose, landmark: Float[Array, "L"]) -> Basis:
+    def basis(pose: Pose, landmark: Landmark) -> Basis:
         eye = jnp.eye(3, dtype=pose.dtype)
         cross = jnp.zeros((size, 3), pose.dtype)
         cross = cross.at[0, 2].set(-landmark[1]).at[1, 2].set(landmark[0])

@@ -1,12 +1,10 @@
 """The error of robocentric mapping: everything as the robot sees it."""
 
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import Pose
+from jaxslam.math.arrays import Landmark, Pose
 from jaxslam.math.xla import settle
 from jaxslam.protocols import Basis, Chart
 
@@ -23,20 +21,18 @@ def robocentric() -> Chart:
     of EKF-SLAM", Robotics and Autonomous Systems 55(1), 2007. Landmarks l = (x, y) only.
     """
 
-    def retract(
-        pose: Pose, landmark: Float[Array, "L"], dx: Pose, dl: Float[Array, "L"]
-    ) -> tuple[Pose, Float[Array, "L"]]:
+    def retract(pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark) -> tuple[Pose, Landmark]:
         moved = settle(se2.inverse(se2.inverse(pose) + dx))
         return moved, se2.from_frame(moved, se2.to_frame(pose, landmark) + dl)
 
     def local(
-        pose0: Pose, landmark0: Float[Array, "L"], pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Pose, Float[Array, "L"]]:
+        pose0: Pose, landmark0: Landmark, pose: Pose, landmark: Landmark
+    ) -> tuple[Pose, Landmark]:
         dx = se2.inverse(pose) - se2.inverse(pose0)
         dl = se2.to_frame(pose, landmark) - se2.to_frame(pose0, landmark0)
         return jnp.concatenate([dx[:2], wrap(dx[2:])]), dl
 
-    def basis(pose: Pose, landmark: Float[Array, "L"]) -> Basis:
+    def basis(pose: Pose, landmark: Landmark) -> Basis:
         c, s = settle((jnp.cos(pose[2]), jnp.sin(pose[2])))
         one = jnp.ones_like(c)
         # With l = R(m - b), R = R(θ) and θ = -b_θ; and the same of t = -R b.

@@ -5,13 +5,13 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxslam import derivatives
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import Control, Landmark, Measurement, Pose, PoseMatrix
 from jaxslam.math.linalg import matmul
 from jaxslam.protocols import Here, Motion, Sensor
 
 
 def motion_at(
-    motion: Motion, pose: Pose, u: Float[Array, "U"], at: Pose
+    motion: Motion, pose: Pose, u: Control, at: Pose
 ) -> tuple[Pose, PoseMatrix, PoseMatrix]:
     """f(pose, u, 0), and ∂f/∂pose (3, 3) and W Q Wᵀ (3, 3) with the Jacobians at another pose."""
     by_pose, by_noise = derivatives.motion_jacobians(motion, at, u)
@@ -21,8 +21,8 @@ def motion_at(
 
 
 def observe_at(
-    sensor: Sensor, here: Here, at_pose: Pose, at_landmark: Float[Array, "L"]
-) -> tuple[Float[Array, "Z"], Float[Array, "Z 3"], Float[Array, "Z L"], Float[Array, "Z Z"]]:
+    sensor: Sensor, here: Here, at_pose: Pose, at_landmark: Landmark
+) -> tuple[Measurement, Float[Array, "Z 3"], Float[Array, "Z L"], Float[Array, "Z Z"]]:
     """h(pose, l), its Jacobians at another pose and landmark, and no added noise (Z, Z)."""
     by_pose, by_landmark = derivatives.observe_jacobians(sensor, at_pose, at_landmark)
     expected = sensor.observe(here.pose, here.landmark)
@@ -30,8 +30,8 @@ def observe_at(
 
 
 def invert_at(
-    sensor: Sensor, pose: Pose, z: Float[Array, "Z"], at_pose: Pose, at_z: Float[Array, "Z"]
-) -> tuple[Float[Array, "L"], Float[Array, "L 3"], Float[Array, "L L"]]:
+    sensor: Sensor, pose: Pose, z: Measurement, at_pose: Pose, at_z: Measurement
+) -> tuple[Landmark, Float[Array, "L 3"], Float[Array, "L L"]]:
     """g(pose, z, s̄), ∂g/∂pose (L, 3) and G_z R G_zᵀ + G_s S G_sᵀ (L, L), Jacobians elsewhere.
 
     The noise is that of z: Solà (32)-(38), with the prior's term of (44).

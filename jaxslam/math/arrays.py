@@ -1,4 +1,7 @@
-"""Arrays that have names of their own, for signatures; shapes are checked while the tests run."""
+"""Arrays that have names of their own, for signatures; shapes are checked while the tests run.
+
+Of one pose, one landmark, one measurement; `vmap` and `scan` add leading axes.
+"""
 
 from jax import Array
 from jaxtyping import Float
@@ -12,3 +15,18 @@ PoseMatrix = Float[Array, "3 3"]
 """by the coordinates of a pose: a covariance, or a Jacobian"""
 PointMatrix = Float[Array, "2 2"]
 PointByPose = Float[Array, "2 3"]
+
+Control = Float[Array, "U"]
+ProcessNoise = Float[Array, "W"]
+ProcessNoiseCov = Float[Array, "W W"]
+StepJacobians = tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]
+"""∂pose'/∂(pose, u, w)"""
+
+Landmark = Float[Array, "L"]
+Measurement = Float[Array, "Z"]
+Unmeasured = Float[Array, "K"]
+"""what a measurement leaves free of its landmark"""
+ObserveJacobians = tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]
+"""∂z/∂(pose, l)"""
+InvertJacobians = tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]
+"""∂l/∂(pose, z, s)"""

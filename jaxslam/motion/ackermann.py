@@ -3,11 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
 from jaxslam.math.linalg import is_concrete
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
@@ -48,23 +47,21 @@ def ackermann(
     """
     _check_lengths(wheelbase, sensor, encoder)
 
-    def rates(u: Float[Array, "U"]) -> tuple[Array, Array, Array]:
+    def rates(u: Control) -> tuple[Array, Array, Array]:
         """By the curvature κ = tan α/L: v; its gain v/v_e; the sensor's twist over v, (3,)."""
         a, b = jnp.asarray(sensor, u.dtype)
         curvature = jnp.tan(u[1]) / jnp.asarray(wheelbase, u.dtype)
         gain = 1 / (1 - jnp.asarray(encoder, u.dtype) * curvature)
         return u[0] * gain, gain, jnp.stack([1 - curvature * b, curvature * a, curvature])
 
-    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
+    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         v, _, direction = rates(perturb(u, w))
         return se2.boxplus(pose, u[2] * v * direction)
 
-    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
+    def perturb(u: Control, w: ProcessNoise) -> Control:
         return jnp.stack([u[0] + w[0], u[1] + w[1], u[2]])
 
-    def jacobians(
-        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
-    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
+    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         dt, tan = u[2], jnp.tan(u[1] + w[1])
         v, gain, direction = rates(perturb(u, w))
         by_pose, by_move = se2.compose_jacobians(pose, se2.exp(dt * v * direction))

@@ -1,11 +1,9 @@
 """Move forward, then turn: the guide's robot."""
 
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
 
 from jaxslam.math import se2
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 
@@ -21,16 +19,14 @@ def increment(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (2, 2) covariance.
     """
 
-    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
+    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         d, turn = perturb(u, w)
         return se2.compose(pose, jnp.stack([d, jnp.zeros_like(d), turn]))
 
-    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
+    def perturb(u: Control, w: ProcessNoise) -> Control:
         return u + w
 
-    def jacobians(
-        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
-    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
+    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         d = u[0] + w[0]
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         by_pose = jnp.eye(3, dtype=pose.dtype).at[0, 2].set(-d * s).at[1, 2].set(d * c)

@@ -4,12 +4,11 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
 from jaxslam.noise import NoiseCov, check_alpha, noise_model
 from jaxslam.protocols import Motion
 
@@ -30,17 +29,15 @@ def odometry(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (3, 3) covariance.
     """
 
-    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
+    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         rot1, trans, rot2 = perturb(u, w)
         facing = jnp.stack([pose[0], pose[1], pose[2] + rot1])
         return se2.compose(facing, jnp.stack([trans, jnp.zeros_like(trans), rot2]))
 
-    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
+    def perturb(u: Control, w: ProcessNoise) -> Control:
         return u + w
 
-    def jacobians(
-        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
-    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
+    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         h, d = pose[2] + u[0] + w[0], u[1] + w[1]
         c, s = jnp.cos(h), jnp.sin(h)
         turned = jnp.stack([-d * s, d * c, jnp.ones_like(d)])  # by θ and by rot1 alike
@@ -77,7 +74,7 @@ def odometry_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
     """
     check_alpha("odometry_noise", alpha, 4)
 
-    def noise(pose: Pose, u: Float[Array, "U"]) -> Float[Array, "W W"]:
+    def noise(pose: Pose, u: Control) -> ProcessNoiseCov:
         a1, a2, a3, a4 = jnp.asarray(alpha, pose.dtype)
         rot1, trans, rot2 = u[0] ** 2, u[1] ** 2, u[2] ** 2
         return jnp.diag(

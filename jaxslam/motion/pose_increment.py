@@ -1,10 +1,7 @@
 """A relative pose, as odometry or scan matching reports it."""
 
-from jax import Array
-from jaxtyping import Float
-
 from jaxslam.math import se2
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 
@@ -20,15 +17,13 @@ def pose_increment(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (3, 3) covariance.
     """
 
-    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
+    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         return se2.compose(pose, perturb(u, w))
 
-    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
+    def perturb(u: Control, w: ProcessNoise) -> Control:
         return u + w
 
-    def jacobians(
-        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
-    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
+    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         by_pose, by_increment = se2.compose_jacobians(pose, u + w)
         return by_pose, by_increment, by_increment
 

@@ -3,9 +3,8 @@
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
 
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
 from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Motion
 
@@ -38,16 +37,16 @@ def substeps(motion: Motion, count: int) -> Motion:
     check_count("substeps: count", count)
     size_u, size_w = len(motion.controls), len(motion.noises)
 
-    def rows(u: Float[Array, "U"], w: Float[Array, "W"]) -> _Rows:
+    def rows(u: Control, w: ProcessNoise) -> _Rows:
         return u.reshape(count, size_u), w.reshape(count, size_w)
 
-    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
+    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         def one(pose: Pose, row: _Rows) -> tuple[Array, None]:
             return motion.step(pose, *row), None
 
         return jax.lax.scan(one, pose, rows(u, w))[0]
 
-    def noise_cov(pose: Pose, u: Float[Array, "U"]) -> Array:
+    def noise_cov(pose: Pose, u: Control) -> Array:
         def one(pose: Pose, row: _Rows) -> _Rows:
             u_k, none = row
             return motion.step(pose, u_k, none), motion.noise_cov(pose, u_k)
@@ -56,13 +55,11 @@ def substeps(motion: Motion, count: int) -> Motion:
         own = jnp.eye(count, dtype=blocks.dtype)[:, None, :, None]
         return (own * blocks[:, :, None, :]).reshape(count * size_w, count * size_w)
 
-    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
+    def perturb(u: Control, w: ProcessNoise) -> Control:
         assert motion.perturb is not None
         return jax.vmap(motion.perturb)(*rows(u, w)).ravel()
 
-    def jacobians(
-        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
-    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
+    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         hand = motion.jacobians
         assert hand is not None
 

@@ -1,11 +1,9 @@
 """Velocities held over an interval, integrated by one Euler step."""
 
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
 
 from jaxslam.math import se2
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
 
@@ -23,16 +21,14 @@ def unicycle(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (2, 2) covariance.
     """
 
-    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
+    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         v, omega, dt = perturb(u, w)
         return se2.compose(pose, jnp.stack([v * dt, jnp.zeros_like(dt), omega * dt]))
 
-    def perturb(u: Float[Array, "U"], w: Float[Array, "W"]) -> Float[Array, "U"]:
+    def perturb(u: Control, w: ProcessNoise) -> Control:
         return jnp.stack([u[0] + w[0], u[1] + w[1], u[2]])
 
-    def jacobians(
-        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
-    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
+    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         v, omega, dt = u[0] + w[0], u[1] + w[1], u[2]
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         by_pose = jnp.eye(3, dtype=pose.dtype)

@@ -4,11 +4,10 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
-from jaxslam.math.arrays import Pose, PoseMatrix
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
 from jaxslam.noise import NoiseCov, check_alpha, noise_model
 from jaxslam.protocols import Motion
 
@@ -32,17 +31,15 @@ def velocity(noise_cov: NoiseCov) -> Motion:
         ValueError: if noise_cov is not a (3, 3) covariance.
     """
 
-    def twist_of(u: Float[Array, "U"], w: Float[Array, "W"]) -> Array:
+    def twist_of(u: Control, w: ProcessNoise) -> Array:
         v, omega, dt = u[0] + w[0], u[1] + w[1], u[2]
         return jnp.stack([v * dt, jnp.zeros_like(dt), omega * dt])
 
-    def step(pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]) -> Pose:
+    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         zero, final = jnp.zeros_like(u[2]), w[2] * u[2]
         return se2.compose(pose, se2.exp(twist_of(u, w)) + jnp.stack([zero, zero, final]))
 
-    def jacobians(
-        pose: Pose, u: Float[Array, "U"], w: Float[Array, "W"]
-    ) -> tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]:
+    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         twist, dt, zero = twist_of(u, w), u[2], jnp.zeros_like(u[2])
         by_pose, by_move = se2.compose_jacobians(pose, se2.exp(twist))
         (by_twist,) = se2.exp_jacobians(twist)
@@ -79,7 +76,7 @@ def velocity_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
     """
     check_alpha("velocity_noise", alpha, 6)
 
-    def noise(pose: Pose, u: Float[Array, "U"]) -> Float[Array, "W W"]:
+    def noise(pose: Pose, u: Control) -> ProcessNoiseCov:
         a1, a2, a3, a4, a5, a6 = jnp.asarray(alpha, pose.dtype)
         v, omega = u[0] ** 2, u[1] ** 2
         return jnp.diag(jnp.stack([a1 * v + a2 * omega, a3 * v + a4 * omega, a5 * v + a6 * omega]))

@@ -4,12 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import Point, Pose
+from jaxslam.math.arrays import (
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Point,
+    Pose,
+    Unmeasured,
+)
 from jaxslam.math.linalg import is_concrete
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Reduced, Sensor
@@ -75,23 +82,23 @@ def bearing_inverse_depth(
     if to_point is not None and is_concrete(to_point) and not to_point > 0:
         raise ValueError(f"bearing_inverse_depth: expected to_point above 0, got {to_point}")
 
-    def sight(frame: Array, landmark: Float[Array, "L"]) -> tuple[Array, Array]:
+    def sight(frame: Array, landmark: Landmark) -> tuple[Array, Array]:
         """v, and the frame's axes at the map's origin, where v is a point."""
         v = landmark[3] * (landmark[:2] - frame[:2]) + _direction(landmark[2])
         return v, frame.at[:2].set(0.0)
 
-    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
+    def observe(pose: Pose, landmark: Landmark) -> Measurement:
         v, axes = sight(sensor_pose(pose), landmark)
         return se2.polar(se2.to_frame(axes, v))[1:]
 
-    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
+    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
         return wrap(z - z_hat)
 
-    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
+    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
         frame = sensor_pose(pose)
         return jnp.concatenate([frame[:2], wrap(frame[2:] + z), s])
 
-    def position(landmark: Float[Array, "L"]) -> Point:
+    def position(landmark: Landmark) -> Point:
         # max(ρ, _FAR) with slope 1 everywhere. Added to the cut value, not to ρ, the term is an
         # exact zero: in float32 ρ + (_FAR - ρ) could be 0.
         inverse = landmark[3]
@@ -99,15 +106,13 @@ def bearing_inverse_depth(
         inverse = cut + (inverse - jax.lax.stop_gradient(inverse))
         return landmark[:2] + _direction(landmark[2]) / inverse
 
-    def embed(pose: Pose, point: Point) -> Float[Array, "L"]:
+    def embed(pose: Pose, point: Point) -> Landmark:
         origin = sensor_pose(pose)[:2]
         distance, alpha = se2.polar(point - origin)
         inverse = 1.0 / jnp.maximum(distance, _NEAR)
         return jnp.stack([origin[0], origin[1], alpha, inverse])
 
-    def observe_jacobians(
-        pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
+    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
         frame = sensor_pose(pose)
         v, axes = sight(frame, landmark)
         by_axes, by_v = se2.to_frame_jacobians(axes, v)
@@ -121,13 +126,11 @@ def bearing_inverse_depth(
         )
         return outer @ by_frame.T @ sensor_pose_jacobian(pose), outer @ by_landmark
 
-    def invert_jacobians(
-        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
-    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
+    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
         eye = jnp.eye(4, dtype=pose.dtype)
         return eye[:, :3] @ sensor_pose_jacobian(pose), eye[:, 2:3], eye[:, 3:]
 
-    def ready(pose: Pose, landmark: Float[Array, "L"], cov: Array) -> Array:
+    def ready(pose: Pose, landmark: Landmark, cov: Array) -> Array:
         inverse = jnp.where(landmark[3] > 0, landmark[3], 1.0)
         # v is along the line of sight, scaled by ρ: d = |v|/ρ, cos γ = v·(cos α, sin α)/|v|.
         v = landmark[3] * (landmark[:2] - sensor_pose(pose)[:2]) + _direction(landmark[2])

@@ -1,13 +1,10 @@
 """The robot's position in the map: a satellite receiver, a total station."""
 
-import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam.math.arrays import Pose
-from jaxslam.noise import NoiseCov, noise_model
-from jaxslam.protocols import Free, Sensor
+from jaxslam.noise import NoiseCov
+from jaxslam.protocols import Sensor
+from jaxslam.sensors.absolute import absolute
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
@@ -25,37 +22,11 @@ def position_fix(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     """
     sensor_pose, sensor_pose_jacobian = mounting("position_fix", mount)
 
-    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
-        return sensor_pose(pose)[:2]
-
-    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
-        return z - z_hat
-
-    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
-        return jnp.zeros(0, pose.dtype)
-
-    def observe_jacobians(
-        pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
-        return sensor_pose_jacobian(pose)[:2], jnp.zeros((2, 0), pose.dtype)
-
-    def invert_jacobians(
-        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
-    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
-        none = jnp.zeros((0, 3), pose.dtype)
-        return none, none[:, :2], none[:, :0]
-
-    return Sensor(
-        name="position_fix",
-        measurements=("x [m]", "y [m]"),
-        landmark=(),
-        observe=observe,
-        residual=residual,
-        noise_cov=noise_model("position_fix", noise_cov, 2),
-        invert=invert,
-        position=lambda landmark: jnp.zeros(2, landmark.dtype),
-        embed=lambda pose, point: jnp.zeros(0, pose.dtype),
-        free=Free(jnp.zeros(0), jnp.zeros((0, 0))),
-        observe_jacobians=observe_jacobians,
-        invert_jacobians=invert_jacobians,
+    return absolute(
+        "position_fix",
+        ("x [m]", "y [m]"),
+        observe=lambda pose: sensor_pose(pose)[:2],
+        residual=lambda z, z_hat: z - z_hat,
+        jacobian=lambda pose: sensor_pose_jacobian(pose)[:2],
+        noise_cov=noise_cov,
     )

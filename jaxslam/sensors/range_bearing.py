@@ -1,15 +1,20 @@
 """Distance and direction of a point landmark: a laser scanner's corner, a sonar's echo."""
 
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import Pose
+from jaxslam.math.arrays import (
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Pose,
+    Unmeasured,
+)
 from jaxslam.noise import NoiseCov, noise_model
-from jaxslam.protocols import Free, Sensor
+from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
@@ -27,26 +32,22 @@ def range_bearing(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     """
     sensor_pose, sensor_pose_jacobian = mounting("range_bearing", mount)
 
-    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
+    def observe(pose: Pose, landmark: Landmark) -> Measurement:
         return se2.polar_in_frame(sensor_pose(pose), landmark)
 
-    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
+    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
         return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1])])
 
-    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
+    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
         return se2.from_frame(sensor_pose(pose), se2.rectangular(z))
 
-    def observe_jacobians(
-        pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
+    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
         frame = sensor_pose(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
         (outer,) = se2.polar_jacobians(se2.to_frame(frame, landmark))
         return outer @ by_frame @ sensor_pose_jacobian(pose), outer @ by_point
 
-    def invert_jacobians(
-        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
-    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
+    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
         frame = sensor_pose(pose)
         by_frame, by_point = se2.from_frame_jacobians(frame, se2.rectangular(z))
         (inner,) = se2.rectangular_jacobians(z)
@@ -56,14 +57,10 @@ def range_bearing(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     return Sensor(
         name="range_bearing",
         measurements=("range [m]", "bearing [rad]"),
-        landmark=("x [m]", "y [m]"),
         observe=observe,
         residual=residual,
         noise_cov=noise_model("range_bearing", noise_cov, 2),
         invert=invert,
-        position=lambda landmark: landmark,
-        embed=lambda pose, point: point,
-        free=Free(jnp.zeros(0), jnp.zeros((0, 0))),
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,
     )

@@ -2,14 +2,20 @@
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import Pose
+from jaxslam.math.arrays import (
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Pose,
+    Unmeasured,
+)
 from jaxslam.noise import NoiseCov, noise_model
-from jaxslam.protocols import Free, Sensor
+from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
@@ -29,20 +35,18 @@ def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -
     """
     sensor_pose, sensor_pose_jacobian = mounting("range_bearing_signature", mount)
 
-    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
+    def observe(pose: Pose, landmark: Landmark) -> Measurement:
         seen = se2.polar(se2.to_frame(sensor_pose(pose), landmark[:2]))
         return jnp.concatenate([seen, landmark[2:]])
 
-    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
+    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
         return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1]), z[2] - z_hat[2]])
 
-    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
+    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
         point = se2.from_frame(sensor_pose(pose), se2.rectangular(z[:2]))
         return jnp.concatenate([point, z[2:]])
 
-    def observe_jacobians(
-        pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
+    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
         frame = sensor_pose(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark[:2])
         (outer,) = se2.polar_jacobians(se2.to_frame(frame, landmark[:2]))
@@ -50,9 +54,7 @@ def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -
         by_pose = by_pose.at[:2].set(outer @ by_frame @ sensor_pose_jacobian(pose))
         return by_pose, _beside_one(outer @ by_point)
 
-    def invert_jacobians(
-        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
-    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
+    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
         by_frame, by_point = se2.from_frame_jacobians(sensor_pose(pose), se2.rectangular(z[:2]))
         (inner,) = se2.rectangular_jacobians(z[:2])
         by_pose = jnp.zeros((3, 3), pose.dtype)
@@ -69,7 +71,6 @@ def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -
         invert=invert,
         position=lambda landmark: landmark[:2],
         embed=lambda pose, point: jnp.concatenate([point, jnp.zeros_like(point[:1])]),
-        free=Free(jnp.zeros(0), jnp.zeros((0, 0))),
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,
     )

@@ -2,12 +2,17 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
-from jaxslam.math.arrays import Pose
+from jaxslam.math.arrays import (
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Pose,
+    Unmeasured,
+)
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
@@ -40,26 +45,22 @@ def range_only(
     """
     sensor_pose, sensor_pose_jacobian = mounting("range_only", mount)
 
-    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
+    def observe(pose: Pose, landmark: Landmark) -> Measurement:
         return se2.polar_in_frame(sensor_pose(pose), landmark)[:1]
 
-    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
+    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
         return z - z_hat
 
-    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
+    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
         return se2.from_frame(sensor_pose(pose), se2.rectangular(jnp.concatenate([z, s])))
 
-    def observe_jacobians(
-        pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
+    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
         frame = sensor_pose(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
         outer = se2.polar_jacobians(se2.to_frame(frame, landmark))[0][:1]
         return outer @ by_frame @ sensor_pose_jacobian(pose), outer @ by_point
 
-    def invert_jacobians(
-        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
-    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
+    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
         frame, seen = sensor_pose(pose), jnp.concatenate([z, s])
         by_frame, by_point = se2.from_frame_jacobians(frame, se2.rectangular(seen))
         by_polar = by_point @ se2.rectangular_jacobians(seen)[0]
@@ -68,13 +69,10 @@ def range_only(
     return Sensor(
         name="range_only",
         measurements=("range [m]",),
-        landmark=("x [m]", "y [m]"),
         observe=observe,
         residual=residual,
         noise_cov=noise_model("range_only", noise_cov, 1),
         invert=invert,
-        position=lambda landmark: landmark,
-        embed=lambda pose, point: point,
         free=prior("range_only", free, 1),
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,

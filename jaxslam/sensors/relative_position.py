@@ -1,14 +1,19 @@
 """The position of a landmark in the sensor's own frame, Cartesian."""
 
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
-from jaxslam.math.arrays import Pose
+from jaxslam.math.arrays import (
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Pose,
+    Unmeasured,
+)
 from jaxslam.noise import NoiseCov, noise_model
-from jaxslam.protocols import Free, Sensor
+from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
@@ -25,38 +30,30 @@ def relative_position(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sens
     """
     sensor_pose, sensor_pose_jacobian = mounting("relative_position", mount)
 
-    def observe(pose: Pose, landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
+    def observe(pose: Pose, landmark: Landmark) -> Measurement:
         return se2.to_frame(sensor_pose(pose), landmark)
 
-    def residual(z: Float[Array, "Z"], z_hat: Float[Array, "Z"]) -> Float[Array, "Z"]:
+    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
         return z - z_hat
 
-    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
+    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
         return se2.from_frame(sensor_pose(pose), z)
 
-    def observe_jacobians(
-        pose: Pose, landmark: Float[Array, "L"]
-    ) -> tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]:
+    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
         by_frame, by_point = se2.to_frame_jacobians(sensor_pose(pose), landmark)
         return by_frame @ sensor_pose_jacobian(pose), by_point
 
-    def invert_jacobians(
-        pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]
-    ) -> tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]:
+    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
         by_frame, by_point = se2.from_frame_jacobians(sensor_pose(pose), z)
         return by_frame @ sensor_pose_jacobian(pose), by_point, jnp.zeros((2, 0), pose.dtype)
 
     return Sensor(
         name="relative_position",
         measurements=("ahead [m]", "left [m]"),
-        landmark=("x [m]", "y [m]"),
         observe=observe,
         residual=residual,
         noise_cov=noise_model("relative_position", noise_cov, 2),
         invert=invert,
-        position=lambda landmark: landmark,
-        embed=lambda pose, point: point,
-        free=Free(jnp.zeros(0), jnp.zeros((0, 0))),
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,
     )

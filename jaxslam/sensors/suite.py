@@ -8,9 +8,8 @@ from typing import Any, Literal, NoReturn
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
 
-from jaxslam.math.arrays import Point, Pose
+from jaxslam.math.arrays import Landmark, Measurement, Point, Pose, Unmeasured
 from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Free, Sensor
 from jaxslam.types import Scan
@@ -112,7 +111,6 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
         invert=not_one,
         position=first.position,
         embed=first.embed,
-        free=Free(jnp.zeros(0), jnp.zeros((0, 0))),
         reduced=first.reduced,
         parts=made,
     )
@@ -149,13 +147,13 @@ def on_ground(sensor: Sensor, size: int) -> Sensor:
         return sensor
     kept = sensor.free.mean.shape[0]
 
-    def invert(pose: Pose, z: Float[Array, "Z"], s: Float[Array, "K"]) -> Float[Array, "L"]:
+    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
         return jnp.concatenate([sensor.invert(pose, z, s[:kept]), s[kept:]])
 
-    def embed(pose: Pose, point: Point) -> Float[Array, "L"]:
+    def embed(pose: Pose, point: Point) -> Landmark:
         return jnp.concatenate([sensor.embed(pose, point), jnp.zeros(spare, pose.dtype)])
 
-    dtype = sensor.free.mean.dtype
+    dtype = jnp.asarray(sensor.free.mean).dtype
     free = Free(
         jnp.concatenate([sensor.free.mean, jnp.zeros(spare, dtype)]),
         jnp.eye(kept + spare, dtype=dtype).at[:kept, :kept].set(sensor.free.cov),
