@@ -170,7 +170,7 @@ FILTERS: dict[str, Callable[..., Candidate]] = {
     "ukf_left": lambda world, **more: variant(
         world, chart=left_invariant(), linearize=unscented(), **more
     ),
-    "square_root": lambda world, **more: variant(world, square_root=True, **more),
+    "square_root": lambda world, **more: variant(world, covariance="square_root", **more),
 }
 """By name; each takes a scenario, and further options of `ekf_slam`, and returns what `monte_carlo`
 runs on it."""

@@ -13,12 +13,11 @@ import numpy as np
 
 from benchmarks.speed.timing import together
 from jaxslam import association, life, run
-from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters import ekf_slam
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.map_management.merging import duplicates
-from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
@@ -58,13 +57,13 @@ def measure():
     joint, scan = jax.tree.map(
         lambda *leaves: jnp.stack(leaves), *(problem(sensor, seed) for seed in range(RUNS))
     )
-    models = {"sensor": sensor, "chart": euclidean(), "linearize": at_estimate()}
+    settings = EkfSettings(sensor)
 
     def correct(joint, scan):
-        return correct_in_turn(joint, scan.z, scan.tag, scan.valid, **models)[0]
+        return correct_in_turn(joint, scan.z, scan.tag, scan.valid, settings)[0]
 
     def find(method):
-        return lambda joint, scan: tuple(method(prediction_of(joint, **models), scan))
+        return lambda joint, scan: tuple(method(prediction_of(joint, settings), scan))
 
     programs = {"correction": correct} | {name: find(method) for name, method in METHODS.items()}
     actions = {}

@@ -13,9 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxslam import association, plot
-from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
-from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.math.stats import chi2_quantile
@@ -58,8 +57,7 @@ def decide(method, sigma, key):
     noise = jax.vmap(lambda z, n: root_psd(SENSOR.noise_cov(z)) @ n)(exact, normals)
     z = jax.vmap(SENSOR.residual)(exact + noise, jnp.zeros_like(exact))
     scan = Scan(z, jnp.full(SEEN, -1), jnp.ones(SEEN, bool))
-    models = {"sensor": SENSOR, "chart": euclidean(), "linearize": at_estimate()}
-    found = method(prediction_of(joint, **models), scan)
+    found = method(prediction_of(joint, EkfSettings(SENSOR)), scan)
     right = found.slot == jnp.arange(SEEN)
     return right.mean(), (~right & (found.slot >= 0)).mean(), jnp.asarray(found.exhausted)
 

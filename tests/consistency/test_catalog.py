@@ -273,7 +273,7 @@ def test_the_square_root_filter_is_the_filter(options):
     world = dataclasses.replace(worlds.ring(steps=20), pose_cov=np.diag([0.01, 0.02, 0.003]))
     here = draw(world)
     plain = drive(here, "ekf", **options)
-    root = drive(here, "ekf", square_root=True, **options)
+    root = drive(here, "ekf", covariance="square_root", **options)
     for name in ("pose", "pose_cov", "points", "point_covs"):
         ours, theirs = getattr(root.estimate, name), getattr(plain.estimate, name)
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-11)
@@ -291,18 +291,18 @@ def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
     _, log = simulate(world, jax.random.key(1))
     single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, log)
     smallest = {}
-    for square_root in (False, True):
-        filter = catalog.variant(world, square_root=square_root)
+    for covariance in ("plain", "square_root"):
+        filter = catalog.variant(world, covariance=covariance)
         trace = jax.jit(
             lambda log, f=filter: run(
                 f, log, world.pose, world.pose_cov, KEY, probe=lambda s: s.cov
             )
         )(single)
         cov = np.asarray(trace.probe, np.float64)
-        cov = cov @ cov.transpose(0, 2, 1) if square_root else cov
-        smallest[square_root] = np.linalg.eigvalsh(cov)[:, 0].min()
-    assert smallest[False] < 0
-    assert smallest[True] > 0
+        cov = cov @ cov.transpose(0, 2, 1) if filter.square_root else cov
+        smallest[covariance] = np.linalg.eigvalsh(cov)[:, 0].min()
+    assert smallest["plain"] < 0
+    assert smallest["square_root"] > 0
 
 
 # --- canonical form -----------------------------------------------------------------------------
@@ -332,8 +332,8 @@ def test_variants_for_points_refuse_other_landmarks(name):
     [
         ({"linearize": linearize.first_estimate(), "chart": charts.right_invariant()}, "Euclidean"),
         ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
-        ({"square_root": True, "joseph": True}, "square root"),
-        ({"square_root": True, "chart": charts.robocentric()}, "motion apart"),
+        ({"covariance": "root"}, 'or "joseph" or "square_root", got \'root\''),
+        ({"covariance": "square_root", "chart": charts.robocentric()}, "motion apart"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(options, why):

@@ -71,7 +71,7 @@ def assert_same(a, b, rtol=1e-9):
     [
         (PLACES, {}),
         (9, {"births": 1, "gate": 9.0, "iterations": 2}),
-        (9, {"update": "joint", "joseph": True, "linearize": "unscented"}),
+        (9, {"update": "joint", "covariance": "joseph", "linearize": "unscented"}),
     ],
 )
 def test_the_same_as_the_ordinary_filter(area, options):
@@ -145,7 +145,7 @@ def test_gradients_pass_through_a_change_of_area():
     [
         ({"area": 0}, "area"),
         ({"area": 4, "watch": True}, "does not take watch"),
-        ({"area": 4, "square_root": True}, "does not take square_root"),
+        ({"area": 4, "covariance": "square_root"}, "got 'square_root'"),
         ({"area": 4, "chart": charts.right_invariant()}, "right_invariant"),
         ({"area": 4, "linearize": linearize.first_estimate()}, "first_estimate"),
         ({"area": 4, "sensor": sensors.compass(np.eye(1))}, "compass has no landmarks"),

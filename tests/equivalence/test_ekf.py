@@ -320,7 +320,7 @@ def test_joseph_form_is_the_plain_form():
     joint = some_joint()
     scan = some_scan(joint, [13, 11])
     plain, plain_info = updater(update="joint")(joint, scan)
-    joseph, info = updater(update="joint", joseph=True)(joint, scan)
+    joseph, info = updater(update="joint", covariance="joseph")(joint, scan)
     assert_same((joseph, info), (plain, plain_info), 1e-12)
     assert np.abs(plain.cov - joint.cov).max() > 1e-3
 
@@ -472,7 +472,7 @@ def test_jit_is_no_jit():
     [
         {},
         {"update": "joint", "gate": 9.0, "births": 1},
-        {"chart": "right_invariant", "iterations": 2, "joseph": True},
+        {"chart": "right_invariant", "iterations": 2, "covariance": "joseph"},
         {"chart": "right_invariant", "update": "joint"},
     ],
 )

@@ -156,7 +156,7 @@ def test_joint_is_sequential_where_the_measurement_is_linear(name):
 def test_iterations_and_josephs_form_change_nothing_where_the_measurement_is_linear():
     log = drive("position_fix", np.zeros(3))
     once = filtered("position_fix", log, mount=np.zeros(3))
-    again = filtered("position_fix", log, mount=np.zeros(3), iterations=2, joseph=True)
+    again = filtered("position_fix", log, mount=np.zeros(3), iterations=2, covariance="joseph")
     assert_same(once, again)
 
 

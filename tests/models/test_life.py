@@ -169,7 +169,7 @@ def test_a_root_does_not_change_because_another_run_loses_a_landmark():
     seen = np.full((2, 12, 2), -1)
     seen[:, :, 0], seen[0, 0, 1] = 0, 1
     one, other = log_of(seen[0]), log_of(seen[1])
-    go = driver(square_root=True)
+    go = driver(covariance="square_root")
     beside = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), one, other))
     twice = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), other, other))
     assert beside.info.removed[0].any()

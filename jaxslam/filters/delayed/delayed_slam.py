@@ -7,20 +7,19 @@ import jax.numpy as jnp
 
 from jaxslam import validation
 from jaxslam.association.known import known as known_association
-from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.delayed.observations import confirm, intersect, take
 from jaxslam.filters.delayed.promotion import promote
 from jaxslam.filters.delayed.state import SIZE, Delayed, Distance, Fresh, Layout, Rules, empty
 from jaxslam.filters.delayed.triangulation import Meeting, meeting_of
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.filters.ekf.predicted_measurements import prediction_of
+from jaxslam.filters.ekf.scan import associated
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.reporting import info_of, seen_before, status_of
-from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math.linalg import check_count, is_concrete
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Associate, Association, Filter, Motion, Sensor
+from jaxslam.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.sensors.suite import on_ground
 from jaxslam.types import Estimate, Info, Scan
 
@@ -150,11 +149,7 @@ def delayed_slam(
     )
     seen_in_table = on_ground(sensor, SIZE)
     plain = ekf_slam(motion, seen_in_table, capacity)
-    options: dict[str, Any] = {
-        "sensor": seen_in_table,
-        "chart": euclidean(),
-        "linearize": at_estimate(),
-    }
+    settings = EkfSettings(sensor=seen_in_table, associate=associate, gate=gate)
 
     def init(pose: Array, pose_cov: Array) -> Delayed:
         return empty(layout, pose, pose_cov)
@@ -189,12 +184,9 @@ def delayed_slam(
         joint = state.joint
         landmarks = jnp.arange(layout.slots) < capacity
         shown = joint._replace(alive=joint.alive & landmarks)
-        found = Association(*associate(prediction_of(shown, **options), scan._replace(z=z)))
-        matched = scan.valid & (found.slot >= 0) & ~found.is_new
-        is_new = scan.valid & found.is_new
-        joint, done = correct_in_turn(
-            joint, z, jnp.maximum(found.slot, 0), matched, gate=gate, **options
-        )
+        found, matched = associated(shown, scan._replace(z=z), settings)
+        is_new = found.is_new
+        joint, done = correct_in_turn(joint, z, jnp.maximum(found.slot, 0), matched, settings)
         state = state._replace(joint=joint)
         repeated = jnp.zeros_like(is_new)
         if tagged:

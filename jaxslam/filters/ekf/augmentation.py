@@ -2,35 +2,36 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import settle
-from jaxslam.protocols import Chart, Here, Linearizer, Sensor
+from jaxslam.protocols import Here
 from jaxslam.slots import Joint
 
 
 def augment(
     joint: Joint,
-    z: jax.Array,
-    tag: jax.Array,
-    slot: jax.Array,
-    granted: jax.Array,
-    *,
-    sensor: Sensor,
-    chart: Chart,
-    linearize: Linearizer,
-    square_root: bool = False,
+    z: Float[Array, "m Z"],
+    tag: Int[Array, "m"],
+    slot: Int[Array, "m"],
+    granted: Bool[Array, "m"],
+    settings: EkfSettings,
 ) -> Joint:
     """Start landmarks from measurements z (m, Z) in free slots (m,), where granted (m,).
 
     L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
     with the prior's term of (44); several in one scan are correlated through the robot.
     """
+    chart, square_root = settings.chart, settings.square_root
     here = Here(joint, chart, joint.pose, slots.robot_cov(joint, square_root))
 
-    def one(z_i: jax.Array, tag_i: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        landmark, by_pose, own = linearize.invert(sensor, z_i, tag_i, here)
+    def one(
+        z_i: Float[Array, "Z"], tag_i: Int[Array, ""]
+    ) -> tuple[Float[Array, "L"], Float[Array, "L 3"], Float[Array, "L L"]]:
+        landmark, by_pose, own = settings.linearize.invert(settings.sensor, z_i, tag_i, here)
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)
             by_pose = by_pose @ basis.pose - basis.cross
@@ -43,5 +44,5 @@ def augment(
     joint = slots.scatter(
         joint, slot, granted, landmark, by_pose, own, tag, square_root=square_root
     )
-    born = jnp.zeros_like(joint.alive).at[slot].max(granted)
-    return joint._replace(lin=linearize.born(joint, born))
+    new = jnp.zeros_like(joint.alive).at[slot].max(granted)
+    return joint._replace(lin=settings.linearize.born(joint, new))

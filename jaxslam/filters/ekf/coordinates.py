@@ -39,3 +39,12 @@ def with_cov_of_coordinates(
         cross = jnp.where(alive, cross, 0.0)
         cov = moved_cov(cov, Transition(undo, cross, landmark, undo, None), None)
     return joint._replace(cov=linalg.root_psd(cov) if square_root else cov)
+
+
+def retracted(chart: Chart, joint: Joint, xi: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Pose (3,) and landmarks (N, L) moved by errors ξ (D,)."""
+    over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
+    poses, landmarks = over_landmarks(
+        joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
+    )
+    return poses[0], jnp.where(joint.alive[:, None], landmarks, 0.0)

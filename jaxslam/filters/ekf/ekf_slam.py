@@ -1,10 +1,8 @@
 """EKF-SLAM: the one Kalman-type SLAM filter, of which the published variants are arguments."""
 
-from functools import partial
-from typing import Any, Literal
-
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
@@ -12,8 +10,14 @@ from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf import to_points
 from jaxslam.filters.ekf.beliefs import moments
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import in_order, part_updates
-from jaxslam.filters.ekf.settings import check_chart, check_map_manager, check_numbers, check_parts
+from jaxslam.filters.ekf.scan import turns_of, update_by_scan, without
+from jaxslam.filters.ekf.settings import (
+    Covariance,
+    EkfSettings,
+    Update,
+    check_numbers,
+    check_settings,
+)
 from jaxslam.filters.map_management.merging import Duplicates, find_duplicate, told_apart
 from jaxslam.filters.map_management.merging import merge as merge_pair
 from jaxslam.linearize.at_estimate import at_estimate
@@ -33,12 +37,11 @@ def ekf_slam(
     chart: Chart | None = None,
     linearize: Linearizer | None = None,
     associate: Associate | None = None,
-    update: Literal["sequential", "joint"] = "sequential",
+    update: Update = "sequential",
     gate: float | None = None,
     iterations: int = 1,
-    joseph: bool = False,
+    covariance: Covariance = "plain",
     births: int | None = None,
-    square_root: bool = False,
     watch: bool = False,
     life: Life | None = None,
     merge: Duplicates | None = None,
@@ -60,119 +63,68 @@ def ekf_slam(
         chart: the error P is the covariance of; default `charts.euclidean()`.
         linearize: where Jacobians are taken; default `linearize.at_estimate()`.
         associate: default `association.known()`.
-        update: "sequential" corrects place by place, linearizing anew each time, as the guide does;
-            "joint" corrects by the whole scan at once.
+        update: "sequential" corrects by one measurement after the other, linearizing anew each
+            time, as the guide does; "joint" corrects by the whole scan at once.
         gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
             The guide's 3 σ is `stats.sigma_gate(3)`, and `stats.chi2_quantile` gives a probability.
         iterations: passes of the iterated EKF, each from the same prior; 1 is the plain EKF.
-        joseph: Joseph's form of the covariance update; dearer, and safer in float32.
+        covariance: "plain"; "joseph", Joseph's form of the update, dearer, and safer in float32; or
+            "square_root", to hold a root X of P = X Xᵀ instead of P, in which float32 goes as far
+            as float64 does in P; the same filter, dearer (the prediction is O(N³)).
         births: at most so many new landmarks a scan, the rest `Status.DEFERRED`; the guide starts
             one. Default no limit.
-        square_root: hold a root X of P = X Xᵀ instead of P, in which float32 goes as far as float64
-            does in P; the same filter, dearer (the prediction is O(N³)).
         life: which landmarks stay in the map (`jaxslam.life`); default all.
         merge: take two landmarks for one (`filters.merging.duplicates`); default never.
         watch: keep a `slots.Watch` in the state, which campaigns report.
     Raises:
         ValueError: on models, charts, linearizers or associations that are none or of wrong sizes
             (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
-            update, a chart or linearizer that does not fit the sensor's landmarks or one another,
-            a life that is none, Joseph's form of a square root, several iterations of a statistical
-            linearizer, or a linearizer of landmarks for a suite with an absolute sensor.
+            update or covariance, a chart or linearizer that does not fit the sensor's landmarks or
+            one another, a life that is none, a square root in a chart that keeps the last motion
+            apart, several iterations of a statistical linearizer, or a linearizer of landmarks for
+            a suite with an absolute sensor.
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
-    chart = chart or euclidean()
-    linearize = linearize or at_estimate()
-    associate = associate or known_association()
-    check_numbers("ekf_slam", capacity, update, gate, iterations, births)
-    check_chart(sensor, chart)
-    check_parts(sensor, chart, linearize, iterations, joseph, square_root)
-    check_map_manager(sensor, life, merge)
-    size_l, size_z = len(sensor.landmark), len(sensor.measurements)
-    move = partial(
-        propagate,
-        motion=motion,
-        chart=chart,
-        linearize=linearize,
-        square_root=square_root,
+    check_numbers("ekf_slam", capacity, update, gate, iterations, births, covariance)
+    settings = EkfSettings(
+        sensor=sensor,
+        chart=chart or euclidean(),
+        linearize=linearize or at_estimate(),
+        associate=associate or known_association(),
+        update=update,
+        gate=gate,
+        iterations=iterations,
+        covariance=covariance,
+        births=births,
+        life=life,
     )
+    check_settings(settings)
+    check_map_manager(sensor, life, merge)
+    chart, square_root = settings.chart, settings.square_root
+    turns = turns_of(sensor, settings)
+    places = sensor.places if isinstance(sensor, Suite) else ()
 
     def init(pose: jax.Array, pose_cov: jax.Array) -> Joint:
-        ground = jnp.zeros((capacity, size_l), pose.dtype)
-        turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
-        if chart.basis is not None:
-            undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
-            pose_cov, turn = undo @ pose_cov @ undo.T, undo @ turn
-        lin = linearize.init(pose, ground)
-        joint = slots.empty(
-            pose,
-            pose_cov,
-            capacity,
-            size_l,
-            lin,
-            square_root=square_root,
-            turn=turn if watch else None,
-            motion_apart=chart.motion_apart,
-        )
-        if sensor.reduced is not None:
-            joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
+        joint = initial_state(pose, pose_cov, capacity, settings, watch=watch)
         if merge is not None:
             joint = joint._replace(apart=jnp.zeros((capacity, capacity), bool))
         return joint if life is None else joint._replace(life=life.init(pose, joint.landmarks))
 
-    def without(joint: Joint, dead: jax.Array) -> Joint:
-        def removed(joint: Joint) -> Joint:
-            # A root is made triangular anew; a run without a removal keeps its own to the bit.
-            less = slots.remove(joint, dead, square_root=square_root)
-            both: Joint = jax.tree.map(lambda a, b: jnp.where(dead.any(), a, b), less, joint)
-            return both
-
-        return where_any(dead.any(), removed, lambda joint: joint, joint)
-
-    options: dict[str, Any] = {
-        "associate": associate,
-        "update": update,
-        "births": births,
-        "life": life,
-        "without": without,
-        "chart": chart,
-        "linearize": linearize,
-        "square_root": square_root,
-        "options": {"gate": gate, "iterations": iterations, "joseph": joseph},
-    }
-    parts = part_updates(sensor, size_l, **options)
-    places = sensor.places if isinstance(sensor, Suite) else ()
-
     def predict(joint: Joint, u: jax.Array, key: jax.Array) -> Joint:
-        return move(joint, u)
+        return propagate(joint, u, motion, settings)
 
     def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
-        joint, info, given_up = in_order(joint, scan, parts)
+        joint, info, evicted = update_by_scan(joint, scan, turns)
         if merge is not None:
-            joint = joint._replace(apart=told_apart(joint, info, places))
-            kept, gone, same = find_duplicate(joint, chart, merge, square_root=square_root)
-
-            def merged(joint: Joint) -> Joint:
-                one = merge_pair(joint, chart, kept, gone, square_root=square_root)
-                both: Joint = jax.tree.map(lambda a, b: jnp.where(same, a, b), one, joint)
-                return both
-
-            joint = where_any(same, merged, lambda joint: joint, joint)
-            pair = jnp.where(same, jnp.stack([kept, gone]), -1).astype(jnp.int32)
-            info = info._replace(merged=pair)
+            joint, info = with_duplicates_merged(joint, info, merge, places, settings)
         if sensor.reduced is not None:
-            which = to_points.ready(joint, sensor, square_root)
-
-            def reduced(joint: Joint) -> Joint:
-                return to_points.reduce(joint, which, sensor, square_root)
-
-            joint = where_any(which.any(), reduced, lambda joint: joint, joint)
+            joint, which = to_points.reduced_where_ready(joint, sensor, square_root)
             info = info._replace(reduced=which)
         if life is not None:
             memory, dead = life.after(joint, info, lambda: estimate(joint))
-            joint = without(joint._replace(life=memory), dead)
-            info = info._replace(removed=dead | given_up)
+            joint = without(joint._replace(life=memory), dead, square_root=square_root)
+            info = info._replace(removed=dead | evicted)
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:
@@ -182,7 +134,7 @@ def ekf_slam(
     return Filter(
         name="ekf_slam",
         control_size=len(motion.controls),
-        measurement_size=size_z,
+        measurement_size=len(sensor.measurements),
         init=init,
         predict=predict,
         update=update_map,
@@ -191,3 +143,71 @@ def ekf_slam(
         places=places,
         square_root=square_root,
     )
+
+
+def initial_state(
+    pose: Float[Array, "3"],
+    pose_cov: Float[Array, "3 3"],
+    capacity: int,
+    settings: EkfSettings,
+    *,
+    watch: bool = False,
+) -> Joint:
+    """A robot whose covariance in coordinates is pose_cov, and no landmark."""
+    sensor, chart = settings.sensor, settings.chart
+    size_l = len(sensor.landmark)
+    ground = jnp.zeros((capacity, size_l), pose.dtype)
+    turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
+    if chart.basis is not None:
+        undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
+        pose_cov, turn = undo @ pose_cov @ undo.T, undo @ turn
+    joint = slots.empty(
+        pose,
+        pose_cov,
+        capacity,
+        size_l,
+        settings.linearize.init(pose, ground),
+        square_root=settings.square_root,
+        turn=turn if watch else None,
+        motion_apart=chart.motion_apart,
+    )
+    if sensor.reduced is not None:
+        joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
+    return joint
+
+
+def with_duplicates_merged(
+    joint: Joint, info: Info, rule: Duplicates, places: tuple[int, ...], settings: EkfSettings
+) -> tuple[Joint, Info]:
+    """The map after the merge of the two landmarks that are most likely one, where there are."""
+    chart, square_root = settings.chart, settings.square_root
+    joint = joint._replace(apart=told_apart(joint, info, places))
+    kept, gone, same = find_duplicate(joint, chart, rule, square_root=square_root)
+
+    def merged(joint: Joint) -> Joint:
+        one = merge_pair(joint, chart, kept, gone, square_root=square_root)
+        both: Joint = jax.tree.map(lambda a, b: jnp.where(same, a, b), one, joint)
+        return both
+
+    joint = where_any(same, merged, lambda joint: joint, joint)
+    pair = jnp.where(same, jnp.stack([kept, gone]), -1).astype(jnp.int32)
+    return joint, info._replace(merged=pair)
+
+
+def check_map_manager(sensor: Sensor, life: Life | None, merge: Duplicates | None) -> None:
+    """What decides which landmarks stay is of the right kind, and can be applied."""
+    if life is not None and not isinstance(life, Life):
+        raise ValueError(
+            f"ekf_slam: expected life to be a Life, as of life.existence, got {life!r}"
+        )
+    if merge is None:
+        return
+    if not isinstance(merge, Duplicates):
+        raise ValueError(
+            f"ekf_slam: expected merge to be a Duplicates, as of merging.duplicates, got {merge!r}"
+        )
+    if len(sensor.landmark) < 2 or "rho [1/m]" in sensor.landmark:
+        raise ValueError(
+            f"ekf_slam: two landmarks of the sensor {sensor.name} are not one where their "
+            "parameters agree, so they cannot be merged"
+        )

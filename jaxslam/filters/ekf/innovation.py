@@ -1,223 +1,351 @@
-"""What measurements say of all errors of a `Joint`: innovations, their covariances, and gains."""
+"""The innovations of m measurements, their covariance S, and what they say of a `Joint`'s errors.
+
+`innovate` linearizes, forms S = H P Hᵀ + R, gates, factors S = L Lᵀ and whitens by L⁻¹: one
+function for each. What the forms of the update (`update`) take of it is an `Innovation`.
+"""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
 from jaxslam.filters.ekf.predicted_measurements import in_chart, innovation_cov
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.to_points import at_slot
 from jaxslam.math import linalg
 from jaxslam.math.xla import apart, settle
-from jaxslam.protocols import Chart, Here, Linearizer, Sensor
+from jaxslam.protocols import Here
 from jaxslam.slots import Joint
 
 
 class Correction(NamedTuple):
     """What `correct` did with its m measurements; the numbers are finite for all of them."""
 
-    innovation: jax.Array
-    """(m, Z) against the prior"""
-    innovation_cov: jax.Array
-    """(m, Z, Z)"""
-    nis: jax.Array
-    """(m,)"""
-    log_likelihood: jax.Array
-    """(m,)"""
-    inside: jax.Array
-    """(m,) bool: passed the gate"""
-    positive: jax.Array
-    """(m,) bool: its innovation covariance is positive definite"""
+    innovation: Float[Array, "m Z"]
+    """against the prior"""
+    innovation_cov: Float[Array, "m Z Z"]
+    nis: Float[Array, "m"]
+    log_likelihood: Float[Array, "m"]
+    inside: Bool[Array, "m"]
+    """passed the gate"""
+    positive: Bool[Array, "m"]
+    """its innovation covariance is positive definite"""
 
 
 class View(NamedTuple):
     """What m measurements see of P, or, of a square-root filter, of its root."""
 
-    robot: jax.Array
-    """(3, D) rows of the robot"""
-    own: jax.Array
-    """(m, L, D) rows of the landmarks seen"""
-    local: jax.Array
-    """(m, 3+L, 3+L) P of the robot and the landmark"""
+    robot: Float[Array, "3 D"]
+    """rows of the robot"""
+    own: Float[Array, "m L D"]
+    """rows of the landmarks seen"""
+    local: Float[Array, "m 3+L 3+L"]
+    """P of the robot and the landmark"""
 
 
-class Weighed(NamedTuple):
+class Innovation(NamedTuple):
     """What m measurements say of all errors, and what the forms of the update are made of."""
 
-    xi: jax.Array
-    """(D,) the correction in the chart"""
-    v: jax.Array
-    """(m·Z, D) V = L⁻¹ H P"""
-    whitened: jax.Array
-    """(m·Z,) L⁻¹ ν"""
-    factor: jax.Array
-    """(m·Z, m·Z) L, with rows of zeros for what is not fused"""
-    s: jax.Array
-    """(m, Z, m, Z) S"""
-    hp: jax.Array
-    """(m·Z, D) H P"""
-    hx: jax.Array
-    """(m, Z, D) H X of a square-root filter, else H P"""
-    noise: jax.Array
-    """(m, Z, Z) R with what the linearizer added"""
-    own_noise: jax.Array
-    """(m, Z, Z) R"""
-    slopes: tuple[jax.Array, jax.Array]
-    """H by the errors of pose (m, Z, 3) and landmark (m, Z, L)"""
-    seen: tuple[jax.Array, jax.Array]
+    xi: Float[Array, "D"]
+    """the correction in the chart"""
+    v: Float[Array, "m*Z D"]
+    """V = L⁻¹ H P"""
+    whitened: Float[Array, "m*Z"]
+    """L⁻¹ ν"""
+    factor: Float[Array, "m*Z m*Z"]
+    """L, with rows of zeros for what is not fused"""
+    s: Float[Array, "m Z m Z"]
+    """S, the identity where not fused"""
+    hp: Float[Array, "m*Z D"]
+    """H P"""
+    hx: Float[Array, "m Z D"]
+    """H X of a square-root filter, else H P"""
+    noise: Float[Array, "m Z Z"]
+    """R with what the linearizer added"""
+    own_noise: Float[Array, "m Z Z"]
+    """R"""
+    jacobians: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
+    """H by the errors of pose and landmark"""
+    seen: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
     """the same by coordinates, at the prior"""
-    fuse: jax.Array
-    """(m,) bool: known, inside the gate and regular alone"""
+    fuse: Bool[Array, "m"]
+    """known, inside the gate and regular alone"""
     correction: Correction
 
 
-def view_of(joint: Joint, slot: jax.Array, square_root: bool = False) -> View:
+class _Linearized(NamedTuple):
+    """m measurements as affine functions of the errors."""
+
+    rows: Float[Array, "m Z 3+L+1"]
+    """H by the errors of pose and landmark, and ν beside them"""
+    rest: Float[Array, "m Z Z"]
+    """what the linearizer adds to R"""
+    seen: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
+    """H by coordinates"""
+
+
+class _Gated(NamedTuple):
+    """Each measurement for itself, against the prior: what the gate looks at."""
+
+    innovation: Float[Array, "m Z"]
+    cov: Float[Array, "m Z Z"]
+    distance: Float[Array, "m"]
+    """ν_iᵀ S_ii⁻¹ ν_i"""
+    inside: Bool[Array, "m"]
+    positive: Bool[Array, "m"]
+    fuse: Bool[Array, "m"]
+
+
+class _Factored(NamedTuple):
+    """S = L Lᵀ of the measurements that are fused."""
+
+    s: Float[Array, "m Z m Z"]
+    factor: Float[Array, "m*Z m*Z"]
+    inverse: Float[Array, "m Z Z"]
+    """L_ii⁻¹ of S_ii, each measurement for itself"""
+    pivots: Float[Array, "m Z"]
+    """the diagonal of L, of one measurement that of L⁻¹"""
+    regular: Bool[Array, "m"]
+
+
+def view_of(joint: Joint, slot: Int[Array, "m"], square_root: bool = False) -> View:
     """What measurements of the landmarks in slot (m,) see."""
     own = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
     local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
     return View(joint.cov[:3], own, local)
 
 
-def weigh(
+def innovate(
     joint: Joint,
-    slot: jax.Array,
+    slot: Int[Array, "m"],
     view: View,
-    z: jax.Array,
-    known: jax.Array,
-    memory: tuple[Joint, jax.Array],
-    *,
-    sensor: Sensor,
-    chart: Chart,
-    linearize: Linearizer,
-    gate: float | None = None,
-    iterations: int = 1,
-    square_root: bool = False,
-) -> Weighed:
+    z: Float[Array, "m Z"],
+    known: Bool[Array, "m"],
+    memory: tuple[Joint, Int[Array, "m"]],
+    settings: EkfSettings,
+) -> Innovation:
     """Solà (26)-(29) for m measurements at once, from the view they have of P.
+
+        view of P        H                       H P          S = H P Hᵀ + R
+        robot (3, D)     by pose (m, Z, 3)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ
+        own (m, L, D)    by landmark (m, Z, L)   V = L⁻¹ H P  ξ = Vᵀ L⁻¹ ν (D,)
+
+    Each iteration linearizes at the prior moved by the last ξ; what is gated and reported is of the
+    first one.
 
     memory: the state that the linearizer remembers by, and the landmarks' slots (m,) there. P may
     have further columns, which count as other errors.
     """
-    whole, slot_in_whole = memory
     m, size_z = z.shape
-    capacity, size_l = joint.landmarks.shape
-    width = 3 + capacity * size_l
-    prior_l = joint.landmarks[slot]
-    own_noise = jax.vmap(sensor.noise_cov)(z)
+    capacity = joint.landmarks.shape[0]
+    own_noise = jax.vmap(settings.sensor.noise_cov)(z)
     same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
-    over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
-    pose, landmark = joint.pose, prior_l
-    xi = jnp.zeros(view.robot.shape[1], z.dtype)
-    for iteration in range(iterations):
-        expected, by_pose, by_landmark, rest = jax.vmap(
-            lambda at, landmark, cov, pose=pose: linearize.observe(
-                at_slot(sensor, whole, at), Here(whole, chart, pose, cov, at, landmark)
-            )
-        )(slot_in_whole, landmark, view.local)
-        noise = own_noise + rest
-        nu = jax.vmap(sensor.residual)(z, expected)
-        if iteration == 0:
-            seen = by_pose, by_landmark
-        xi_l = xi[3:width].reshape(capacity, size_l)[slot]
-        if chart.basis is not None:
-            moved = None if iteration == 0 else (xi[:3], xi_l)
-            by_pose, by_landmark = in_chart(chart, joint.pose, prior_l, by_pose, by_landmark, moved)
-        if iteration > 0:
-            nu = nu + jnp.einsum("mzi,i->mz", by_pose, xi[:3])
-            nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, xi_l)
-        # One array, and so one kernel and not three.
-        found = settle(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
-        by_pose, by_landmark, nu = found[:, :, :3], found[:, :, 3:-1], found[:, :, -1]
-        hp = hx = apart(_seen_rows, found, view.robot, view.own)
-        if square_root:
-            hp = settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
-        s = innovation_cov(hp, by_pose, by_landmark, slot, capacity) + same * noise[:, :, None]
+    xi: jax.Array | None = None
+    gated: _Gated | None = None
+    for _ in range(settings.iterations):
+        model = _linearize(joint, slot, view, z, memory, xi, settings)
+        noise = own_noise + model.rest
+        by_pose, by_landmark, nu = _split_rows(model.rows)
+        hx, hp = _project(model.rows, view, joint, settings)
+        s = innovation_cov(hp, by_pose, by_landmark, slot, capacity)
+        s = s + same * noise[:, :, None]
         marginal = s[jnp.arange(m), :, jnp.arange(m)]
-        own, definite = apart(jax.vmap(linalg.whitener), marginal)
-        if iteration == 0:
-            innovation, alone, positive = nu, marginal, definite
-            distance = (_product(own, nu[:, :, None]) ** 2).sum(axis=(1, 2))
-            # A finite measurement so far off that its d² is not is outside any gate.
-            inside = jnp.isfinite(distance) if gate is None else distance <= gate
-            fuse = known & inside & positive
+        inverse, definite = apart(jax.vmap(linalg.whitener), marginal)
+        first = gated is None
+        if gated is None:
+            gated = _gate(nu, marginal, inverse, definite, known, settings.gate)
+            seen = model.seen
         hp = hp.reshape(m * size_z, -1)
-        both = fuse[:, None, None, None] & fuse[None, None, :, None]
-        s = jnp.where(both, s, same * jnp.eye(size_z, dtype=z.dtype)[None, :, None])
-        s = settle(s)
-        factor = settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
-        pivots = jnp.diagonal(factor).reshape(m, size_z)
-        # Measurements that are regular one by one can still be singular together.
-        regular = definite if m == 1 else (pivots > 0).all(axis=1)
-        # A row without a pivot says nothing, and costs no mask of what it would say.
-        factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
-        if m == 1:  # it has been factored already, alone
-            whiten = jnp.where((fuse & regular)[:, None, None], own, 0.0)
-            v, whitened = apart(_whitened, whiten, hp, nu)
-            pivots = jnp.diagonal(own, axis1=1, axis2=2)
-        else:
-            # As a vector, the factor has one layout: LAPACK wants columns, and XLA (jaxlib 0.12)
-            # may pass rows to a computation that was compiled for columns.
-            v, whitened = apart(_solved, factor.reshape(-1), hp, nu.reshape(-1))
+        factored = _factor(s, same, inverse, definite, gated.fuse)
+        v, whitened = _whiten(factored, gated.fuse, hp, nu)
         xi = linalg.gram(v, whitened[:, None])[:, 0]
-        if iteration == 0:
-            positive = positive & regular
-            log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
-            log_det = -log_det if m == 1 else log_det  # of L⁻¹, of L
-            nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
-        if iteration + 1 < iterations:
-            xi_l = xi[3:width].reshape(capacity, size_l)[slot]
-            poses, landmark = over_landmarks(joint.pose, prior_l, xi[:3], xi_l)
-            pose = poses[0]
-
-    log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
-    return Weighed(
+        if first:
+            correction = _report(gated, factored, whitened)
+    assert xi is not None
+    assert gated is not None
+    return Innovation(
         xi=xi,
         v=v,
         whitened=whitened,
-        factor=factor,
-        s=s,
+        factor=factored.factor,
+        s=factored.s,
         hp=hp,
         hx=hx,
         noise=noise,
         own_noise=own_noise,
-        slopes=(by_pose, by_landmark),
+        jacobians=(by_pose, by_landmark),
         seen=seen,
-        fuse=fuse,
-        correction=Correction(
-            innovation=innovation,
-            innovation_cov=alone,
-            nis=jnp.where(fuse, nis, distance),
-            log_likelihood=jnp.where(fuse & positive, log_likelihood, 0.0),
-            inside=inside,
-            positive=positive,
-        ),
+        fuse=gated.fuse,
+        correction=correction,
+    )
+
+
+def _linearize(
+    joint: Joint,
+    slot: Int[Array, "m"],
+    view: View,
+    z: Float[Array, "m Z"],
+    memory: tuple[Joint, Int[Array, "m"]],
+    xi: Float[Array, "D"] | None,
+    settings: EkfSettings,
+) -> _Linearized:
+    """z ≈ ẑ + H (ξ - ξ_i) at the prior moved by ξ_i; None for the prior itself.
+
+    With ν = z - ẑ + H ξ_i, what is solved for is ξ, from the prior.
+    """
+    whole, slot_in_whole = memory
+    chart, sensor = settings.chart, settings.sensor
+    prior = joint.landmarks[slot]
+    pose, landmark, moved = joint.pose, prior, None
+    if xi is not None:
+        capacity, size_l = joint.landmarks.shape
+        moved = xi[:3], xi[3 : 3 + capacity * size_l].reshape(capacity, size_l)[slot]
+        over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
+        poses, landmark = over_landmarks(joint.pose, prior, *moved)
+        pose = poses[0]
+
+    def observe(
+        at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "3+L 3+L"]
+    ) -> Any:
+        here = Here(whole, chart, pose, cov, at, landmark)
+        return settings.linearize.observe(at_slot(sensor, whole, at), here)
+
+    expected, by_pose, by_landmark, rest = jax.vmap(observe)(slot_in_whole, landmark, view.local)
+    nu = jax.vmap(sensor.residual)(z, expected)
+    seen = by_pose, by_landmark
+    if chart.basis is not None:
+        by_pose, by_landmark = in_chart(chart, joint.pose, prior, by_pose, by_landmark, moved)
+    if moved is not None:
+        nu = nu + jnp.einsum("mzi,i->mz", by_pose, moved[0])
+        nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, moved[1])
+    # One array, and so one kernel and not three.
+    rows = settle(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
+    return _Linearized(rows, rest, seen)
+
+
+def _split_rows(
+    rows: Float[Array, "m Z C"],
+) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"], Float[Array, "m Z"]]:
+    """H by the errors of pose and landmark, and ν."""
+    return rows[:, :, :3], rows[:, :, 3:-1], rows[:, :, -1]
+
+
+def _project(
+    rows: Float[Array, "m Z C"], view: View, joint: Joint, settings: EkfSettings
+) -> tuple[Float[Array, "m Z D"], Float[Array, "m Z D"]]:
+    """H X and H P of a square-root filter; else H P twice."""
+    hp = hx = apart(_seen_rows, rows, view.robot, view.own)
+    if settings.square_root:
+        m, size_z = rows.shape[:2]
+        hp = settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
+    return hx, hp
+
+
+def _gate(
+    nu: Float[Array, "m Z"],
+    cov: Float[Array, "m Z Z"],
+    inverse: Float[Array, "m Z Z"],
+    definite: Bool[Array, "m"],
+    known: Bool[Array, "m"],
+    gate: Any,
+) -> _Gated:
+    """Which measurements are fused, by their distances; inverse: L⁻¹ of each cov = L Lᵀ."""
+    distance = (_product(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))
+    # A finite measurement so far off that its d² is not is outside any gate.
+    inside = jnp.isfinite(distance) if gate is None else distance <= gate
+    return _Gated(nu, cov, distance, inside, definite, known & inside & definite)
+
+
+def _factor(
+    s: Float[Array, "m Z m Z"],
+    same: Float[Array, "m 1 m 1"],
+    inverse: Float[Array, "m Z Z"],
+    definite: Bool[Array, "m"],
+    fuse: Bool[Array, "m"],
+) -> _Factored:
+    """L of the measurements that are fused; S of the others is the identity, L zero.
+
+    same: 1 where both measurements are the same one.
+    """
+    m, size_z = s.shape[:2]
+    both = fuse[:, None, None, None] & fuse[None, None, :, None]
+    unit = jnp.eye(size_z, dtype=s.dtype)
+    s = settle(jnp.where(both, s, same * unit[None, :, None]))
+    factor = settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
+    pivots = jnp.diagonal(factor).reshape(m, size_z)
+    # Measurements that are regular one by one can still be singular together.
+    regular = definite if m == 1 else (pivots > 0).all(axis=1)
+    # A row without a pivot says nothing, and costs no mask of what it would say.
+    factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
+    if m == 1:  # it has been factored already, alone
+        pivots = jnp.diagonal(inverse, axis1=1, axis2=2)
+    return _Factored(s, factor, inverse, pivots, regular)
+
+
+def _whiten(
+    factored: _Factored,
+    fuse: Bool[Array, "m"],
+    hp: Float[Array, "K D"],
+    nu: Float[Array, "m Z"],
+) -> tuple[Float[Array, "K D"], Float[Array, "K"]]:
+    """V = L⁻¹ H P and L⁻¹ ν, zero for what is not fused."""
+    if len(fuse) == 1:
+        inverse = jnp.where((fuse & factored.regular)[:, None, None], factored.inverse, 0.0)
+        return apart(_multiplied, inverse, hp, nu)
+    # As a vector, the factor has one layout: LAPACK wants columns, and XLA (jaxlib 0.12) may pass
+    # rows to a computation that was compiled for columns.
+    return apart(_solved, factored.factor.reshape(-1), hp, nu.reshape(-1))
+
+
+def _report(gated: _Gated, factored: _Factored, whitened: Float[Array, "K"]) -> Correction:
+    """What is reported: of fused measurements the innovations whitened together, else alone."""
+    m, size_z = gated.innovation.shape
+    pivots, positive = factored.pivots, gated.positive & factored.regular
+    log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
+    log_det = -log_det if m == 1 else log_det  # of L⁻¹, of L
+    nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
+    log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
+    return Correction(
+        innovation=gated.innovation,
+        innovation_cov=gated.cov,
+        nis=jnp.where(gated.fuse, nis, gated.distance),
+        log_likelihood=jnp.where(gated.fuse & positive, log_likelihood, 0.0),
+        inside=gated.inside,
+        positive=positive,
     )
 
 
 @linalg.kept_whole
-def _seen_rows(found: jax.Array, robot: jax.Array, own: jax.Array) -> jax.Array:
-    """H P (m, Z, D) of H by pose and landmark, first in found (m, Z, 3+L+1), rows (3, D) and
-    (m, L, D).
-    """
-    terms = [found[:, :, k, None] * robot[None, None, k] for k in range(3)]
-    terms += [found[:, :, 3 + k, None] * own[:, None, k] for k in range(own.shape[1])]
+def _seen_rows(
+    rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], own: Float[Array, "m L D"]
+) -> Float[Array, "m Z D"]:
+    """H P of H by pose and landmark, first in rows, and P of the robot and the landmarks seen."""
+    terms = [rows[:, :, k, None] * robot[None, None, k] for k in range(3)]
+    terms += [rows[:, :, 3 + k, None] * own[:, None, k] for k in range(own.shape[1])]
     return linalg.total(terms)
 
 
-def _solved(factor: jax.Array, hp: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _solved(
+    factor: Float[Array, "KK"], hp: Float[Array, "K D"], nu: Float[Array, "K"]
+) -> tuple[Float[Array, "K D"], Float[Array, "K"]]:
+    """L⁻¹ H P and L⁻¹ ν by substitution."""
     factor = factor.reshape(len(nu), len(nu))
     both = linalg.solve_lower(factor, jnp.concatenate([hp, nu[:, None]], axis=1))
     return both[:, :-1], both[:, -1]
 
 
-def _whitened(whiten: jax.Array, hp: jax.Array, nu: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return _product(whiten, hp[None])[0], _product(whiten, nu[:, :, None]).reshape(-1)
+def _multiplied(
+    inverse: Float[Array, "1 Z Z"], hp: Float[Array, "Z D"], nu: Float[Array, "1 Z"]
+) -> tuple[Float[Array, "Z D"], Float[Array, "Z"]]:
+    """L⁻¹ H P and L⁻¹ ν of one measurement, by L⁻¹."""
+    return _product(inverse, hp[None])[0], _product(inverse, nu[:, :, None]).reshape(-1)
 
 
 @linalg.kept_whole
-def _product(whiten: jax.Array, rhs: jax.Array) -> jax.Array:
-    """W B (m, Z, k) of W (m, Z, Z) and B (m, Z, k)."""
-    each = range(whiten.shape[1])
-    return linalg.total(whiten[:, :, k, None] * rhs[:, k, None] for k in each)
+def _product(inverse: Float[Array, "m Z Z"], rhs: Float[Array, "m Z k"]) -> Float[Array, "m Z k"]:
+    """L⁻¹ B, each."""
+    each = range(inverse.shape[1])
+    return linalg.total(inverse[:, :, k, None] * rhs[:, k, None] for k in each)

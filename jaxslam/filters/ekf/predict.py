@@ -4,32 +4,27 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxslam import slots
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg, se2
 from jaxslam.math.xla import settle
-from jaxslam.protocols import Basis, Chart, Here, Linearizer, Motion
+from jaxslam.protocols import Basis, Here, Motion
 from jaxslam.slots import Joint, Last
 
 
-def propagate(
-    joint: Joint,
-    u: jax.Array,
-    *,
-    motion: Motion,
-    chart: Chart,
-    linearize: Linearizer,
-    square_root: bool = False,
-) -> Joint:
+def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfSettings) -> Joint:
     """Robot motion, O(N) in a chart whose landmarks stand still: Solà (14)-(17).
 
     pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the error of
     the landmarks moves too, with A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block. Of
     a square root X, P = X Xᵀ, A X is taken, and the noise's root beside it made part of it; O(N³).
     """
+    chart, square_root = settings.chart, settings.square_root
     robot = slots.robot_cov(joint, square_root)
     here = Here(joint, chart, joint.pose, robot)
-    pose, by_pose, noise, lin = linearize.motion(motion, u, here)
+    pose, by_pose, noise, lin = settings.linearize.motion(motion, u, here)
     if chart.basis is None:
         moved = Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
     else:

@@ -4,26 +4,20 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.association.predicted import predicted
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.to_points import at_slot
 from jaxslam.math import linalg
 from jaxslam.math.xla import settle
-from jaxslam.protocols import Basis, Chart, Here, Linearizer, Prediction, Sensor
+from jaxslam.protocols import Basis, Chart, Here, Prediction
 from jaxslam.slots import Joint
 
 
-def prediction_of(
-    joint: Joint,
-    *,
-    sensor: Sensor,
-    chart: Chart,
-    linearize: Linearizer,
-    square_root: bool = False,
-) -> Prediction:
+def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
     """The map as an association may see it; what it does not ask for is not computed."""
-
+    sensor, chart, square_root = settings.sensor, settings.chart, settings.square_root
     capacity, size = joint.landmarks.shape
 
-    def slopes() -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    def jacobians() -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """ẑ (N, Z), H by errors of pose (N, Z, 3) and landmark (N, Z, L), H P Hᵀ of each alone."""
         every = jnp.arange(capacity)
         robot, cross, own = settle(_blocks(joint, square_root))
@@ -31,7 +25,7 @@ def prediction_of(
         bottom = jnp.concatenate([cross.transpose(0, 2, 1), own], axis=2)
         local = jnp.concatenate([top, bottom], axis=1)
         expected, by_pose, by_landmark, rest = jax.vmap(
-            lambda slot, landmark, cov: linearize.observe(
+            lambda slot, landmark, cov: settings.linearize.observe(
                 at_slot(sensor, joint, slot), Here(joint, chart, joint.pose, cov, slot, landmark)
             )
         )(every, joint.landmarks, local)
@@ -46,11 +40,11 @@ def prediction_of(
         return expected, by_pose, by_landmark, settle(alone + rest)
 
     def measurements() -> tuple[jax.Array, jax.Array]:
-        expected, _, _, own = slopes()
+        expected, _, _, own = jacobians()
         return expected, own
 
     def cross() -> jax.Array:
-        _, by_pose, by_landmark, _ = slopes()
+        _, by_pose, by_landmark, _ = jacobians()
         cov = joint.cov @ joint.cov.T if square_root else joint.cov
         rows = cov[3:].reshape(capacity, size, cov.shape[1])
         hp = linalg.total(by_pose[:, :, k, None] * cov[None, None, k] for k in range(3))

@@ -1,25 +1,24 @@
 """Corrections one after the other of a map and its last motion, composed with each other at the end
 of the scan (`Chart.motion_apart`)."""
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.filters.ekf.innovation import Correction, view_of, weigh
+from jaxslam.filters.ekf.coordinates import retracted
+from jaxslam.filters.ekf.innovation import Correction, innovate, view_of
 from jaxslam.filters.ekf.observability import informed
 from jaxslam.filters.ekf.predict import Transition, in_charts, moved_cov
 from jaxslam.filters.ekf.robocentric_motion import lever_by, lever_of_motion, out_of
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.linearize.first_order import turned
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.xla import apart, settle
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint, Last
-
-Retract = Callable[[Chart, Joint, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 class Parted(NamedTuple):
@@ -101,15 +100,12 @@ def whole(parted: Parted, chart: Chart) -> Joint:
 
 def correct_group(
     parted: Parted,
-    part: tuple[jax.Array, jax.Array, jax.Array],
-    *,
-    chart: Chart,
-    retracted: Retract,
-    **options: Any,
+    part: tuple[Float[Array, "g Z"], Int[Array, "g"], Bool[Array, "g"]],
+    settings: EkfSettings,
 ) -> tuple[Parted, Correction]:
     """Correct x and δ by g measurements in turn: z (g, Z), slot (g,), known (g,).
 
-    As `correction.correct_in_turn` does it: each corrects what the group sees of P, the rows P_I of
+    As `update.correct_in_turn` does it: each corrects what the group sees of P, the rows P_I of
     the robot, of its landmarks and of δ, and the whole P is read and written once.
     """
     rest, (_, slot, known) = parted.rest, part
@@ -128,7 +124,12 @@ def correct_group(
         tag=rest.tag[slot],
         watch=watch,
     )
-    one = partial(_correct_one, whole=rest, chart=chart, retracted=retracted, **options)
+
+    def one(
+        parted: Parted, measurement: tuple[jax.Array, Any]
+    ) -> tuple[Parted, tuple[jax.Array, jax.Array, Correction]]:
+        return _correct_one(parted, measurement, rest, settings)
+
     # A gradient keeps what each begins with, and computes the rest of these few rows again.
     after, (reach, whitened, done) = jax.lax.scan(
         jax.checkpoint(one, prevent_cse=False),
@@ -137,7 +138,7 @@ def correct_group(
     )
     v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
     xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
-    landmarks = retracted(chart, rest, xi[:size])[1]
+    landmarks = retracted(settings.chart, rest, xi[:size])[1]
     if watch:
         watch = after.rest.watch._replace(directions=rest.watch.directions)
     rest = rest._replace(
@@ -151,12 +152,9 @@ def correct_group(
 
 def _correct_one(
     parted: Parted,
-    place: tuple[jax.Array, Any],
-    *,
+    measurement: tuple[jax.Array, Any],
     whole: Joint,
-    chart: Chart,
-    retracted: Retract,
-    **options: Any,
+    settings: EkfSettings,
 ) -> tuple[Parted, tuple[jax.Array, jax.Array, Correction]]:
     """Correct a local x and δ by a measurement of its landmark i (); the whole map's slot beside.
 
@@ -164,8 +162,8 @@ def _correct_one(
     (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V. Returns V in the columns beside P
     (Z, ·), and L⁻¹ ν (Z,).
     """
-    i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], place)
-    rest = parted.rest
+    i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], measurement)
+    rest, chart = parted.rest, settings.chart
     size_l, size = rest.landmarks.shape[1], rest.cov.shape[0] - 3
     at = jnp.concatenate(
         [jnp.arange(3), 3 + i[0] * size_l + jnp.arange(size_l), size + jnp.arange(3)]
@@ -189,7 +187,7 @@ def _correct_one(
     here = local._replace(pose=found.pose, cov=cov, watch=watch)
     first = jnp.zeros_like(i)
     memory = whole._replace(pose=found.pose), slot
-    said = weigh(here, first, view_of(here, first), z, known, memory, chart=chart, **options)
+    said = innovate(here, first, view_of(here, first), z, known, memory, settings)
     v = said.v[:, len(among) : len(among) + size + 3]
     reach = said.v[:, len(among) + size + 3 :]
     xi = linalg.gram(v, said.whitened[:, None])[:, 0]

@@ -1,205 +1,242 @@
-"""What the scan of one sensor does to a `Joint`: it corrects, then starts new landmarks."""
+"""What a scan does to a `Joint`: each of its sensors corrects the map, then initializes landmarks.
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+The steps are those of the textbook, one function each: `associated` predicts the measurements and
+says of which landmark each is, `update.correct` gates and corrects, `initialized` starts the new
+landmarks, and `reported` says what became of every measurement.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
 
 from jaxslam import slots
 from jaxslam.filters.ekf.augmentation import augment
+from jaxslam.filters.ekf.innovation import Correction
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct, correct_in_turn
 from jaxslam.filters.reporting import info_of, joined, nothing_of, seen_before, status_of
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Associate, Association, Chart, Life, Linearizer, Sensor
+from jaxslam.protocols import Association, Sensor
 from jaxslam.sensors.suite import Part, Suite, on_ground, split_scan
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
 
 
-class Births(NamedTuple):
+class Turn(NamedTuple):
+    """One sensor's turn in a scan."""
+
+    places: int | None
+    """measurement slots of the scan that are its own; None where all are"""
+    settings: EkfSettings | None
+    """None where its measurements are left alone: `Status.UNMATCHED`"""
+
+
+class NewLandmarks(NamedTuple):
     """What became of the measurements of a scan that are of no landmark of the map, (M,) each."""
 
-    slot: jax.Array
-    granted: jax.Array
-    deferred: jax.Array
-    repeated: jax.Array
-    given_up: jax.Array
-    """(N,) slots that were emptied to make room"""
+    slot: Int[Array, "M"]
+    granted: Bool[Array, "M"]
+    deferred: Bool[Array, "M"]
+    repeated: Bool[Array, "M"]
+    evicted: Bool[Array, "N"]
+    """slots that were emptied to make room"""
 
 
-ScanUpdate = Callable[[Joint, Scan], tuple[Joint, Info, jax.Array]]
-"""(joint, scan) -> joint, info, and the slots (N,) bool that were emptied to make room."""
+def turns_of(sensor: Sensor, settings: EkfSettings) -> list[Turn]:
+    """The turn of each sensor of a suite, in order; one of a sensor that is no suite.
 
-
-def scan_update(
-    sensor: Sensor,
-    *,
-    absolute: bool,
-    associate: Associate,
-    update: str,
-    births: int | None,
-    life: Life | None,
-    without: Callable[[Joint, jax.Array], Joint],
-    chart: Chart,
-    linearize: Linearizer,
-    square_root: bool,
-    options: dict[str, Any],
-    reserved: Any = None,
-) -> ScanUpdate:
-    """The update by one sensor, of options as `ekf_slam` has them.
-
-    absolute: every valid measurement corrects the robot. without: (joint, dead) -> the joint with
-    those slots freed. options: gate, iterations, joseph.
-    births: 0 for none at all. reserved: (N,) bool, slots that no new landmark may take.
-    """
-    size_z = len(sensor.measurements)
-    options = options | {
-        "sensor": sensor,
-        "chart": chart,
-        "linearize": linearize,
-        "square_root": square_root,
-    }
-    predict_scan = partial(
-        prediction_of,
-        sensor=sensor,
-        chart=chart,
-        linearize=linearize,
-        square_root=square_root,
-    )
-    at_once = partial(correct, **options)
-    in_turn = partial(correct_in_turn, **options)
-    add_landmarks = partial(
-        augment,
-        sensor=sensor,
-        chart=chart,
-        linearize=linearize,
-        square_root=square_root,
-    )
-
-    def update_map(joint: Joint, scan: Scan) -> tuple[Joint, Info, jax.Array]:
-        # Padding may hold anything, and is multiplied by zero further down.
-        z = jnp.where(scan.valid[:, None], scan.z, 0.0)
-        if not absolute:
-            found = Association(*associate(predict_scan(joint), scan._replace(z=z)))
-            slot, is_new, exhausted = found.slot, found.is_new, jnp.asarray(found.exhausted)
-            matched = scan.valid & (slot >= 0) & ~is_new
-            is_new = scan.valid & is_new
-        else:
-            slot, is_new = jnp.full_like(scan.tag, -1), jnp.zeros_like(scan.valid)
-            matched, exhausted = scan.valid, jnp.asarray(False)
-        parts = (z, jnp.maximum(slot, 0), matched)
-        by_scan = at_once if update == "joint" and len(scan.tag) > 0 else in_turn
-        joint, done = by_scan(joint, *parts)
-
-        def start(joint: Joint) -> tuple[Joint, Births]:
-            repeated = is_new & seen_before(scan.tag, is_new)
-            wanted = is_new & ~repeated
-            rank = jnp.cumsum(wanted)
-            deferred = jnp.zeros_like(wanted) if births is None else wanted & (rank > births)
-            wanted = wanted & ~deferred
-            given_up = jnp.zeros_like(joint.alive)
-            if life is not None and life.make_room is not None:
-                needed = wanted.sum() - (~joint.alive).sum()
-                used = matched & done.inside & done.positive
-                given_up = life.make_room(
-                    joint, needed, slots.concerned(found.slot, used, len(joint.alive))
-                )
-                joint = without(joint, given_up)
-            taken = joint.alive if reserved is None else joint.alive | reserved
-            if births is None or births >= len(wanted):
-                slot, granted = slots.allocate(taken, wanted)
-                joint = add_landmarks(joint, z, scan.tag, slot, granted)
-            else:  # no more places than may be granted
-                turn = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
-                place, there = slots.where_set(turn)
-                slot, granted = slots.allocate(taken, there)
-                joint = add_landmarks(joint, z[place], scan.tag[place], slot, granted)
-                mine = jnp.clip(rank - 1, 0, births - 1)
-                slot, granted = slot[mine], wanted & granted[mine]
-            return joint, Births(slot, granted, deferred, repeated, given_up)
-
-        def start_none(joint: Joint) -> tuple[Joint, Births]:
-            none, given_up = jnp.zeros_like(is_new), jnp.zeros_like(joint.alive)
-            return joint, Births(jnp.zeros_like(slot), none, none, none, given_up)
-
-        if births == 0:  # places that are for robots
-            joint, born = start_none(joint)
-            born = born._replace(deferred=is_new)
-        else:
-            joint, born = where_any(is_new.any(), start, start_none, joint)
-
-        status = status_of(
-            scan.valid,
-            matched=matched,
-            positive=done.positive,
-            inside=done.inside,
-            new=is_new,
-            repeated=born.repeated,
-            granted=born.granted,
-            deferred=born.deferred,
-        )
-        info = info_of(
-            status,
-            matched,
-            size=size_z,
-            slot=slot,
-            born=born.slot,
-            nis=done.nis,
-            innovation=done.innovation,
-            innovation_cov=done.innovation_cov,
-            log_likelihood=done.log_likelihood.sum(),
-            exhausted=exhausted,
-        )
-        return joint, info, born.given_up
-
-    return update_map
-
-
-def part_updates(sensor: Sensor, size_l: int, **options: Any) -> list[tuple[int, ScanUpdate]]:
-    """The update by each sensor of a suite, with how many places of a scan it has.
-
-    Of a sensor that is no suite: its own, with -1 places, which are all of them. Places for robots
-    are left alone.
+    Measurements of robots are left alone.
     """
     if not isinstance(sensor, Suite):
-        return [(-1, scan_update(sensor, absolute=not sensor.landmark, **options))]
+        return [Turn(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
     return [
-        (
-            part.places,
-            left_alone if part.sees == "robots" else part_update(part, size_l, **options),
-        )
+        Turn(part.places, None)
+        if part.sees == "robots"
+        else turn_of(part, len(sensor.landmark), settings)
         for part in sensor.parts
     ]
 
 
-def part_update(part: Part, size_l: int, **options: Any) -> ScanUpdate:
-    """The update by one sensor of a suite, whose rows of z may be longer than its own."""
-    one = scan_update(on_ground(part.sensor, size_l), absolute=part.absolute, **options)
-    size_z = len(part.sensor.measurements)
-    return lambda joint, scan: one(joint, scan._replace(z=scan.z[:, :size_z]))
+def turn_of(part: Part, size: int, settings: EkfSettings) -> Turn:
+    """The turn of one sensor of a suite, among landmarks of `size` numbers."""
+    sensor = on_ground(part.sensor, size)
+    return Turn(part.places, dataclasses.replace(settings, sensor=sensor, absolute=part.absolute))
 
 
-def left_alone(joint: Joint, scan: Scan) -> tuple[Joint, Info, jax.Array]:
-    """A `ScanUpdate` that uses nothing: every valid place is `Status.UNMATCHED`."""
-    return joint, nothing_of(scan), jnp.zeros_like(joint.alive)
+def update_by_scan(
+    joint: Joint, scan: Scan, turns: Sequence[Turn]
+) -> tuple[Joint, Info, Bool[Array, "N"]]:
+    """The update by each sensor in its turn; what became of the scan, and the slots evicted.
 
-
-def in_order(
-    joint: Joint, scan: Scan, parts: list[tuple[int, ScanUpdate]]
-) -> tuple[Joint, Info, jax.Array]:
-    """A scan through several updates, one after the other, each with its own places of it.
-
-    Raises ValueError if the scan does not have their places.
+    Raises ValueError if the scan does not have their measurement slots.
     """
-    if len(parts) == 1 and parts[0][0] == -1:
-        return parts[0][1](joint, scan)
-    infos, given_up = [], jnp.zeros_like(joint.alive)
-    places = [count for count, _ in parts]
-    for own, (_, update) in zip(split_scan(scan, places), parts, strict=True):
-        joint, info, gone = update(joint, own)
+    first = turns[0]
+    if first.places is None and first.settings is not None:
+        return update_by_sensor(joint, scan, first.settings)
+    infos, evicted = [], jnp.zeros_like(joint.alive)
+    counts = [turn.places or 0 for turn in turns]
+    for own, turn in zip(split_scan(scan, counts), turns, strict=True):
+        if turn.settings is None:
+            infos.append(nothing_of(own))
+            continue
+        own = own._replace(z=own.z[:, : len(turn.settings.sensor.measurements)])
+        joint, info, gone = update_by_sensor(joint, own, turn.settings)
         infos.append(info)
-        given_up = given_up | gone
-    return joint, joined(infos, scan.z.shape[1]), given_up
+        evicted = evicted | gone
+    return joint, joined(infos, scan.z.shape[1]), evicted
+
+
+def update_by_sensor(
+    joint: Joint, scan: Scan, settings: EkfSettings
+) -> tuple[Joint, Info, Bool[Array, "N"]]:
+    """The update by the scan of one sensor; what became of it, and the slots (N,) evicted."""
+    # Padding may hold anything, and is multiplied by zero further down.
+    scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
+    found, matched = associated(joint, scan, settings)
+    at_once = settings.update == "joint" and len(scan.tag) > 0
+    by_scan = correct if at_once else correct_in_turn
+    joint, done = by_scan(joint, scan.z, jnp.maximum(found.slot, 0), matched, settings)
+    joint, new = initialized(joint, scan, found, matched, done, settings)
+    return joint, reported(scan, found, matched, done, new, settings), new.evicted
+
+
+def associated(
+    joint: Joint, scan: Scan, settings: EkfSettings
+) -> tuple[Association, Bool[Array, "M"]]:
+    """Of which landmark each measurement is, by what is predicted of the map; and which correct it.
+
+    Those of an absolute sensor are of none, and all valid ones correct.
+    """
+    if settings.absolute:
+        none = jnp.full_like(scan.tag, -1)
+        return Association(none, jnp.zeros_like(scan.valid), jnp.asarray(False)), scan.valid
+    found = Association(*settings.associate(prediction_of(joint, settings), scan))
+    matched = scan.valid & (found.slot >= 0) & ~found.is_new
+    return found._replace(is_new=scan.valid & found.is_new), matched
+
+
+def initialized(
+    joint: Joint,
+    scan: Scan,
+    found: Association,
+    matched: Bool[Array, "M"],
+    done: Correction,
+    settings: EkfSettings,
+) -> tuple[Joint, NewLandmarks]:
+    """The map with the new landmarks of a scan, as many as it may start and there are slots for.
+
+    matched, done: the measurements of known landmarks, and their correction; landmarks that were
+    corrected do not make room for new ones.
+    """
+    is_new, none = found.is_new, jnp.zeros_like(found.is_new)
+    nothing = NewLandmarks(
+        jnp.zeros_like(found.slot), none, none, none, jnp.zeros_like(joint.alive)
+    )
+    if settings.births == 0:
+        return joint, nothing._replace(deferred=is_new)
+
+    def start(joint: Joint) -> tuple[Joint, NewLandmarks]:
+        repeated = is_new & seen_before(scan.tag, is_new)
+        wanted = is_new & ~repeated
+        rank = jnp.cumsum(wanted)
+        deferred = jnp.zeros_like(wanted)
+        if settings.births is not None:
+            deferred = wanted & (rank > settings.births)
+        wanted = wanted & ~deferred
+        used = matched & done.inside & done.positive
+        joint, evicted = _with_room(joint, wanted, found.slot, used, settings)
+        joint, slot, granted = _started(joint, scan, wanted, rank, settings)
+        return joint, NewLandmarks(slot, granted, deferred, repeated, evicted)
+
+    return where_any(is_new.any(), start, lambda joint: (joint, nothing), joint)
+
+
+def _with_room(
+    joint: Joint,
+    wanted: Bool[Array, "M"],
+    slot: Int[Array, "M"],
+    used: Bool[Array, "M"],
+    settings: EkfSettings,
+) -> tuple[Joint, Bool[Array, "N"]]:
+    """The map without the landmarks that `Life.make_room` gives up for new ones, and which."""
+    if settings.life is None or settings.life.make_room is None:
+        return joint, jnp.zeros_like(joint.alive)
+    needed = wanted.sum() - (~joint.alive).sum()
+    measured = slots.concerned(slot, used, len(joint.alive))
+    evicted = settings.life.make_room(joint, needed, measured)
+    return without(joint, evicted, square_root=settings.square_root), evicted
+
+
+def _started(
+    joint: Joint,
+    scan: Scan,
+    wanted: Bool[Array, "M"],
+    rank: Int[Array, "M"],
+    settings: EkfSettings,
+) -> tuple[Joint, Int[Array, "M"], Bool[Array, "M"]]:
+    """Landmarks where wanted, in free slots; the slot of each measurement, and where granted.
+
+    rank: (M,) how many are wanted up to each measurement.
+    """
+    births = settings.births
+    taken = joint.alive if settings.reserved is None else joint.alive | settings.reserved
+    if births is None or births >= len(wanted):
+        slot, granted = slots.allocate(taken, wanted)
+        return augment(joint, scan.z, scan.tag, slot, granted, settings), slot, granted
+    # No more than may be granted are computed.
+    turn = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
+    at, there = slots.where_set(turn)
+    slot, granted = slots.allocate(taken, there)
+    joint = augment(joint, scan.z[at], scan.tag[at], slot, granted, settings)
+    mine = jnp.clip(rank - 1, 0, births - 1)
+    return joint, slot[mine], wanted & granted[mine]
+
+
+def reported(
+    scan: Scan,
+    found: Association,
+    matched: Bool[Array, "M"],
+    done: Correction,
+    new: NewLandmarks,
+    settings: EkfSettings,
+) -> Info:
+    """What became of the measurements of one sensor."""
+    status = status_of(
+        scan.valid,
+        matched=matched,
+        positive=done.positive,
+        inside=done.inside,
+        new=found.is_new,
+        repeated=new.repeated,
+        granted=new.granted,
+        deferred=new.deferred,
+    )
+    return info_of(
+        status,
+        matched,
+        size=len(settings.sensor.measurements),
+        slot=found.slot,
+        born=new.slot,
+        nis=done.nis,
+        innovation=done.innovation,
+        innovation_cov=done.innovation_cov,
+        log_likelihood=done.log_likelihood.sum(),
+        exhausted=jnp.asarray(found.exhausted),
+    )
+
+
+def without(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
+    """The map without the landmarks of the slots `dead`; of a batch, a run without such is kept."""
+
+    def removed(joint: Joint) -> Joint:
+        # A root is made triangular anew; a run without a removal keeps its own to the bit.
+        less = slots.remove(joint, dead, square_root=square_root)
+        both: Joint = jax.tree.map(lambda a, b: jnp.where(dead.any(), a, b), less, joint)
+        return both
+
+    return where_any(dead.any(), removed, lambda joint: joint, joint)

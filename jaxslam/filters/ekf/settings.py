@@ -1,12 +1,53 @@
-"""What `ekf_slam` refuses."""
+"""What a Kalman-type SLAM filter on a `Joint` is set to, and what its factories refuse."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 
-from jaxslam.filters.map_management.merging import Duplicates
+from jaxslam.association.known import known
+from jaxslam.charts.euclidean import euclidean
+from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math.linalg import check_count, check_gate
-from jaxslam.protocols import Chart, Life, Linearizer, Sensor
+from jaxslam.protocols import Associate, Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Suite
+
+Update = Literal["sequential", "joint"]
+
+Covariance = Literal["plain", "joseph", "square_root"]
+"""P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or a root X of P = X Xᵀ is held and updated"""
+
+
+@dataclass(frozen=True, eq=False)
+class EkfSettings:
+    """The models and options of a Kalman-type SLAM filter, which each of its steps takes last.
+
+    A factory makes it once and checks it; `dataclasses.replace` gives each sensor of a suite its
+    own. Options as `ekf_slam` has them.
+    """
+
+    sensor: Sensor
+    chart: Chart = field(default_factory=euclidean)
+    linearize: Linearizer = field(default_factory=at_estimate)
+    associate: Associate = field(default_factory=known)
+    update: Update = "sequential"
+    gate: float | None = None
+    iterations: int = 1
+    covariance: Covariance = "plain"
+    births: int | None = None
+    """new landmarks a scan, at most; None for no limit, 0 for none at all"""
+    life: Life | None = None
+    """which landmarks make room for new ones"""
+    absolute: bool = False
+    """every valid measurement corrects the robot, whatever its tag"""
+    reserved: Any = None
+    """(N,) bool: slots that no new landmark may take; None for no such slots"""
+
+    @property
+    def square_root(self) -> bool:
+        """Whether the state holds a root of the covariance."""
+        return self.covariance == "square_root"
 
 
 def check_numbers(
@@ -16,14 +57,25 @@ def check_numbers(
     gate: float | None,
     iterations: int,
     births: int | None,
+    covariance: str = "plain",
 ) -> None:
-    """Counts are counts, the update is one of two, the gate positive; errors name the filter."""
+    """Counts are counts, the update and the covariance of a known form, the gate positive; errors
+    name the filter.
+    """
     for name, value in (("capacity", capacity), ("iterations", iterations), ("births", births)):
         if value is not None or name != "births":
             check_count(f"{filter}: {name}", value)
     if update not in ("sequential", "joint"):
         raise ValueError(f'{filter}: expected update "sequential" or "joint", got {update!r}')
     check_gate(filter, gate)
+    check_covariance(filter, covariance, get_args(Covariance))
+
+
+def check_covariance(filter: str, covariance: str, forms: tuple[str, ...]) -> None:
+    """The form of the covariance is one of those that the filter has."""
+    if covariance not in forms:
+        expected = " or ".join(f'"{form}"' for form in forms)
+        raise ValueError(f"{filter}: expected covariance {expected}, got {covariance!r}")
 
 
 def check_chart(sensor: Sensor, chart: Chart) -> None:
@@ -46,15 +98,10 @@ def check_chart(sensor: Sensor, chart: Chart) -> None:
         )
 
 
-def check_parts(
-    sensor: Sensor,
-    chart: Chart,
-    linearize: Linearizer,
-    iterations: int,
-    joseph: bool,
-    square_root: bool,
-) -> None:
-    """Chart, linearizer and form of the covariance go together."""
+def check_settings(settings: EkfSettings) -> None:
+    """Sensor, chart, linearizer and form of the covariance go together."""
+    sensor, chart, linearize = settings.sensor, settings.chart, settings.linearize
+    check_chart(sensor, chart)
     if linearize.euclidean and (chart.basis is not None or len(sensor.landmark) != 2):
         raise ValueError(
             f"ekf_slam: the linearizer {linearize.name} is for the Euclidean chart and landmarks "
@@ -65,7 +112,7 @@ def check_parts(
             f"ekf_slam: the linearizer {linearize.name} is for landmarks alone, and the suite "
             f"{sensor.name} has an absolute sensor"
         )
-    if linearize.name == "unscented" and iterations > 1:
+    if linearize.name == "unscented" and settings.iterations > 1:
         raise ValueError("ekf_slam: the linearizer unscented does not iterate")
     if sensor.reduced is not None and chart.basis is not None:
         ground = jnp.zeros(len(sensor.landmark))
@@ -74,29 +121,8 @@ def check_parts(
                 f"ekf_slam: the landmarks of {sensor.name} become points, for which those of the "
                 f"chart {chart.name} must not turn with the robot"
             )
-    if chart.motion_apart and square_root:
+    if chart.motion_apart and settings.square_root:
         raise ValueError(
             f"ekf_slam: the chart {chart.name} keeps the last motion apart, which has no square "
             "root here"
-        )
-    if joseph and square_root:
-        raise ValueError("ekf_slam: Joseph's form is of a covariance, not of its square root")
-
-
-def check_map_manager(sensor: Sensor, life: Life | None, merge: Duplicates | None) -> None:
-    """What decides which landmarks stay is of the right kind, and can be applied."""
-    if life is not None and not isinstance(life, Life):
-        raise ValueError(
-            f"ekf_slam: expected life to be a Life, as of life.existence, got {life!r}"
-        )
-    if merge is None:
-        return
-    if not isinstance(merge, Duplicates):
-        raise ValueError(
-            f"ekf_slam: expected merge to be a Duplicates, as of merging.duplicates, got {merge!r}"
-        )
-    if len(sensor.landmark) < 2 or "rho [1/m]" in sensor.landmark:
-        raise ValueError(
-            f"ekf_slam: two landmarks of the sensor {sensor.name} are not one where their "
-            "parameters agree, so they cannot be merged"
         )

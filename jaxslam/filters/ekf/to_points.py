@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from jaxslam import slots
 from jaxslam.math import linalg
+from jaxslam.math.xla import where_any
 from jaxslam.protocols import Sensor
 from jaxslam.slots import Joint
 
@@ -33,6 +34,16 @@ def seen_as(sensor: Sensor, reduced: Array | tuple[()]) -> Sensor:
 def at_slot(sensor: Sensor, joint: Joint, slot: Array) -> Sensor:
     """The sensor as it sees the landmark of a slot () of the map."""
     return sensor if isinstance(joint.reduced, tuple) else seen_as(sensor, joint.reduced[slot])
+
+
+def reduced_where_ready(joint: Joint, sensor: Sensor, square_root: bool) -> tuple[Joint, Array]:
+    """The map with the landmarks that may become points turned into them, and which (N,) bool."""
+    which = ready(joint, sensor, square_root)
+
+    def reduced(joint: Joint) -> Joint:
+        return reduce(joint, which, sensor, square_root)
+
+    return where_any(which.any(), reduced, lambda joint: joint, joint), which
 
 
 def ready(joint: Joint, sensor: Sensor, square_root: bool) -> Array:

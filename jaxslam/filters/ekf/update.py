@@ -1,23 +1,26 @@
-"""The correction of a Kalman-type SLAM filter on a `Joint`, by a scan at once or place by place.
+"""The correction of a Kalman-type SLAM filter on a `Joint`, by a scan at once or one by one.
 
 With `predict`, they exploit that a motion touches the robot alone, and a measurement
-the robot and one landmark: no dense D×D product is formed. They take the models as records, so one
-set of equations serves every sensor, chart and linearizer. `filters.ekf_slam` binds them.
+the robot and one landmark: no dense D×D product is formed. The models are records of the settings,
+so one set of equations serves every sensor, chart and linearizer.
 """
 
-from functools import partial
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.ekf import robocentric_update
-from jaxslam.filters.ekf.innovation import Correction, Weighed, view_of, weigh
+from jaxslam.filters.ekf.coordinates import retracted
+from jaxslam.filters.ekf.innovation import Correction, Innovation, innovate, view_of
 from jaxslam.filters.ekf.observability import along, informed, split
 from jaxslam.filters.ekf.robocentric_motion import lever_of_motion, moved_anew
+from jaxslam.filters.ekf.settings import Covariance, EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import apart, settle, where_any
-from jaxslam.protocols import Chart, Linearizer, Sensor
+from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
 
 # Up to this many rows P stays in the cache next to a core: the pass over it is bound by arithmetic,
@@ -28,194 +31,237 @@ _CACHED, _LANES = 128, 16
 # more loads of P_I, fewer more of P.
 _GROUP, _GROUP_BEYOND = 3, 4
 
+_State = TypeVar("_State")
+
+Measurements = tuple[Float[Array, "m Z"], Int[Array, "m"], Bool[Array, "m"]]
+"""z, the slot of the landmark of each, and whether it is known"""
+
 
 def correct(
     joint: Joint,
-    z: jax.Array,
-    slot: jax.Array,
-    known: jax.Array,
-    *,
-    sensor: Sensor,
-    chart: Chart,
-    linearize: Linearizer,
-    gate: float | None = None,
-    iterations: int = 1,
-    joseph: bool = False,
-    square_root: bool = False,
+    z: Float[Array, "m Z"],
+    slot: Int[Array, "m"],
+    known: Bool[Array, "m"],
+    settings: EkfSettings,
 ) -> tuple[Joint, Correction]:
     """Correct by m measurements at once, z (m, Z) of the landmarks in slot (m,): Solà (26)-(30).
 
     With S = H P Hᵀ + R = L Lᵀ and V = L⁻¹ H P: x ← x ⊞ Vᵀ L⁻¹ ν and P ← P - Vᵀ V, symmetric as it
-    stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot means nothing. Places
-    not known (m,), outside the gate (ν_iᵀ S_ii⁻¹ ν_i above it, each against the prior) or with a
-    singular S do nothing.
+    stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot means nothing.
+    Measurements not known (m,), outside the gate (ν_iᵀ S_ii⁻¹ ν_i above it, each against the prior)
+    or with a singular S do nothing.
 
     Each further iteration linearizes at the newest estimate x_i = x ⊞ ξ_i but starts again from the
-    prior: ξ_{i+1} = K (z - h(x_i) + H ξ_i) (Bell & Cathey 1993). joseph: P ← (I-KH)P(I-KH)ᵀ + KRKᵀ.
+    prior: ξ_{i+1} = K (z - h(x_i) + H ξ_i) (Bell & Cathey 1993).
 
-    square_root: of P = X Xᵀ, X ← X - Vᵀ (L + N)⁻¹ H X, R = N Nᵀ (Andrews 1968, "A square root
-    formulation of the Kalman covariance equations", AIAA Journal 6(6)).
+    Other forms of the covariance: "joseph", P ← (I-KH)P(I-KH)ᵀ + KRKᵀ; "square_root", of P = X Xᵀ,
+    X ← X - Vᵀ (L + N)⁻¹ H X, R = N Nᵀ (Andrews 1968, "A square root formulation of the Kalman
+    covariance equations", AIAA Journal 6(6)).
     """
-    found = weigh(
-        joint,
-        slot,
-        view_of(joint, slot, square_root),
-        z,
-        known,
-        (joint, slot),
-        sensor=sensor,
-        chart=chart,
-        linearize=linearize,
-        gate=gate,
-        iterations=iterations,
-        square_root=square_root,
-    )
-    m, size_z = z.shape
+    view = view_of(joint, slot, settings.square_root)
+    found = innovate(joint, slot, view, z, known, (joint, slot), settings)
+    cov = _corrected_cov(joint.cov, found, settings.covariance)
+    if joint.last:
+        return _with_last_motion(joint, found, cov, slot, settings.chart), found.correction
+    moved = _moved(joint, found, found.xi, slot, settings.chart)
+    return moved._replace(cov=cov), found.correction
+
+
+def _corrected_cov(
+    cov: Float[Array, "D D"], found: Innovation, form: Covariance
+) -> Float[Array, "D D"]:
+    """P, or its root X, after the correction."""
     v, factor, noise = found.v, found.factor, found.noise
-    same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
-    each = found.fuse[:, None, None, None]
-    if joseph:
+    m, size_z = noise.shape[:2]
+    if form == "plain":
+        return cov - linalg.square(v)
+    same = jnp.eye(m, dtype=noise.dtype)[:, None, :, None]
+    if form == "joseph":
+        each = found.fuse[:, None, None, None]
         fused_noise = jnp.where(each, same * noise[:, :, None], 0.0)
-        cov = _joseph(joint.cov, found.hp, found.s, fused_noise, factor, v)
-    elif square_root:
-        root = jax.vmap(lambda cov: linalg.cholesky(cov)[0])(noise)
-        unit = jnp.eye(size_z, dtype=z.dtype)
-        root = same * jnp.where(found.fuse[:, None, None], root, unit)[:, :, None]
-        root = factor + root.reshape(m * size_z, m * size_z)
-        hx = found.hx.reshape(m * size_z, -1)
-        cov = joint.cov - linalg.gram(v, settle(linalg.solve_lower(root, hx)))
-    else:
-        cov = joint.cov - linalg.square(v)
-    xi, last = found.xi, joint.last
-    if last:
-        seen_last = along(*found.slopes, *split(last.cov.T, joint.landmarks.shape[0]), slot)
-        seen_last = linalg.solve_lower(factor, seen_last.reshape(m * size_z, 3))
-        step = linalg.gram(seen_last, found.whitened[:, None])[:, 0]
-        lever = lever_of_motion(joint, chart)
-        xi = xi - lever @ step
-        last = last._replace(
-            cov=last.cov - linalg.gram(seen_last, v),
-            own=last.own - linalg.gram(seen_last, seen_last),
-        )
-    moved = _moved(joint, found, xi, slot, chart)._replace(cov=cov, last=last)
-    if last:
-        moved = moved_anew(moved, moved.pose[2] - joint.pose[2], step, lever, chart)
-    return moved, found.correction
+        return _joseph(cov, found.hp, found.s, fused_noise, factor, v)
+    root = jax.vmap(lambda cov: linalg.cholesky(cov)[0])(noise)
+    unit = jnp.eye(size_z, dtype=noise.dtype)
+    root = same * jnp.where(found.fuse[:, None, None], root, unit)[:, :, None]
+    root = factor + root.reshape(m * size_z, m * size_z)
+    hx = found.hx.reshape(m * size_z, -1)
+    return cov - linalg.gram(v, settle(linalg.solve_lower(root, hx)))
+
+
+def _with_last_motion(
+    joint: Joint, found: Innovation, cov: Float[Array, "D D"], slot: Int[Array, "m"], chart: Chart
+) -> Joint:
+    """The map corrected but for the last motion, then composed with the corrected motion."""
+    last, capacity = joint.last, joint.landmarks.shape[0]
+    seen_last = along(*found.jacobians, *split(last.cov.T, capacity), slot)
+    seen_last = linalg.solve_lower(found.factor, seen_last.reshape(-1, 3))
+    step = linalg.gram(seen_last, found.whitened[:, None])[:, 0]
+    lever = lever_of_motion(joint, chart)
+    last = last._replace(
+        cov=last.cov - linalg.gram(seen_last, found.v),
+        own=last.own - linalg.gram(seen_last, seen_last),
+    )
+    moved = _moved(joint, found, found.xi - lever @ step, slot, chart)
+    moved = moved._replace(cov=cov, last=last)
+    return moved_anew(moved, moved.pose[2] - joint.pose[2], step, lever, chart)
 
 
 def correct_in_turn(
     joint: Joint,
-    z: jax.Array,
-    slot: jax.Array,
-    known: jax.Array,
-    *,
-    chart: Chart,
-    joseph: bool = False,
-    square_root: bool = False,
-    **options: Any,
+    z: Float[Array, "m Z"],
+    slot: Int[Array, "m"],
+    known: Bool[Array, "m"],
+    settings: EkfSettings,
 ) -> tuple[Joint, Correction]:
     """Correct by m measurements one after the other, each linearized at what those before left.
 
-    The same numbers as `correct` on each alone, with P read and written once a group of them: what
-    a group sees of P are the rows P_I of the robot and of its landmarks. Each measurement corrects
-    means and these rows, P_I ← P_I - V_Iᵀ V, and leaves V; at the end P ← P - Σ Vᵀ V over the
-    group. This is the postponed update of Guivant & Nebot 2001 ("Optimization of the simultaneous
+    The same numbers as `correct` on each alone, with P read and written once a group of them:
+
+        for each group (g measurements, W = 3 + g·L):
+            P_I (W, D)  <-  rows of the robot and of the group's landmarks, of P (D, D)
+            for each measurement: means and P_I corrected, P_I ← P_I - V_Iᵀ V; V (Z, D) is left
+            P (D, D)    <-  P - Σ Vᵀ V over the group
+
+    This is the postponed update of Guivant & Nebot 2001 ("Optimization of the simultaneous
     localization and map-building algorithm for real-time implementation", IEEE T-RA 17(3)), over
     one scan. A group without a known measurement in any run of a batch costs nothing.
 
     In a chart that keeps the last motion apart, map and motion are corrected side by side, and
-    composed once (`filters.parted`). Options are those of `correct`, which is used as it is, one
-    measurement at a time, for forms of the update that need all of P.
+    composed once (`robocentric_update`). A form of the covariance that needs all of P is corrected
+    by `correct`, one measurement at a time.
     """
-    whole = joseph or square_root
-    m, size_l = z.shape[0], joint.landmarks.shape[1]
+    measurements = z, slot, known
     size = joint.cov.shape[1]
+    if settings.covariance != "plain":
+        return _in_groups(
+            lambda joint, one: correct(joint, *one, settings), joint, measurements, 1, joint
+        )
     cached = size <= _CACHED
-    group = 1 if whole else max(1, min(_GROUP if cached else _GROUP_BEYOND, m))
+    group = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
+    if settings.chart.motion_apart and joint.last:
+        return _in_turn_with_motion(joint, measurements, group, settings)
+    if cached:
+        joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
+    joint, done = _in_groups(
+        lambda joint, part: correct_group(joint, part, settings), joint, measurements, group, joint
+    )
+    return joint._replace(cov=joint.cov[:, :size]), done
+
+
+def _in_turn_with_motion(
+    joint: Joint, measurements: Measurements, group: int, settings: EkfSettings
+) -> tuple[Joint, Correction]:
+    """`correct_in_turn` in a chart that keeps the last motion apart; P has columns for it."""
+    z, _, known = measurements
+    size = joint.cov.shape[1]
+    columns = size + 3 + (-(size + 3) % _LANES if size <= _CACHED else 0)
+
+    def with_motion(joint: Joint) -> tuple[Joint, Correction]:
+        rest, done = _in_groups(
+            lambda parted, part: robocentric_update.correct_group(parted, part, settings),
+            robocentric_update.part(joint, settings.chart, columns),
+            measurements,
+            group,
+            joint,
+        )
+        # A run without a measurement must keep its map to the bit.
+        after = robocentric_update.whole(rest, settings.chart)
+        kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)
+        return kept, done
+
+    nothing = _nothing(joint, z)
+    return where_any(known.any(), with_motion, lambda joint: (joint, nothing), joint)
+
+
+def _in_groups(
+    work: Callable[[_State, Measurements], tuple[_State, Correction]],
+    state: _State,
+    measurements: Measurements,
+    group: int,
+    joint: Joint,
+) -> tuple[_State, Correction]:
+    """The state after work(state, g measurements) on each group of m, padded: (⌈m/g⌉, g, …).
+
+    joint: the map, of whose precision what is reported is.
+    """
+    m = len(measurements[0])
     groups = -(-m // group)
 
     def padded(part: jax.Array) -> jax.Array:
         wide = jnp.pad(part, [(0, groups * group - m), *[(0, 0)] * (part.ndim - 1)])
         return wide.reshape(groups, group, *part.shape[1:])
 
-    def one_of_all(joint: Joint, part: Any) -> tuple[Joint, Correction]:
-        return correct(joint, *part, chart=chart, joseph=joseph, square_root=square_root, **options)
+    def of_group(state: _State, part: Measurements) -> tuple[_State, Correction]:
+        nothing = _nothing(joint, part[0])
+        known = part[2].any()
+        return where_any(known, lambda s: work(s, part), lambda s: (s, nothing), state)
 
-    def in_group(joint: Joint, part: Any) -> tuple[Joint, Correction]:
-        slot = part[1]
-        of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
-        at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
-        rows = joint.cov[at]
-        watch: Any = joint.watch
-        if watch:
-            watch = watch._replace(directions=watch.directions[at])
-        # The local map, and beside its P the matrix that takes P_I of before to P_I of now.
-        local = joint._replace(
-            landmarks=joint.landmarks[slot],
-            cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
-            alive=joint.alive[slot],
-            tag=joint.tag[slot],
-            watch=watch,
-        )
+    state, done = jax.lax.scan(of_group, state, jax.tree.map(padded, measurements))
+    shape = (groups * group,)
+    return state, jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[2:])[:m], done)
 
-        def one(local: Joint, place: Any) -> tuple[Joint, Any]:
-            i, part = place
-            i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], (i, part))
-            memory = joint._replace(pose=local.pose), slot
-            found = weigh(local, i, view_of(local, i), z, known, memory, chart=chart, **options)
-            v, reach = found.v[:, : len(at)], found.v[:, len(at) :]
-            moved = _moved(local, found, found.xi[: len(at)], i, chart)
-            moved = moved._replace(cov=local.cov - linalg.gram(v, found.v))
-            done = jax.tree.map(lambda leaf: leaf[0], found.correction)
-            return moved, (reach, found.whitened, done)
 
-        # A gradient keeps what each begins with, and computes the rest of these few rows again.
-        local, (reach, whitened, done) = jax.lax.scan(
-            jax.checkpoint(one, prevent_cse=False),
-            local,
-            (jnp.arange(group), part),
-        )
-        v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
-        landmarks = _moved_map(joint, v[:, :size], whitened, chart)
-        if watch:
-            watch = local.watch._replace(directions=joint.watch.directions)
-        cov = joint.cov - linalg.gram(v[:, :size], v)
-        return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov, watch=watch), done
+def correct_group(
+    joint: Joint, part: Measurements, settings: EkfSettings
+) -> tuple[Joint, Correction]:
+    """Correct by a group of g measurements in turn: the local map by each, then P by them all.
 
-    def in_groups(work: Any, state: Any) -> tuple[Any, Correction]:
-        def of_group(state: Any, part: Any) -> tuple[Any, Correction]:
-            nothing = _nothing(joint, part[0])
-            some = part[2].any()
-            after: tuple[Any, Correction] = where_any(
-                some, lambda s: work(s, part), lambda s: (s, nothing), state
-            )
-            return after
+        local P (W, W) | M (W, W)    P_I of now = M P_I of before, W = 3 + g·L
+        V (g·Z, D) = reach (g·Z, W) P_I of before
 
-        state, done = jax.lax.scan(of_group, state, jax.tree.map(padded, (z, slot, known)))
-        shape = (groups * group,)
-        return state, jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[2:])[:m], done)
+    P may have columns of zeros beyond its own.
+    """
+    slot, chart = part[1], settings.chart
+    size_l, size = joint.landmarks.shape[1], joint.cov.shape[0]
+    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
+    at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
+    rows = joint.cov[at]
+    watch: Any = joint.watch
+    if watch:
+        watch = watch._replace(directions=watch.directions[at])
+    local = joint._replace(
+        landmarks=joint.landmarks[slot],
+        cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
+        alive=joint.alive[slot],
+        tag=joint.tag[slot],
+        watch=watch,
+    )
 
-    if whole:
-        return in_groups(one_of_all, joint)
-    if chart.motion_apart and joint.last:
-        work = partial(
-            robocentric_update.correct_group, chart=chart, retracted=retracted, **options
-        )
+    def one(local: Joint, measurement: tuple[jax.Array, Any]) -> tuple[Joint, Any]:
+        return _correct_local(local, measurement, joint, settings)
 
-        def with_motion(joint: Joint) -> tuple[Joint, Correction]:
-            columns = size + 3 + (-(size + 3) % _LANES if cached else 0)
-            rest, done = in_groups(work, robocentric_update.part(joint, chart, columns))
-            # A run without a measurement must keep its map to the bit.
-            after = robocentric_update.whole(rest, chart)
-            kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)
-            return kept, done
+    # A gradient keeps what each begins with, and computes the rest of these few rows again.
+    local, (reach, whitened, done) = jax.lax.scan(
+        jax.checkpoint(one, prevent_cse=False),
+        local,
+        (jnp.arange(len(slot)), part),
+    )
+    v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
+    landmarks = _moved_map(joint, v[:, :size], whitened, chart)
+    if watch:
+        watch = local.watch._replace(directions=joint.watch.directions)
+    cov = joint.cov - linalg.gram(v[:, :size], v)
+    return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov, watch=watch), done
 
-        nothing = _nothing(joint, z)
-        return where_any(known.any(), with_motion, lambda joint: (joint, nothing), joint)
-    if cached:
-        joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
-    joint, done = in_groups(in_group, joint)
-    return joint._replace(cov=joint.cov[:, :size]), done
+
+def _correct_local(
+    local: Joint, measurement: tuple[jax.Array, Any], whole: Joint, settings: EkfSettings
+) -> tuple[Joint, tuple[jax.Array, jax.Array, Correction]]:
+    """Correct a local map by a measurement of its landmark i (); the whole map's slot beside.
+
+    P of the local map and the matrix M beside it are corrected as one:
+    [P M] ← [P M] - Vᵀ [V reach].
+    Returns reach (Z, W), and L⁻¹ ν (Z,).
+    """
+    i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], measurement)
+    width, chart = local.cov.shape[0], settings.chart
+    memory = whole._replace(pose=local.pose), slot
+    found = innovate(local, i, view_of(local, i), z, known, memory, settings)
+    v, reach = found.v[:, :width], found.v[:, width:]
+    moved = _moved(local, found, found.xi[:width], i, chart)
+    moved = moved._replace(cov=local.cov - linalg.gram(v, found.v))
+    done = jax.tree.map(lambda leaf: leaf[0], found.correction)
+    return moved, (reach, found.whitened, done)
 
 
 def _nothing(joint: Joint, z: jax.Array) -> Correction:
@@ -233,7 +279,7 @@ def _nothing(joint: Joint, z: jax.Array) -> Correction:
     )
 
 
-def _moved(joint: Joint, found: Weighed, xi: jax.Array, slot: jax.Array, chart: Chart) -> Joint:
+def _moved(joint: Joint, found: Innovation, xi: jax.Array, slot: jax.Array, chart: Chart) -> Joint:
     """The means moved by ξ (D,), and what the measurements tell a watch; P as it was."""
     pose, landmarks = retracted(chart, joint, xi)
     watch = joint.watch
@@ -256,15 +302,6 @@ def _moved_map(joint: Joint, v: jax.Array, whitened: jax.Array, chart: Chart) ->
 
     each = v.reshape(*whitened.shape, -1)
     return jax.lax.scan(move, joint, (each, whitened))[0].landmarks
-
-
-def retracted(chart: Chart, joint: Joint, xi: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Pose (3,) and landmarks (N, L) moved by errors ξ (D,)."""
-    over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
-    poses, landmarks = over_landmarks(
-        joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
-    )
-    return poses[0], jnp.where(joint.alive[:, None], landmarks, 0.0)
 
 
 def _joseph(

@@ -1,8 +1,7 @@
 """EKF localization: where the robot is in a map that is known."""
 
 import dataclasses
-from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,14 @@ from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import in_order, left_alone, scan_update
-from jaxslam.filters.ekf.settings import check_numbers
+from jaxslam.filters.ekf.scan import Turn, update_by_scan
+from jaxslam.filters.ekf.settings import (
+    Covariance,
+    EkfSettings,
+    Update,
+    check_covariance,
+    check_numbers,
+)
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
 from jaxslam.math.linalg import is_concrete
@@ -31,7 +36,7 @@ from jaxslam.protocols import (
     Prediction,
     Sensor,
 )
-from jaxslam.sensors.suite import Part, Suite
+from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 
@@ -47,10 +52,10 @@ def localization(
     chart: Chart | None = None,
     linearize: Linearizer | None = None,
     associate: Associate | None = None,
-    update: Literal["sequential", "joint"] = "sequential",
+    update: Update = "sequential",
     gate: float | None = None,
     iterations: int = 1,
-    joseph: bool = False,
+    covariance: Covariance = "plain",
 ) -> Filter:
     """Extended Kalman filter of the pose alone, in a map without error (Williams; the Notes).
 
@@ -68,7 +73,8 @@ def localization(
         tags: (N,) int, different; default the row numbers.
         chart: the error P is of; its pose part. Default `charts.euclidean()`.
         linearize: one without a memory of landmarks (at_estimate, unscented).
-        associate, update, gate, iterations, joseph: as for `ekf_slam`.
+        associate, update, gate, iterations: as for `ekf_slam`.
+        covariance: "plain" or "joseph", as there.
     Raises:
         ValueError: on a map that is not finite (N, L), tags that are not N different numbers from 0
             on, a chart or linearizer that needs the landmarks' errors, and as `ekf_slam` does.
@@ -80,40 +86,32 @@ def localization(
     chart = _of_pose(chart or euclidean())
     linearize = linearize or at_estimate()
     check_numbers("localization", capacity, update, gate, iterations, None)
+    check_covariance("localization", covariance, ("plain", "joseph"))
     if linearize.euclidean or linearize.name == "at_truth":
         raise ValueError(f"localization: the linearizer {linearize.name} is for maps with errors")
     if linearize.name == "unscented" and iterations > 1:
         raise ValueError("localization: the linearizer unscented does not iterate")
-    options: dict[str, Any] = {
-        "associate": _never_new(associate or known_association()),
-        "update": update,
-        "births": 0,
-        "life": None,
-        "without": lambda joint, dead: joint,
-        "chart": chart,
-        "square_root": False,
-        "options": {"gate": gate, "iterations": iterations, "joseph": joseph},
-    }
-
-    def update_by(one: Sensor) -> Any:
-        absolute = not one.landmark
-        at = linearize if absolute else _on_map(linearize, one, points)
-        return scan_update(_without_landmark(one), absolute=absolute, linearize=at, **options)
-
-    def part_update(part: Part) -> Any:
-        if part.sees == "robots":
-            return left_alone
-        of_part, size = update_by(part.sensor), len(part.sensor.measurements)
-        return lambda joint, scan: of_part(joint, scan._replace(z=scan.z[:, :size]))
-
-    places: tuple[int, ...] = ()
-    parts: list[Any] = []
+    settings = EkfSettings(
+        sensor=sensor,
+        chart=chart,
+        linearize=linearize,
+        associate=_never_new(associate or known_association()),
+        update=update,
+        gate=gate,
+        iterations=iterations,
+        covariance=covariance,
+        births=0,
+    )
+    places = sensor.places if isinstance(sensor, Suite) else ()
+    turns = [Turn(None, _in_map(sensor, points, settings))]
     if isinstance(sensor, Suite):
-        places = sensor.places
-        parts = [(part.places, part_update(part)) for part in sensor.parts]
-    else:
-        parts = [(-1, update_by(sensor))]
-    move = partial(propagate, motion=motion, chart=chart, linearize=linearize)
+        turns = [
+            Turn(
+                part.places,
+                None if part.sees == "robots" else _in_map(part.sensor, points, settings),
+            )
+            for part in sensor.parts
+        ]
 
     def init(pose: Array, pose_cov: Array) -> Joint:
         ground = jnp.zeros((capacity, 0), pose.dtype)
@@ -124,10 +122,10 @@ def localization(
         return joint._replace(alive=jnp.ones(capacity, bool), tag=jnp.asarray(names))
 
     def predict(joint: Joint, u: Array, key: Array) -> Joint:
-        return move(joint, u)
+        return propagate(joint, u, motion, settings)
 
     def update_pose(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        joint, info, _ = in_order(joint, scan, parts)
+        joint, info, _ = update_by_scan(joint, scan, turns)
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:
@@ -155,6 +153,15 @@ def localization(
         estimate=estimate,
         chart=chart,
         places=places,
+    )
+
+
+def _in_map(sensor: Sensor, points: Any, settings: EkfSettings) -> EkfSettings:
+    """The settings for one sensor of landmarks that are known, or of none."""
+    absolute = not sensor.landmark
+    linearize = settings.linearize if absolute else _on_map(settings.linearize, sensor, points)
+    return dataclasses.replace(
+        settings, sensor=_without_landmark(sensor), linearize=linearize, absolute=absolute
     )
 
 

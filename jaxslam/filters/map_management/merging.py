@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import slots
-from jaxslam.filters.ekf.update import retracted
+from jaxslam.filters.ekf.coordinates import retracted
 from jaxslam.math import linalg
 from jaxslam.math.linalg import is_concrete
 from jaxslam.math.stats import chi2_quantile

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +11,11 @@ from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import ScanUpdate, in_order, part_update
+from jaxslam.filters.ekf.scan import Turn, turn_of, update_by_scan
+from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance
 from jaxslam.filters.multi_robot.joining import SIZE, best_way, entered, points_seen, sees_in_full
 from jaxslam.filters.multi_robot.pose_initialization import Entry
 from jaxslam.filters.reporting import joined
-from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import check_count, check_gate
@@ -37,10 +36,10 @@ def team_slam(
     report: int = 0,
     chart: Chart | None = None,
     associate: Associate | None = None,
-    update: Literal["sequential", "joint"] = "sequential",
+    update: Update = "sequential",
     gate: float | None = None,
     iterations: int = 1,
-    joseph: bool = False,
+    covariance: Covariance = "plain",
     births: int | None = None,
 ) -> Filter:
     """EKF-SLAM of R robots and one map, with all their cross-covariances.
@@ -71,7 +70,8 @@ def team_slam(
         tags: (R,) that mean robots; default N, N + 1, ….
         report: which robot `estimate` is of; `team.poses` has all.
         chart: `charts.euclidean()` or None; no other.
-        associate, update, gate, iterations, joseph, births: as for `ekf_slam`; births are a sensor.
+        associate, update, gate, iterations, births: as for `ekf_slam`; births are a sensor.
+        covariance: "plain" or "joseph", as there.
     Raises:
         ValueError: without robots, on tags that clash, another chart, no such robot to report,
             landmarks that are not (x, y), a robot without start whose sensors cannot tell it where
@@ -82,23 +82,24 @@ def team_slam(
         validation.check_models("team_slam", robot.motion, robot.sensors)
     validation.check_parts("team_slam", chart=chart, associate=associate)
     _check(robots, report, chart, update, gate, iterations, births)
+    check_covariance("team_slam", covariance, ("plain", "joseph"))
     count = len(robots)
     control_ends, place_ends, size_z = sizes(robots)
-    models: dict[str, Any] = {"chart": _headings_wrapped(), "linearize": at_estimate()}
-    options = models | {
-        "square_root": False,
-        "associate": associate or known_association(),
-        "update": update,
-        "births": births,
-        "life": None,
-        "without": lambda joint, dead: joint,
-        "options": {"gate": gate, "iterations": iterations, "joseph": joseph},
-        "reserved": np.arange(capacity + count - 1) >= capacity,
-    }
-    quota: dict[str, dict[str, Any]] = {"landmarks": {}, "robots": {"births": 0}}
-    updates: list[list[tuple[int, ScanUpdate]]] = [
+    settings = EkfSettings(
+        sensor=robots[0].sensors,
+        chart=_headings_wrapped(),
+        associate=associate or known_association(),
+        update=update,
+        gate=gate,
+        iterations=iterations,
+        covariance=covariance,
+        births=births,
+        reserved=np.arange(capacity + count - 1) >= capacity,
+    )
+    for_robots = dataclasses.replace(settings, births=0)
+    turns: list[list[Turn]] = [
         [
-            (part.places, part_update(part, SIZE, **(options | quota[part.sees])))
+            turn_of(part, SIZE, for_robots if part.sees == "robots" else settings)
             for part in robot.sensors.parts
         ]
         for robot in robots
@@ -160,7 +161,7 @@ def team_slam(
     def predict(joint: Joint, u: Array, key: Array) -> Joint:
         for b, robot in enumerate(robots):
             own = u[control_ends[b] - len(robot.motion.controls) : control_ends[b]]
-            moved = propagate(driven_by(joint, b), own, motion=robot.motion, **models)
+            moved = propagate(driven_by(joint, b), own, robot.motion, settings)
             moved = back(moved, b, joint)
             if b in unknown:
                 there = joint.alive[slot_of(b)]
@@ -177,7 +178,7 @@ def team_slam(
         someone = jnp.where(jnp.arange(count) == robot, False, there)
         nobody = (whom & ~someone[None, :]).any(axis=1) | ~there[robot]
         own = scan._replace(valid=scan.valid & ~nobody)
-        after, info, _ = in_order(driven_by(joint, robot), own, updates[robot])
+        after, info, _ = update_by_scan(driven_by(joint, robot), own, turns[robot])
         status = jnp.where(scan.valid & nobody, Status.UNMATCHED, info.status)
         return back(after, robot, joint), info._replace(status=status.astype(jnp.int32))
 

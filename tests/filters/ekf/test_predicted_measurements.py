@@ -9,6 +9,7 @@ import pytest
 
 from jaxslam import charts, linearize, sensors
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
@@ -58,11 +59,12 @@ def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_roo
     chart, joint = charts.REGISTRY[name](), some_joint()
     scan = some_scan(joint)
     held = joint._replace(cov=np.linalg.cholesky(joint.cov)) if square_root else joint
-    models = {"sensor": SENSOR, "chart": chart, "linearize": linearize.at_estimate()}
+    covariance = "square_root" if square_root else "plain"
+    settings = EkfSettings(SENSOR, chart, covariance=covariance)
 
     @jax.jit
     def look(held, scan):
-        prediction = prediction_of(held, **models, square_root=square_root)
+        prediction = prediction_of(held, settings)
         return prediction.pairs(scan), prediction.cross()
 
     pairs, cross = jax.device_get(look(held, scan))
@@ -84,17 +86,13 @@ def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_roo
 def test_a_scan_judged_for_association_is_judged_alike_in_the_correction():
     joint = some_joint()
     scan = some_scan(joint)
-    models = {
-        "sensor": SENSOR,
-        "chart": charts.euclidean(),
-        "linearize": linearize.unscented(),
-    }
+    settings = EkfSettings(SENSOR, linearize=linearize.unscented())
     slot, each = np.array([3, 0, 1]), np.arange(3)
 
     @jax.jit
     def judged(joint, scan):
-        pairs = prediction_of(joint, **models).pairs(scan)
-        return pairs, correct(joint, scan.z, slot, scan.valid, **models)[1]
+        pairs = prediction_of(joint, settings).pairs(scan)
+        return pairs, correct(joint, scan.z, slot, scan.valid, settings)[1]
 
     pairs, done = jax.device_get(judged(joint, scan))
     np.testing.assert_allclose(pairs.innovation[each, slot], done.innovation, atol=1e-12)

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import charts, filters, linearize, motion, sensors
+from jaxslam import charts, filters, motion, sensors
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct, correct_in_turn
 from jaxslam.types import Scan
 
@@ -17,7 +18,7 @@ def test_corrections_in_turn_are_those_one_by_one():
     ekf = filters.ekf_slam(
         motion.pose_increment(np.diag([0.04, 0.02, 0.01])), SEES, 4, chart=chart, watch=True
     )
-    options = {"sensor": SEES, "chart": chart, "linearize": linearize.at_estimate(), "gate": 60.0}
+    settings = EkfSettings(SEES, chart, gate=60.0)
     seen = jax.vmap(SEES.observe, (None, 0))
     key = jax.random.key(0)
 
@@ -34,11 +35,11 @@ def test_corrections_in_turn_are_those_one_by_one():
     z = z + jnp.asarray([[0.2, 0.1], [-0.3, 0.05], [0.1, -0.1], [40.0, 0.0]])  # the last is wild
     slot, known = jnp.asarray([2, 0, 1, 0]), jnp.asarray([True, True, False, True])
 
-    alone = jax.jit(lambda joint, *part: correct(joint, *part, **options))
+    alone = jax.jit(lambda joint, *part: correct(joint, *part, settings))
     wanted = joint
     for i in range(4):
         wanted, _ = alone(wanted, z[i : i + 1], slot[i : i + 1], known[i : i + 1])
-    turns = jax.jit(lambda joint, *part: correct_in_turn(joint, *part, **options))
+    turns = jax.jit(lambda joint, *part: correct_in_turn(joint, *part, settings))
     got, done = turns(joint, z, slot, known)
 
     assert list(done.inside & known) == [True, True, False, False]

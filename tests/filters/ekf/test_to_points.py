@@ -61,7 +61,8 @@ def state_of(joint):
 @cache
 def traced(name, square_root, to_point):
     """A run whose probe is the state after every step; one program for every `to_point`."""
-    options = {"chart": CHARTS[name](), "square_root": square_root, "watch": True}
+    covariance = "square_root" if square_root else "plain"
+    options = {"chart": CHARTS[name](), "covariance": covariance, "watch": True}
     filter = ekf_slam(MOTION, camera(to_point=to_point), 4, **options)
     return jax.device_get(driven(filter, a_log(), probe=state_of)._replace(final=()))
 

@@ -70,7 +70,7 @@ def slam_in_a_known_map(scenario, log, chart_name, options):
         ("euclidean", {}),
         ("euclidean", {"update": "joint"}),
         ("euclidean", {"iterations": 3}),
-        ("euclidean", {"joseph": True, "gate": 4.0}),
+        ("euclidean", {"covariance": "joseph", "gate": 4.0}),
         ("right_invariant", {}),
         ("left_invariant", {"update": "joint"}),
     ],

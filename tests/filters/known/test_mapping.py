@@ -125,7 +125,7 @@ def test_refusals():
         ({"capacity": 3}, "no 2 landmarks"),
         ({"chart": charts.right_invariant()}, "Euclidean"),
         ({"chart": charts.robocentric()}, "Euclidean"),
-        ({"square_root": True}, "covariance"),
+        ({"covariance": "square_root"}, "covariance"),
         ({"linearize": linearize.first_estimate()}, "Jacobians"),
     ):
         other = ekf_slam(ring(3).motion, sensor, **({"capacity": 2} | options))

@@ -225,7 +225,7 @@ def test_refusals():
         closing(plain).init(jnp.zeros(3), jnp.eye(3))
     models = motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2)), 3
     with pytest.raises(ValueError, match="root"):
-        closing(ekf_slam(*models, life=recency(), square_root=True))
+        closing(ekf_slam(*models, life=recency(), covariance="square_root"))
     with pytest.raises(ValueError, match="Joint"):
         closing(eif_slam(*models)).init(jnp.zeros(3), jnp.eye(3))
 

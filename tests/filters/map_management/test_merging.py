@@ -157,7 +157,8 @@ RULE = duplicates(0.5)
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"chart": "right_invariant"}, {"square_root": True}, {"update": "joint"}]
+    "options",
+    [{}, {"chart": "right_invariant"}, {"covariance": "square_root"}, {"update": "joint"}],
 )
 def test_a_filter_merges_what_it_holds_twice(options):
     log = seen_twice()
@@ -172,7 +173,7 @@ def test_a_filter_merges_what_it_holds_twice(options):
     plain, go_plain = merging_driver(**options)
     before = state_at(go_plain(log), at)
     chart = charts.REGISTRY[options.get("chart", "euclidean")]()
-    square_root = options.get("square_root", False)
+    square_root = plain.square_root
     by_hand = MERGE(before, chart, 0, 2, square_root=square_root)
     expected = jax.jit(plain.estimate)(by_hand)
     for name in ("pose", "pose_cov", "points", "point_covs"):
@@ -235,11 +236,11 @@ def test_refusals_of_duplicates():
             ekf_slam(MOTION, sensor, 3, merge=RULE)
 
 
-@pytest.mark.parametrize("square_root", [False, True])
-def test_landmarks_that_differ_stay_two_in_either_form(square_root):
+@pytest.mark.parametrize("covariance", ["plain", "square_root"])
+def test_landmarks_that_differ_stay_two_in_either_form(covariance):
     """0.45 m apart, known to centimetres, and seen by turns: only their distance tells them apart."""
     sensor = sensors.range_bearing(np.diag([0.02, 0.01]) ** 2)
-    filter = ekf_slam(MOTION, sensor, 4, merge=duplicates(0.5), square_root=square_root)
+    filter = ekf_slam(MOTION, sensor, 4, merge=duplicates(0.5), covariance=covariance)
     z = np.array([[[2.0, 0.0]], [[2.0, 0.225]]] * 5)
     scan = Scan(z, np.array([[0], [1]] * 5, np.int32), np.ones((10, 1), bool))
     log = Log(np.zeros((10, 3)), scan)

@@ -10,6 +10,7 @@ import pytest
 
 from jaxslam import charts, motion, se2, sensors
 from jaxslam.filters import ekf_slam
+from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct
 from jaxslam.filters.map_management.relocalization import (
     lost,
@@ -18,7 +19,7 @@ from jaxslam.filters.map_management.relocalization import (
     relocated,
     seen_points,
 )
-from jaxslam.linearize import at_estimate, first_estimate
+from jaxslam.linearize import first_estimate
 from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.slots import Joint
 from jaxslam.types import Scan, Status
@@ -309,8 +310,8 @@ def test_relocated_is_the_limit_of_an_update_from_a_large_covariance(name):
     found = RELOCATED(joint, chart, slot, seen, covs)
     # Linearized at the answer, the same update from a large covariance hardly moves the pose.
     wide = LOST(joint._replace(pose=found.pose), chart, 1e7 * np.eye(3))
-    models = {"sensor": sensor, "chart": chart, "linearize": at_estimate()}
-    correction = jax.jit(partial(correct, **models))
+    settings = EkfSettings(sensor, chart)
+    correction = jax.jit(lambda *given: correct(*given, settings))
     limit, _ = correction(wide, seen, np.maximum(slot, 0), slot >= 0)
     tolerance = 1e-5 if name == "euclidean" else 1e-3  # basis at the answer, or before it
     np.testing.assert_allclose(found.pose, limit.pose, atol=tolerance)
