@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, report
 from jaxslam import datasets, filters
-from jaxslam.filters.information.marginals import marginals, whole_marginals
+from jaxslam.filters.information.marginals import blanket_marginals, whole_marginals
 from jaxslam.math.linalg import mahalanobis_squared
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.simulation.scenarios.view import between_ranges
@@ -50,7 +50,7 @@ def driven(filter, start, log):
 def believed(state):
     """Points (N, 2) by tag, which are there, and (pose_cov, point_covs) as reported and whole."""
     if hasattr(state, "links"):
-        return state.landmarks, state.alive, (marginals(state), whole_marginals(state))
+        return state.landmarks, state.alive, (blanket_marginals(state), whole_marginals(state))
     count = len(state.tag)
     slot = jnp.argmax(state.tag[None, :] == jnp.arange(count)[:, None], axis=1)
     alive = (state.tag[None, :] == jnp.arange(count)[:, None]).any(axis=1)
@@ -103,7 +103,7 @@ def judged(world, runs: int, candidates) -> dict[str, dict[str, float]]:
         }
         if counts:
             mean = {k: float(np.mean(v)) for k, v in counts._asdict().items()}
-            out[name] |= {k: mean[k] for k in ("cut", "relocated", "dropped", "broken")}
+            out[name] |= {k: mean[k] for k in ("cut", "relocated", "dropped", "refused")}
             out[name]["deferred"] = float(np.mean(deferred))
         row = "  ".join(f"{k} {v:.4g}" for k, v in out[name].items())
         print(f"  {name:18}{row}", flush=True)
@@ -142,7 +142,7 @@ def measure(runs: int = 10, steps: int = 300) -> list[Metric]:
             share = row["map RMSE [m]"] / ekf
             metrics += [
                 Metric(f"{filter}, 20 active, map RMSE by EKF's, {name}", share, high=1.1),
-                Metric(f"{filter}, scans refused, {name}", row["broken"], high=0.0),
+                Metric(f"{filter}, scans refused, {name}", row["refused"], high=0.0),
             ]
     return metrics
 

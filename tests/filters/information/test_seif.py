@@ -10,15 +10,15 @@ import pytest
 from worlds import draw
 
 from jaxslam import filters, sensors
-from jaxslam.filters.information import sparse_state, sparsification
+from jaxslam.filters.information import link_lists, sparse_state, sparsification
 from jaxslam.filters.information.marginals import (
+    blanket_cov,
+    blanket_marginals,
     information_of,
-    local_cov,
-    marginals,
     whole_information,
     whole_mean,
 )
-from jaxslam.filters.information.mean_recovery import relaxed
+from jaxslam.filters.information.mean_recovery import recover_passive_means
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.scenarios.view import between_ranges
@@ -66,14 +66,18 @@ def rows(upto=40):
 
 @jax.jit
 def dense(state):
-    return information_of(state, jnp.arange(state.own.shape[0]))
+    return information_of(state, jnp.arange(state.diagonal.shape[0]))
 
 
 def canonical(state):
     """Ω and ξ of all, in NumPy."""
     omega, state = np.asarray(dense(state)), jax.device_get(state)
     mean = np.concatenate([state.pose, np.ravel(state.landmarks)])
-    return omega, omega @ mean + np.concatenate([state.owed_robot, np.ravel(state.owed)]), mean
+    return (
+        omega,
+        omega @ mean + np.concatenate([state.pose_residual, np.ravel(state.landmark_residual)]),
+        mean,
+    )
 
 
 def picks(slots_, robot=False):
@@ -118,7 +122,7 @@ def close(a, b, tolerance=1e-9):
 def test_every_step_is_the_dense_formula():
     """Motion, sparsification, measurement and birth, in Ω and ξ, by dense NumPy."""
     f, predict, update = made()
-    relax = jax.jit(functools.partial(relaxed, share=5))
+    relax = jax.jit(functools.partial(recover_passive_means, count=5))
     noise = np.diag([0.1, np.deg2rad(1.0)]) ** 2
     state, cut, born = start(f), 0, 0
     for u, scan in rows():
@@ -146,7 +150,7 @@ def test_every_step_is_the_dense_formula():
         close(xi, xi_bar, 1e-12)
         # the scan
         after_scan, info = jax.device_get(update(moved, scan, KEY))
-        old, new = (set(np.asarray(s.slot)) - {COUNT} for s in (state, after_scan))
+        old, new = (set(np.asarray(s.active)) - {COUNT} for s in (state, after_scan))
         gone = sorted(old - new)
         if gone:
             cut += 1
@@ -216,13 +220,13 @@ def test_mean_recovery_converges_to_the_whole_mean():
     np.testing.assert_allclose(found[alive], np.asarray(landmarks)[alive], atol=1e-4)
 
 
-def test_whole_map_and_blankets():
+def test_whole_map_and_markov_blankets():
     state = driven()
     omega = whole_information(state).toarray()
     np.testing.assert_allclose(omega, dense(state), atol=1e-12 * np.abs(omega).max())
     cov = np.linalg.inv(omega)
-    found = np.asarray(jax.jit(marginals)(state)[1])
-    cov_of, chosen = jax.jit(local_cov), set(np.asarray(state.slot))
+    found = np.asarray(jax.jit(blanket_marginals)(state)[1])
+    cov_of, chosen = jax.jit(blanket_cov), set(np.asarray(state.active))
     neighbours = np.asarray(state.neighbours)
     for slot in np.flatnonzero(state.alive):
         at = [0, 1, 2, 3 + 2 * slot, 4 + 2 * slot]
@@ -246,7 +250,7 @@ def test_sparsification_is_overconfident():
     root = rng.normal(size=(9, 9))
     omega = root @ root.T + 0.1 * np.eye(9)
     gone = np.array([False, False, True])
-    sparsify = jax.jit(sparsification.sparsified)
+    sparsify = jax.jit(sparsification.sparsify)
     after, nats = sparsify(omega, gone)
     after = np.asarray(after)
     assert np.linalg.eigvalsh(after)[0] > 0
@@ -281,25 +285,25 @@ def test_sparsification_of_some_is_overconfident_about_the_rest():
     assert smaller == 20
 
 
-def test_springs():
+def test_the_least_psd_completion_of_a_link():
     rng = np.random.default_rng(0)
     links = [*rng.normal(size=(20, 2, 2)), np.zeros((2, 2)), np.outer([1.0, 2.0], [3.0, 1.0])]
-    spring = jax.jit(sparsification.spring)
+    completion = jax.jit(sparsification.psd_completion)
     for link in links:
-        u, v = (np.asarray(part) for part in spring(link))
+        u, v = (np.asarray(part) for part in completion(link))
         np.testing.assert_allclose(u @ u, link @ link.T, atol=1e-12)
         np.testing.assert_allclose(v @ v, link.T @ link, atol=1e-12)
         assert np.linalg.eigvalsh(np.block([[u, link], [link.T, v]]))[0] > -1e-12
-    slope = jax.jit(jax.grad(lambda b: sparsification.spring(b)[0].sum()))(np.zeros((2, 2)))
+    slope = jax.jit(jax.grad(lambda b: sparsification.psd_completion(b)[0].sum()))(np.zeros((2, 2)))
     assert np.isfinite(slope).all()
 
 
 @pytest.mark.parametrize("conservative", [False, True])
 def test_a_full_list_drops_its_weakest_link(conservative):
     """Three links enter a list of two: the weakest goes, on both sides, and Ω̃ ⪰ Ω, or ⪯."""
-    state = jax.jit(lambda: sparse_state.empty(jnp.zeros(3), jnp.eye(3), 5, 1, 2))()
-    state = state._replace(own=100.0 * np.asarray(state.own))
-    enter = jax.jit(functools.partial(sparsification.linked, conservative=conservative))
+    state = jax.jit(lambda: sparse_state.empty_map(jnp.zeros(3), jnp.eye(3), 5, 1, 2))()
+    state = state._replace(diagonal=100.0 * np.asarray(state.diagonal))
+    enter = jax.jit(functools.partial(link_lists.enter_link, conservative=conservative))
     link = np.array([[-2.0, 0.5], [0.1, -1.0]])
     yes = np.array(True)
     at = [np.array(k) for k in range(5)]
@@ -325,7 +329,7 @@ def test_a_full_list_drops_its_weakest_link(conservative):
     norm = np.linalg.norm(np.asarray(link))
     np.testing.assert_allclose(state.counts.dropped_links, 1.1 * norm)
     # where the conservative way would take too much, it is not taken
-    weak = state._replace(own=np.tile(0.5 * np.eye(2), (5, 1, 1)))
+    weak = state._replace(diagonal=np.tile(0.5 * np.eye(2), (5, 1, 1)))
     weak = enter(weak, at[0], at[4], 0.5 * link, yes)
     assert int(weak.counts.anchored) == (1 if conservative else 3)
 
@@ -333,7 +337,7 @@ def test_a_full_list_drops_its_weakest_link(conservative):
 def test_few_links_stay_definite_and_are_counted():
     state = driven(links=8)
     assert int(state.counts.dropped) > 0
-    assert int(state.counts.broken) == 0
+    assert int(state.counts.refused) == 0
     omega = whole_information(state).toarray()
     np.testing.assert_array_equal(omega, omega.T)
     assert np.linalg.eigvalsh(omega)[0] > 0
@@ -352,7 +356,7 @@ def test_statuses_of_strange_scans():
     tag[there[0]] = tag[there[2]]
     after, info = update(state, scan._replace(tag=jnp.asarray(tag)), KEY)
     assert int(info.status[there[2]]) == Status.REPEATED
-    assert int(after.counts.broken) == 0
+    assert int(after.counts.refused) == 0
 
 
 def test_lost_definiteness_is_refused_and_counted():
@@ -361,7 +365,7 @@ def test_lost_definiteness_is_refused_and_counted():
     _, scan = list(rows(11))[-1]
     bad = state._replace(omega=state.omega.at[0, 0].set(-1.0))
     after, info = update(bad, scan, KEY)
-    assert int(after.counts.broken) == 1
+    assert int(after.counts.refused) == 1
     np.testing.assert_array_equal(after.pose, bad.pose)
     status = np.asarray(info.status)[np.asarray(scan.valid)]
     assert np.all(status == Status.SINGULAR)
@@ -382,7 +386,7 @@ def test_float32_keeps_its_type_and_its_definiteness():
         wide, _ = update(predict(wide, u, KEY), scan, KEY)
     kinds = {leaf.dtype for leaf in jax.tree.leaves(state)}
     assert kinds == {jnp.dtype("float32"), jnp.dtype("int32"), jnp.dtype("bool")}
-    assert int(state.counts.broken) == 0
+    assert int(state.counts.refused) == 0
     np.testing.assert_allclose(state.pose, wide.pose, atol=1e-2)
 
 
