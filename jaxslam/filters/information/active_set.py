@@ -6,7 +6,8 @@ waits until there is none.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jax import Array
+from jaxtyping import Bool, Int
 
 from jaxslam import slots
 from jaxslam.filters.information.link_lists import enter_link, enter_links
@@ -64,12 +65,12 @@ def deactivate(
     entered = leaving[order][:, None] & (state.active < n)[None, :] & ~earlier.any(axis=1)
     entered = entered & (order[:, None] != every[None, :])
 
-    def enter_pair(state: SparseState, of: tuple[jax.Array, ...]) -> tuple[SparseState, None]:
+    def enter_pair(state: SparseState, of: tuple[Array, ...]) -> tuple[SparseState, None]:
         a, b, on = of
         pair = state.active[a], state.active[b]
         return enter_link(state, *pair, blocks[a, b], on, conservative), None
 
-    def enter_row(state: SparseState, of: tuple[jax.Array, ...]) -> tuple[SparseState, None]:
+    def enter_row(state: SparseState, of: tuple[Array, ...]) -> tuple[SparseState, None]:
         a, on = of
         return enter_links(state, state.active[a], state.active, blocks[a], on), None
 

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.derivatives import observe_jacobians
@@ -29,7 +30,7 @@ from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import gaussian_terms, log_density
 from jaxslam.protocols import Filter, Motion, Sensor
-from jaxslam.types import Info, Scan
+from jaxslam.types import Estimate, Info, Scan
 
 
 class CanonicalInnovations(NamedTuple):
@@ -239,7 +240,7 @@ def initialize_landmarks(
 def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
     """Ω with √eps of its diagonal added: what is tried where rounding has made it indefinite."""
     share = math.sqrt(float(jnp.finfo(omega.dtype).eps))
-    load: jax.Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
+    load: Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
     return omega + load
 
 
@@ -256,21 +257,19 @@ def report(
     association: TagAssociation,
     of: CanonicalInnovations,
     initialized: Bool[Array, "M"],
-    *,
-    postponed: Bool[Array, "M"] | None = None,
-    deferred: Bool[Array, "M"] | None = None,
+    waiting: Bool[Array, "M"] | None = None,
 ) -> Info:
-    """The info of a scan; postponed and deferred as `reporting.status_of` has them."""
+    """The info of a scan; measurements of landmarks that are waiting are deferred."""
     status = status_of(
         scan.valid,
         matched=association.known,
         positive=of.positive,
         inside=of.inside,
-        postponed=postponed,
+        postponed=waiting,
         new=association.new,
         repeated=association.repeated,
         granted=initialized,
-        deferred=deferred,
+        deferred=waiting,
         singular=association.has_slot,
     )
     return info_of(
@@ -288,12 +287,12 @@ def report(
 
 def information_filter(
     settings: InformationSettings,
-    init: Callable[..., Any],
-    predict: Callable[..., Any],
-    update: Callable[..., Any],
-    estimate: Callable[..., Any],
+    init: Callable[[Array, Array], Any],
+    predict: Callable[[Any, Array, Array], Any],
+    update: Callable[[Any, Scan, Array], tuple[Any, Info]],
+    estimate: Callable[[Any], Estimate],
 ) -> Filter:
-    """The `Filter` of these functions; its error coordinates are those of the map."""
+    """The `Filter` of these functions, with its error in map coordinates."""
     return Filter(
         name=settings.name,
         control_size=len(settings.motion.controls),

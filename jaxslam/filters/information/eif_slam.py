@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.beliefs import moments
@@ -68,7 +68,7 @@ def eif_slam(
     """
     settings = InformationSettings("eif_slam", motion, sensor, capacity, gate, floor)
 
-    def init(pose: jax.Array, pose_cov: jax.Array) -> CanonicalState:
+    def init(pose: Array, pose_cov: Array) -> CanonicalState:
         size = len(sensor.landmark)
         d = 3 + capacity * size
         information = canonical.initial_information(pose_cov, floor).astype(pose.dtype)
@@ -82,13 +82,13 @@ def eif_slam(
             refused=jnp.zeros((), jnp.int32),
         )
 
-    def predict(state: CanonicalState, u: jax.Array, key: jax.Array) -> CanonicalState:
+    def predict(state: CanonicalState, u: Array, key: Array) -> CanonicalState:
         pose, omega, residual = canonical.motion_update(
             motion, state.pose, u, state.omega, state.residual
         )
         return state._replace(pose=pose, omega=omega, residual=residual)
 
-    def update(state: CanonicalState, scan: Scan, key: jax.Array) -> tuple[CanonicalState, Info]:
+    def update(state: CanonicalState, scan: Scan, key: Array) -> tuple[CanonicalState, Info]:
         measured = associate_by_table(state.tag, state.alive, scan)
         innovations = canonical.innovations(
             settings, state.omega, state.pose, state.landmarks, scan, measured.slot, measured.known

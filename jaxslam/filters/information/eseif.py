@@ -1,8 +1,8 @@
 """The exactly sparse extended information filter: sparse because the robot is relocated."""
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jax import Array
+from jaxtyping import Bool, Int
 
 from jaxslam.filters.information import canonical
 from jaxslam.filters.information.active_set import (
@@ -109,20 +109,20 @@ def eseif(
         wait=wait,
     )
 
-    def update(state: SparseState, scan: Scan, key: jax.Array) -> tuple[SparseState, Info]:
+    def update(state: SparseState, scan: Scan, key: Array) -> tuple[SparseState, Info]:
         check_scan_size(settings, scan)
         state = recover_passive_means(state, settings.recovered)
         measured = associate_by_index(state.alive, scan)
         matches = active_matches(state, measured)
-        state, first, relocated = relocate_or_correct(settings, state, scan, measured, matches)
-        state, index, entered = activate_others(settings, state, measured, matches, relocated)
+        state, first, solved = relocate_or_correct(settings, state, scan, measured, matches)
+        state, index, entered = activate_others(settings, state, measured, matches, solved)
         active, late = matches.any(axis=1) | entered, measured.known & entered
         second = canonical.innovations(
             settings, state.omega, state.pose, active_means(state), scan, index, late
         )
         omega, residual = canonical.measurement_update(state.omega, active_residual(state), second)
         state, corrected = recover_active_means(state, omega, residual, second.omega_positive)
-        solved = relocated & corrected
+        solved = solved & corrected
         state = repeat_recovery(settings, state, omega, solved)
         omega, landmarks, initialized = canonical.initialize_landmarks(
             sensor, omega, state.pose, scan.z, index, active & measured.new & solved
@@ -130,16 +130,9 @@ def eseif(
         state = enter_landmarks(state, measured.slot, landmarks, initialized)
         state = finish_scan(state, scan, index, active, omega, solved)
         waiting = measured.has_slot & ~active
-        innovations = merge_passes(first, canonical.refuse_unless(corrected, second), late)
-        innovations = postpone(innovations, waiting & measured.known, solved)
-        return state, canonical.report(
-            scan,
-            measured,
-            innovations,
-            initialized,
-            postponed=waiting & measured.known,
-            deferred=waiting & solved,
-        )
+        second = canonical.refuse_unless(corrected, second)
+        innovations = merge_passes(first, second, late, waiting, solved)
+        return state, canonical.report(scan, measured, innovations, initialized, waiting & solved)
 
     return sparse_filter(settings, update)
 
@@ -179,31 +172,27 @@ def activate_others(
 
 
 def merge_passes(
-    first: CanonicalInnovations, second: CanonicalInnovations, late: Bool[Array, "M"]
+    first: CanonicalInnovations,
+    second: CanonicalInnovations,
+    late: Bool[Array, "M"],
+    waiting: Bool[Array, "M"],
+    solved: Bool[Array, ""],
 ) -> CanonicalInnovations:
-    """The second pass's innovations where late, else the first's. The whitened rows, of which
-    nothing is left to do, and Ω's flag are the first's."""
+    """For the report, the second pass's innovations where late, else the first's.
 
-    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+    Those of landmarks that wait are to be deferred, not rejected: they count as inside the gate,
+    and as singular only where the scan could not be solved for. Whitened rows are the first's.
+    """
+
+    def pick(a: Array, b: Array) -> Array:
         return jnp.where(late.reshape(-1, *[1] * (a.ndim - 1)), b, a)
 
-    of_measurements = (
-        "compared",
-        "positive",
-        "inside",
-        "innovation",
-        "innovation_cov",
-        "nis",
-        "log_likelihood",
-    )
     return first._replace(
-        **{name: pick(getattr(first, name), getattr(second, name)) for name in of_measurements}
+        compared=pick(first.compared, second.compared),
+        positive=jnp.where(waiting, solved, pick(first.positive, second.positive)),
+        inside=pick(first.inside, second.inside) | waiting,
+        innovation=pick(first.innovation, second.innovation),
+        innovation_cov=pick(first.innovation_cov, second.innovation_cov),
+        nis=pick(first.nis, second.nis),
+        log_likelihood=pick(first.log_likelihood, second.log_likelihood),
     )
-
-
-def postpone(
-    of: CanonicalInnovations, waiting: Bool[Array, "M"], solved: Bool[Array, ""]
-) -> CanonicalInnovations:
-    """Innovations of landmarks that wait count as inside the gate, and as singular only where the
-    scan could not be solved for: they are to be deferred, not rejected."""
-    return of._replace(positive=jnp.where(waiting, solved, of.positive), inside=of.inside | waiting)

@@ -1,8 +1,8 @@
 """Entering links in the lists of a `SparseState`; a full list drops its weakest link."""
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information.sparse_state import SparseState
 from jaxslam.filters.information.sparsification import drop_link
@@ -27,7 +27,7 @@ def enter_link(
     on = on & (size > 0)
     i, j = jnp.where(on, i, n), jnp.where(on, j, n)
 
-    def weakest(of: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    def weakest(of: Array) -> tuple[Array, Array, Array, Array]:
         row = state.neighbours.at[of].get(mode="fill", fill_value=n)
         links = state.links.at[of].get(mode="fill", fill_value=0)
         weight = jnp.where(row < n, (links**2).sum(axis=(1, 2)), -1.0)

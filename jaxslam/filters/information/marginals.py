@@ -7,14 +7,13 @@ far below it where a whole map has drifted, since what lies outside is held at i
 blanket postpones this, and does not end it. For consistency take `whole_marginals`.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-from jaxtyping import Array, Float, Int
+from jax import Array
+from jaxtyping import Float, Int
 
 from jaxslam.filters.information.sparse_state import SparseState, landmark_blocks
 from jaxslam.math import linalg
@@ -24,21 +23,21 @@ from jaxslam.math.angles import wrap
 def information_of(state: SparseState, slot: Int[Array, "B"]) -> Float[Array, "D D"]:
     """Ω of the robot and the landmarks of these slots, D = 3 + 2B; N for none, no slot twice."""
     n, count = state.alive.shape[0], slot.shape[0]
-    there = slot < n
+    present = slot < n
     rows = state.neighbours.at[slot].get(mode="fill", fill_value=n)
     links = state.links.at[slot].get(mode="fill", fill_value=0)
-    match = (rows[:, :, None] == slot[None, None, :]) & there[None, None, :]
+    match = (rows[:, :, None] == slot[None, None, :]) & present[None, None, :]
     blocks = jnp.einsum("bkij,bkc->bcij", links, match.astype(links.dtype))
-    at = (slot[:, None] == state.active[None, :]) & there[:, None]
-    active, place = at.any(axis=1), jnp.argmax(at, axis=1)
-    area = landmark_blocks(state.omega)[place][:, place]
+    at = (slot[:, None] == state.active[None, :]) & present[:, None]
+    active, index = at.any(axis=1), jnp.argmax(at, axis=1)
     both = active[:, None] & active[None, :]
-    blocks = blocks + jnp.where(both[:, :, None, None], area, 0.0)
-    own = state.diagonal.at[slot].get(mode="fill", fill_value=0)
-    own = jnp.where(there[:, None, None], own, jnp.eye(2, dtype=own.dtype)[None])
+    dense = landmark_blocks(state.omega)[index][:, index]
+    blocks = blocks + jnp.where(both[:, :, None, None], dense, 0.0)
+    passive = state.diagonal.at[slot].get(mode="fill", fill_value=0)
+    passive = jnp.where(present[:, None, None], passive, jnp.eye(2, dtype=passive.dtype)[None])
     every = jnp.arange(count)
-    blocks = blocks.at[every, every].add(jnp.where(active[:, None, None], 0.0, own))
-    robot = state.omega[:3, 3:].reshape(3, -1, 2)[:, place]
+    blocks = blocks.at[every, every].add(jnp.where(active[:, None, None], 0.0, passive))
+    robot = state.omega[:3, 3:].reshape(3, -1, 2)[:, index]
     robot = jnp.where(active[None, :, None], robot, 0.0).reshape(3, 2 * count)
     flat = blocks.transpose(0, 2, 1, 3).reshape(2 * count, 2 * count)
     top = jnp.concatenate([state.omega[:3, :3], robot], axis=1)
@@ -79,34 +78,35 @@ def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Arra
     return cov[:3, :3], points
 
 
-def whole_information(state: SparseState) -> Any:
-    """Ω of robot and all N landmarks, (3 + 2N, 3 + 2N), a `scipy.sparse` matrix; not traceable."""
-    slot = np.asarray(state.active)
-    n, at = len(state.diagonal), np.flatnonzero(slot < len(state.diagonal))
+def whole_information(state: SparseState) -> scipy.sparse.csc_array:
+    """Ω of robot and all N landmarks, (3 + 2N, 3 + 2N); not traceable."""
+    active = np.asarray(state.active)
+    n, index = len(state.alive), np.flatnonzero(active < len(state.alive))
+    slot, passive = active[index], np.setdiff1d(np.arange(n), active)
     rows, columns, values = [], [], []
 
-    def add(first: Any, second: Any, blocks: Any) -> None:
+    def add(first: np.ndarray, second: np.ndarray, blocks: np.ndarray) -> None:
         """Blocks (m, 2, 2) at landmarks first (m,), second (m,)."""
-        i = 3 + 2 * np.asarray(first)[:, None, None] + np.arange(2)[None, :, None]
-        j = 3 + 2 * np.asarray(second)[:, None, None] + np.arange(2)[None, None, :]
+        i = 3 + 2 * first[:, None, None] + np.arange(2)[None, :, None]
+        j = 3 + 2 * second[:, None, None] + np.arange(2)[None, None, :]
         rows.append(np.broadcast_to(i, blocks.shape).ravel())
         columns.append(np.broadcast_to(j, blocks.shape).ravel())
-        values.append(np.asarray(blocks).ravel())
+        values.append(blocks.ravel())
 
-    rest = np.setdiff1d(np.arange(n), slot[at])
-    add(rest, rest, np.asarray(state.diagonal)[rest])
-    index = np.asarray(state.neighbours)
-    first, column = np.nonzero(index < n)
-    add(first, index[first, column], np.asarray(state.links)[first, column])
-    area = np.asarray(landmark_blocks(state.omega))[at][:, at]
-    one, two = (m.ravel() for m in np.meshgrid(slot[at], slot[at], indexing="ij"))
-    add(one, two, area.reshape(-1, 2, 2))
-    omega = np.asarray(state.omega)
-    own = 3 + (2 * slot[at][:, None] + np.arange(2)).ravel()
-    in_area = 3 + (2 * at[:, None] + np.arange(2)).ravel()
-    robot = np.concatenate([np.arange(3), own])
-    i, j = (m.ravel() for m in np.meshgrid(np.arange(3), robot, indexing="ij"))
-    top = omega[:3][:, np.concatenate([np.arange(3), in_area])].ravel()
+    add(passive, passive, np.asarray(state.diagonal)[passive])
+    neighbours = np.asarray(state.neighbours)
+    first, column = np.nonzero(neighbours < n)
+    add(first, neighbours[first, column], np.asarray(state.links)[first, column])
+    dense = np.asarray(landmark_blocks(state.omega))[index][:, index]
+    one, two = (m.ravel() for m in np.meshgrid(slot, slot, indexing="ij"))
+    add(one, two, dense.reshape(-1, 2, 2))
+    # The robot's rows and columns: its own block, and its links to the active landmarks.
+    own, linked = (3 + (2 * k[:, None] + np.arange(2)).ravel() for k in (slot, index))
+    i, j = (
+        m.ravel()
+        for m in np.meshgrid(np.arange(3), np.concatenate([np.arange(3), own]), indexing="ij")
+    )
+    top = np.asarray(state.omega)[:3][:, np.concatenate([np.arange(3), linked])].ravel()
     beside = j >= 3
     rows += [i, j[beside]]
     columns += [j, i[beside]]

@@ -6,7 +6,8 @@ that of the landmarks it is linked to: ρ_j ← ρ_j - Ω_ji δ_i. Ω and ξ = �
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information import canonical
 from jaxslam.filters.information.settings import SparseSettings
@@ -40,7 +41,7 @@ def recover_passive_means(state: SparseState, count: int) -> SparseState:
     """The means of the next `count` landmarks, those that are passive, one after the other."""
     n = state.alive.shape[0]
 
-    def recover_one(state: SparseState, i: jax.Array) -> tuple[SparseState, None]:
+    def recover_one(state: SparseState, i: Array) -> tuple[SparseState, None]:
         slot = (state.next_recovered + i) % n
         step, positive = linalg.solve_psd(state.diagonal[slot], state.landmark_residual[slot])
         on = state.alive[slot] & positive & ~(state.active == slot).any()

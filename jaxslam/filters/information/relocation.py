@@ -1,4 +1,4 @@
-"""Relocation, what `eseif` does in place of sparsification: the pose is forgotten and found anew.
+"""Relocation, what `eseif` does in place of sparsification: the pose is estimated anew.
 
 With z_β the scan's measurements of active landmarks, the pose is marginalized out of the active
 block, and estimated from z_β alone:
@@ -10,7 +10,8 @@ What is given up is what odometry said between map and z_β, so Ω claims no mor
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jax import Array
+from jaxtyping import Bool, Float
 
 from jaxslam.filters.information import canonical
 from jaxslam.filters.information.canonical import CanonicalInnovations

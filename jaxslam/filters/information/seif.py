@@ -1,8 +1,8 @@
 """The sparse extended information filter: a step costs the same in a map of any size."""
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jax import Array
+from jaxtyping import Int
 
 from jaxslam.filters.information import canonical
 from jaxslam.filters.information.active_set import (
@@ -47,7 +47,7 @@ def seif(
     """Sparse extended information filter (Thrun et al. 2004; the Notes, corrected by ERRATA).
 
     The robot is linked to at most `active` landmarks, the most recent ones, each landmark to at
-    most `links` others. Four steps, none of which touches the rest of a `Sparse` map:
+    most `links` others. Four steps, none of which touches the rest of the map:
 
     1. motion update (`canonical.motion_update`), of the robot and the active landmarks;
     2. sparsification (`sparsification.sparsify`): the least recently measured active landmarks
@@ -99,7 +99,7 @@ def seif(
         whole=whole,
     )
 
-    def update(state: SparseState, scan: Scan, key: jax.Array) -> tuple[SparseState, Info]:
+    def update(state: SparseState, scan: Scan, key: Array) -> tuple[SparseState, Info]:
         check_scan_size(settings, scan)
         state = recover_passive_means(state, settings.recovered)
         measured = associate_by_index(state.alive, scan)

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information import canonical
 from jaxslam.filters.information.marginals import blanket_marginals, whole_marginals
@@ -18,17 +18,17 @@ from jaxslam.filters.information.sparse_state import (
 from jaxslam.protocols import Filter
 from jaxslam.types import Estimate, Info, Scan
 
-Update = Callable[[SparseState, Scan, jax.Array], tuple[SparseState, Info]]
+Update = Callable[[SparseState, Scan, Array], tuple[SparseState, Info]]
 
 
 def sparse_filter(settings: SparseSettings, update: Update) -> Filter:
     """The filter of an update of a `SparseState`."""
 
-    def init(pose: jax.Array, pose_cov: jax.Array) -> SparseState:
+    def init(pose: Array, pose_cov: Array) -> SparseState:
         information = canonical.initial_information(pose_cov, settings.floor).astype(pose.dtype)
         return empty_map(pose, information, settings.capacity, settings.active_size, settings.links)
 
-    def predict(state: SparseState, u: jax.Array, key: jax.Array) -> SparseState:
+    def predict(state: SparseState, u: Array, key: Array) -> SparseState:
         pose, omega, residual = canonical.motion_update(
             settings.motion, state.pose, u, state.omega, active_residual(state)
         )

@@ -9,7 +9,8 @@ dense block, and no array of N landmarks is read or written but at a few rows.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 
 class ApproximationCounts(NamedTuple):

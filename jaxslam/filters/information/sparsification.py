@@ -13,7 +13,8 @@
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information.sparse_state import (
     ApproximationCounts,

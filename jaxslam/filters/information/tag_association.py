@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jax import Array
+from jaxtyping import Bool, Int
 
 from jaxslam import slots
 from jaxslam.filters.reporting import seen_before

@@ -7,10 +7,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dense_form import (
+    COUNT,
+    at,
+    canonical,
+    close,
+    dense,
+    dtypes,
+    h_of,
+    initialized,
+    measured,
+    narrow,
+)
 
 from jaxslam import filters, motion, sensors
 from jaxslam.filters.information import sparsification
-from jaxslam.filters.information.marginals import information_of
 from jaxslam.filters.information.mean_recovery import recover_passive_means
 from jaxslam.filters.information.relocation import determines_pose, marginalize_pose
 from jaxslam.filters.information.sparse_state import linked_to_robot
@@ -21,7 +32,7 @@ from jaxslam.types import Status
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.01, 0.01, 0.005]) ** 2
-COUNT, STEPS, RUNS = 36, 60, 12
+STEPS, RUNS = 60, 12
 ODOMETRY = np.diag([0.002, 0.004]) ** 2  # good, so that the robot's links last
 NOISE = np.diag([0.1, np.deg2rad(2.0)]) ** 2
 MODELS = motion.increment(ODOMETRY), sensors.range_bearing(NOISE), COUNT
@@ -69,31 +80,6 @@ def rows(run=0, upto=STEPS):
     log = jax.tree.map(lambda leaf: leaf[run], logs()[1])
     for t in range(upto):
         yield log.control[t], jax.tree.map(lambda leaf: leaf[t], log.scan)
-
-
-dense = jax.jit(lambda state: information_of(state, jnp.arange(COUNT)))
-
-
-def at(slots, robot=True):
-    """Rows of robot and landmarks in Ω."""
-    return np.array(([0, 1, 2] if robot else []) + [3 + 2 * s + k for s in slots for k in (0, 1)])
-
-
-def h_of(pose, point, slot):
-    """(2, D) of range and bearing, and what is expected."""
-    dx, dy = point - pose[:2]
-    q = dx * dx + dy * dy
-    r = np.sqrt(q)
-    h = np.zeros((2, 3 + 2 * COUNT))
-    h[:, at([slot])] = [
-        [-dx / r, -dy / r, 0, dx / r, dy / r],
-        [dy / q, -dx / q, -1, -dy / q, dx / q],
-    ]
-    return h, np.array([r, np.arctan2(dy, dx) - pose[2]])
-
-
-def close(a, b, tolerance=1e-8):
-    np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.abs(b).max())
 
 
 def least(matrix):
@@ -147,10 +133,7 @@ def test_every_step_is_the_dense_formula():
     for u, scan in there + back:
         before = jax.device_get(relax(predict(state, u, KEY)))
         state, info = jax.device_get(step(state, u, scan))
-        omega = np.array(dense(before))
-        residual = np.concatenate([before.pose_residual, np.ravel(before.landmark_residual)])
-        mean = np.concatenate([before.pose, np.ravel(before.landmarks)])
-        xi = omega @ mean + residual
+        omega, xi, mean = canonical(before)
         active = sorted(set(np.asarray(before.active)) - {COUNT})
         status = np.asarray(info.status)
         fused = np.flatnonzero(status == Status.FUSED)
@@ -168,14 +151,10 @@ def test_every_step_is_the_dense_formula():
                 if (slot in active) is not known:
                     continue
                 late += not known
-                h, expected = h_of(mean[:3], mean[at([slot], robot=False)], slot)
-                nu = np.asarray(scan.z[i]) - expected
-                nu[1] = np.angle(np.exp(1j * nu[1]))
-                more = h.T @ np.linalg.inv(NOISE)
-                omega, xi = omega + more @ h, xi + more @ (nu + h @ mean)
+                omega, xi, h = measured(omega, xi, mean, scan, i, NOISE)
                 if relocated:
-                    full = full + more @ h
-            # the area moves to where its block says, with all others where they are
+                    full = full + h.T @ np.linalg.inv(NOISE) @ h
+            # the active block moves to its mean, all others held where they are
             here = at(active) if known else at(sorted(set(np.asarray(state.active)) - {COUNT}))
             left = xi - omega @ mean
             if known:
@@ -184,17 +163,10 @@ def test_every_step_is_the_dense_formula():
             assert least(full - omega) > -1e-9
         mean = np.concatenate([state.pose, np.ravel(state.landmarks)])
         for i in np.flatnonzero(status == Status.BORN):
-            slot = int(scan.tag[i])
-            h, _ = h_of(mean[:3], mean[at([slot], robot=False)], slot)
-            more = h.T @ np.linalg.inv(NOISE) @ h
-            omega, xi = omega + more, xi + more @ mean
-            own = at([slot], robot=False)
-            omega[own, own] -= 1.0  # padding
-        close(np.asarray(dense(state)), omega)
-        xi_after = np.asarray(dense(state)) @ mean + np.concatenate(
-            [state.pose_residual, np.ravel(state.landmark_residual)]
-        )
-        close(np.asarray(xi_after), xi, 1e-6)
+            omega, xi = initialized(omega, xi, mean, int(scan.tag[i]), NOISE)
+        omega_after, xi_after, _ = canonical(state)
+        close(omega_after, omega)
+        close(xi_after, xi, 1e-6)
         ties = np.flatnonzero(np.abs(omega[:3, 3:]).max(axis=0).reshape(-1, 2).max(axis=1))
         assert len(ties) <= 9
     assert relocations >= 2 and late > 2
@@ -335,16 +307,10 @@ def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
 def test_float32_gradients_and_a_lost_area():
     f, step, *_ = made("eseif", **AREA)
 
-    def narrow(tree):
-        return jax.tree.map(
-            lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, tree
-        )
-
     state = start(f, jnp.float32)
     for u, scan in rows(run=1):
         state, info = step(state, narrow(u), narrow(scan))
-    kinds = {leaf.dtype for leaf in jax.tree.leaves(state)}
-    assert kinds == {jnp.dtype("float32"), jnp.dtype("int32"), jnp.dtype("bool")}
+    assert dtypes(state) == {"float32", "int32", "bool"}
     assert int(state.counts.refused) == 0 and int(state.counts.relocated) > 0
     omega = np.array(state.omega)
     omega[0, 0] = -1.0
