@@ -82,7 +82,7 @@ def sparse(points, make):
     return filter, state._replace(
         landmarks=jnp.asarray(points),
         alive=jnp.ones(count, bool),
-        own=jnp.broadcast_to(200.0 * jnp.eye(2), state.own.shape),
+        diagonal=jnp.broadcast_to(200.0 * jnp.eye(2), state.diagonal.shape),
         neighbours=jnp.asarray(index),
         links=jnp.asarray(links),
     )

@@ -1,12 +1,13 @@
 """The sparse information filters: `python -m benchmarks.seif [--runs 10] [--steps 300] [--park]`.
 
 SEIF and the exactly sparse ESEIF beside the EKF, on the same draws of `circle` and of a cloister
-seen 3 m far: their maps, and their honesty, by the covariances of Markov blankets that they report
-unless told otherwise and by the whole of their Ω. --park: Victoria Park instead, where there is no
-truth: their maps, aligned, from the batch solution's, against the EKF's from it. There a scan has
-two places and a loop hundreds of scans, and what decides is mean recovery: with the ten landmarks a
-scan of the default most means lag behind, and models are linearized at them. So each filter runs
-with `passive` 10 and 150, all landmarks. What a step costs is in `benchmarks.scaling`.
+seen 3 m far: the errors of their maps, and their NEES, by the Markov-blanket marginals that they
+report unless told otherwise and by the whole of their Ω. --park: Victoria Park instead, where there
+is no ground truth: the distance of their maps, aligned, from the batch solution's, against the
+EKF's. There a scan has two measurements and a loop hundreds of scans, and mean recovery decides:
+with the ten landmarks a scan of the default most means lag behind, and models are linearized at
+them. So each filter runs with `passive` 10 and 150, all landmarks. What a step costs is in
+`benchmarks.scaling`.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, report
 from jaxslam import datasets, filters
-from jaxslam.filters.information.marginals import marginals, whole_marginals
+from jaxslam.filters.information.marginals import blanket_marginals, whole_marginals
 from jaxslam.math.linalg import mahalanobis_squared
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.simulation.scenarios.view import between_ranges
@@ -47,10 +48,10 @@ def driven(filter, start, log):
     return final, states, path.reshape(-1, 3), status.reshape(whole, -1)
 
 
-def believed(state):
-    """Points (N, 2) by tag, which are there, and (pose_cov, point_covs) as reported and whole."""
+def estimated_map(state):
+    """Points (N, 2) by tag, which exist, and (pose_cov, point_covs) as reported and whole."""
     if hasattr(state, "links"):
-        return state.landmarks, state.alive, (marginals(state), whole_marginals(state))
+        return state.landmarks, state.alive, (blanket_marginals(state), whole_marginals(state))
     count = len(state.tag)
     slot = jnp.argmax(state.tag[None, :] == jnp.arange(count)[:, None], axis=1)
     alive = (state.tag[None, :] == jnp.arange(count)[:, None]).any(axis=1)
@@ -59,14 +60,14 @@ def believed(state):
     return state.landmarks[slot], alive, ((state.cov[:3, :3], covs),) * 2
 
 
-def judged(world, runs: int, candidates) -> dict[str, dict[str, float]]:
+def errors_and_nees(world, runs: int, candidates) -> dict[str, dict[str, float]]:
     """RMSE of position and of the map at the end, and NEES of pose and of the landmarks."""
     start = jnp.asarray(world.pose, float), jnp.asarray(world.pose_cov)
 
     def look(state, pose, landmarks):
         error = pose - state.pose
         error = error.at[2].set((error[2] + jnp.pi) % (2 * jnp.pi) - jnp.pi)
-        points, alive, both = believed(state)
+        points, alive, both = estimated_map(state)
         off = jnp.where(alive[:, None], landmarks - points, 0.0)
         nees = []
         for pose_cov, covs in both:
@@ -103,7 +104,7 @@ def judged(world, runs: int, candidates) -> dict[str, dict[str, float]]:
         }
         if counts:
             mean = {k: float(np.mean(v)) for k, v in counts._asdict().items()}
-            out[name] |= {k: mean[k] for k in ("cut", "relocated", "dropped", "broken")}
+            out[name] |= {k: mean[k] for k in ("cut", "relocated", "dropped", "refused")}
             out[name]["deferred"] = float(np.mean(deferred))
         row = "  ".join(f"{k} {v:.4g}" for k, v in out[name].items())
         print(f"  {name:18}{row}", flush=True)
@@ -118,9 +119,11 @@ def compared(world, runs, setups) -> dict[str, dict[str, float]]:
     for active, links in setups:
         for name, make in (("SEIF", filters.seif), ("ESEIF", filters.eseif)):
             candidates[f"{name}, {active} active"] = make(*models, active=active, links=links)
-    print(f"\n{world.name}, {runs} runs of {world.steps} steps; honest: NEES 3 of a pose, 2 of a")
-    print("landmark, with the errors of linearization more, as the EKF's")
-    return judged(world, runs, candidates)
+    print(
+        f"\n{world.name}, {runs} runs of {world.steps} steps; a consistent filter has a NEES of 3"
+    )
+    print("of a pose and 2 of a landmark; errors of linearization add to it, as to the EKF's")
+    return errors_and_nees(world, runs, candidates)
 
 
 def measure(runs: int = 10, steps: int = 300) -> list[Metric]:
@@ -142,7 +145,7 @@ def measure(runs: int = 10, steps: int = 300) -> list[Metric]:
             share = row["map RMSE [m]"] / ekf
             metrics += [
                 Metric(f"{filter}, 20 active, map RMSE by EKF's, {name}", share, high=1.1),
-                Metric(f"{filter}, scans refused, {name}", row["broken"], high=0.0),
+                Metric(f"{filter}, scans refused, {name}", row["refused"], high=0.0),
             ]
     return metrics
 
@@ -177,7 +180,7 @@ def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Me
         start = filter.init(jnp.asarray(data.pose, float), jnp.asarray(data.pose_cov, float))
         drive = jax.jit(lambda log, f=filter, s=start: _final(f, s, log))
         state, path_, deferred = drive(jax.tree.map(jnp.asarray, data.log))
-        points, alive, both = believed(state)
+        points, alive, both = estimated_map(state)
         found[name] = Solution(np.asarray(path_), np.asarray(points))
         spread = [float(jnp.sqrt(jnp.linalg.det(pose[:2, :2]))) for pose, _ in both]
         if not bool(alive.all()):

@@ -1,76 +1,79 @@
-"""The canonical (information) form of a Gaussian over a robot and some landmarks: its atoms.
+"""The canonical (information) form of a Gaussian over a robot and A landmarks: the filter's steps.
 
-The error e = x - μ of robot and A landmarks, D = 3 + A·L, has the information matrix Ω (D, D), the
-inverse of its covariance, and the vector ρ = Ω E[e], what the mean is still *owed*: the textbooks'
-ξ = Ω μ + ρ. Holding ρ instead of ξ changes no equation and spares much: a heading may wrap, a large
-map does not cancel in float32, ρ = 0 says that μ is the mean, and what leaves the mean alone
-(sparsification: ξ̃ = ξ + (Ω̃ - Ω) μ) leaves ρ alone.
+The error e = x - μ, D = 3 + A·L numbers, has the information matrix Ω (D, D), the inverse of its
+covariance, and the information residual ρ = Ω E[e] (D,): the textbooks' information vector is
+ξ = Ω μ + ρ. Holding ρ instead of ξ changes no equation: a heading may wrap, a large map does not
+cancel in float32, ρ = 0 says that μ is the mean, and what leaves the mean alone (sparsification:
+ξ̃ = ξ + (Ω̃ - Ω) μ) leaves ρ alone.
 
-Padding, a place without a landmark: zero mean, zero links, unit diagonal of Ω, zero of ρ.
+Padding, an index without a landmark: zero mean, zero links, unit diagonal of Ω, zero of ρ.
 Sources: Thrun et al., "Simultaneous localization and mapping with sparse extended information
 filters", IJRR 23(7-8), 2004; the Notes, with the corrections of ERRATA.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
+from jaxslam.charts.euclidean import euclidean
 from jaxslam.derivatives import observe_jacobians
+from jaxslam.filters.information.settings import InformationSettings
+from jaxslam.filters.information.tag_association import TagAssociation
 from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Motion, Sensor
-from jaxslam.types import Info, Scan
+from jaxslam.math.gaussians import gaussian_terms, log_density
+from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.types import Estimate, Info, Scan
 
 
-class Weighed(NamedTuple):
-    """What a scan's M measurements say of the errors, in units of their own noise."""
+class CanonicalInnovations(NamedTuple):
+    """Innovations of the M measurements (Z) of a scan, and the information that they bring."""
 
-    rows: jax.Array
-    """(M·Z, D) N⁻¹ H, R = N Nᵀ; zero for what is not fused"""
-    innovation: jax.Array
-    """(M·Z,) N⁻¹ ν of the same"""
-    known: jax.Array
-    """(M,) bool: of a landmark of the map, and compared with it"""
-    positive: jax.Array
-    """(M,) bool: S, R and Ω are positive definite"""
-    inside: jax.Array
-    """(M,) bool: within the gate"""
-    fused: jax.Array
-    """(M,) bool: known, positive and inside"""
-    nu: jax.Array
-    """(M, Z) innovations ν"""
-    s: jax.Array
-    """(M, Z, Z) S of each alone"""
-    nis: jax.Array
-    """(M,) of fused places given those before, of the others alone"""
-    log_likelihood: jax.Array
-    """(M,), 0 where not fused"""
-    sound: jax.Array
-    """() bool: Ω is positive definite"""
+    whitened_jacobian: Float[Array, "MZ D"]
+    """N⁻¹ H, R = N Nᵀ; zero where not fused"""
+    whitened: Float[Array, "MZ"]
+    """N⁻¹ ν of the same"""
+    compared: Bool[Array, "M"]
+    """of a landmark of the map, and compared with it"""
+    positive: Bool[Array, "M"]
+    """S, R and Ω are positive definite"""
+    inside: Bool[Array, "M"]
+    """within the gate"""
+    innovation: Float[Array, "M Z"]
+    """ν"""
+    innovation_cov: Float[Array, "M Z Z"]
+    """S of each alone"""
+    nis: Float[Array, "M"]
+    """of fused measurements given those before, of the others alone"""
+    log_likelihood: Float[Array, "M"]
+    """0 where not fused"""
+    omega_positive: Bool[Array, ""]
+    """Ω is positive definite"""
 
 
-def started(pose_cov: jax.Array, floor: float) -> jax.Array:
-    """P0⁻¹ (3, 3), of P0 + floor² I where P0 is not positive definite: certainty has no inverse."""
+def initial_information(pose_cov: Float[Array, "3 3"], floor: float) -> Float[Array, "3 3"]:
+    """P0⁻¹, of P0 + floor² I where P0 is not positive definite: certainty has no inverse."""
     eye = jnp.eye(3, dtype=pose_cov.dtype)
     positive = linalg.cholesky(pose_cov)[1]
     safe = jnp.where(positive, pose_cov, pose_cov + floor**2 * eye)
     return linalg.symmetrize(linalg.solve_psd(safe, eye)[0])
 
 
-def check_floor(name: str, floor: float) -> None:
-    """Raise ValueError unless the floor is above 0."""
-    if not floor > 0:
-        raise ValueError(f"{name}: expected a floor above 0, got {floor}")
-
-
-def moved(
-    motion: Motion, pose: jax.Array, u: jax.Array, omega: jax.Array, owed: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The motion update: pose (3,), Ω (D, D), ρ (D,) after a control; 3x3 inversions alone.
+def motion_update(
+    motion: Motion,
+    pose: Float[Array, "3"],
+    u: Float[Array, "U"],
+    omega: Float[Array, "D D"],
+    residual: Float[Array, "D"],
+) -> tuple[Float[Array, "3"], Float[Array, "D D"], Float[Array, "D"]]:
+    """Pose, Ω and ρ after a control; 3x3 inversions alone.
 
     With F = ∂f/∂pose and S Sᵀ = W Q Wᵀ (any rank), Φ = F⁻ᵀ Ω F⁻¹ and φ = F⁻ᵀ ρ on the robot's rows,
 
@@ -84,175 +87,219 @@ def moved(
     back = linalg.inverse(by_pose)
     phi = omega.at[:3].set(back.T @ omega[:3])
     phi = phi.at[:, :3].set(phi[:, :3] @ back)
-    owed = owed.at[:3].set(back.T @ owed[:3])
-    seen = root.T @ phi[:3]
-    inner = jnp.eye(3, dtype=omega.dtype) + seen[:, :3] @ root
-    gain = (linalg.inverse(linalg.symmetrize(inner)) @ seen).T
-    left = phi - gain @ seen
+    residual = residual.at[:3].set(back.T @ residual[:3])
+    by_noise = root.T @ phi[:3]
+    inner = jnp.eye(3, dtype=omega.dtype) + by_noise[:, :3] @ root
+    gain = (linalg.inverse(linalg.symmetrize(inner)) @ by_noise).T
+    left = phi - gain @ by_noise
     omega = left - (left[:, :3] @ root) @ gain.T + gain @ gain.T
-    return after, linalg.symmetrize(omega), owed - gain @ (root.T @ owed[:3])
+    return after, linalg.symmetrize(omega), residual - gain @ (root.T @ residual[:3])
 
 
-def rows_at(by_pose: jax.Array, own: jax.Array, place: jax.Array, count: int) -> jax.Array:
-    """(m·k, D) of rows by the pose (m, k, 3) and by the landmark (m, k, L) of a place (m,)."""
-    m, k, size = own.shape
-    at = (place[:, None] == jnp.arange(count)[None, :]).astype(own.dtype)
-    wide = jnp.einsum("mkl,ma->mkal", own, at).reshape(m, k, count * size)
-    return jnp.concatenate([by_pose, wide], axis=2).reshape(m * k, 3 + count * size)
-
-
-def weigh(
-    omega: jax.Array,
-    pose: jax.Array,
-    landmarks: jax.Array,
+def innovations(
+    settings: InformationSettings,
+    omega: Float[Array, "D D"],
+    pose: Float[Array, "3"],
+    landmarks: Float[Array, "A L"],
     scan: Scan,
-    place: jax.Array,
-    known: jax.Array,
-    sensor: Sensor,
-    gate: float | None,
-) -> Weighed:
-    """Measurements z (M, Z) of the landmarks (A, L) in places (M,), where known (M,).
+    index: Int[Array, "M"],
+    known: Bool[Array, "M"],
+) -> CanonicalInnovations:
+    """ν = z ⊖ h(x, l), S = H Ω⁻¹ Hᵀ + R and what of them passes the gate; Ω is factored once.
 
-    NIS and gate are of S = H Ω⁻¹ Hᵀ + R, Ω factored once. A measurement whose R or S is not
-    positive definite does nothing and is `Status.SINGULAR`, as are all where Ω is not.
+    A measurement whose R or S is not positive definite does nothing and is `Status.SINGULAR`, as
+    are all where Ω is not.
+
+    Args:
+        index: which of the landmarks each measurement is of, where known.
     """
-    m, size_z = scan.z.shape
+    sensor, gate = settings.sensor, settings.gate
+    m, size = scan.z.shape
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
-    landmark = landmarks[place]
-    expected = jax.vmap(sensor.observe, (None, 0))(pose, landmark)
-    by_pose, by_own = jax.vmap(lambda at: observe_jacobians(sensor, pose, at))(landmark)
-    nu = jax.vmap(sensor.residual)(z, expected)
+    measured = landmarks[index]
+    predicted = jax.vmap(sensor.observe, (None, 0))(pose, measured)
+    by_pose, by_landmark = jax.vmap(lambda at: observe_jacobians(sensor, pose, at))(measured)
+    innovation = jax.vmap(sensor.residual)(z, predicted)
     noise = jax.vmap(sensor.noise_cov)(z)
-    h = rows_at(by_pose, by_own, place, landmarks.shape[0])
-    factor, sound = linalg.cholesky(omega)
-    seen = linalg.solve_lower(factor, h.T)
+    jacobian = stack_jacobians(by_pose, by_landmark, index, landmarks.shape[0])
+
+    factor, omega_positive = linalg.cholesky(omega)
+    half = linalg.solve_lower(factor, jacobian.T)
     same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
-    s = (seen.T @ seen).reshape(m, size_z, m, size_z) + same * noise[:, :, None]
-    marginal = s[jnp.arange(m), :, jnp.arange(m)]
-    distance, positive = jax.vmap(_squared)(nu, marginal)
-    root, noisy = jax.vmap(linalg.cholesky)(noise)
-    inside = jnp.isfinite(distance) if gate is None else distance <= gate
-    positive = positive & noisy & sound
+    joint_cov = (half.T @ half).reshape(m, size, m, size) + same * noise[:, :, None]
+    innovation_cov = joint_cov[jnp.arange(m), :, jnp.arange(m)]
+    alone = jax.vmap(gaussian_terms)(innovation, innovation_cov)
+    noise_factor, noise_positive = jax.vmap(linalg.cholesky)(noise)
+    positive = alone.positive & noise_positive & omega_positive
+    inside = jnp.isfinite(alone.distance) if gate is None else alone.distance <= gate
     fused = known & inside & positive
-    both = fused[:, None, None, None] & fused[None, None, :, None]
-    unit = same * jnp.eye(size_z, dtype=z.dtype)[None, :, None]
-    whiten = linalg.whitener_by_rows(jnp.where(both, s, unit).reshape(m * size_z, m * size_z))[0]
-    fused_nu = jnp.where(fused[:, None], nu, 0.0)
-    nis = ((whiten @ fused_nu.reshape(-1)).reshape(m, size_z) ** 2).sum(axis=1)
-    pivots = jnp.diagonal(whiten).reshape(m, size_z)
-    log_det = -2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
-    likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
 
-    def whitened(root: jax.Array, values: jax.Array) -> jax.Array:
-        return linalg.solve_lower(root, values)
-
-    rows = jax.vmap(whitened)(root, h.reshape(m, size_z, h.shape[1]))
-    return Weighed(
-        rows=jnp.where(fused[:, None, None], rows, 0.0).reshape(h.shape),
-        innovation=jax.vmap(whitened)(root, fused_nu).reshape(-1),
-        known=known,
+    fused_innovation = jnp.where(fused[:, None], innovation, 0.0)
+    nis, log_likelihood = _densities_in_turn(fused_innovation, joint_cov, fused)
+    rows = jax.vmap(linalg.solve_lower)(noise_factor, jacobian.reshape(m, size, jacobian.shape[1]))
+    return CanonicalInnovations(
+        whitened_jacobian=jnp.where(fused[:, None, None], rows, 0.0).reshape(jacobian.shape),
+        whitened=jax.vmap(linalg.solve_lower)(noise_factor, fused_innovation).reshape(-1),
+        compared=known,
         positive=positive,
         inside=inside,
-        fused=fused,
-        nu=nu,
-        s=marginal,
-        nis=jnp.where(fused, nis, distance),
-        log_likelihood=jnp.where(fused, likelihood, 0.0),
-        sound=sound,
+        innovation=innovation,
+        innovation_cov=innovation_cov,
+        nis=jnp.where(fused, nis, alone.distance),
+        log_likelihood=jnp.where(fused, log_likelihood, 0.0),
+        omega_positive=omega_positive,
     )
 
 
-def informed(omega: jax.Array, owed: jax.Array, of: Weighed) -> tuple[jax.Array, jax.Array]:
-    """The measurement update: Ω ← Ω + Σ Hᵀ R⁻¹ H, ρ ← ρ + Σ Hᵀ R⁻¹ ν."""
-    return linalg.symmetrize(omega + of.rows.T @ of.rows), owed + of.rows.T @ of.innovation
+def stack_jacobians(
+    by_pose: Float[Array, "M Z 3"],
+    by_landmark: Float[Array, "M Z L"],
+    index: Int[Array, "M"],
+    count: int,
+) -> Float[Array, "MZ D"]:
+    """H of M functions of the pose and of one landmark each, index of `count`; D = 3 + count·L."""
+    m, rows, size = by_landmark.shape
+    at = (index[:, None] == jnp.arange(count)[None, :]).astype(by_landmark.dtype)
+    wide = jnp.einsum("mkl,ma->mkal", by_landmark, at).reshape(m, rows, count * size)
+    return jnp.concatenate([by_pose, wide], axis=2).reshape(m * rows, 3 + count * size)
 
 
-def stepped(pose: jax.Array, step: jax.Array) -> jax.Array:
-    """The pose (3,) moved by an error (3,), its heading wrapped."""
-    there = pose + step
-    return there.at[2].set(wrap(there[2]))
+def _densities_in_turn(
+    innovation: Float[Array, "M Z"],
+    joint_cov: Float[Array, "M Z M Z"],
+    fused: Bool[Array, "M"],
+) -> tuple[Float[Array, "M"], Float[Array, "M"]]:
+    """d² and log-density of each fused innovation given those before it."""
+    m, size = innovation.shape
+    both = fused[:, None, None, None] & fused[None, None, :, None]
+    eye = jnp.eye(m * size, dtype=innovation.dtype)
+    fused_cov = jnp.where(both, joint_cov, eye.reshape(joint_cov.shape))
+    inverse_factor = linalg.whitener_by_rows(fused_cov.reshape(eye.shape))[0]
+    distance = (inverse_factor @ innovation.reshape(-1)).reshape(m, size) ** 2
+    pivots = jnp.diagonal(inverse_factor).reshape(m, size)
+    log_det = -2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
+    nis = distance.sum(axis=1)
+    return nis, log_density(nis, log_det, size)
 
 
-def born(
-    omega: jax.Array,
-    pose: jax.Array,
-    z: jax.Array,
-    place: jax.Array,
-    granted: jax.Array,
+def measurement_update(
+    omega: Float[Array, "D D"], residual: Float[Array, "D"], of: CanonicalInnovations
+) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
+    """Ω ← Ω + Σ Hᵀ R⁻¹ H, ρ ← ρ + Σ Hᵀ R⁻¹ ν."""
+    rows = of.whitened_jacobian
+    return linalg.symmetrize(omega + rows.T @ rows), residual + rows.T @ of.whitened
+
+
+def mean_error(
+    omega: Float[Array, "D D"], residual: Float[Array, "D"], omega_positive: Bool[Array, ""]
+) -> tuple[Float[Array, "D"], Bool[Array, ""]]:
+    """E[e] = Ω⁻¹ ρ, and whether it could be solved for: Ω is positive definite, as it was before
+    the scan (omega_positive). Zero where it could not."""
+    error, positive = linalg.solve_psd(omega, residual)
+    solved = omega_positive & positive
+    return jnp.where(solved, error, 0.0), solved
+
+
+def correct_pose(pose: Float[Array, "3"], error: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The pose moved by an error, its heading wrapped."""
+    moved = pose + error
+    return moved.at[2].set(wrap(moved[2]))
+
+
+def initialize_landmarks(
     sensor: Sensor,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """New landmarks of measurements (m, Z) in empty places (m,): Ω, the landmarks (m, L), granted.
+    omega: Float[Array, "D D"],
+    pose: Float[Array, "3"],
+    z: Float[Array, "M Z"],
+    index: Int[Array, "M"],
+    wanted: Bool[Array, "M"],
+) -> tuple[Float[Array, "D D"], Float[Array, "M L"], Bool[Array, "M"]]:
+    """Ω with new landmarks at empty indices, where wanted; the landmarks; which were initialized.
 
     l = g(x, z), with C = G_z R G_zᵀ + G_s S G_sᵀ: Ω ← Ω + Jᵀ C⁻¹ J, J = [-G_x, I], the same as
-    augmentation in covariance form (Solà (32)-(38)), and ρ as it is. Places whose C is not positive
-    definite are not granted.
+    augmentation in covariance form (Solà (32)-(38)), and ρ as it is. A landmark whose C is not
+    positive definite is not initialized.
     """
     size = len(sensor.landmark)
     count = (omega.shape[0] - 3) // size
-    z = jnp.where(granted[:, None], z, 1.0)
-    landmark, by_pose, own = jax.vmap(lambda z: first_order.invert_at(sensor, pose, z, pose, z))(z)
-    root, positive = jax.vmap(linalg.cholesky)(own)
-    granted = granted & positive
-    unit = jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype), own.shape)
+    z = jnp.where(wanted[:, None], z, 1.0)
+    landmark, by_pose, cov = jax.vmap(lambda z: first_order.invert_at(sensor, pose, z, pose, z))(z)
+    root, positive = jax.vmap(linalg.cholesky)(cov)
+    initialized = wanted & positive
+    unit = jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype), cov.shape)
     both = jax.vmap(linalg.solve_lower)(root, jnp.concatenate([-by_pose, unit], axis=2))
-    both = jnp.where(granted[:, None, None], both, 0.0)
-    rows = rows_at(both[:, :, :3], both[:, :, 3:], place, count)
-    filled = (granted[:, None] & (place[:, None] == jnp.arange(count)[None, :])).any(axis=0)
+    both = jnp.where(initialized[:, None, None], both, 0.0)
+    rows = stack_jacobians(both[:, :, :3], both[:, :, 3:], index, count)
+    filled = (initialized[:, None] & (index[:, None] == jnp.arange(count)[None, :])).any(axis=0)
     # Padding's unit goes first, to an exact zero.
-    empty = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(filled, size)])
-    omega = omega - jnp.diag(empty.astype(omega.dtype)) + rows.T @ rows
-    return linalg.symmetrize(omega), landmark, granted
+    padding = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(filled, size)])
+    omega = omega - jnp.diag(padding.astype(omega.dtype)) + rows.T @ rows
+    return linalg.symmetrize(omega), landmark, initialized
 
 
-def judged(weighed: Weighed, sound: jax.Array) -> Weighed:
-    """What was weighed, where the scan could be solved for, sound (), or else all singular."""
-    return weighed._replace(
-        positive=weighed.positive & sound,
-        log_likelihood=jnp.where(sound, weighed.log_likelihood, 0.0),
+def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    """Ω with √eps of its diagonal added: what is tried where rounding has made it indefinite."""
+    share = math.sqrt(float(jnp.finfo(omega.dtype).eps))
+    load: Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
+    return omega + load
+
+
+def refuse_unless(solved: Bool[Array, ""], of: CanonicalInnovations) -> CanonicalInnovations:
+    """The innovations where the mean could be solved for; or else all of them are singular."""
+    return of._replace(
+        positive=of.positive & solved,
+        log_likelihood=jnp.where(solved, of.log_likelihood, 0.0),
     )
 
 
-def reported(
-    weighed: Weighed,
+def report(
     scan: Scan,
-    slot: jax.Array,
-    *,
-    matched: jax.Array | None = None,
-    **fates: jax.Array,
+    association: TagAssociation,
+    of: CanonicalInnovations,
+    initialized: Bool[Array, "M"],
+    waiting: Bool[Array, "M"] | None = None,
 ) -> Info:
-    """The info of a scan with its slots (M,).
-
-    matched: (M,) bool, those of landmarks of the map, where more than were weighed. fates: as
-    `reporting.status_of` has them.
-    """
-    known = weighed.known
+    """The info of a scan; measurements of landmarks that are waiting are deferred."""
     status = status_of(
         scan.valid,
-        matched=known if matched is None else matched,
-        positive=weighed.positive,
-        inside=weighed.inside,
-        **fates,
+        matched=association.known,
+        positive=of.positive,
+        inside=of.inside,
+        postponed=waiting,
+        new=association.new,
+        repeated=association.repeated,
+        granted=initialized,
+        deferred=waiting,
+        singular=association.has_slot,
     )
     return info_of(
         status,
-        known,
+        of.compared,
         size=scan.z.shape[1],
-        slot=slot,
-        born=slot,
-        nis=weighed.nis,
-        innovation=weighed.nu,
-        innovation_cov=weighed.s,
-        log_likelihood=weighed.log_likelihood.sum(),
+        slot=association.slot,
+        born=association.slot,
+        nis=of.nis,
+        innovation=of.innovation,
+        innovation_cov=of.innovation_cov,
+        log_likelihood=of.log_likelihood.sum(),
     )
 
 
-def loaded(omega: jax.Array) -> jax.Array:
-    """Ω with √eps of its diagonal added: what is tried where rounding has made it indefinite."""
-    share = math.sqrt(float(jnp.finfo(omega.dtype).eps))
-    more: jax.Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
-    return omega + more
-
-
-def _squared(nu: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
-    factor, positive = linalg.cholesky(cov)
-    return (linalg.solve_lower(factor, nu) ** 2).sum(), positive
+def information_filter(
+    settings: InformationSettings,
+    init: Callable[[Array, Array], Any],
+    predict: Callable[[Any, Array, Array], Any],
+    update: Callable[[Any, Scan, Array], tuple[Any, Info]],
+    estimate: Callable[[Any], Estimate],
+) -> Filter:
+    """The `Filter` of these functions, with its error in map coordinates."""
+    return Filter(
+        name=settings.name,
+        control_size=len(settings.motion.controls),
+        measurement_size=len(settings.sensor.measurements),
+        init=init,
+        predict=predict,
+        update=update,
+        estimate=estimate,
+        chart=euclidean(),
+    )

@@ -1,81 +1,84 @@
-"""Mean recovery in a `sparse_state.Sparse`: coordinate descent on ½ eᵀ Ω e - ρᵀ e, block by block.
+"""Mean recovery in a `SparseState`: coordinate descent on ½ eᵀ Ω e - ρᵀ e, block by block.
 
-A block that solves for its own error δ moves its mean by it, owes nothing any more, and passes on
-what its neighbours owe then: ρ_j ← ρ_j - Ω_ji δ_i. Ω and ξ = Ω μ + ρ are left as they are.
+A block that is solved for its error δ moves its mean by δ, has no residual any more, and changes
+that of the landmarks it is linked to: ρ_j ← ρ_j - Ω_ji δ_i. Ω and ξ = Ω μ + ρ stay as they are.
 """
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information import canonical
-from jaxslam.filters.information.sparse_state import Sparse
+from jaxslam.filters.information.settings import SparseSettings
+from jaxslam.filters.information.sparse_state import (
+    SparseState,
+    active_residual,
+    with_active_residual,
+)
 from jaxslam.math import linalg
 from jaxslam.math.xla import settle
 
 
-def owed_of(state: Sparse) -> jax.Array:
-    """ρ of the area, (3 + 2A,)."""
-    own = state.owed.at[state.slot].get(mode="fill", fill_value=0)
-    return jnp.concatenate([state.owed_robot, own.reshape(-1)])
-
-
-def owing(state: Sparse, owed: jax.Array) -> Sparse:
-    """The state with ρ (3 + 2A,) of the area."""
-    own = owed[3:].reshape(-1, 2)
-    after = state.owed.at[state.slot].set(own, mode="drop")
-    return state._replace(owed_robot=owed[:3], owed=after)
-
-
-def passed_on(state: Sparse, slot: jax.Array, step: jax.Array) -> Sparse:
-    """Landmarks slot (m,) moved by step (m, 2), and what the landmarks of their lists owe then."""
-    n = state.own.shape[0]
+def move_landmarks(
+    state: SparseState, slot: Int[Array, "B"], step: Float[Array, "B 2"]
+) -> SparseState:
+    """The means of landmarks moved, and the residuals of those in their lists changed by it."""
+    n = state.alive.shape[0]
     row = state.neighbours.at[slot].get(mode="fill", fill_value=n)
     links = state.links.at[slot].get(mode="fill", fill_value=0)
     # Who writes to the lists next needs the slots, so waits for this, and needs no copy of all N.
-    row, links, own = settle((row, links, state.slot))
-    change = jnp.einsum("mkij,mi->mkj", links, step)
+    row, links, active = settle((row, links, state.active))
+    change = jnp.einsum("mkij,mi->mkj", links, step).reshape(-1, 2)
     return state._replace(
-        slot=own,
+        active=active,
         landmarks=state.landmarks.at[slot].add(step, mode="drop"),
-        owed=state.owed.at[row.reshape(-1)].add(-change.reshape(-1, 2), mode="drop"),
+        landmark_residual=state.landmark_residual.at[row.reshape(-1)].add(-change, mode="drop"),
     )
 
 
-def relaxed(state: Sparse, share: int) -> Sparse:
-    """The means of the next `share` landmarks, those that are passive, one after the other."""
-    n = state.own.shape[0]
+def recover_passive_means(state: SparseState, count: int) -> SparseState:
+    """The means of the next `count` landmarks, those that are passive, one after the other."""
+    n = state.alive.shape[0]
 
-    def one(state: Sparse, i: jax.Array) -> tuple[Sparse, None]:
-        slot = (state.turn + i) % n
-        step, positive = linalg.solve_psd(state.own[slot], state.owed[slot])
-        on = state.alive[slot] & positive & ~(state.slot == slot).any()
+    def recover_one(state: SparseState, i: Array) -> tuple[SparseState, None]:
+        slot = (state.next_recovered + i) % n
+        step, positive = linalg.solve_psd(state.diagonal[slot], state.landmark_residual[slot])
+        on = state.alive[slot] & positive & ~(state.active == slot).any()
         step = jnp.where(on, step, 0.0)
-        state = passed_on(state, slot[None], step[None])
-        left = state.owed.at[jnp.where(on, slot, n)].set(0.0, mode="drop")
-        return state._replace(owed=left), None
+        state = move_landmarks(state, slot[None], step[None])
+        left = state.landmark_residual.at[jnp.where(on, slot, n)].set(0.0, mode="drop")
+        return state._replace(landmark_residual=left), None
 
-    state, _ = jax.lax.scan(one, state, jnp.arange(share))
-    return state._replace(turn=((state.turn + share) % n).astype(jnp.int32))
+    state, _ = jax.lax.scan(recover_one, state, jnp.arange(count))
+    return state._replace(next_recovered=((state.next_recovered + count) % n).astype(jnp.int32))
 
 
-def solved(
-    state: Sparse, omega: jax.Array, owed: jax.Array, sound: jax.Array
-) -> tuple[Sparse, jax.Array]:
-    """The means of the area moved by Ω⁻¹ ρ, of Ω (3 + 2A, 3 + 2A), and whether that is definite.
+def recover_active_means(
+    state: SparseState,
+    omega: Float[Array, "D D"],
+    residual: Float[Array, "D"],
+    omega_positive: Bool[Array, ""],
+) -> tuple[SparseState, Bool[Array, ""]]:
+    """Robot and active landmarks moved by Ω⁻¹ ρ, and whether that could be solved for.
 
-    Where it is not, or not sound (), means and ρ stay as they are. Ω of the state is left alone.
+    Where it could not (`canonical.mean_error`), means and ρ stay as they are. Ω of the state is
+    left alone.
     """
-    step, positive = linalg.solve_psd(omega, owed)
-    sound = sound & positive
-    step = jnp.where(sound, step, 0.0)
-    state = owing(state, jnp.where(sound, 0.0, owed_of(state)))
-    state = state._replace(pose=canonical.stepped(state.pose, step[:3]))
-    return passed_on(state, state.slot, step[3:].reshape(-1, 2)), sound
+    error, solved = canonical.mean_error(omega, residual, omega_positive)
+    state = with_active_residual(state, jnp.where(solved, 0.0, active_residual(state)))
+    state = state._replace(pose=canonical.correct_pose(state.pose, error[:3]))
+    return move_landmarks(state, state.active, error[3:].reshape(-1, 2)), solved
 
 
-def swept(state: Sparse, omega: jax.Array, sound: jax.Array, share: int, times: int) -> Sparse:
-    """Mean recovery once round, `times` over: the passive share, then the area of Ω."""
-    for _ in range(times):
-        state = relaxed(state, share)
-        state, _ = solved(state, omega, owed_of(state), sound)
+def repeat_recovery(
+    settings: SparseSettings,
+    state: SparseState,
+    omega: Float[Array, "D D"],
+    solved: Bool[Array, ""],
+) -> SparseState:
+    """Mean recovery, the rounds after the first: passive landmarks, then the active block."""
+    for _ in range(settings.sweeps - 1):
+        state = recover_passive_means(state, settings.recovered)
+        state, _ = recover_active_means(state, omega, active_residual(state), solved)
     return state

@@ -1,20 +1,31 @@
 """The sparse extended information filter: a step costs the same in a map of any size."""
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Int
 
 from jaxslam.filters.information import canonical
-from jaxslam.filters.information.mean_recovery import owed_of, relaxed, solved, swept
+from jaxslam.filters.information.active_set import (
+    activate,
+    active_matches,
+    assign_indices,
+    deactivate,
+)
+from jaxslam.filters.information.mean_recovery import (
+    recover_active_means,
+    recover_passive_means,
+    repeat_recovery,
+)
+from jaxslam.filters.information.settings import SparseSettings
 from jaxslam.filters.information.sparse_filter import (
-    allotted,
-    asked,
-    check_sparse,
-    closed,
-    in_area,
+    check_scan_size,
+    enter_landmarks,
+    finish_scan,
     sparse_filter,
 )
-from jaxslam.filters.information.sparse_state import Sparse
-from jaxslam.filters.information.sparsification import activated, retired
+from jaxslam.filters.information.sparse_state import SparseState, active_means, active_residual
+from jaxslam.filters.information.sparsification import cut_robot_links
+from jaxslam.filters.information.tag_association import TagAssociation, associate_by_index
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.types import Info, Scan
 
@@ -36,40 +47,44 @@ def seif(
     """Sparse extended information filter (Thrun et al. 2004; the Notes, corrected by ERRATA).
 
     The robot is linked to at most `active` landmarks, the most recent ones, each landmark to at
-    most `links` others. Four steps, none of which touches the rest of a `Sparse` map:
+    most `links` others. Four steps, none of which touches the rest of the map:
 
-    1. motion update (`canonical.moved`), on the robot and the active landmarks;
-    2. sparsification (`sparsification.sparsified`) of as many of the least recent active landmarks
-       as the scan needs places for; then measurement update and new landmarks (`canonical`);
-    3. mean recovery (`mean_recovery`), one block at a time: the block of robot and active
+    1. motion update (`canonical.motion_update`), of the robot and the active landmarks;
+    2. sparsification (`sparsification.sparsify`): the least recently measured active landmarks
+       lose their links to the robot, as many as the scan needs room for;
+    3. measurement update and new landmarks (`canonical`);
+    4. mean recovery (`mean_recovery`), one block at a time: the block of robot and active
        landmarks, and `passive` landmarks in rotation.
 
-    With active = capacity it is `eif_slam`. What is approximated is counted in `Sparse.counts`.
-    NIS, gate and, unless `whole`, `estimate` take covariances of Markov blankets
-    (`marginals`), which hold all other landmarks at their means: less than the true ones, by
-    much in a map that has drifted as a whole. Sparsification is overconfident too, which `eseif` is
-    not. Landmarks are points known by their tags, and the tag of one is its slot.
+    With active = capacity it is `eif_slam`. `sparsification` says what is dropped, and where;
+    `SparseState.counts` how much. NIS, gate and, unless `whole`, `estimate` take covariances of
+    Markov blankets (`marginals`), which hold all other landmarks at their means: less than the true
+    ones, by much in a map that has drifted as a whole. Sparsification is overconfident too, which
+    `eseif` is not. Landmarks are points associated by their tags, and the tag of one is its slot.
 
-    An area that is not positive definite: as in `eif_slam`, with `Counts.broken`.
+    An active block that is not positive definite: as in `eif_slam`, counted in
+    `ApproximationCounts.refused`.
 
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`, at the estimate.
         capacity: landmarks N; a tag beyond is `Status.OVERFLOW`.
-        active: places of the area, at least those of a scan; capped at the capacity.
+        active: most active landmarks, at least as many as a scan has measurement slots; capped at
+            the capacity.
         links: most links K of a landmark to others while one of both is passive.
-        passive: landmarks a scan whose means are recovered in rotation, beside the active.
-        sweeps: how often mean recovery goes round a scan: the passive share, then the area.
-        conservative: how a full list gives up its weakest link, `sparsification.without_link`.
-            False: overconfidently, Ω stays definite. True: claiming less, which in a map that needs
-            many more links than it may have costs Ω its definiteness.
+        passive: landmarks whose means are recovered in rotation each scan, beside the active ones.
+        sweeps: rounds of mean recovery a scan: passive landmarks, then the active block.
+        conservative: how a full list drops its weakest link, `sparsification.drop_link`. False:
+            overconfidently, Ω stays positive definite. True: claiming less; where a map needs many
+            more links than it may have, Ω does not stay positive definite.
         whole: `estimate` inverts Ω of all landmarks, O(N³): what the filter believes.
         gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
         floor: standard deviation [m, rad] added to a singular pose_cov, which has no inverse.
     Raises:
         ValueError: as `eif_slam`; on an active, links, passive or sweeps below 1; on landmarks that
-            are not points (x, y); and, from `update`, on a scan with more places than `active`.
+            are not points (x, y); and, from `update`, on a scan with more measurement slots than
+            `active`.
     """
-    check_sparse(
+    settings = SparseSettings(
         "seif",
         motion,
         sensor,
@@ -80,49 +95,50 @@ def seif(
         links=links,
         passive=passive,
         sweeps=sweeps,
-    )
-    count, share = min(active, capacity), min(passive, capacity)
-
-    def update(state: Sparse, scan: Scan, key: jax.Array) -> tuple[Sparse, Info]:
-        state = relaxed(state, share)
-        of = asked(state, scan)
-        # Places for the scan: empty ones first, then those not measured for longest.
-        needs = of.wanted & ~of.match.any(axis=1)
-        free = state.slot >= capacity
-        last = jnp.where(of.match.any(axis=0), jnp.iinfo(jnp.int32).max, state.seen)
-        turn = jnp.cumsum(needs) - 1
-        place, taken = allotted(jnp.where(free, -1, last), turn, needs, of.match)
-        state = retired(state, taken & ~free, min(scan.tag.shape[0], count), conservative)
-        state = activated(state, place, of.slot, needs)
-
-        weighed = canonical.weigh(
-            state.omega, state.pose, in_area(state), scan, place, of.known, sensor, gate
-        )
-        omega, owed = canonical.informed(state.omega, owed_of(state), weighed)
-        state, sound = solved(state, omega, owed, weighed.sound)
-        state = swept(state, omega, sound, share, sweeps - 1)
-        room = of.wanted & of.new & sound
-        omega, points, granted = canonical.born(omega, state.pose, scan.z, place, room, sensor)
-        state = closed(state, of, place, of.wanted, omega, points, granted, sound, scan.valid.any())
-        info = canonical.reported(
-            canonical.judged(weighed, sound),
-            scan,
-            of.slot,
-            new=of.new,
-            repeated=of.repeated,
-            granted=granted,
-            singular=of.wanted,
-        )
-        return state, info
-
-    return sparse_filter(
-        "seif",
-        motion,
-        sensor,
-        capacity,
-        update,
-        active=active,
-        links=links,
+        conservative=conservative,
         whole=whole,
-        floor=floor,
     )
+
+    def update(state: SparseState, scan: Scan, key: Array) -> tuple[SparseState, Info]:
+        check_scan_size(settings, scan)
+        state = recover_passive_means(state, settings.recovered)
+        measured = associate_by_index(state.alive, scan)
+        state, index = sparsify_and_activate(settings, state, measured)
+        innovations = canonical.innovations(
+            settings, state.omega, state.pose, active_means(state), scan, index, measured.known
+        )
+        omega, residual = canonical.measurement_update(
+            state.omega, active_residual(state), innovations
+        )
+        state, solved = recover_active_means(state, omega, residual, innovations.omega_positive)
+        state = repeat_recovery(settings, state, omega, solved)
+        room = measured.new & measured.has_slot & solved
+        omega, landmarks, initialized = canonical.initialize_landmarks(
+            sensor, omega, state.pose, scan.z, index, room
+        )
+        state = enter_landmarks(state, measured.slot, landmarks, initialized)
+        state = finish_scan(state, scan, index, measured.has_slot, omega, solved)
+        innovations = canonical.refuse_unless(solved, innovations)
+        return state, canonical.report(scan, measured, innovations, initialized)
+
+    return sparse_filter(settings, update)
+
+
+def sparsify_and_activate(
+    settings: SparseSettings, state: SparseState, measured: TagAssociation
+) -> tuple[SparseState, Int[Array, "M"]]:
+    """The state with all measured landmarks active, and their indices in the active set.
+
+    Empty indices are given first, then those of the landmarks not measured for longest, which are
+    sparsified and become passive.
+    """
+    matches = active_matches(state, measured)
+    enters = measured.has_slot & ~matches.any(axis=1)
+    empty = state.active >= settings.capacity
+    order = jnp.where(matches.any(axis=0), jnp.iinfo(jnp.int32).max, state.last_measured)
+    order = jnp.where(empty, -1, order)
+    index, given = assign_indices(order, jnp.cumsum(enters) - 1, enters, matches)
+    leaving, most = given & ~empty, min(matches.shape)
+    state = cut_robot_links(state, leaving)
+    state = deactivate(state, leaving, most, settings.conservative)
+    return activate(state, index, measured.slot, enters), index

@@ -1,99 +1,130 @@
-"""The sparse canonical form of `filters.seif`: a dense area around the robot, and lists of links.
+"""The sparse canonical form of `filters.seif`: a dense active block of Ω, and lists of links.
 
-Ω of the robot and the A active landmarks is one dense block, the area. A passive landmark has no
-link to the robot; what it shares with other landmarks stands in its list of at most K links. A pair
-of which both are active is in the area alone, every other in the lists of both. So a motion or a
-scan touches the area, and no array of N landmarks is read or written but at a few rows.
+Ω of the robot and the A active landmarks is one dense block. A passive landmark has no link to the
+robot; its links to other landmarks are in its list of at most K. A pair of which both are active is
+in the dense block alone, every other pair in the lists of both. So a motion or a scan changes the
+dense block, and no array of N landmarks is read or written but at a few rows.
 """
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 
-class Counts(NamedTuple):
+class ApproximationCounts(NamedTuple):
     """What was approximated so far, or went wrong."""
 
-    cut: jax.Array
-    """() int32: landmarks whose link to the robot was cut by sparsification"""
-    cut_nats: jax.Array
-    """() Σ I(x; m0 | active): information that sparsification dropped, in nats"""
-    dropped: jax.Array
-    """() int32: links between landmarks dropped, their lists being full"""
-    dropped_links: jax.Array
-    """() Σ |Ω_ij| (Frobenius) of the same"""
-    anchored: jax.Array
-    """() int32: how many of them were dropped the definite way, overconfidently"""
-    broken: jax.Array
-    """() int32: scans refused because the area was not positive definite"""
-    relocated: jax.Array
-    """() int32: how often the robot's pose was marginalized out, and found anew (`eseif`)"""
+    cut: Int[Array, ""]
+    """landmarks whose link to the robot was removed, by `sparsification.sparsify` or a relocation
+    (`eseif`)"""
+    cut_nats: Float[Array, ""]
+    """Σ I(x; m0 | active) that sparsification dropped, and Σ ½ (log |Ω| - log |Ω̃|) of the active
+    block by relocations, in nats"""
+    dropped: Int[Array, ""]
+    """links between landmarks dropped, their lists being full (`sparsification.drop_link`)"""
+    dropped_links: Float[Array, ""]
+    """Σ |Ω_ij| (Frobenius) of the same"""
+    anchored: Int[Array, ""]
+    """how many of them were dropped overconfidently, so that Ω stays positive definite"""
+    refused: Int[Array, ""]
+    """scans refused because Ω of the active block was not positive definite"""
+    relocated: Int[Array, ""]
+    """how often the robot's pose was marginalized out, and estimated anew (`eseif`)"""
 
 
-class Sparse(NamedTuple):
-    """Robot and map; μ, ρ and padding as in `filters.canonical`. A landmark's slot is its tag."""
+class SparseState(NamedTuple):
+    """Robot and map; μ, ρ and padding as in `canonical`. A landmark's slot is its tag."""
 
-    pose: jax.Array
-    """(3,)"""
-    landmarks: jax.Array
-    """(N, 2)"""
-    owed_robot: jax.Array
-    """(3,) ρ of the robot"""
-    owed: jax.Array
-    """(N, 2) ρ of the landmarks"""
-    alive: jax.Array
-    """(N,) bool"""
-    slot: jax.Array
-    """(A,) int32 which landmark is active at each place of the area, N for none"""
-    seen: jax.Array
-    """(A,) int32: the scan in which it was last measured"""
-    omega: jax.Array
-    """(3 + 2A, 3 + 2A) Ω of the robot and the active landmarks; unit diagonal where none"""
-    own: jax.Array
-    """(N, 2, 2) diagonal blocks of Ω; of an active landmark that in `omega` counts"""
-    neighbours: jax.Array
-    """(N, K) int32 which landmarks each is linked to, N for none"""
-    links: jax.Array
-    """(N, K, 2, 2) Ω_ij of the same"""
-    turn: jax.Array
-    """() int32: the passive landmark whose mean is recovered next"""
-    scans: jax.Array
-    """() int32"""
-    counts: Counts
+    pose: Float[Array, "3"]
+    landmarks: Float[Array, "N 2"]
+    pose_residual: Float[Array, "3"]
+    """information residual ρ of the robot"""
+    landmark_residual: Float[Array, "N 2"]
+    """ρ of the landmarks"""
+    alive: Bool[Array, "N"]
+    active: Int[Array, "A"]
+    """slots of the active landmarks, by their index in the dense block; N for none"""
+    last_measured: Int[Array, "A"]
+    """the scan in which each was last measured"""
+    omega: Float[Array, "D D"]
+    """Ω of the robot and the active landmarks, D = 3 + 2A; unit diagonal where there is none"""
+    diagonal: Float[Array, "N 2 2"]
+    """diagonal blocks of Ω; of an active landmark the block in `omega` counts instead"""
+    neighbours: Int[Array, "N K"]
+    """slots of the landmarks that each is linked to, N for none"""
+    links: Float[Array, "N K 2 2"]
+    """Ω_ij of the same"""
+    next_recovered: Int[Array, ""]
+    """the passive landmark whose mean is recovered next"""
+    scans: Int[Array, ""]
+    counts: ApproximationCounts
 
 
-def empty(pose: jax.Array, start: jax.Array, capacity: int, active: int, links: int) -> Sparse:
-    """A robot with information start (3, 3) and no landmark."""
+def empty_map(
+    pose: Float[Array, "3"],
+    information: Float[Array, "3 3"],
+    capacity: int,
+    active: int,
+    links: int,
+) -> SparseState:
+    """A robot and no landmark."""
     dtype, none = pose.dtype, jnp.zeros((), jnp.int32)
-    eye = jnp.eye(2, dtype=dtype)
-    nothing = jnp.zeros((), dtype)
-    return Sparse(
+    zero = jnp.zeros((), dtype)
+    return SparseState(
         pose=pose,
         landmarks=jnp.zeros((capacity, 2), dtype),
-        owed_robot=jnp.zeros(3, dtype),
-        owed=jnp.zeros((capacity, 2), dtype),
+        pose_residual=jnp.zeros(3, dtype),
+        landmark_residual=jnp.zeros((capacity, 2), dtype),
         alive=jnp.zeros(capacity, bool),
-        slot=jnp.full(active, capacity, jnp.int32),
-        seen=jnp.zeros(active, jnp.int32),
-        omega=jnp.eye(3 + 2 * active, dtype=dtype).at[:3, :3].set(start),
-        own=jnp.broadcast_to(eye, (capacity, 2, 2)),
+        active=jnp.full(active, capacity, jnp.int32),
+        last_measured=jnp.zeros(active, jnp.int32),
+        omega=jnp.eye(3 + 2 * active, dtype=dtype).at[:3, :3].set(information),
+        diagonal=jnp.broadcast_to(jnp.eye(2, dtype=dtype), (capacity, 2, 2)),
         neighbours=jnp.full((capacity, links), capacity, jnp.int32),
         links=jnp.zeros((capacity, links, 2, 2), dtype),
-        turn=none,
+        next_recovered=none,
         scans=none,
-        counts=Counts(none, nothing, none, nothing, none, none, none),
+        counts=ApproximationCounts(none, zero, none, zero, none, none, none),
     )
 
 
-def blocks_of(omega: jax.Array) -> jax.Array:
-    """(A, A, 2, 2) of the landmarks of an area."""
+def active_means(state: SparseState) -> Float[Array, "A 2"]:
+    """The means of the active landmarks, 0 where there is none."""
+    means: Array = state.landmarks.at[state.active].get(mode="fill", fill_value=0)
+    return means
+
+
+def active_residual(state: SparseState) -> Float[Array, "D"]:
+    """ρ of the robot and the active landmarks."""
+    own = state.landmark_residual.at[state.active].get(mode="fill", fill_value=0)
+    return jnp.concatenate([state.pose_residual, own.reshape(-1)])
+
+
+def with_active_residual(state: SparseState, residual: Float[Array, "D"]) -> SparseState:
+    """The state with ρ of the robot and the active landmarks."""
+    own = residual[3:].reshape(-1, 2)
+    after = state.landmark_residual.at[state.active].set(own, mode="drop")
+    return state._replace(pose_residual=residual[:3], landmark_residual=after)
+
+
+def linked_to_robot(omega: Float[Array, "D D"]) -> Bool[Array, "A"]:
+    """Which active landmarks have a link to the robot."""
+    linked: Array = (omega[:3, 3:] != 0).any(axis=0).reshape(-1, 2).any(axis=1)
+    return linked
+
+
+def landmark_blocks(omega: Float[Array, "D D"]) -> Float[Array, "A A 2 2"]:
+    """Ω of the active landmarks, in blocks."""
     count = (omega.shape[0] - 3) // 2
     return omega[3:, 3:].reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
 
 
-def with_blocks(omega: jax.Array, blocks: jax.Array) -> jax.Array:
-    """The area with other blocks (A, A, 2, 2) of landmarks."""
+def with_landmark_blocks(
+    omega: Float[Array, "D D"], blocks: Float[Array, "A A 2 2"]
+) -> Float[Array, "D D"]:
+    """Ω with other blocks of the active landmarks."""
     count = blocks.shape[0]
     flat = blocks.transpose(0, 2, 1, 3).reshape(2 * count, 2 * count)
     return omega.at[3:, 3:].set(flat)

@@ -7,12 +7,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dense_form import (
+    COUNT,
+    at,
+    canonical,
+    close,
+    dense,
+    dtypes,
+    h_of,
+    initialized,
+    measured,
+    narrow,
+)
 
 from jaxslam import filters, motion, sensors
 from jaxslam.filters.information import sparsification
-from jaxslam.filters.information.eseif import fixes_pose, tied, without_pose
-from jaxslam.filters.information.marginals import information_of
-from jaxslam.filters.information.mean_recovery import relaxed
+from jaxslam.filters.information.mean_recovery import recover_passive_means
+from jaxslam.filters.information.relocation import determines_pose, marginalize_pose
+from jaxslam.filters.information.sparse_state import linked_to_robot
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import simulate
@@ -20,7 +32,7 @@ from jaxslam.types import Status
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.01, 0.01, 0.005]) ** 2
-COUNT, STEPS, RUNS = 36, 60, 12
+STEPS, RUNS = 60, 12
 ODOMETRY = np.diag([0.002, 0.004]) ** 2  # good, so that the robot's links last
 NOISE = np.diag([0.1, np.deg2rad(2.0)]) ** 2
 MODELS = motion.increment(ODOMETRY), sensors.range_bearing(NOISE), COUNT
@@ -70,31 +82,6 @@ def rows(run=0, upto=STEPS):
         yield log.control[t], jax.tree.map(lambda leaf: leaf[t], log.scan)
 
 
-dense = jax.jit(lambda state: information_of(state, jnp.arange(COUNT)))
-
-
-def at(slots, robot=True):
-    """Rows of robot and landmarks in Ω."""
-    return np.array(([0, 1, 2] if robot else []) + [3 + 2 * s + k for s in slots for k in (0, 1)])
-
-
-def h_of(pose, point, slot):
-    """(2, D) of range and bearing, and what is expected."""
-    dx, dy = point - pose[:2]
-    q = dx * dx + dy * dy
-    r = np.sqrt(q)
-    h = np.zeros((2, 3 + 2 * COUNT))
-    h[:, at([slot])] = [
-        [-dx / r, -dy / r, 0, dx / r, dy / r],
-        [dy / q, -dx / q, -1, -dy / q, dx / q],
-    ]
-    return h, np.array([r, np.arctan2(dy, dx) - pose[2]])
-
-
-def close(a, b, tolerance=1e-8):
-    np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.abs(b).max())
-
-
 def least(matrix):
     """The least eigenvalue, as a share of the largest diagonal entry."""
     return np.linalg.eigvalsh(matrix)[0] / np.abs(np.diagonal(matrix)).max()
@@ -122,35 +109,32 @@ def test_tachers_counter_example_and_relocation_on_the_same_information():
     gone = np.array([False, False, False, True, True])
     h = rng.normal(size=(6, 13))
     h[:, 9:] = 0  # measurements of the landmarks that stay
-    after = np.asarray(jax.jit(sparsification.sparsified)(omega, gone)[0])
+    after = np.asarray(jax.jit(sparsification.sparsify)(omega, gone)[0])
     assert np.linalg.eigvalsh(omega - after)[0] < -1e-3
-    owed = rng.normal(size=13)
-    less, owed_less = jax.device_get(jax.jit(without_pose)(omega, owed))
-    assert not less[:3].any() and not owed_less[:3].any()
+    residual = rng.normal(size=13)
+    less, residual_less = jax.device_get(jax.jit(marginalize_pose)(omega, residual))
+    assert not less[:3].any() and not residual_less[:3].any()
     # the marginal of the landmarks: covariance and mean
     close(np.linalg.inv(less[3:, 3:]), np.linalg.inv(omega)[3:, 3:])
-    close(np.linalg.solve(less[3:, 3:], owed_less[3:]), np.linalg.solve(omega, owed)[3:])
+    close(np.linalg.solve(less[3:, 3:], residual_less[3:]), np.linalg.solve(omega, residual)[3:])
     relocated, full = less + h.T @ h, omega + h.T @ h
     assert np.linalg.eigvalsh(full - relocated)[0] > -1e-9
     assert np.linalg.eigvalsh(np.linalg.inv(relocated) - np.linalg.inv(full))[0] > -1e-9
-    np.testing.assert_array_equal(jax.jit(tied)(relocated), ~gone)
+    np.testing.assert_array_equal(jax.jit(linked_to_robot)(relocated), ~gone)
 
 
 def test_every_step_is_the_dense_formula():
     """Relocation, measurements of both kinds and births, by dense NumPy, on a noisy run."""
     f, step, predict, _ = made("eseif", **AREA)
-    relax = jax.jit(functools.partial(relaxed, share=5))
+    relax = jax.jit(functools.partial(recover_passive_means, count=5))
     state, relocations, late = start(f), 0, 0
     there = list(rows(run=1, upto=40))
     back = [(-u, scan) for (u, _), (_, scan) in zip(there[:20:-1], there[19:0:-1], strict=False)]
     for u, scan in there + back:
         before = jax.device_get(relax(predict(state, u, KEY)))
         state, info = jax.device_get(step(state, u, scan))
-        omega = np.array(dense(before))
-        owed = np.concatenate([before.owed_robot, np.ravel(before.owed)])
-        mean = np.concatenate([before.pose, np.ravel(before.landmarks)])
-        xi = omega @ mean + owed
-        active = sorted(set(np.asarray(before.slot)) - {COUNT})
+        omega, xi, mean = canonical(before)
+        active = sorted(set(np.asarray(before.active)) - {COUNT})
         status = np.asarray(info.status)
         fused = np.flatnonzero(status == Status.FUSED)
         relocated = int(state.counts.relocated) > int(before.counts.relocated)
@@ -167,15 +151,11 @@ def test_every_step_is_the_dense_formula():
                 if (slot in active) is not known:
                     continue
                 late += not known
-                h, expected = h_of(mean[:3], mean[at([slot], robot=False)], slot)
-                nu = np.asarray(scan.z[i]) - expected
-                nu[1] = np.angle(np.exp(1j * nu[1]))
-                more = h.T @ np.linalg.inv(NOISE)
-                omega, xi = omega + more @ h, xi + more @ (nu + h @ mean)
+                omega, xi, h = measured(omega, xi, mean, scan, i, NOISE)
                 if relocated:
-                    full = full + more @ h
-            # the area moves to where its block says, with all others where they are
-            here = at(active) if known else at(sorted(set(np.asarray(state.slot)) - {COUNT}))
+                    full = full + h.T @ np.linalg.inv(NOISE) @ h
+            # the active block moves to its mean, all others held where they are
+            here = at(active) if known else at(sorted(set(np.asarray(state.active)) - {COUNT}))
             left = xi - omega @ mean
             if known:
                 mean[here] += np.linalg.solve(omega[np.ix_(here, here)], left[here])
@@ -183,22 +163,15 @@ def test_every_step_is_the_dense_formula():
             assert least(full - omega) > -1e-9
         mean = np.concatenate([state.pose, np.ravel(state.landmarks)])
         for i in np.flatnonzero(status == Status.BORN):
-            slot = int(scan.tag[i])
-            h, _ = h_of(mean[:3], mean[at([slot], robot=False)], slot)
-            more = h.T @ np.linalg.inv(NOISE) @ h
-            omega, xi = omega + more, xi + more @ mean
-            own = at([slot], robot=False)
-            omega[own, own] -= 1.0  # padding
-        close(np.asarray(dense(state)), omega)
-        xi_after = np.asarray(dense(state)) @ mean + np.concatenate(
-            [state.owed_robot, np.ravel(state.owed)]
-        )
-        close(np.asarray(xi_after), xi, 1e-6)
+            omega, xi = initialized(omega, xi, mean, int(scan.tag[i]), NOISE)
+        omega_after, xi_after, _ = canonical(state)
+        close(omega_after, omega)
+        close(xi_after, xi, 1e-6)
         ties = np.flatnonzero(np.abs(omega[:3, 3:]).max(axis=0).reshape(-1, 2).max(axis=1))
         assert len(ties) <= 9
     assert relocations >= 2 and late > 2
     assert int(state.counts.relocated) == relocations
-    assert int(state.counts.dropped) == int(state.counts.broken) == 0
+    assert int(state.counts.dropped) == int(state.counts.refused) == 0
     assert int(state.counts.cut) > 0 and float(state.counts.cut_nats) > 0
 
 
@@ -279,12 +252,12 @@ def test_what_gives_a_pose():
 
     one, two = rows_of([1.0, 2.0]), rows_of([1.0, 2.0], [-2.0, 1.0])
     spread = np.sqrt(np.linalg.inv(two.T @ two)[2, 2])
-    assert not fixes_pose(jnp.asarray(one), 10.0)
-    assert fixes_pose(jnp.asarray(two), 1.01 * spread)
-    assert not fixes_pose(jnp.asarray(two), 0.99 * spread)
-    assert not fixes_pose(jnp.zeros((4, 3)), 10.0)
+    assert not determines_pose(jnp.asarray(one), 10.0)
+    assert determines_pose(jnp.asarray(two), 1.01 * spread)
+    assert not determines_pose(jnp.asarray(two), 0.99 * spread)
+    assert not determines_pose(jnp.zeros((4, 3)), 10.0)
     ranges = rows_of([1.0, 2.0], [-2.0, 1.0], [0.5, 3.0])[::2]
-    assert not fixes_pose(jnp.asarray(ranges), 10.0)
+    assert not determines_pose(jnp.asarray(ranges), 10.0)
 
 
 def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
@@ -295,10 +268,10 @@ def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
     for u, scan in scans:
         state, info = step(state, u, scan)
     known = np.flatnonzero(state.alive)
-    away = np.setdiff1d(known, np.asarray(state.slot))[:2]
+    away = np.setdiff1d(known, np.asarray(state.active))[:2]
     new = np.setdiff1d(np.arange(COUNT), known)[:2]
-    # every place tied to the robot, so that none is open
-    places = np.flatnonzero(np.asarray(state.slot) < COUNT)
+    # every active landmark is linked to the robot, so that none may leave
+    places = np.flatnonzero(np.asarray(state.active) < COUNT)
     omega = np.array(state.omega)
     for p in places:
         omega[0, 3 + 2 * p] = omega[3 + 2 * p, 0] = omega[0, 3 + 2 * p] or 1e-6
@@ -313,7 +286,7 @@ def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
     after, info = update(full, odd, KEY)
     np.testing.assert_array_equal(info.status[:4], [Status.DEFERRED] * 4)
     assert np.all(np.asarray(info.slot) == -1)
-    np.testing.assert_array_equal(after.slot, full.slot)
+    np.testing.assert_array_equal(after.active, full.active)
     assert int(after.counts.relocated) == int(state.counts.relocated)
     # or links are cut instead, and counted
     bold = filters.eseif(*MODELS, **AREA, wait=False)
@@ -325,7 +298,7 @@ def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
     omega[:3, 3:7], omega[3:7, :3] = 0, 0
     after, info = update(full._replace(omega=omega), odd, KEY)
     np.testing.assert_array_equal(info.status[:4], [Status.DEFERRED] * 2 + [Status.FUSED] * 2)
-    assert set(away) <= set(np.asarray(after.slot).tolist())
+    assert set(away) <= set(np.asarray(after.active).tolist())
 
 
 # --- the house ------------------------------------------------------------------------------------
@@ -334,22 +307,16 @@ def test_without_a_relocation_known_landmarks_wait_and_new_ones_with_them():
 def test_float32_gradients_and_a_lost_area():
     f, step, *_ = made("eseif", **AREA)
 
-    def narrow(tree):
-        return jax.tree.map(
-            lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, tree
-        )
-
     state = start(f, jnp.float32)
     for u, scan in rows(run=1):
         state, info = step(state, narrow(u), narrow(scan))
-    kinds = {leaf.dtype for leaf in jax.tree.leaves(state)}
-    assert kinds == {jnp.dtype("float32"), jnp.dtype("int32"), jnp.dtype("bool")}
-    assert int(state.counts.broken) == 0 and int(state.counts.relocated) > 0
+    assert dtypes(state) == {"float32", "int32", "bool"}
+    assert int(state.counts.refused) == 0 and int(state.counts.relocated) > 0
     omega = np.array(state.omega)
     omega[0, 0] = -1.0
     lost = state._replace(omega=omega)
     after, info = step(lost, narrow(u), narrow(scan))
-    assert int(after.counts.broken) == 1
+    assert int(after.counts.refused) == 1
     assert set(np.asarray(info.status)[np.asarray(scan.valid)]) == {int(Status.SINGULAR)}
 
     before, row = next(
@@ -366,8 +333,9 @@ def test_float32_gradients_and_a_lost_area():
     def loss(sigma, before):
         sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.03])) ** 2)
         other = filters.eseif(MODELS[0], sensor, COUNT, active=9, links=COUNT - 1, passive=1)
-        scan = row[1]._replace(z=row[1].z + 0.01)
-        after, _ = other.update(other.predict(before, row[0], KEY), scan, KEY)
+        u, scan = jax.tree.map(jnp.asarray, row)
+        scan = scan._replace(z=scan.z + 0.01)
+        after, _ = other.update(other.predict(before, u, KEY), scan, KEY)
         return after.pose[:2].sum() + after.omega[0, 0] * 1e-3, after.counts.relocated
 
     slope, relocated = jax.jit(jax.grad(loss, has_aux=True))(0.1, before)

@@ -20,7 +20,7 @@ def test_fewer_landmarks_are_active_than_the_map_has(name, scenario, active):
     filter = catalog.CANONICAL[name](world)
     pose, cov = jnp.zeros(3), jnp.eye(3)
     state = jax.eval_shape(filter.init, pose, cov)
-    assert state.slot.shape == (active,) and active < count
+    assert state.active.shape == (active,) and active < count
     places = world.places or count
     scan = Scan(jnp.zeros((places, 2)), jnp.arange(places), jnp.ones(places, bool))
     _, info = jax.eval_shape(filter.update, state, scan, jax.random.key(0))

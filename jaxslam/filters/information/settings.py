@@ -1,0 +1,89 @@
+"""What the factories of the information filters were asked for, checked once."""
+
+from dataclasses import dataclass
+
+from jaxslam import validation
+from jaxslam.math.linalg import check_count, check_gate
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.sensors.suite import Suite
+
+
+@dataclass(frozen=True, eq=False)
+class InformationSettings:
+    """Models and options of every information filter; ValueError, by its name, on bad ones."""
+
+    name: str
+    motion: Motion
+    sensor: Sensor
+    capacity: int
+    """landmark slots N"""
+    gate: float | None
+    """greatest squared Mahalanobis distance of an innovation"""
+    floor: float
+    """standard deviation [m, rad] added to a singular initial covariance"""
+
+    def __post_init__(self) -> None:
+        name, sensor = self.name, self.sensor
+        validation.check_models(name, self.motion, sensor)
+        check_count(f"{name}: capacity", self.capacity)
+        check_gate(name, self.gate)
+        if not self.floor > 0:
+            raise ValueError(f"{name}: expected a floor above 0, got {self.floor}")
+        if isinstance(sensor, Suite):
+            raise ValueError(f"{name}: expected one sensor, not a suite")
+        if len(sensor.landmark) == 0:
+            raise ValueError(f"{name}: the sensor {sensor.name} has no landmarks")
+        if sensor.reduced is not None:
+            raise ValueError(f"{name}: the landmarks of {sensor.name} become points")
+
+
+@dataclass(frozen=True, eq=False)
+class SparseSettings(InformationSettings):
+    """The same of a filter with an active set and lists of links."""
+
+    active: int
+    """landmarks that may be active, if the map has as many"""
+    links: int
+    """K, most links in the list of a landmark"""
+    passive: int
+    """landmarks whose means are recovered in rotation each scan, if the map has as many"""
+    sweeps: int
+    """rounds of mean recovery a scan"""
+    conservative: bool
+    """a full list drops a link so that Ω claims less, where it stays positive definite"""
+    whole: bool
+    """covariances of the estimate are of the whole Ω, not of Markov blankets"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for option in ("active", "links", "passive", "sweeps"):
+            check_count(f"{self.name}: {option}", getattr(self, option))
+        if len(self.sensor.landmark) != 2:
+            raise ValueError(
+                f"{self.name}: the landmarks of {self.sensor.name} are not points (x, y)"
+            )
+
+    @property
+    def active_size(self) -> int:
+        """A, the size of the active set."""
+        return min(self.active, self.capacity)
+
+    @property
+    def recovered(self) -> int:
+        """How many passive means a round of mean recovery takes."""
+        return min(self.passive, self.capacity)
+
+
+@dataclass(frozen=True, eq=False)
+class RelocationSettings(SparseSettings):
+    """The same of a filter that relocates the robot."""
+
+    turn: float
+    """greatest standard deviation of the heading [rad] that a relocation may leave"""
+    wait: bool
+    """measurements wait for a relocation; or else links are cut by sparsification"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.turn > 0:
+            raise ValueError(f"{self.name}: expected a turn above 0, got {self.turn}")
