@@ -20,6 +20,10 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
+from jaxtyping import install_import_hook
+
+install_import_hook("jaxslam", "shapes.checked")  # before the package is first imported
+
 from spending import Spending
 
 jax.config.update("jax_enable_x64", True)
