@@ -22,9 +22,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 import jax
 from jaxtyping import install_import_hook
 
-install_import_hook("jaxslam", "shapes.checked")  # before the package is first imported
-
-from spending import Spending
+# Before the package is first imported, `spending` included.
+install_import_hook("jaxslam", "shapes.checked")
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 4)
@@ -37,6 +36,8 @@ KEPT = 2**29
 
 
 def pytest_configure(config):
+    from spending import Spending
+
     config.pluginmanager.register(Spending(config))
 
 
