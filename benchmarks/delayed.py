@@ -4,8 +4,8 @@
 
 `cloister` with a camera, as in `benchmarks.bearing`: one bearing of 1° a landmark and step, the
 start known, identities known. Every third column stands, so that 100 runs with a table of stored
-measurements take minutes. `delayed` promotes an intersection that was confirmed three times, `delayed, once`
-once; the landmarks of `inverse_depth` exist from the first bearing on.
+measurements take minutes. `delayed` promotes an intersection that was confirmed three times,
+`delayed, once` once; the landmarks of `inverse_depth` exist from the first bearing on.
 
 The wait is in steps from the first bearing of a landmark to the landmark. A landmark is false when
 it ends farther than 1 m from the column of its name. The robot's heading gains 1.1° (1 σ) a step

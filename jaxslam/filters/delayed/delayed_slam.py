@@ -6,8 +6,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxslam import validation
-from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.delayed.confirmation import confirm_hypotheses
 from jaxslam.filters.delayed.intersection import intersect_measurements
@@ -17,28 +15,24 @@ from jaxslam.filters.delayed.settings import (
     Hypotheses,
     Promotion,
     StoredMeasurements,
+    delayed_settings,
 )
 from jaxslam.filters.delayed.state import (
     SIZE,
     DelayedState,
     NewMeasurements,
-    TableLayout,
     empty_state,
 )
 from jaxslam.filters.delayed.stored_measurements import store_measurements
-from jaxslam.filters.delayed.triangulation import Triangulation, triangulation_of
+from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.innovation import Correction
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.reporting import info_of, seen_before, status_of
 from jaxslam.linearize.at_estimate import at_estimate
-from jaxslam.math.linalg import check_count, is_concrete
-from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Association, Filter, Motion, Sensor
-from jaxslam.sensors.suite import on_ground
-from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 
 
@@ -96,7 +90,7 @@ def delayed_slam(
         ValueError: on a capacity below 1, a gate not above 0, a part of another kind, or a sensor
             that does not fit.
     """
-    settings = _settings(
+    settings = delayed_settings(
         motion,
         sensor,
         capacity,
@@ -107,13 +101,10 @@ def delayed_slam(
         gate=gate,
         associate=associate,
     )
-    associate = associate or known_association()
-    layout, table_sensor = settings.layout, on_ground(sensor, SIZE)
-    chart, linearize = euclidean(), at_estimate()
-    ekf = ekf_slam(motion, table_sensor, capacity)
+    ekf = ekf_slam(motion, settings.sensor, capacity)
 
     def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> DelayedState:
-        return empty_state(layout, pose, pose_cov)
+        return empty_state(settings.layout, pose, pose_cov)
 
     def predict(state: DelayedState, u: Float[Array, "U"], key: Array) -> DelayedState:
         return state._replace(joint=ekf.predict(state.joint, u, key))
@@ -121,27 +112,9 @@ def delayed_slam(
     def update(state: DelayedState, scan: Scan, key: Array) -> tuple[DelayedState, Info]:
         # Padding may hold anything, and is multiplied by zero further down.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
-        # Associate with the landmarks of the map.
-        prediction = prediction_of(
-            _landmarks_alone(state.joint, capacity),
-            sensor=table_sensor,
-            chart=chart,
-            linearize=linearize,
-        )
-        found = Association(*associate(prediction, scan))
-        matched = scan.valid & (found.slot >= 0) & ~found.is_new
-        # Gate and correct.
-        joint, correction = correct_in_turn(
-            state.joint,
-            scan.z,
-            jnp.maximum(found.slot, 0),
-            matched,
-            sensor=table_sensor,
-            chart=chart,
-            linearize=linearize,
-            gate=settings.gate,
-        )
-        state = state._replace(joint=joint, clock=state.clock + 1)
+        state = state._replace(clock=state.clock + 1)
+        found, matched = _associated(settings, state, scan)
+        state, correction = _corrected(settings, state, scan, found, matched)
         new = _new_measurements(settings, scan, found)
 
         def initialize(state: DelayedState) -> tuple[DelayedState, _Outcome]:
@@ -152,13 +125,11 @@ def delayed_slam(
             return state, _Outcome(stored, promoted)
 
         def leave(state: DelayedState) -> tuple[DelayedState, _Outcome]:
-            nobody = jnp.zeros_like(new.is_new)
-            none = jnp.full(scan.tag.shape, -1, jnp.int32)
-            return state, _Outcome(nobody, Promoted(none, nobody))
+            return state, _nothing(new)
 
         steps = initialize if len(scan.tag) > 0 else leave
         state, outcome = where_any(new.wanted.any(), steps, leave, state)
-        return state, _report(scan, found, matched, correction, new, outcome)
+        return state, _reported(scan, found, matched, correction, new, outcome)
 
     def estimate(state: DelayedState) -> Estimate:
         joint, size = state.joint, 3 + SIZE * capacity
@@ -189,9 +160,49 @@ class _Outcome(NamedTuple):
     promoted: Promoted
 
 
-def _landmarks_alone(joint: Joint, capacity: int) -> Joint:
-    """The joint as association sees it: hypotheses and stored measurements are no landmarks."""
-    return joint._replace(alive=joint.alive & (jnp.arange(len(joint.alive)) < capacity))
+def _nothing(new: NewMeasurements) -> _Outcome:
+    no = jnp.zeros_like(new.is_new)
+    return _Outcome(no, Promoted(jnp.full(new.tag.shape, -1, jnp.int32), no))
+
+
+def _associated(
+    settings: DelayedSettings, state: DelayedState, scan: Scan
+) -> tuple[Association, Bool[Array, "M"]]:
+    """Of which landmark of the map each measurement is, and which of them are of one.
+
+    Hypotheses and stored measurements are no landmarks.
+    """
+    joint = state.joint
+    landmarks = joint.alive & (jnp.arange(settings.layout.slots) < settings.layout.landmarks)
+    prediction = prediction_of(
+        joint._replace(alive=landmarks),
+        sensor=settings.sensor,
+        chart=euclidean(),
+        linearize=at_estimate(),
+    )
+    found = Association(*settings.associate(prediction, scan))
+    return found, scan.valid & (found.slot >= 0) & ~found.is_new
+
+
+def _corrected(
+    settings: DelayedSettings,
+    state: DelayedState,
+    scan: Scan,
+    found: Association,
+    matched: Bool[Array, "M"],
+) -> tuple[DelayedState, Correction]:
+    """The state corrected by the measurements of landmarks of the map that are within the gate."""
+    joint, correction = correct_in_turn(
+        state.joint,
+        scan.z,
+        jnp.maximum(found.slot, 0),
+        matched,
+        sensor=settings.sensor,
+        chart=euclidean(),
+        linearize=at_estimate(),
+        gate=settings.gate,
+    )
+    return state._replace(joint=joint), correction
 
 
 def _new_measurements(settings: DelayedSettings, scan: Scan, found: Association) -> NewMeasurements:
@@ -203,7 +214,7 @@ def _new_measurements(settings: DelayedSettings, scan: Scan, found: Association)
     return NewMeasurements(scan.z, unknown, scan.tag, is_new, jnp.zeros_like(is_new))
 
 
-def _report(
+def _reported(
     scan: Scan,
     found: Association,
     matched: Bool[Array, "M"],
@@ -235,49 +246,4 @@ def _report(
         innovation_cov=correction.innovation_cov,
         log_likelihood=correction.log_likelihood.sum(),
         exhausted=jnp.asarray(found.exhausted),
-    )
-
-
-def _settings(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    *,
-    triangulation: Triangulation | None,
-    stored: StoredMeasurements | None,
-    hypotheses: Hypotheses | None,
-    promotion: Promotion | None,
-    gate: float | None,
-    associate: Associate | None,
-) -> DelayedSettings:
-    """The settings of `delayed_slam`, checked, with its defaults."""
-    name = "delayed_slam"
-    validation.check_models(name, motion, sensor)
-    validation.check_parts(name, associate=associate)
-    if len(sensor.measurements) != 1 or len(sensor.landmark) != 2:
-        raise ValueError(
-            f"{name}: expected a sensor of one bearing or one range of points (x, y), got "
-            f"{sensor.name} with {sensor.measurements} of {sensor.landmark}"
-        )
-    check_count(f"{name}: capacity", capacity)
-    gate = chi2_quantile(0.99, 1) if gate is None else gate
-    if is_concrete(gate) and not gate > 0:
-        raise ValueError(f"{name}: expected gate above 0, got {gate}")
-    triangulation = triangulation_of(sensor) if triangulation is None else triangulation
-    stored = StoredMeasurements() if stored is None else stored
-    hypotheses = Hypotheses() if hypotheses is None else hypotheses
-    promotion = Promotion() if promotion is None else promotion
-    validation.check_record(name, "triangulation", triangulation, Triangulation)
-    validation.check_record(name, "stored", stored, StoredMeasurements)
-    validation.check_record(name, "hypotheses", hypotheses, Hypotheses)
-    validation.check_record(name, "promotion", promotion, Promotion)
-    return DelayedSettings(
-        sensor=sensor,
-        triangulation=triangulation,
-        layout=TableLayout(capacity, hypotheses.capacity, stored.capacity),
-        by_tag=associate is None,
-        gate=gate,
-        stored=stored,
-        hypotheses=hypotheses,
-        promotion=promotion,
     )

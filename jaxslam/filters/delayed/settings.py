@@ -3,11 +3,14 @@
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from jaxslam.filters.delayed.state import TableLayout
-from jaxslam.filters.delayed.triangulation import Triangulation
-from jaxslam.math.linalg import check_count, is_concrete
+from jaxslam import validation
+from jaxslam.association.known import known
+from jaxslam.filters.delayed.state import SIZE, TableLayout
+from jaxslam.filters.delayed.triangulation import Triangulation, triangulation_of
+from jaxslam.math.linalg import check_count, check_gate, is_concrete
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Sensor
+from jaxslam.protocols import Associate, Motion, Sensor
+from jaxslam.sensors.suite import on_ground
 
 Distance = Literal["mahalanobis", "bhattacharyya"]
 
@@ -103,8 +106,10 @@ class DelayedSettings:
     """What each step of `delayed_slam` takes beside the state and the scan."""
 
     sensor: Sensor
+    """of the landmarks of the table, whose third parameter it ignores"""
     triangulation: Triangulation
     layout: TableLayout
+    associate: Associate
     by_tag: bool
     """identities are known: only measurements of one tag intersect"""
     gate: float
@@ -112,6 +117,50 @@ class DelayedSettings:
     stored: StoredMeasurements
     hypotheses: Hypotheses
     promotion: Promotion
+
+
+def delayed_settings(
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    *,
+    triangulation: Triangulation | None,
+    stored: StoredMeasurements | None,
+    hypotheses: Hypotheses | None,
+    promotion: Promotion | None,
+    gate: float | None,
+    associate: Associate | None,
+) -> DelayedSettings:
+    """The settings of `delayed_slam` from its arguments, checked; None is for the default."""
+    name = "delayed_slam"
+    validation.check_models(name, motion, sensor)
+    validation.check_parts(name, associate=associate)
+    if len(sensor.measurements) != 1 or len(sensor.landmark) != 2:
+        raise ValueError(
+            f"{name}: expected a sensor of one bearing or one range of points (x, y), got "
+            f"{sensor.name} with {sensor.measurements} of {sensor.landmark}"
+        )
+    check_count(f"{name}: capacity", capacity)
+    check_gate(name, gate)
+    triangulation = triangulation_of(sensor) if triangulation is None else triangulation
+    stored = StoredMeasurements() if stored is None else stored
+    hypotheses = Hypotheses() if hypotheses is None else hypotheses
+    promotion = Promotion() if promotion is None else promotion
+    validation.check_record(name, "triangulation", triangulation, Triangulation)
+    validation.check_record(name, "stored", stored, StoredMeasurements)
+    validation.check_record(name, "hypotheses", hypotheses, Hypotheses)
+    validation.check_record(name, "promotion", promotion, Promotion)
+    return DelayedSettings(
+        sensor=on_ground(sensor, SIZE),
+        triangulation=triangulation,
+        layout=TableLayout(capacity, hypotheses.capacity, stored.capacity),
+        associate=known() if associate is None else associate,
+        by_tag=associate is None,
+        gate=chi2_quantile(0.99, 1) if gate is None else gate,
+        stored=stored,
+        hypotheses=hypotheses,
+        promotion=promotion,
+    )
 
 
 def _check_positive(record: Any, *fields: str) -> None:

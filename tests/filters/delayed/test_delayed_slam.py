@@ -550,7 +550,7 @@ def test_without_names_intersections_find_the_landmarks():
     [
         ({"sensor": sensors.range_bearing(np.eye(2))}, "one bearing or one range"),
         ({"capacity": 0}, "delayed_slam: capacity"),
-        ({"gate": 0}, "delayed_slam: expected gate above 0"),
+        ({"gate": 0}, "delayed_slam: expected a gate above 0"),
         ({"triangulation": 3}, "delayed_slam: expected triangulation to be a Triangulation"),
         ({"triangulation": rays}, "got the function rays: call it"),
         ({"stored": 32}, "delayed_slam: expected stored to be a StoredMeasurements, got int"),
