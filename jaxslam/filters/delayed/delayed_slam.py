@@ -125,7 +125,7 @@ def delayed_slam(
             return state, _Outcome(stored, promoted)
 
         def leave(state: DelayedState) -> tuple[DelayedState, _Outcome]:
-            return state, _nothing(new)
+            return state, _Outcome(jnp.zeros_like(new.is_new), Promoted.none(new))
 
         steps = initialize if len(scan.tag) > 0 else leave
         state, outcome = where_any(new.wanted.any(), steps, leave, state)
@@ -158,11 +158,6 @@ class _Outcome(NamedTuple):
 
     stored: Bool[Array, "M"]
     promoted: Promoted
-
-
-def _nothing(new: NewMeasurements) -> _Outcome:
-    no = jnp.zeros_like(new.is_new)
-    return _Outcome(no, Promoted(jnp.full(new.tag.shape, -1, jnp.int32), no))
 
 
 def _associated(

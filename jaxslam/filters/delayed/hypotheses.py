@@ -62,61 +62,55 @@ def point_residuals(
     return settle(PointResiduals(value, variance, by_point, by_stored))
 
 
-def relative_to_robot(
-    joint: Joint, layout: TableLayout
-) -> tuple[Float[Array, "C 2"], Float[Array, "C 2 2"]]:
-    """Each hypothesis less the robot's position, and the covariance of that."""
+class UncertainPoints(NamedTuple):
+    """Gaussian positions (x, y) [m]."""
+
+    mean: Float[Array, "*n 2"]
+    cov: Float[Array, "*n 2 2"]
+
+
+def relative_to_robot(joint: Joint, layout: TableLayout) -> UncertainPoints:
+    """Each hypothesis (C,) less the robot's position."""
     first, count = layout.landmarks, layout.hypotheses
     own = covariance_blocks(joint)[first : first + count][:, :2]
     own = own[jnp.arange(count), :, first + jnp.arange(count), :2]
     cross = joint.cov[:2, 3:].reshape(2, layout.slots, SIZE)[:, first : first + count, :2]
     cross = cross.transpose(1, 0, 2)
     cov = own + joint.cov[None, :2, :2] - cross - cross.transpose(0, 2, 1)
-    return joint.landmarks[first : first + count, :2] - joint.pose[None, :2], cov
+    return UncertainPoints(joint.landmarks[layout.of_hypotheses, :2] - joint.pose[None, :2], cov)
 
 
-def relative_spread(delta: Float[Array, "*n 2"], cov: Float[Array, "*n 2 2"]) -> Float[Array, "*n"]:
-    """√(largest eigenvalue of the covariance) of δ, over |δ|."""
+def relative_spread(points: UncertainPoints) -> Float[Array, "*n"]:
+    """√(largest eigenvalue of the covariance) over the distance from the origin."""
+    mean, cov = points
     middle = 0.5 * (cov[..., 0, 0] + cov[..., 1, 1])
     half = 0.5 * (cov[..., 0, 0] - cov[..., 1, 1])
     square = half**2 + cov[..., 0, 1] * cov[..., 1, 0]
     largest = middle + safe_root(square)
-    length = (delta**2).sum(axis=-1)
+    length = (mean**2).sum(axis=-1)
     return safe_root(largest) / jnp.sqrt(jnp.where(length > 0, length, 1.0))
 
 
 def closer_than(
-    distance: Distance,
-    limit: float,
-    points: Float[Array, "p 2"],
-    covs: Float[Array, "p 2 2"],
-    others: Float[Array, "q 2"],
-    other_covs: Float[Array, "q 2 2"],
+    distance: Distance, limit: float, points: UncertainPoints, others: UncertainPoints
 ) -> Bool[Array, "p q"]:
-    """Whether the distance of Gaussians N(point, cov) from others is below a limit.
+    """Whether the distance of each of p points from each of q others is below a limit.
 
     By `mahalanobis_squared` (as of independent ones) or `bhattacharyya` of `uncertain_poses`; never
     where a covariance is singular.
     """
     measure = _DISTANCES[distance]
 
-    def frame(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Frame:
+    def frame(point: UncertainPoints) -> Frame:
         # Points are frames whose heading is known equally well, and the same.
-        inert = jnp.pad(cov, [(0, 1), (0, 1)]).at[2, 2].set(1.0)
-        return Frame(jnp.pad(point, [(0, 1)]), inert)
+        inert = jnp.pad(point.cov, [(0, 1), (0, 1)]).at[2, 2].set(1.0)
+        return Frame(jnp.pad(point.mean, [(0, 1)]), inert)
 
-    def one(
-        point: Float[Array, "2"],
-        cov: Float[Array, "2 2"],
-        other: Float[Array, "2"],
-        other_cov: Float[Array, "2 2"],
-    ) -> Bool[Array, ""]:
-        how_far, regular = measure(frame(point, cov), frame(other, other_cov))
+    def one(point: UncertainPoints, other: UncertainPoints) -> Bool[Array, ""]:
+        how_far, regular = measure(frame(point), frame(other))
         return regular & (how_far < limit)
 
-    out: Array = jax.vmap(jax.vmap(one, (None, None, 0, 0)), (0, 0, None, None))(
-        points, covs, others, other_covs
-    )
+    out: Array = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(points, others)
     return settle(out)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.delayed.hypotheses import relative_spread, safe_root
+from jaxslam.filters.delayed.hypotheses import UncertainPoints, relative_spread, safe_root
 from jaxslam.filters.delayed.state import SIZE, covariance_blocks, covariance_rows
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math import linalg
@@ -120,7 +120,7 @@ def initial_estimate(
         value=value,
         minus_r_inv=minus_r_inv,
         nis=(value[2:] ** 2).sum(),
-        spread=relative_spread(point - s[0, :2], relative),
+        spread=relative_spread(UncertainPoints(point - s[0, :2], relative)),
         regular=regular & positive,
     )
 

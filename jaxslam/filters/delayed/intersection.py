@@ -8,7 +8,12 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.filters.delayed.hypotheses import closer_than, relative_spread, relative_to_robot
+from jaxslam.filters.delayed.hypotheses import (
+    UncertainPoints,
+    closer_than,
+    relative_spread,
+    relative_to_robot,
+)
 from jaxslam.filters.delayed.settings import DelayedSettings
 from jaxslam.filters.delayed.state import (
     SIZE,
@@ -40,20 +45,39 @@ def intersect_measurements(
         unexplained: those stored that are within the gate of no hypothesis.
     """
 
-    def intersect(state: DelayedState) -> DelayedState:
-        return _intersect(settings, state, new, slot, unexplained)
+    def form(state: DelayedState) -> DelayedState:
+        sharpest = _sharpest(settings, state, new, slot, unexplained)
+        return _form_hypotheses(settings, state, sharpest)
 
-    return where_any(unexplained.any(), intersect, lambda s: s, state)
+    return where_any(unexplained.any(), form, lambda s: s, state)
 
 
-def _intersect(
+class _Sharpest(NamedTuple):
+    """The k intersections of least spread, the sharpest first."""
+
+    points: UncertainPoints
+    """(k,); the covariances relative to the sensor"""
+    ok: Bool[Array, "k"]
+    """allowed, and sharp enough for a hypothesis"""
+    pair: Int[Array, "k"]
+    """a number of the two stored measurements, which mirrored points have in common"""
+    parents: Int[Array, "k 2"]
+    """their slots"""
+    which: Int[Array, "k"]
+    """which of their A points it is"""
+    tag: Int[Array, "k"]
+    group: Int[Array, "k"]
+    """hypotheses of one group exclude each other"""
+
+
+def _sharpest(
     settings: DelayedSettings,
     state: DelayedState,
     new: NewMeasurements,
     slot: Int[Array, "M"],
     unexplained: Bool[Array, "M"],
-) -> DelayedState:
-    """`intersect_measurements`, of which a scan without an unexplained measurement has no need."""
+) -> _Sharpest:
+    """The sharpest intersections of unexplained measurements, as many as hypotheses have slots."""
     layout, joint = settings.layout, state.joint
     found = intersections_of(joint, layout, settings.triangulation, slot)
     older = joint.alive[layout.of_stored] & (state.taken_at < state.clock)
@@ -61,72 +85,69 @@ def _intersect(
     allowed = allowed & (new.tag[:, None] == joint.tag[None, layout.of_stored])
     sharp = found.ok & allowed[:, :, None] & (found.spread <= settings.hypotheses.spread)
     spread = jnp.where(sharp, found.spread, jnp.inf)
-    if settings.by_tag:
+    if settings.by_tag:  # the best partner alone
         partner = jnp.argmin(spread.min(axis=2), axis=1)
         sharp = sharp & (partner[:, None] == jnp.arange(layout.stored)[None, :])[:, :, None]
         spread = jnp.where(sharp, spread, jnp.inf)
-
-    # The sharpest, as many as there are hypotheses.
-    _, w, a = spread.shape
-    tried = min(spread.size, layout.hypotheses)
-    best = jax.lax.top_k(-jax.lax.stop_gradient(spread.reshape(-1)), tried)[1]
-    good = sharp.reshape(-1)[best]
-    points, covs = found.points.reshape(-1, 2)[best], found.cov.reshape(-1, 2, 2)[best]
+    m, w, a = spread.shape
+    count = min(spread.size, layout.hypotheses)
+    best = jax.lax.top_k(-jax.lax.stop_gradient(spread.reshape(-1)), count)[1]
     measurement, pair, which = best // (w * a), best // a, best % a
     tag = new.tag[measurement]
-    duplicate = _duplicates(settings, joint, points, covs, pair, good, tag)
-    wanted = good & ~duplicate
+    return _Sharpest(
+        points=UncertainPoints(
+            found.points.reshape(-1, 2)[best], found.cov.reshape(-1, 2, 2)[best]
+        ),
+        ok=sharp.reshape(-1)[best],
+        pair=pair,
+        parents=jnp.stack([slot[measurement], layout.first_stored + pair % w], axis=1),
+        which=which,
+        tag=tag,
+        group=tag if settings.by_tag else state.clock * (m * w) + pair,
+    )
 
+
+def _form_hypotheses(
+    settings: DelayedSettings, state: DelayedState, found: _Sharpest
+) -> DelayedState:
+    """The state with a hypothesis for each intersection that is no duplicate, while slots last."""
+    layout, joint = settings.layout, state.joint
+    wanted = found.ok & ~_duplicates(settings, joint, found)
     place, granted = slots.allocate(joint.alive[layout.of_hypotheses], wanted)
     source = granted[None, :] & (place[None, :] == jnp.arange(layout.hypotheses)[:, None])
     formed, source = source.any(axis=1), jnp.argmax(source, axis=1)
-    parents = jnp.stack([slot[measurement], layout.first_stored + pair % w], axis=1)[source]
-    group = tag[source] if settings.by_tag else state.clock * (len(new.tag) * w) + pair[source]
-    joint = add_hypotheses(
-        joint, layout, settings.triangulation, formed, parents, which[source], tag[source]
-    )
+    parents, which, tag = found.parents[source], found.which[source], found.tag[source]
+    joint = add_hypotheses(joint, layout, settings.triangulation, formed, parents, which, tag)
     refused = increased(state.counts.refused, wanted & ~granted)
     return state._replace(
         joint=joint,
         persistence=jnp.where(formed, 1.0, state.persistence),
         confirmed_at=jnp.where(formed, state.clock, state.confirmed_at),
-        group=jnp.where(formed, group, state.group).astype(jnp.int32),
+        group=jnp.where(formed, found.group[source], state.group).astype(jnp.int32),
         parents=jnp.where(formed[:, None], parents, state.parents).astype(jnp.int32),
         counts=state.counts._replace(refused=refused),
     )
 
 
-def _duplicates(
-    settings: DelayedSettings,
-    joint: Joint,
-    points: Float[Array, "k 2"],
-    covs: Float[Array, "k 2 2"],
-    pair: Int[Array, "k"],
-    good: Bool[Array, "k"],
-    tag: Int[Array, "k"],
-) -> Bool[Array, "k"]:
-    """Which of k intersections, the sharpest first, are at the place of one before or a hypothesis.
+def _duplicates(settings: DelayedSettings, joint: Joint, found: _Sharpest) -> Bool[Array, "k"]:
+    """Which intersections are at the place of a sharper one, or of a hypothesis of before.
 
-    The mirrored points of one pair are no duplicates of each other.
+    Mirrored points of one pair are no duplicates of each other.
     """
-    layout, count = settings.layout, len(pair)
-    old, old_covs = relative_to_robot(joint, layout)
-    others = jnp.concatenate([points, joint.pose[None, :2] + old])
-    close = closer_than(
-        settings.hypotheses.distance,
-        settings.hypotheses.same_below,
-        points,
-        covs,
-        others,
-        jnp.concatenate([covs, old_covs]),
-    )
-    of_earlier, of_old = close[:, :count], close[:, count:]
-    earlier = jnp.arange(count)[:, None] > jnp.arange(count)[None, :]
-    of_earlier = of_earlier & earlier & good[None, :] & (pair[:, None] != pair[None, :])
-    of_earlier = of_earlier & (tag[:, None] == tag[None, :])
+    layout, count = settings.layout, len(found.pair)
+    old = relative_to_robot(joint, layout)
+    old = old._replace(mean=joint.pose[None, :2] + old.mean)
+    others = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), found.points, old)
+    limit = settings.hypotheses.same_below
+    close = closer_than(settings.hypotheses.distance, limit, found.points, others)
+    of_sharper, of_old = close[:, :count], close[:, count:]
+    sharper = jnp.arange(count)[:, None] > jnp.arange(count)[None, :]
+    of_sharper = of_sharper & sharper & found.ok[None, :]
+    of_sharper = of_sharper & (found.pair[:, None] != found.pair[None, :])
+    of_sharper = of_sharper & (found.tag[:, None] == found.tag[None, :])
     of_old = of_old & joint.alive[layout.of_hypotheses][None, :]
-    of_old = of_old & (tag[:, None] == joint.tag[layout.of_hypotheses][None, :])
-    return of_earlier.any(axis=1) | of_old.any(axis=1)
+    of_old = of_old & (found.tag[:, None] == joint.tag[layout.of_hypotheses][None, :])
+    return of_sharper.any(axis=1) | of_old.any(axis=1)
 
 
 class Intersections(NamedTuple):
@@ -160,7 +181,7 @@ def intersections_of(
         by_a = by_a - jnp.eye(2, SIZE, dtype=by_a.dtype)[None]
         jacobian = jnp.concatenate([by_a, by_b], axis=2)
         relative = jnp.einsum("aij,jk,alk->ail", jacobian, cov, jacobian)
-        spread = relative_spread(points - a[None, :2], relative)
+        spread = relative_spread(UncertainPoints(points - a[None, :2], relative))
         return points, ok, relative, jnp.where(ok, spread, jnp.inf)
 
     start = 3 + SIZE * first

@@ -8,7 +8,7 @@ For the most persistent hypothesis that this scan confirmed, at most `per_scan` 
 4. `add_landmark` where accepted; what that uses up or rules out is deleted.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +57,11 @@ class Promoted(NamedTuple):
     refused: Bool[Array, "M"]
     """one was ready, and the map is full"""
 
+    @classmethod
+    def none(cls, new: NewMeasurements) -> Self:
+        """No landmark of any measurement."""
+        return cls(jnp.full(len(new.tag), -1, jnp.int32), jnp.zeros_like(new.is_new))
+
 
 class _Decision(NamedTuple):
     """Where neither holds, the measurements of a hypothesis contradict each other."""
@@ -101,10 +106,8 @@ def promote_hypotheses(
         )
         return (state, jnp.where(considered | gone, -1, confirmed_by), done), None
 
-    nothing = Promoted(jnp.full(len(new.tag), -1, jnp.int32), jnp.zeros_like(new.is_new))
-    (state, _, done), _ = jax.lax.scan(
-        once, (state, confirmed_by, nothing), None, length=settings.promotion.per_scan
-    )
+    start = state, confirmed_by, Promoted.none(new)
+    (state, _, done), _ = jax.lax.scan(once, start, None, length=settings.promotion.per_scan)
     return state, done._replace(refused=done.refused & (done.slot < 0))
 
 
@@ -117,7 +120,7 @@ def _candidate(
     excluding = (state.group[:, None] == state.group[None, :]) & alive[None, :]
     excluding = excluding & ~jnp.eye(layout.hypotheses, dtype=bool)
     ahead = ~(excluding & (level[None, :] > level[:, None] - promotion.lead)).any(axis=1)
-    sharp = relative_spread(*relative_to_robot(state.joint, layout)) <= promotion.spread
+    sharp = relative_spread(relative_to_robot(state.joint, layout)) <= promotion.spread
     may = alive & (confirmed_by >= 0) & (level >= promotion.persistence) & ahead & sharp
     return may.any(), jnp.argmax(jnp.where(may, level, -jnp.inf))
 
@@ -241,13 +244,8 @@ def _rivals(
     # hypothesis of the same place.
     parents = state.parents
     rivals = rivals | ((parents >= 0) & used_up[jnp.maximum(parents, 0)]).any(axis=1)
-    points, covs = relative_to_robot(state.joint, settings.layout)
-    same_place = closer_than(
-        settings.hypotheses.distance,
-        settings.hypotheses.same_below,
-        points,
-        covs,
-        points[chosen][None],
-        covs[chosen][None],
-    )
+    points = relative_to_robot(state.joint, settings.layout)
+    itself = jax.tree.map(lambda part: part[chosen][None], points)
+    limit = settings.hypotheses.same_below
+    same_place = closer_than(settings.hypotheses.distance, limit, points, itself)
     return rivals | same_place[:, 0]

@@ -15,7 +15,7 @@ from jaxslam import Scenario, motion, sensors
 from jaxslam.association import nearest
 from jaxslam.filters import delayed_slam, ekf_slam
 from jaxslam.filters.delayed.confirmation import constraints_of, correct_hypotheses
-from jaxslam.filters.delayed.hypotheses import closer_than, point_residuals
+from jaxslam.filters.delayed.hypotheses import UncertainPoints, closer_than, point_residuals
 from jaxslam.filters.delayed.initialization import add_landmark, initial_estimate
 from jaxslam.filters.delayed.intersection import add_hypotheses
 from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
@@ -291,9 +291,10 @@ def test_gaussians_are_told_apart_by_either_distance():
     d2 = np.array([0.25 / 0.08, 0.25 / 0.4, 4 / 0.02])
     log_det = [0.0, np.log(5) - np.log(3), 0.0]
     bhattacharyya = d2 / 4 + np.array(log_det)
+    gaussians = UncertainPoints(points, cov[None]), UncertainPoints(others, other_covs)
     for distance, by_hand in (("mahalanobis", d2), ("bhattacharyya", bhattacharyya)):
         for limit in (0.3, 0.7, 1.0, 4.0):
-            near = CLOSER(distance, limit, points, cov[None], others, other_covs)
+            near = CLOSER(distance, limit, *gaussians)
             np.testing.assert_array_equal(near[0], by_hand < limit)
 
 
