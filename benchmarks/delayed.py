@@ -3,9 +3,9 @@
     python -m benchmarks.delayed [--runs 100] [--every 3]
 
 `cloister` with a camera, as in `benchmarks.bearing`: one bearing of 1° a landmark and step, the
-start known, identities known. Every third column stands, so that 100 runs with a table of sightings
-take minutes. `delayed` promotes an intersection that was confirmed three times, `delayed, once`
-once; the landmarks of `inverse_depth` exist from the first bearing on.
+start known, identities known. Every third column stands, so that 100 runs with a table of stored
+measurements take minutes. `delayed` promotes an intersection that was confirmed three times,
+`delayed, once` once; the landmarks of `inverse_depth` exist from the first bearing on.
 
 The wait is in steps from the first bearing of a landmark to the landmark. A landmark is false when
 it ends farther than 1 m from the column of its name. The robot's heading gains 1.1° (1 σ) a step
@@ -28,6 +28,7 @@ from benchmarks.gate import Metric, alone
 from jaxslam import motion, sensors
 from jaxslam.association import nearest
 from jaxslam.filters import delayed_slam, ekf_slam
+from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import mahalanobis_squared
 from jaxslam.math.stats import chi2_quantile
@@ -50,10 +51,14 @@ def named(every):
     )
     count = len(columns)
     parts = world.motion, camera, count
-    tables = {"sightings": 6 * count, "hypotheses": 2 * count}
+    tables = {
+        "stored": StoredMeasurements(capacity=6 * count),
+        "hypotheses": Hypotheses(capacity=2 * count),
+    }
+    once = Promotion(persistence=2, lead=0)
     return scenario, {
         "delayed": delayed_slam(*parts, **tables),
-        "delayed, once": delayed_slam(*parts, persistence=2, lead=0, **tables),
+        "delayed, once": delayed_slam(*parts, promotion=once, **tables),
         "inverse_depth": ekf_slam(world.motion, rays, count, update="joint"),
     }
 
@@ -72,10 +77,9 @@ def nameless():
         scenario.motion,
         camera,
         8,
-        sightings=40,
-        hypotheses=40,
-        persistence=6,
-        decay=0.7,
+        stored=StoredMeasurements(capacity=40),
+        hypotheses=Hypotheses(capacity=40, decay=0.7),
+        promotion=Promotion(persistence=6),
         associate=nearest(*gates),
     )
     return scenario, filter

@@ -23,10 +23,11 @@ import jaxslam
 from benchmarks.gate import Metric, alone
 from jaxslam import datasets, se2
 from jaxslam.filters import delayed_slam
+from jaxslam.filters.delayed.settings import StoredMeasurements
 from jaxslam.types import Status
 
 FIGURE = Path(__file__).parent / "figures" / "plaza1.png"
-OPTIONS = {"sightings": 40, "hypotheses": 16, "spacing": 2.0}
+STORED = StoredMeasurements(capacity=40, spacing=2.0)
 SPOILED, FARTHEST = 0.1, 80.0
 
 
@@ -69,7 +70,7 @@ def beacons(motion, estimate, data):
 
 def measure(figure=False):
     data, raw = read(), read(range_bias=(0.0, 0.0))
-    slam = delayed_slam(data.motion, data.sensor, data.capacity, **OPTIONS)
+    slam = delayed_slam(data.motion, data.sensor, data.capacity, stored=STORED)
 
     @jax.jit
     def go(log):

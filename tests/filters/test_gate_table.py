@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxslam import filters, motion, sensors
+from jaxslam.filters.delayed.settings import Hypotheses, StoredMeasurements
 from jaxslam.filters.reporting import info_of, nothing_of, status_of
 from jaxslam.types import Scan, Status
 
@@ -184,7 +185,14 @@ def test_a_delayed_filter_reports_bearings_by_the_table():
     sensor = dataclasses.replace(
         sensors.bearing_only(np.diag([1e-4])), noise_cov=noise, residual=lambda z, zh: z - zh
     )
-    filter = filters.delayed_slam(MOVE, sensor, 2, gate=20.0, sightings=4, hypotheses=2)
+    filter = filters.delayed_slam(
+        MOVE,
+        sensor,
+        2,
+        gate=20.0,
+        stored=StoredMeasurements(capacity=4),
+        hypotheses=Hypotheses(capacity=2),
+    )
     state = jax.jit(filter.init)(np.zeros(3), 1e-4 * np.eye(3))
     landmarks, alive, tag = (
         np.array(getattr(state.joint, k)) for k in ("landmarks", "alive", "tag")

@@ -1,138 +1,153 @@
-"""A landmark as many sightings of it place it at once, and what they say beyond that of the map."""
+"""A landmark located by all its stored measurements at once, and their correction of the map."""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.delayed.hypotheses import blocks_of, relative_spread, safe_root
-from jaxslam.filters.delayed.state import SIZE
-from jaxslam.filters.delayed.triangulation import Meeting
+from jaxslam.filters.delayed.hypotheses import UncertainPoints, relative_spread, safe_root
+from jaxslam.filters.delayed.state import SIZE, covariance_blocks, covariance_rows
+from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.xla import settle
 from jaxslam.slots import Joint
 
-Array = jax.Array
-
 # Gauss-Newton steps from a hypothesis, which is near already.
-_DESCENTS = 4
+_STEPS = 4
 
 
 class InitialEstimate(NamedTuple):
-    """A landmark as m sightings place it, every Jacobian taken there."""
+    """A landmark as m stored measurements locate it, every Jacobian taken there."""
 
-    point: Array
-    """(2,) x*"""
-    by_sight: Array
-    """(m, 3) G_s"""
-    turn: Array
-    """(m, m) Qᵀ L⁻¹"""
-    value: Array
-    """(m,) Qᵀ L⁻¹ e"""
-    undo: Array
-    """(2, 2) -R⁻¹"""
-    nis: Array
-    """() what the sightings disagree by: chi-square with m - 2 degrees of freedom"""
-    spread: Array
-    """() the largest standard deviation of the place, relative to where the first sighting was
-    taken, over the distance"""
-    regular: Array
-    """() bool: the sightings locate it"""
+    point: Float[Array, "2"]
+    """x*"""
+    by_stored: Float[Array, "m 3"]
+    """G_s"""
+    transform: Float[Array, "m m"]
+    """Qᵀ L⁻¹"""
+    value: Float[Array, "m"]
+    """Qᵀ L⁻¹ e"""
+    minus_r_inv: Float[Array, "2 2"]
+    """-R⁻¹"""
+    nis: Float[Array, ""]
+    """what the measurements disagree by: chi-square with m - 2 degrees of freedom"""
+    spread: Float[Array, ""]
+    """the largest standard deviation of the point, relative to where the first measurement was
+    taken, over their distance"""
+    regular: Bool[Array, ""]
+    """the measurements locate it"""
 
 
 def initial_estimate(
-    joint: Joint, meeting: Meeting, start: Array, sightings: Array, use: Array
+    joint: Joint,
+    triangulation: Triangulation,
+    start: Float[Array, "2"],
+    stored: Int[Array, "m"],
+    use: Bool[Array, "m"],
 ) -> InitialEstimate:
-    """Where m sightings place a landmark, and how well they agree.
+    """Where m stored measurements locate a landmark, and how well they agree.
 
-    Each sighting of the landmark says g(s_k, x) = 0, to first order e + G_s δs + G_x δx = 0. With
-    M = G_s P_ss G_sᵀ = L Lᵀ, x* is where eᵀ M⁻¹ e is least. A rotation Qᵀ of the rows L⁻¹ (·) that
-    makes those of G_x upper triangular, two Householder reflections, parts them; both parts have
-    unit covariance, and none with one another:
+    Each stored measurement of the landmark says g(s_k, x) = 0, to first order
+    e + G_s δs + G_x δx = 0. With M = G_s P_ss G_sᵀ = L Lᵀ, x* is where eᵀ M⁻¹ e is least. The
+    orthogonal Qᵀ (two Householder reflections) that makes L⁻¹ G_x upper triangular divides the rows
+    Qᵀ L⁻¹ (e + G_s δs + G_x δx) = 0 into two parts of unit covariance, uncorrelated:
 
     - the first two, R δx = -(e₁ + G₁ δs), give the landmark: P_x· = -R⁻¹ G₁ P_s·, P_xx = (RᵀR)⁻¹;
     - the others, in which x does not occur, measure e₂ = -G₂ δs, and correct the whole map.
 
-    So each sighting counts once, and no prior of the landmark is needed. (What is done with feature
-    tracks by A. I. Mourikis, S. I. Roumeliotis, "A multi-state constraint Kalman filter for
+    So each measurement counts once, and no prior of the landmark is needed. (What is done with
+    feature tracks by A. I. Mourikis, S. I. Roumeliotis, "A multi-state constraint Kalman filter for
     vision-aided inertial navigation", ICRA 2007, who keep the second part alone.) A hypothesis only
-    says which sightings belong together: corrected by one after the other, each at another place,
-    it holds Jacobians that contradict each other, and a robot corrected through it would take the
-    difference for information.
+    says which measurements belong together: corrected by one after the other, each linearized at
+    another point, it holds Jacobians that contradict each other, and a robot corrected through it
+    would take the difference for information.
 
     Args:
-        start: (2,) where to begin.
-        sightings: (m,) slots, those to use first.
-        use: (m,) bool.
+        start: where Gauss-Newton begins.
+        stored: the slots of the measurements, those to use first.
+        use: which to use.
     """
-    m = len(sightings)
-    seen = joint.landmarks[sightings]
-    blocks = blocks_of(joint)[sightings][:, :, sightings]
-    both, unit = use[:, None] & use[None, :], jnp.eye(m, dtype=seen.dtype)
+    m = len(stored)
+    s = joint.landmarks[stored]
+    residual = triangulation.residual
+    blocks = covariance_blocks(joint)[stored][:, :, stored]
+    both, unit = use[:, None] & use[None, :], jnp.eye(m, dtype=s.dtype)
 
-    def rows(point: Array) -> tuple[Array, Array, Array, Array, Array]:
-        value = jnp.where(use, jax.vmap(meeting.miss, (0, None))(seen, point), 0.0)
-        by_sight, by_point = jax.vmap(jax.jacfwd(meeting.miss, argnums=(0, 1)), (0, None))(
-            seen, point
-        )
-        by_sight = jnp.where(use[:, None], by_sight, 0.0)
-        own = jnp.einsum("mi,minj,nj->mn", by_sight, blocks, by_sight)
-        whiten, positive = linalg.whitener_by_rows(jnp.where(both, own, unit))
-        by_point = whiten @ jnp.where(use[:, None], by_point, 0.0)
-        return whiten @ value, by_sight, by_point, whiten, positive
+    def whitened(
+        point: Float[Array, "2"],
+    ) -> tuple[
+        Float[Array, "m"], Float[Array, "m 3"], Float[Array, "m 2"], Float[Array, "m m"], Array
+    ]:
+        """L⁻¹ e, G_s, L⁻¹ G_x, L⁻¹, and whether M is positive definite."""
+        value = jnp.where(use, jax.vmap(residual, (0, None))(s, point), 0.0)
+        by_stored, by_point = jax.vmap(jax.jacfwd(residual, argnums=(0, 1)), (0, None))(s, point)
+        by_stored = jnp.where(use[:, None], by_stored, 0.0)
+        cov = jnp.einsum("mi,minj,nj->mn", by_stored, blocks, by_stored)
+        inverse_root, positive = linalg.whitener_by_rows(jnp.where(both, cov, unit))
+        by_point = inverse_root @ jnp.where(use[:, None], by_point, 0.0)
+        return inverse_root @ value, by_stored, by_point, inverse_root, positive
 
-    def descend(before: Any, _: None) -> tuple[Any, None]:
+    def gauss_newton(before: Any, _: None) -> tuple[Any, None]:
         point = before[0]
-        found = rows(point)
-        value, _by_sight, by_point, _whiten, positive = found
+        terms = whitened(point)
+        value, _by_stored, by_point, _inverse_root, positive = terms
         step, regular = linalg.solve_psd(by_point.T @ by_point, by_point.T @ value)
-        return (point - jnp.where(regular & positive, step, 0.0), point, found), None
+        return (point - jnp.where(regular & positive, step, 0.0), point, terms), None
 
-    # The rows at the end of the last descent are those of one more, whose end is not used.
-    nothing = jnp.zeros((m, 3 + SIZE + m), seen.dtype)
-    none = nothing[:, 0], nothing[:, :SIZE], nothing[:, :2], nothing[:, 6:], jnp.asarray(True)
-    _, point, found = jax.lax.scan(descend, (start, start, none), None, length=_DESCENTS + 1)[0]
-    value, by_sight, by_point, whiten, positive = found
-    turn = settle(_triangular(by_point))
-    triangle, value, turn = (turn @ by_point)[:2], turn @ value, turn @ whiten
-    regular = (use.sum() >= 2) & (jnp.abs(triangle[0, 0] * triangle[1, 1]) > 0)
-    safe = jnp.where(regular, triangle, jnp.eye(2, dtype=triangle.dtype))
-    undo = -linalg.inverse(safe.at[1, 0].set(0.0))
-    point = point + undo @ value[:2]
-    cross = undo @ (turn @ jnp.einsum("mi,mij->mj", by_sight, blocks[:, :, 0, :2]))[:2]
-    apart = linalg.symmetrize(undo @ undo.T - cross - cross.T + blocks[0, :2, 0, :2])
+    # The terms at the end of the last step are those of one more, whose end is not used.
+    zeros = jnp.zeros((m, 3 + SIZE + m), s.dtype)
+    none = zeros[:, 0], zeros[:, :SIZE], zeros[:, :2], zeros[:, 6:], jnp.asarray(True)
+    _, point, terms = jax.lax.scan(gauss_newton, (start, start, none), None, length=_STEPS + 1)[0]
+    value, by_stored, by_point, inverse_root, positive = terms
+    q = settle(_triangularizing(by_point))
+    r, value, transform = (q @ by_point)[:2], q @ value, q @ inverse_root
+    regular = (use.sum() >= 2) & (jnp.abs(r[0, 0] * r[1, 1]) > 0)
+    safe = jnp.where(regular, r, jnp.eye(2, dtype=r.dtype))
+    minus_r_inv = -linalg.inverse(safe.at[1, 0].set(0.0))
+    point = point + minus_r_inv @ value[:2]
+    # The covariance of the point less where the first measurement was taken.
+    with_first = transform @ jnp.einsum("mi,mij->mj", by_stored, blocks[:, :, 0, :2])
+    cross = minus_r_inv @ with_first[:2]
+    own = minus_r_inv @ minus_r_inv.T
+    relative = linalg.symmetrize(own - cross - cross.T + blocks[0, :2, 0, :2])
     return InitialEstimate(
         point=point,
-        by_sight=by_sight,
-        turn=turn,
+        by_stored=by_stored,
+        transform=transform,
         value=value,
-        undo=undo,
+        minus_r_inv=minus_r_inv,
         nis=(value[2:] ** 2).sum(),
-        spread=relative_spread(point - seen[0, :2], apart),
+        spread=relative_spread(UncertainPoints(point - s[0, :2], relative)),
         regular=regular & positive,
     )
 
 
-def add_landmark(joint: Joint, found: InitialEstimate, slot: Array, sightings: Array) -> Joint:
-    """The map with the landmark in a dead slot (), corrected by what its sightings say beyond it.
+def add_landmark(
+    joint: Joint, estimate: InitialEstimate, slot: Int[Array, ""], stored: Int[Array, "m"]
+) -> Joint:
+    """The joint with the landmark in a dead slot, corrected by what its measurements say beyond it.
 
-    sightings: those of `fit`.
+    Args:
+        estimate: as of `initial_estimate`, of the measurements in the slots `stored`.
     """
     capacity = joint.landmarks.shape[0]
-    table = joint.cov[3:].reshape(capacity, SIZE, -1)
-    hp = settle(found.turn @ jnp.einsum("mi,mid->md", found.by_sight, table[sightings]))
+    rows = covariance_rows(joint)[stored]
+    hp = settle(estimate.transform @ jnp.einsum("mi,mid->md", estimate.by_stored, rows))
     mine = 3 + SIZE * slot + jnp.arange(2)
-    half = (found.undo @ hp[:2]).at[:, mine].add(0.5 * found.undo @ found.undo.T)
+    own = 0.5 * estimate.minus_r_inv @ estimate.minus_r_inv.T
+    half = (estimate.minus_r_inv @ hp[:2]).at[:, mine].add(own)
     # Padding's unit variance goes first, to an exact zero.
     cov = joint.cov.at[mine, mine].add(-1.0)
     cov = cov.at[mine].add(half).at[:, mine].add(half.T)
     # Of unit covariance, and none with the landmark: S = I, and S⁻¹ costs nothing.
-    v, white = hp[2:], found.value[2:]
-    moved = -linalg.gram(v, white[:, None])[:, 0]
+    v, value = hp[2:], estimate.value[2:]
+    moved = -linalg.gram(v, value[:, None])[:, 0]
     pose = joint.pose + moved[:3]
     here = (jnp.arange(capacity) == slot)[:, None]
-    placed = jnp.where(here, jnp.pad(found.point, [(0, SIZE - 2)])[None], joint.landmarks)
+    placed = jnp.where(here, jnp.pad(estimate.point, [(0, SIZE - 2)])[None], joint.landmarks)
     return joint._replace(
         pose=jnp.concatenate([pose[:2], wrap(pose[2:])]),
         landmarks=placed + moved[3:].reshape(capacity, SIZE),
@@ -141,15 +156,15 @@ def add_landmark(joint: Joint, found: InitialEstimate, slot: Array, sightings: A
     )
 
 
-def _triangular(matrix: Array) -> Array:
-    """Orthogonal Qᵀ (m, m) with Qᵀ A upper triangular, of A (m, 2); rows of zeros stay."""
+def _triangularizing(matrix: Float[Array, "m 2"]) -> Float[Array, "m m"]:
+    """Orthogonal Qᵀ, two Householder reflections, with Qᵀ A upper triangular; zero rows stay."""
     m = matrix.shape[0]
-    turn = jnp.eye(m, dtype=matrix.dtype)
+    q = jnp.eye(m, dtype=matrix.dtype)
     for k in range(2):
-        column = jnp.where(jnp.arange(m) >= k, (turn @ matrix)[:, k], 0.0)
+        column = jnp.where(jnp.arange(m) >= k, (q @ matrix)[:, k], 0.0)
         sign = jnp.where(column[k] >= 0, 1.0, -1.0)
         axis = column.at[k].add(sign * safe_root((column**2).sum()))
         square = (axis**2).sum()
         scale = jnp.where(square > 0, 2 / jnp.where(square > 0, square, 1.0), 0.0)
-        turn = turn - scale * axis[:, None] * (axis @ turn)[None, :]
-    return turn
+        q = q - scale * axis[:, None] * (axis @ q)[None, :]
+    return q

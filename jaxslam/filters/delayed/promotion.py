@@ -1,156 +1,251 @@
-"""The step from hypothesis to landmark, with all its sightings at once."""
+"""The last step: a hypothesis becomes a landmark, made of all its stored measurements at once.
 
-from typing import NamedTuple
+For the most persistent hypothesis that this scan confirmed, at most `per_scan` times:
+
+1. `_candidate`: it is persistent enough, ahead of those that exclude it, and its place is sharp;
+2. `_measurements_of`: its stored measurements; `_outermost`: up to eight of them;
+3. `_locate`: the place that explains these best, and a decision: accept it, wait, or refuse it;
+4. `add_landmark` where accepted; what that uses up or rules out is deleted.
+"""
+
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Int
 
-from jaxslam.filters.delayed import hypotheses as table
+from jaxslam.filters.delayed.hypotheses import (
+    closer_than,
+    point_residuals,
+    relative_spread,
+    relative_to_robot,
+)
 from jaxslam.filters.delayed.initialization import InitialEstimate, add_landmark, initial_estimate
-from jaxslam.filters.delayed.state import Delayed, Rules, after, more, without
+from jaxslam.filters.delayed.settings import DelayedSettings
+from jaxslam.filters.delayed.state import (
+    DelayedState,
+    NewMeasurements,
+    delete_slots,
+    increased,
+    is_newer,
+    slots_where,
+)
 from jaxslam.math.stats import chi2_quantiles
 from jaxslam.math.xla import settle, where_any
 
-Array = jax.Array
-
-# Sightings that a landmark is made of at its promotion: two locate it, and the others are a
-# matrix that `linalg` factors without a library call.
+# Stored measurements that a landmark is made of: two locate it, and the others are a matrix that
+# `linalg` factors without a library call.
 _USED = 8
 
-# A landmark whose sightings fit together so badly, or worse, by chance this seldom is none.
+# A landmark whose measurements fit together so badly, or worse, by chance this seldom is refused.
 _UNLIKELY = 1e-3
 
-# By so much -2 log likelihood must the place of a landmark be better than its twin.
-_CLOSE = 9.0
+# By so much -2 log likelihood must the place of a landmark be better than its mirror solution.
+_AMBIGUOUS = 9.0
 
-# Two descents that end so close, relative to the distance, ended at one place. Beyond, two places
-# explain the sightings, however near each other.
+# Two estimates so close to each other, relative to the distance, are of one place.
 _ONE_PLACE = 0.02
 
 
-def promote(
-    rules: Rules, state: Delayed, names: Array, by: Array
-) -> tuple[Delayed, Array, Array, Array]:
-    """The hypothesis that is most persistent, if it may, as a landmark.
+class Promoted(NamedTuple):
+    """What became of the hypotheses that each measurement of a scan confirmed last."""
 
-    by (C,): the measurement that confirmed each. Returns by without it, and the measurement
-    and the slot: measurement -1 where none may, slot -1 where the map is full, -2 where its
-    sightings do not fit together, or not yet in one place.
+    slot: Int[Array, "M"]
+    """of the landmark that one of them became, or -1"""
+    refused: Bool[Array, "M"]
+    """one was ready, and the map is full"""
+
+    @classmethod
+    def none(cls, new: NewMeasurements) -> Self:
+        """No landmark of any measurement."""
+        return cls(jnp.full(len(new.tag), -1, jnp.int32), jnp.zeros_like(new.is_new))
+
+
+class _Decision(NamedTuple):
+    """Where neither holds, the measurements of a hypothesis contradict each other."""
+
+    accepted: Bool[Array, ""]
+    """it becomes a landmark"""
+    undecided: Bool[Array, ""]
+    """its place is not sharp yet, or another explains the measurements nearly as well"""
+
+
+def promote_hypotheses(
+    settings: DelayedSettings,
+    state: DelayedState,
+    new: NewMeasurements,
+    confirmed_by: Int[Array, "C"],
+) -> tuple[DelayedState, Promoted]:
+    """The state with the most persistent confirmed hypotheses promoted, waiting, or deleted.
+
+    confirmed_by: the measurement that confirmed each, or -1.
     """
-    layout = rules.layout
-    joint = state.joint
-    alive = joint.alive[layout.of_hypotheses]
-    others = (state.group[:, None] == state.group[None, :]) & alive[None, :]
-    others = others & ~jnp.eye(layout.hypotheses, dtype=bool)
-    level = state.persistence
-    ahead = ~(others & (level[None, :] > level[:, None] - rules.lead)).any(axis=1)
-    sharp = table.relative_spread(*table.from_robot(joint, layout)) <= rules.ready
-    may = alive & (by >= 0) & (level >= rules.persistence) & ahead & sharp
-    chosen = jnp.argmax(jnp.where(may, level, -jnp.inf))
-    free = ~joint.alive[layout.of_landmarks]
-    any_may, room = may.any(), free.any()
-    go = any_may & room
-    home = jnp.argmax(free)
-    place = jnp.where(any_may, by[chosen], -1)
+    measurements = jnp.arange(len(new.tag))
 
-    def entering(state: Delayed) -> Delayed:
-        joint = state.joint
-        origin = layout.landmarks + chosen
-        # Its sightings: of its tag, or those that see it.
-        seen = joint.alive[layout.of_sightings]
-        seen = seen & (joint.tag[layout.of_sightings] == joint.tag[origin])
-        miss = table.misses(joint, rules.meeting, origin[None], layout.sighting_slots)
-        # Of its own sightings the variance is almost none: rounding and curvature remain.
-        variance = miss.variance[0] + state.noise
-        seeing = seen & (miss.value[0] ** 2 <= rules.gate * variance)
-        fit, sights, verdict = _explanation(rules, state, origin, seeing)
-        # Of a batch, the runs without a promotion wait, and keep all they have to the bit.
-        verdict = settle(_Verdict(verdict.yes & go, verdict.wait | ~go))
-        entered = add_landmark(joint, fit, home, sights)
-        joint = jax.tree.map(lambda a, b: jnp.where(verdict.yes, a, b), entered, joint)
-        mine = verdict.yes & (jnp.arange(layout.slots) == home)
-        joint = joint._replace(tag=jnp.where(mine, names[place], joint.tag).astype(jnp.int32))
-        leaving = verdict.yes & (seen if rules.tagged else seeing)
-        gone = jnp.zeros(layout.slots, bool).at[layout.of_sightings].set(leaving)
-        itself = jnp.arange(layout.hypotheses) == chosen
-        rivals = _rivals(rules, state._replace(joint=joint), chosen, gone)
-        rivals = rivals & joint.alive[layout.of_hypotheses] & ~itself & verdict.yes
-        gone = gone.at[layout.of_hypotheses].set((rivals | itself) & ~verdict.wait)
-        counts = state.counts
-        counts = counts._replace(
-            rivals=more(counts.rivals, rivals),
-            promoted=more(counts.promoted, verdict.yes),
-            refuted=more(counts.refuted, ~verdict.yes & ~verdict.wait),
+    def once(carry: Any, _: None) -> tuple[Any, None]:
+        state, confirmed_by, done = carry
+        ready, chosen = _candidate(settings, state, confirmed_by)
+        free = ~state.joint.alive[settings.layout.of_landmarks]
+        room, slot = free.any(), jnp.argmax(free)
+        by = jnp.where(ready, confirmed_by[chosen], -1)
+        before = state.counts.promoted
+        go = ready & room
+        state = where_any(
+            go, lambda s: _promote(settings, s, chosen, slot, new.name[by], go), lambda s: s, state
         )
-        return without(layout, state._replace(joint=joint, counts=counts), gone)
+        # Each is considered once a scan.
+        considered = ready & (jnp.arange(len(confirmed_by)) == chosen)
+        gone = ~state.joint.alive[settings.layout.of_hypotheses]
+        here = measurements == by
+        succeeded = go & (state.counts.promoted > before)
+        done = Promoted(
+            jnp.where(here & succeeded, slot, done.slot).astype(jnp.int32),
+            done.refused | (here & ~room),
+        )
+        return (state, jnp.where(considered | gone, -1, confirmed_by), done), None
 
-    before = state.counts.promoted
-    state = where_any(go, entering, lambda s: s, state)
-    dealt_with = any_may & (jnp.arange(layout.hypotheses) == chosen)
-    by = jnp.where(dealt_with | ~state.joint.alive[layout.of_hypotheses], -1, by)
-    done = go & (state.counts.promoted > before)
-    return state, by, place, jnp.where(done, home, jnp.where(room, -2, -1))
-
-
-class _Verdict(NamedTuple):
-    """() bool each; where neither holds, the sightings contradict each other."""
-
-    yes: Array
-    """the hypothesis becomes a landmark"""
-    wait: Array
-    """its place is not sharp yet, or another explains the sightings nearly as well"""
+    start = state, confirmed_by, Promoted.none(new)
+    (state, _, done), _ = jax.lax.scan(once, start, None, length=settings.promotion.per_scan)
+    return state, done._replace(refused=done.refused & (done.slot < 0))
 
 
-def _explanation(
-    rules: Rules, state: Delayed, origin: Array, seeing: Array
-) -> tuple[InitialEstimate, Array, _Verdict]:
-    """The place that explains the sightings seeing (W,) of the hypothesis in slot origin best, and
-    the slots of those it is made of."""
-    joint = state.joint
-    # The oldest and the newest, from the farthest places.
-    rank = (seeing[None, :] & ~after(state.taken)).sum(axis=1)
-    outer = jnp.where(seeing, jnp.maximum(rank, seeing.sum() + 1 - rank), 0)
-    best = jax.lax.top_k(outer, min(_USED, rules.layout.sightings))[1]
-    use, sights = seeing[best], rules.layout.sighting_slots[best]
-    start = joint.landmarks[origin, :2]
-    # With the twin of two sightings that are far from each other.
-    places = joint.landmarks[sights]
-    reach = ((places[:, :2] - places[:1, :2]) ** 2).sum(axis=1)
-    other = places[jnp.argmax(jnp.where(use, reach, -1.0))]
-    starts = jnp.concatenate([start[None], rules.meeting.twins(places[0], other, start)])
-    fits = jax.vmap(initial_estimate, (None, None, 0, None, None))(
-        joint, rules.meeting, starts, sights, use
+def _candidate(
+    settings: DelayedSettings, state: DelayedState, confirmed_by: Int[Array, "C"]
+) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Whether a confirmed hypothesis may be promoted, and which, the most persistent."""
+    layout, promotion, level = settings.layout, settings.promotion, state.persistence
+    alive = state.joint.alive[layout.of_hypotheses]
+    excluding = (state.group[:, None] == state.group[None, :]) & alive[None, :]
+    excluding = excluding & ~jnp.eye(layout.hypotheses, dtype=bool)
+    ahead = ~(excluding & (level[None, :] > level[:, None] - promotion.lead)).any(axis=1)
+    sharp = relative_spread(relative_to_robot(state.joint, layout)) <= promotion.spread
+    may = alive & (confirmed_by >= 0) & (level >= promotion.persistence) & ahead & sharp
+    return may.any(), jnp.argmax(jnp.where(may, level, -jnp.inf))
+
+
+def _promote(
+    settings: DelayedSettings,
+    state: DelayedState,
+    chosen: Int[Array, ""],
+    slot: Int[Array, ""],
+    name: Int[Array, ""],
+    go: Bool[Array, ""],
+) -> DelayedState:
+    """The state after the decision on a hypothesis; as it was, to the bit, where not `go`.
+
+    slot, name: of the landmark that it may become.
+    """
+    layout, joint = settings.layout, state.joint
+    same_tag, own = _measurements_of(settings, state, chosen)
+    used, use = _outermost(settings, state, own)
+    estimate, decision = _locate(settings, state, chosen, used, use)
+    # Of a batch, the runs without a promotion wait, and keep all they have to the bit.
+    accepted, undecided = settle(_Decision(decision.accepted & go, decision.undecided | ~go))
+
+    with_landmark = add_landmark(joint, estimate, slot, used)
+    joint = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), with_landmark, joint)
+    here = accepted & (jnp.arange(layout.slots) == slot)
+    joint = joint._replace(tag=jnp.where(here, name, joint.tag).astype(jnp.int32))
+    state = state._replace(joint=joint)
+
+    used_up = accepted & (same_tag if settings.by_tag else own)
+    itself = jnp.arange(layout.hypotheses) == chosen
+    rivals = _rivals(settings, state, chosen, slots_where(layout, stored=used_up))
+    rivals = rivals & joint.alive[layout.of_hypotheses] & ~itself & accepted
+    counts = state.counts._replace(
+        rivals=increased(state.counts.rivals, rivals),
+        promoted=increased(state.counts.promoted, accepted),
+        refuted=increased(state.counts.refuted, ~accepted & ~undecided),
     )
-    cost = jnp.where(fits.regular, fits.nis, jnp.inf)
+    dead = slots_where(layout, hypotheses=(rivals | itself) & ~undecided, stored=used_up)
+    return delete_slots(layout, state._replace(counts=counts), dead)
+
+
+def _measurements_of(
+    settings: DelayedSettings, state: DelayedState, chosen: Int[Array, ""]
+) -> tuple[Bool[Array, "W"], Bool[Array, "W"]]:
+    """The stored measurements of the tag of a hypothesis, and those of them that it explains."""
+    layout, joint = settings.layout, state.joint
+    hypothesis = layout.landmarks + chosen
+    same_tag = joint.alive[layout.of_stored]
+    same_tag = same_tag & (joint.tag[layout.of_stored] == joint.tag[hypothesis])
+    found = point_residuals(joint, settings.triangulation, hypothesis[None], layout.stored_slots)
+    # Corrected by its own measurements it leaves g almost no variance: that of the noise is added,
+    # for rounding and curvature.
+    variance = found.variance[0] + state.noise_var
+    return same_tag, same_tag & (found.value[0] ** 2 <= settings.gate * variance)
+
+
+def _outermost(
+    settings: DelayedSettings, state: DelayedState, own: Bool[Array, "W"]
+) -> tuple[Int[Array, "m"], Bool[Array, "m"]]:
+    """The slots of the oldest and the newest of these stored measurements, and which to use.
+
+    They were taken from the farthest places.
+    """
+    rank = (own[None, :] & ~is_newer(state.taken_at)).sum(axis=1)
+    outer = jnp.where(own, jnp.maximum(rank, own.sum() + 1 - rank), 0)
+    best = jax.lax.top_k(outer, min(_USED, settings.layout.stored))[1]
+    return settings.layout.stored_slots[best], own[best]
+
+
+def _locate(
+    settings: DelayedSettings,
+    state: DelayedState,
+    chosen: Int[Array, ""],
+    used: Int[Array, "m"],
+    use: Bool[Array, "m"],
+) -> tuple[InitialEstimate, _Decision]:
+    """The place that explains m stored measurements of a hypothesis best, and whether it may stand.
+
+    Estimated from the hypothesis, and from its mirror solutions in two measurements that were taken
+    far from each other.
+    """
+    joint, triangulation = state.joint, settings.triangulation
+    start = joint.landmarks[settings.layout.landmarks + chosen, :2]
+    s = joint.landmarks[used]
+    reach = ((s[:, :2] - s[:1, :2]) ** 2).sum(axis=1)
+    farthest = s[jnp.argmax(jnp.where(use, reach, -1.0))]
+    mirrored = triangulation.mirror_solutions(s[0], farthest, start)
+    estimates = jax.vmap(initial_estimate, (None, None, 0, None, None))(
+        joint, triangulation, jnp.concatenate([start[None], mirrored]), used, use
+    )
+    cost = jnp.where(estimates.regular, estimates.nis, jnp.inf)
     first = jnp.argmin(cost)
-    fit = jax.tree.map(lambda part: part[first], fits)
-    # Another place that explains the sightings nearly as well: wait for more.
-    far = ((fits.point - fit.point[None]) ** 2).sum(axis=1)
-    scale = (_ONE_PLACE**2) * ((fit.point - places[0, :2]) ** 2).sum()
-    ambiguous = ((cost < fit.nis + _CLOSE) & (far > scale)).any()
-    wait = fit.regular & (ambiguous | (fit.spread > rules.ready))
+    best = jax.tree.map(lambda part: part[first], estimates)
+
+    far = ((estimates.point - best.point[None]) ** 2).sum(axis=1)
+    scale = (_ONE_PLACE**2) * ((best.point - s[0, :2]) ** 2).sum()
+    ambiguous = ((cost < best.nis + _AMBIGUOUS) & (far > scale)).any()
+    undecided = best.regular & (ambiguous | (best.spread > settings.promotion.spread))
     # By degrees of freedom, from 1 on; of numbers, since the tail itself is much code to compile.
-    limits = jnp.asarray(chi2_quantiles(1 - _UNLIKELY, np.arange(1, _USED)), fit.nis.dtype)
+    limits = jnp.asarray(chi2_quantiles(1 - _UNLIKELY, np.arange(1, _USED)), best.nis.dtype)
     dof = jnp.maximum(use.sum() - 2, 1)
-    likely = fit.nis <= limits[dof - 1]
-    return fit, sights, _Verdict(fit.regular & likely & ~wait, wait)
+    likely = best.nis <= limits[dof - 1]
+    return best, _Decision(best.regular & likely & ~undecided, undecided)
 
 
-def _rivals(rules: Rules, state: Delayed, chosen: Array, gone: Array) -> Array:
-    """(C,) bool: the hypotheses that a landmark made of one rules out, itself among them.
+def _rivals(
+    settings: DelayedSettings,
+    state: DelayedState,
+    chosen: Int[Array, ""],
+    used_up: Bool[Array, "S"],
+) -> Bool[Array, "C"]:
+    """The hypotheses that a landmark made of one rules out, itself among them.
 
-    gone (S,): the slots that its sightings leave.
+    used_up: the slots of the stored measurements that it is made of.
     """
     rivals = state.group == state.group[chosen]
-    if rules.tagged:
+    if settings.by_tag:
         return rivals
     # A measurement is of one landmark, so what else was made of these is none; nor is a second
     # hypothesis of the same place.
     parents = state.parents
-    rivals = rivals | ((parents >= 0) & gone[jnp.maximum(parents, 0)]).any(axis=1)
-    points, covs = table.from_robot(state.joint, rules.layout)
-    same_place = table.near(
-        rules.distance, rules.same, points, covs, points[chosen][None], covs[chosen][None]
-    )
+    rivals = rivals | ((parents >= 0) & used_up[jnp.maximum(parents, 0)]).any(axis=1)
+    points = relative_to_robot(state.joint, settings.layout)
+    itself = jax.tree.map(lambda part: part[chosen][None], points)
+    limit = settings.hypotheses.same_below
+    same_place = closer_than(settings.hypotheses.distance, limit, points, itself)
     return rivals | same_place[:, 0]

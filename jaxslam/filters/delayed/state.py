@@ -1,172 +1,227 @@
-"""The state of `delayed_slam`: one table of landmarks, hypotheses and sightings."""
+"""The state of `delayed_slam`: landmarks, hypotheses and stored measurements in one joint Gaussian.
 
-from typing import Literal, NamedTuple
+All three are rows of the landmark table of one `slots.Joint`, three parameters in each slot:
 
-import jax
+                          slot              mean               covariance P (D, D)
+                                        ┌───────────┐    ┌─────┬─────┬─────┬─────┐
+    robot                               │ x   y   θ │    │  ·  │  ·  │  ·  │  ·  │
+                                        ├───────────┤    ├─────┼─────┼─────┼─────┤
+    landmark              0 … N-1       │ x   y   - │    │  ·  │  ·  │  ·  │  ·  │
+                                        ├───────────┤    ├─────┼─────┼─────┼─────┤
+    hypothesis            N … N+C-1     │ x   y   - │    │  ·  │  ·  │  ·  │  ·  │
+                                        ├───────────┤    ├─────┼─────┼─────┼─────┤
+    stored measurement    N+C … S-1     │ x   y   q │    │  ·  │  ·  │  ·  │  ·  │
+                                        └───────────┘    └─────┴─────┴─────┴─────┘
+
+with S = N + C + W slots and D = 3 + 3 S. A stored measurement is (x, y), where the sensor was, and
+q, what it saw: a direction [rad] or a distance [m], in the map's frame (`triangulation`). The third
+parameter of a point is padding (-). No block of P is left out, so the noise of a measurement that
+takes part in several intersections is one variable, and is never counted as independent.
+
+The way of a measurement of no landmark of the map through the table:
+
+    measurement ──► stored measurement ──► hypothesis ──► landmark
+            stored             two intersect       confirmed often enough; made of all its stored
+                                                   measurements, which then leave the table
+"""
+
+from typing import NamedTuple
+
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.filters.delayed.triangulation import Meeting
-from jaxslam.protocols import Sensor
+from jaxslam.math.xla import where_any
 from jaxslam.slots import Joint
-
-Array = jax.Array
-Distance = Literal["mahalanobis", "bhattacharyya"]
 
 SIZE = 3
 """parameters of a slot"""
 
 
-class Layout(NamedTuple):
-    """How many slots of each kind, in their order."""
+class TableLayout(NamedTuple):
+    """How many slots of each kind the table has, in this order."""
 
     landmarks: int
+    """N"""
     hypotheses: int
-    sightings: int
+    """C"""
+    stored: int
+    """W"""
 
     @property
     def slots(self) -> int:
-        """of the whole table."""
-        return self.landmarks + self.hypotheses + self.sightings
+        """S of the whole table."""
+        return self.landmarks + self.hypotheses + self.stored
 
     @property
-    def first_sighting(self) -> int:
-        """its slot."""
+    def first_stored(self) -> int:
+        """The slot of the first stored measurement."""
         return self.landmarks + self.hypotheses
 
     @property
     def of_landmarks(self) -> slice:
-        """their slots."""
+        """The slots of landmarks."""
         return slice(0, self.landmarks)
 
     @property
     def of_hypotheses(self) -> slice:
-        """their slots."""
-        return slice(self.landmarks, self.first_sighting)
+        """The slots of hypotheses."""
+        return slice(self.landmarks, self.first_stored)
 
     @property
-    def of_sightings(self) -> slice:
-        """their slots."""
-        return slice(self.first_sighting, self.slots)
+    def of_stored(self) -> slice:
+        """The slots of stored measurements."""
+        return slice(self.first_stored, self.slots)
 
     @property
-    def hypothesis_slots(self) -> Array:
-        """(C,) the same as numbers."""
+    def hypothesis_rows(self) -> slice:
+        """The rows of P that hypotheses own."""
+        return slice(3 + SIZE * self.landmarks, 3 + SIZE * self.first_stored)
+
+    @property
+    def hypothesis_slots(self) -> Int[Array, "C"]:
+        """`of_hypotheses` as numbers."""
         return self.landmarks + jnp.arange(self.hypotheses)
 
     @property
-    def sighting_slots(self) -> Array:
-        """(W,) the same as numbers."""
-        return self.first_sighting + jnp.arange(self.sightings)
+    def stored_slots(self) -> Int[Array, "W"]:
+        """`of_stored` as numbers."""
+        return self.first_stored + jnp.arange(self.stored)
 
 
-class Rules(NamedTuple):
-    """What `delayed_slam` was told; see there."""
+class DelayedCounts(NamedTuple):
+    """What was deleted, refused and promoted since the start, () int each."""
 
-    layout: Layout
-    sensor: Sensor
-    meeting: Meeting
-    tagged: bool
-    """sightings meet those of their tag only"""
-    gate: float
-    spacing: float
-    spread: float
-    ready: float
-    distance: Distance
-    same: float
-    persistence: float
-    decay: float
-    lead: float
-    patience: int
-
-
-class Counts(NamedTuple):
-    """What the tables lost or gave up, () int each, since the start."""
-
-    evicted: Array
-    """sightings that left the full table as the oldest, by marginalization"""
-    refused: Array
-    """intersections that found the table of hypotheses full"""
-    vanished: Array
-    """hypotheses that were not confirmed often enough"""
-    rivals: Array
-    """hypotheses that ended with the promotion of another"""
-    promoted: Array
+    evicted: Int[Array, ""]
+    """stored measurements that were marginalized as the oldest of a full table"""
+    refused: Int[Array, ""]
+    """intersections that found all slots of hypotheses taken"""
+    vanished: Int[Array, ""]
+    """hypotheses deleted because they were not confirmed often enough"""
+    rivals: Int[Array, ""]
+    """hypotheses deleted because another that excludes them was promoted"""
+    promoted: Int[Array, ""]
     """hypotheses that became landmarks"""
-    refuted: Array
-    """hypotheses that ended at their promotion: their sightings do not fit together"""
+    refuted: Int[Array, ""]
+    """hypotheses deleted instead of promoted: their stored measurements contradict each other"""
 
 
-class Delayed(NamedTuple):
-    """The state: a table of landmarks, hypotheses and sightings, and how these stand."""
+class DelayedState(NamedTuple):
+    """The table, and the records of its stored measurements and hypotheses."""
 
     joint: Joint
-    """landmarks first, then hypotheses, then sightings; see `filters.hypotheses`"""
-    clock: Array
-    """() int: scans so far"""
-    taken: Array
-    """(W,) int: the scan that each sighting is of"""
-    noise: Array
-    """(W,) variance of what each saw [rad² or m²]"""
-    persistence: Array
-    """(C,) of each hypothesis"""
-    confirmed: Array
-    """(C,) int: the scan that formed it or confirmed it last"""
-    group: Array
-    """(C,) int: hypotheses of one group exclude each other"""
-    parents: Array
-    """(C, 2) int: slots of the sightings it was formed of, -1 for one that left"""
-    counts: Counts
+    """robot, landmarks, hypotheses and stored measurements, as in the diagram above"""
+    clock: Int[Array, ""]
+    """scans so far"""
+    taken_at: Int[Array, "W"]
+    """the scan that each stored measurement is of"""
+    noise_var: Float[Array, "W"]
+    """the variance of each stored q [rad² or m²]"""
+    persistence: Float[Array, "C"]
+    """of each hypothesis: 1, and 1 more for each confirmation, less the decay"""
+    confirmed_at: Int[Array, "C"]
+    """the scan that formed each hypothesis or confirmed it last"""
+    group: Int[Array, "C"]
+    """hypotheses of one group exclude each other"""
+    parents: Int[Array, "C 2"]
+    """slots of the two stored measurements each was formed of, -1 for one that has left"""
+    counts: DelayedCounts
 
 
-class Fresh(NamedTuple):
-    """The measurements of a scan that are of no landmark of the map, (M,) each."""
+class NewMeasurements(NamedTuple):
+    """The M measurements of a scan, and which of them are of no landmark of the map."""
 
-    z: Array
-    tag: Array
-    fresh: Array
-    """bool"""
+    z: Float[Array, "M 1"]
+    tag: Int[Array, "M"]
+    """only measurements of one tag intersect; -1 throughout where identities are unknown"""
+    name: Int[Array, "M"]
+    """the tag that a landmark would get"""
+    is_new: Bool[Array, "M"]
+    """of no landmark of the map"""
+    repeated: Bool[Array, "M"]
+    """new, and its tag is that of an earlier new one of the scan"""
+
+    @property
+    def wanted(self) -> Bool[Array, "M"]:
+        """New, and not repeated."""
+        return self.is_new & ~self.repeated
 
 
-def empty(layout: Layout, pose: Array, pose_cov: Array) -> Delayed:
-    """Nothing but the robot."""
+def empty_state(
+    layout: TableLayout, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]
+) -> DelayedState:
+    """The state with nothing but the robot."""
     none = jnp.asarray(0, jnp.int32)
     ints = jnp.zeros(layout.hypotheses, jnp.int32)
-    return Delayed(
+    return DelayedState(
         joint=slots.empty(pose, pose_cov, layout.slots, SIZE),
         clock=none,
-        taken=jnp.zeros(layout.sightings, jnp.int32),
-        noise=jnp.zeros(layout.sightings, pose.dtype),
+        taken_at=jnp.zeros(layout.stored, jnp.int32),
+        noise_var=jnp.zeros(layout.stored, pose.dtype),
         persistence=jnp.zeros(layout.hypotheses, pose.dtype),
-        confirmed=ints,
+        confirmed_at=ints,
         group=ints,
         parents=jnp.full((layout.hypotheses, 2), -1, jnp.int32),
-        counts=Counts(none, none, none, none, none, none),
+        counts=DelayedCounts(none, none, none, none, none, none),
     )
 
 
-def without(layout: Layout, state: Delayed, gone: Array) -> Delayed:
-    """Slots gone (S,) bool emptied; their parts in hypotheses are forgotten."""
+def covariance_blocks(joint: Joint) -> Float[Array, "S 3 S 3"]:
+    """P of the table, without the robot, by slots."""
+    capacity = joint.alive.shape[0]
+    return joint.cov[3:, 3:].reshape(capacity, SIZE, capacity, SIZE)
+
+
+def covariance_rows(joint: Joint) -> Float[Array, "S 3 D"]:
+    """The rows of P of each slot, robot's columns first."""
+    return joint.cov[3:].reshape(joint.alive.shape[0], SIZE, -1)
+
+
+def slots_where(
+    layout: TableLayout,
+    *,
+    hypotheses: Bool[Array, "C"] | None = None,
+    stored: Bool[Array, "W"] | None = None,
+) -> Bool[Array, "S"]:
+    """Masks of hypotheses and of stored measurements as one of all slots."""
+    mask = jnp.zeros(layout.slots, bool)
+    if hypotheses is not None:
+        mask = mask.at[layout.of_hypotheses].set(hypotheses)
+    if stored is not None:
+        mask = mask.at[layout.of_stored].set(stored)
+    return mask
+
+
+def delete_slots(layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"]) -> DelayedState:
+    """The state with these slots marginalized out, and forgotten as parents of hypotheses."""
     parents = state.parents
-    orphaned = (parents >= 0) & gone[jnp.maximum(parents, 0)]
-    persistence = jnp.where(gone[layout.of_hypotheses], 0.0, state.persistence)
+    orphaned = (parents >= 0) & dead[jnp.maximum(parents, 0)]
+    persistence = jnp.where(dead[layout.of_hypotheses], 0.0, state.persistence)
     return state._replace(
-        joint=slots.remove(state.joint, gone),
+        joint=slots.remove(state.joint, dead),
         parents=jnp.where(orphaned, -1, parents),
         persistence=persistence,
     )
 
 
-def after(when: Array) -> Array:
-    """(W, W) bool: whether sighting j was taken after i, when (W,); of one scan, whether j > i.
+def delete_slots_if_any(
+    layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"]
+) -> DelayedState:
+    """As `delete_slots`, at no cost where no run of a batch deletes one."""
+    return where_any(dead.any(), lambda s: delete_slots(layout, s, dead), lambda s: s, state)
+
+
+def is_newer(time: Int[Array, "W"]) -> Bool[Array, "W W"]:
+    """Whether stored measurement j was taken after i; of one time, whether j > i.
 
     A rank is a row's sum: one kernel, where two sorts are more to compile than all else around.
     """
-    place = jnp.arange(len(when))
-    later = when[None, :] > when[:, None]
-    return later | ((when[None, :] == when[:, None]) & (place[None, :] > place[:, None]))
+    place = jnp.arange(len(time))
+    later = time[None, :] > time[:, None]
+    return later | ((time[None, :] == time[:, None]) & (place[None, :] > place[:, None]))
 
 
-def more(count: Array, these: Array) -> Array:
-    """A count () and how many of these more."""
-    return count + these.sum(dtype=jnp.int32)
+def increased(count: Int[Array, ""], by: Bool[Array, "..."]) -> Int[Array, ""]:
+    """A count, and how many of a mask are set more."""
+    return count + by.sum(dtype=jnp.int32)

@@ -1,50 +1,56 @@
-"""Where two measurements that see a landmark in part meet: rays of bearings, circles of ranges.
+"""Where two measurements locate a landmark: rays of bearings and circles of ranges intersect.
 
-A *sighting* is such a measurement as a variable of the map, s = (x, y, q) (3,): where the sensor
-was, and what it saw, in the map's frame. A bearing gives the ray from (x, y) in the direction q
-[rad], a range the circle of radius q [m] about it.
+A *stored measurement* is a measurement as a variable of the map, s = (x, y, q) (3,): where the
+sensor was, and what it saw, in the map's frame. A bearing gives the ray from (x, y) in the
+direction q [rad], a range the circle of radius q [m] about it.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Sensor
 
-Array = jax.Array
+Stored = Float[Array, "3"]
+"""a stored measurement s = (x, y, q)"""
+Point = Float[Array, "2"]
+"""(x, y) [m]"""
+Solutions = tuple[Float[Array, "A 2"], Bool[Array, "A"]]
+"""points, and whether each is one"""
 
 
 @dataclass(frozen=True, eq=False)
-class Meeting:
-    """How the sightings of one kind of sensor locate a landmark, two of them at a time."""
+class Triangulation:
+    """How stored measurements of one kind of sensor locate a landmark, two of them at a time."""
 
     name: str
-    count: int
-    """A, in how many points two sightings can meet."""
-    sight: Callable[[Array, Array], Array]
-    """(pose, z) -> s (3,), the measurement as a variable of the map."""
-    meet: Callable[[Array, Array], tuple[Array, Array]]
+    solutions: int
+    """A, in how many points two can intersect"""
+    store: Callable[[Float[Array, "3"], Float[Array, "1"]], Stored]
+    """(pose, z) -> s, the measurement as a variable of the map"""
+    intersect: Callable[[Stored, Stored], Solutions]
     """(s, s') -> points (A, 2) and whether each is one, (A,) bool: where it is not, or badly
-    conditioned, the point is finite and without meaning."""
-    miss: Callable[[Array, Array], Array]
-    """(s, point (2,)) -> (): what was seen less what that point would have been seen as, zero for
-    the true point of a perfect sensor."""
-    twins: Callable[[Array, Array, Array], Array]
-    """(s, s', point (2,)) -> (A - 1, 2): where else a landmark could be that two sightings see
-    there."""
+    conditioned, the point is finite and without meaning"""
+    residual: Callable[[Stored, Point], Float[Array, ""]]
+    """(s, point) -> g: what was seen less what that point would have been seen as, zero for the
+    true point of a perfect sensor [rad or m]"""
+    mirror_solutions: Callable[[Stored, Stored, Point], Float[Array, "B 2"]]
+    """(s, s', point) -> the other A - 1 points that two measurements of a landmark there allow"""
 
 
-def rays(sensor: Sensor, *, parallax: float = 0.1) -> Meeting:
-    """Bearings: p + t (cos q, sin q), t > 0. Two rays meet in at most one point.
+def rays(sensor: Sensor, *, parallax: float = 0.1) -> Triangulation:
+    """Bearings: p + t (cos q, sin q), t > 0. Two rays intersect in at most one point.
 
-    With δ = p' - p and c = sin(q' - q), the lengths are t = δ × d'/c and t' = δ × d/c. A meeting
-    lies in front of both sensors, and the rays cross at an angle of at least `parallax`.
+    With δ = p' - p and c = sin(q' - q), the lengths are t = δ × d'/c and t' = δ × d/c. The
+    intersection lies in front of both sensors, where the rays cross at an angle of at least
+    `parallax`.
 
     Args:
         sensor: a bearing z (1,) of points, as `sensors.bearing_only`; where it is mounted is read
@@ -56,12 +62,12 @@ def rays(sensor: Sensor, *, parallax: float = 0.1) -> Meeting:
     _check("rays", sensor, "bearing [rad]", parallax)
     least = float(np.sin(parallax)) if is_concrete(parallax) else jnp.sin(parallax)
 
-    def sight(pose: Array, z: Array) -> Array:
+    def store(pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
         start = sensor.invert(pose, z, jnp.zeros(1, z.dtype))
         ahead = sensor.invert(pose, z, jnp.ones(1, z.dtype)) - start
         return jnp.concatenate([start, jnp.arctan2(ahead[1], ahead[0])[None]])
 
-    def meet(a: Array, b: Array) -> tuple[Array, Array]:
+    def intersect(a: Stored, b: Stored) -> Solutions:
         toward_a, toward_b = _unit(a[2]), _unit(b[2])
         delta = b[:2] - a[:2]
         sine = _cross(toward_a, toward_b)
@@ -71,17 +77,17 @@ def rays(sensor: Sensor, *, parallax: float = 0.1) -> Meeting:
         point = a[:2] + along_a * toward_a
         return point[None], (crossing & (along_a > 0) & (along_b > 0))[None]
 
-    def miss(s: Array, point: Array) -> Array:
+    def residual(s: Stored, point: Point) -> Float[Array, ""]:
         return wrap(s[2] - se2.polar(point - s[:2])[1])
 
-    def twins(a: Array, b: Array, point: Array) -> Array:
+    def mirror_solutions(a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
         return jnp.zeros((0, 2), point.dtype)
 
-    return Meeting("rays", 1, sight, meet, miss, twins)
+    return Triangulation("rays", 1, store, intersect, residual, mirror_solutions)
 
 
-def circles(sensor: Sensor, *, angle: float = 0.3) -> Meeting:
-    """Ranges: |x - p| = q. Two circles meet in two points, mirrored in the line of their centres.
+def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
+    """Ranges: |x - p| = q. Two circles intersect in two mirrored points.
 
     With δ = p' - p, d = |δ|, a = (d² + q² - q'²)/(2d) and h² = q² - a², the points are
     p + (a δ ± h δ^⊥)/d. The circles must cross at an angle φ, sin φ = d h/(q q'), of at least
@@ -96,12 +102,12 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Meeting:
     _check("circles", sensor, "range [m]", angle)
     least = float(np.sin(angle)) if is_concrete(angle) else jnp.sin(angle)
 
-    def sight(pose: Array, z: Array) -> Array:
+    def store(pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
         # The sensor is halfway between the ends of a diameter.
         ends = [sensor.invert(pose, z, jnp.full(1, s, z.dtype)) for s in (0.0, np.pi)]
         return jnp.concatenate([0.5 * (ends[0] + ends[1]), z])
 
-    def meet(a: Array, b: Array) -> tuple[Array, Array]:
+    def intersect(a: Stored, b: Stored) -> Solutions:
         delta = b[:2] - a[:2]
         square = (delta**2).sum()
         apart = (square > 0) & (a[2] > 0) & (b[2] > 0)
@@ -116,10 +122,10 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Meeting:
         points = (a[:2] + share * delta)[None] + jnp.stack([height * across, -height * across])
         return points, jnp.stack([crossing, crossing])
 
-    def miss(s: Array, point: Array) -> Array:
+    def residual(s: Stored, point: Point) -> Float[Array, ""]:
         return s[2] - se2.polar(point - s[:2])[0]
 
-    def twins(a: Array, b: Array, point: Array) -> Array:
+    def mirror_solutions(a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
         axis = b[:2] - a[:2]
         square = (axis**2).sum()
         offset = point - a[:2]
@@ -127,10 +133,10 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Meeting:
         mirrored = a[:2] + 2 * along * axis - offset
         return jnp.where(square > 0, mirrored, point)[None]
 
-    return Meeting("circles", 2, sight, meet, miss, twins)
+    return Triangulation("circles", 2, store, intersect, residual, mirror_solutions)
 
 
-def meeting_of(sensor: Sensor) -> Meeting:
+def triangulation_of(sensor: Sensor) -> Triangulation:
     """`rays` or `circles`, by what the sensor measures; ValueError where it is neither."""
     if sensor.measurements == ("range [m]",):
         return circles(sensor)
@@ -147,9 +153,9 @@ def _check(name: str, sensor: Sensor, measurement: str, angle: float) -> None:
         raise ValueError(f"{name}: expected an angle in (0, π/2), got {angle}")
 
 
-def _unit(angle: Array) -> Array:
+def _unit(angle: Float[Array, ""]) -> Point:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
-def _cross(a: Array, b: Array) -> Array:
+def _cross(a: Point, b: Point) -> Float[Array, ""]:
     return a[0] * b[1] - a[1] * b[0]

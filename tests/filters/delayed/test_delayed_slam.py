@@ -1,8 +1,9 @@
-"""Delayed initialization: meetings, hypotheses, what a landmark is made of, and the filter."""
+"""Delayed initialization: intersections, hypotheses, landmarks made of them, and the filter."""
 
 import dataclasses
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,62 +14,64 @@ import jaxslam
 from jaxslam import Scenario, motion, sensors
 from jaxslam.association import nearest
 from jaxslam.filters import delayed_slam, ekf_slam
-from jaxslam.filters.delayed import hypotheses
+from jaxslam.filters.delayed.confirmation import constraints_of, correct_hypotheses
+from jaxslam.filters.delayed.hypotheses import UncertainPoints, closer_than, point_residuals
 from jaxslam.filters.delayed.initialization import add_landmark, initial_estimate
-from jaxslam.filters.delayed.state import Layout
-from jaxslam.filters.delayed.triangulation import circles, meeting_of, rays
+from jaxslam.filters.delayed.intersection import add_hypotheses
+from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
+from jaxslam.filters.delayed.state import TableLayout
+from jaxslam.filters.delayed.triangulation import circles, rays, triangulation_of
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Status
 
 CAMERA = sensors.bearing_only([[0.01**2]])
 BEACON = sensors.range_only([[0.05**2]])
 KINDS = {"rays": rays(CAMERA), "circles": circles(BEACON)}
+RESIDUAL = {kind: jax.jit(jax.vmap(model.residual)) for kind, model in KINDS.items()}
 
 
-MISS = {kind: jax.jit(jax.vmap(meeting.miss)) for kind, meeting in KINDS.items()}
-
-
-# --- where two sightings meet -------------------------------------------------------------------
+# --- where two measurements intersect -----------------------------------------------------------
 
 
 def seen_by(kind, places, point):
-    """Perfect sightings (q, 3) of a point from places (q, 2), in plain NumPy."""
+    """Perfect stored measurements (q, 3) of a point from places (q, 2), in plain NumPy."""
     delta = point - places
     seen = np.arctan2(delta[:, 1], delta[:, 0]) if kind == "rays" else np.hypot(*delta.T)
     return np.column_stack([places, seen])
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_perfect_sightings_meet_at_the_point(kind):
+def test_perfect_measurements_intersect_at_the_point(kind):
     rng = np.random.default_rng(0)
     places, points = rng.uniform(-5, 5, (200, 2, 2)), rng.uniform(-5, 5, (200, 2))
     seen = np.stack([seen_by(kind, p, x) for p, x in zip(places, points, strict=True)])
-    met, ok = jax.jit(jax.vmap(KINDS[kind].meet))(seen[:, 0], seen[:, 1])
-    miss = np.linalg.norm(np.asarray(met) - points[:, None], axis=2).min(axis=1)
-    # The angle at the point between the two directions to it decides whether the meeting is sharp.
+    met, ok = jax.jit(jax.vmap(KINDS[kind].intersect))(seen[:, 0], seen[:, 1])
+    off = np.linalg.norm(np.asarray(met) - points[:, None], axis=2).min(axis=1)
+    # The angle at the point between the two directions to it decides whether the intersection is sharp.
     a, b = points - places[:, 0], points - places[:, 1]
     sine = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     sine = sine / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
     least = np.sin(0.1 if kind == "rays" else 0.3)
     np.testing.assert_array_equal(np.asarray(ok).all(axis=1), sine >= least)
     assert 100 < ok[:, 0].sum() < 200
-    np.testing.assert_allclose(miss[sine >= least], 0, atol=1e-9)
-    wrong = MISS[kind](seen[:, 0], points)
-    np.testing.assert_allclose(wrong, 0, atol=1e-12)
+    np.testing.assert_allclose(off[sine >= least], 0, atol=1e-9)
+    np.testing.assert_allclose(RESIDUAL[kind](seen[:, 0], points), 0, atol=1e-12)
 
 
-def test_two_circles_meet_in_mirrored_points():
-    points, ok = KINDS["circles"].meet(jnp.asarray([0.0, 0, 5]), jnp.asarray([6.0, 0, 5]))
+def test_two_circles_intersect_in_mirrored_points():
+    points, ok = KINDS["circles"].intersect(jnp.asarray([0.0, 0, 5]), jnp.asarray([6.0, 0, 5]))
     assert ok.all()
     np.testing.assert_allclose(points, [[3, 4], [3, -4]], atol=1e-12)
 
 
-def with_slopes(meet):
-    """The points, whether they are, and their derivatives by both sightings."""
-    return jax.jit(lambda a, b: (*meet(a, b), jax.jacfwd(lambda *s: meet(*s)[0], (0, 1))(a, b)))
+def with_jacobians(intersect):
+    """The points, whether they are, and their derivatives by both measurements."""
+    return jax.jit(
+        lambda a, b: (*intersect(a, b), jax.jacfwd(lambda *s: intersect(*s)[0], (0, 1))(a, b))
+    )
 
 
-MEET = {kind: with_slopes(meeting.meet) for kind, meeting in KINDS.items()}
+INTERSECT = {kind: with_jacobians(model.intersect) for kind, model in KINDS.items()}
 
 
 @pytest.mark.parametrize(
@@ -86,26 +89,26 @@ MEET = {kind: with_slopes(meeting.meet) for kind, meeting in KINDS.items()}
         ("circles", [0, 0, -2.0], [1, 0, 2.0]),  # noise can make a range negative
     ],
 )
-def test_what_does_not_meet_is_not_ok_and_finite(kind, a, b):
+def test_what_does_not_intersect_is_not_ok_and_finite(kind, a, b):
     a, b = jnp.asarray(a, float), jnp.asarray(b, float)
-    points, ok, slopes = MEET[kind](a, b)
+    points, ok, jacobians = INTERSECT[kind](a, b)
     assert not ok.any()
-    assert all(np.isfinite(x).all() for x in (points, *slopes))
+    chex.assert_tree_all_finite((points, jacobians))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_sighting_is_where_the_sensor_is_mounted(kind):
+def test_a_measurement_is_stored_where_the_sensor_is_mounted(kind):
     mount = (0.3, -0.2, 0.7)
     factory = sensors.bearing_only if kind == "rays" else sensors.range_only
     sensor = factory([[1e-4]], mount=mount)
     pose, point = np.array([1.0, 2.0, 2.5]), np.array([-3.0, 4.0])
     c, s = np.cos(pose[2]), np.sin(pose[2])
     place = pose[:2] + np.array([[c, -s], [s, c]]) @ mount[:2]
-    seen = meeting_of(sensor).sight(jnp.asarray(pose), sensor.observe(pose, point))
+    seen = triangulation_of(sensor).store(jnp.asarray(pose), sensor.observe(pose, point))
     np.testing.assert_allclose(seen, seen_by(kind, place[None], point)[0], atol=1e-12)
 
 
-def test_bad_meetings_are_refused():
+def test_bad_triangulations_are_refused():
     with pytest.raises(ValueError, match="one bearing"):
         rays(BEACON)
     with pytest.raises(ValueError, match="one range"):
@@ -116,24 +119,24 @@ def test_bad_meetings_are_refused():
 
 # --- hypotheses in the table --------------------------------------------------------------------
 
-LAYOUT = Layout(2, 2, 4)
-FORM = jax.jit(hypotheses.form, static_argnums=(1, 2))
-MISSES = jax.jit(hypotheses.misses, static_argnums=1)
-CONSTRAINTS = jax.jit(hypotheses.constraints)
-MOVE = jax.jit(hypotheses.move_hypotheses, static_argnums=1)
-FIT = jax.jit(initial_estimate, static_argnums=1)
-ENTER = jax.jit(add_landmark)
-NEAR = jax.jit(hypotheses.near, static_argnums=0)
+LAYOUT = TableLayout(2, 2, 4)
+ADD_HYPOTHESES = jax.jit(add_hypotheses, static_argnums=(1, 2))
+RESIDUALS = jax.jit(point_residuals, static_argnums=1)
+CONSTRAINTS = jax.jit(constraints_of)
+CORRECT = jax.jit(correct_hypotheses, static_argnums=1)
+ESTIMATE = jax.jit(initial_estimate, static_argnums=1)
+ADD_LANDMARK = jax.jit(add_landmark)
+CLOSER = jax.jit(closer_than, static_argnums=0)
 
 
 def table(kind, seed=0, scale=0.01):
-    """A joint state with a random covariance and four sightings of the point (1, 5)."""
+    """A joint state with a random covariance and four stored measurements of the point (1, 5)."""
     rng = np.random.default_rng(seed)
     size = 3 + 3 * LAYOUT.slots
     root = rng.normal(size=(size, size)) * scale
     cov = root @ root.T / size**0.5
     joint = jaxslam.slots.empty(jnp.asarray([0.1, 0.2, 0.3]), jnp.eye(3), LAYOUT.slots, 3)
-    # One landmark, no hypothesis, sightings.
+    # One landmark, no hypothesis, stored measurements.
     alive = np.array([True, False, False, False, True, True, True, True])
     live = np.concatenate([np.ones(3, bool), np.repeat(alive, 3)])
     live[5] = False  # the landmark's padding
@@ -152,30 +155,30 @@ def table(kind, seed=0, scale=0.01):
 
 
 def closest_point(kind, seen):
-    """The number of the meeting point of two sightings that is near (1, 5)."""
-    points = np.asarray(MEET[kind](*map(jnp.asarray, seen))[0])
+    """The number of the intersection of two measurements that is near (1, 5)."""
+    points = np.asarray(INTERSECT[kind](*map(jnp.asarray, seen))[0])
     return int(np.argmin(np.linalg.norm(points - [1, 5], axis=1)))
 
 
-def formed(kind, joint):
-    which = closest_point(kind, joint.landmarks[4:6])
-    born = jnp.asarray([True, False])
-    parents, which = jnp.asarray([[4, 5], [4, 4]]), jnp.asarray([which, 0])
-    return FORM(joint, LAYOUT, KINDS[kind], born, parents, which, jnp.zeros(2, int))
+def formed(kind, joint, which):
+    """The joint with a hypothesis where the first two measurements intersect."""
+    new, parents = jnp.asarray([True, False]), jnp.asarray([[4, 5], [4, 4]])
+    which = jnp.asarray([which, 0])
+    return ADD_HYPOTHESES(joint, LAYOUT, KINDS[kind], new, parents, which, jnp.zeros(2, int))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_covariance_of_an_intersection_is_that_of_draws(kind):
     joint = table(kind, scale=0.002)
-    new = formed(kind, joint)
+    at = closest_point(kind, joint.landmarks[4:6])
+    new = formed(kind, joint, at)
     rng = np.random.default_rng(1)
     live = np.r_[0:5, 15:27]
     mean = np.concatenate([joint.pose, np.asarray(joint.landmarks).reshape(-1)])[live]
     root = np.linalg.cholesky(np.asarray(joint.cov)[np.ix_(live, live)])
     draws = mean + rng.normal(size=(20_000, len(live))) @ root.T
-    at = closest_point(kind, joint.landmarks[4:6])
-    meet = jax.jit(jax.vmap(lambda a, b: KINDS[kind].meet(a, b)[0][at]))
-    points = meet(draws[:, 5:8], draws[:, 8:11])
+    intersect = jax.jit(jax.vmap(lambda a, b: KINDS[kind].intersect(a, b)[0][at]))
+    points = intersect(draws[:, 5:8], draws[:, 8:11])
     together = np.cov(np.column_stack([draws, points]).T)
     rows = np.r_[live, 9, 10]
     claimed = np.asarray(new.cov)[np.ix_(rows, rows)]
@@ -194,28 +197,29 @@ def test_the_covariance_of_an_intersection_is_that_of_draws(kind):
     np.testing.assert_array_equal(new.cov, new.cov.T)
 
 
-def slope_rows(kind, joint, point, sightings, differences):
-    """G by the whole state, and the differences g, of a point against sightings; numerically."""
+def jacobian_rows(kind, joint, point, stored, differences):
+    """The residuals g of a point, G by the whole state, and G by the point; numerically."""
 
-    def miss(s, x):
-        return np.asarray(MISS[kind](s, x))
+    def residual(s, x):
+        return np.asarray(RESIDUAL[kind](s, x))
 
-    seen = np.asarray(joint.landmarks)[sightings]
+    seen = np.asarray(joint.landmarks)[stored]
     points = np.broadcast_to(point, (len(seen), 2))
-    by_sight = differences(miss, (seen, points), 0)
-    by_point = differences(miss, (seen, points), 1)
+    by_stored = differences(residual, (seen, points), 0)
+    by_point = differences(residual, (seen, points), 1)
     rows = np.zeros((len(seen), len(joint.cov)))
-    for k, slot in enumerate(sightings):
-        rows[k, 3 + 3 * slot : 6 + 3 * slot] = by_sight[k]
-    return miss(seen, points), rows, by_point
+    for k, slot in enumerate(stored):
+        rows[k, 3 + 3 * slot : 6 + 3 * slot] = by_stored[k]
+    return residual(seen, points), rows, by_point
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
-    joint = formed(kind, table(kind))
+    joint = table(kind)
+    joint = formed(kind, joint, closest_point(kind, joint.landmarks[4:6]))
     slots = jnp.asarray([2, 3])
-    found = MISSES(joint, KINDS[kind], slots, jnp.asarray([6, 7]))
-    value, rows, by_point = slope_rows(
+    found = RESIDUALS(joint, KINDS[kind], slots, jnp.asarray([6, 7]))
+    value, rows, by_point = jacobian_rows(
         kind, joint, np.asarray(joint.landmarks)[2, :2], [6], differences
     )
     rows[0, 9:11] = by_point[0]
@@ -227,9 +231,9 @@ def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     gain = cov @ rows.T / s
     gain[np.delete(np.arange(len(gain)), [9, 10])] = 0
     left = np.eye(len(cov)) - gain @ rows
-    part = (found.value[:, 0], found.by_point[:, 0], found.by_sight[:, 0])
+    part = (found.value[:, 0], found.by_point[:, 0], found.by_stored[:, 0])
     constraint = CONSTRAINTS(joint, slots, jnp.asarray([6, 6]), *part)
-    new = MOVE(joint, LAYOUT, constraint, jnp.asarray([True, False]))
+    new = CORRECT(joint, LAYOUT, constraint, jnp.asarray([True, False]))
     np.testing.assert_allclose(new.cov, left @ cov @ left.T, atol=1e-9 * cov.max())
     np.testing.assert_allclose(
         new.landmarks[2, :2], joint.landmarks[2, :2] - gain[9:11, 0] * value, atol=1e-8
@@ -239,22 +243,22 @@ def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_landmark_of_all_its_sightings_is_the_constrained_least_squares(kind, differences):
+def test_a_landmark_of_all_its_measurements_is_the_constrained_least_squares(kind, differences):
     """Against the solution of minimize δᵀP⁻¹δ subject to the four constraints, by one inverse."""
     joint = table(kind)
-    sightings = jnp.asarray([4, 5, 6, 7, 4])
+    stored = jnp.asarray([4, 5, 6, 7, 4])
     use = jnp.asarray([True, True, True, True, False])
     start = jnp.asarray([1.1, 5.1])
-    fit = FIT(joint, KINDS[kind], start, sightings, use)
-    new = ENTER(joint, fit, jnp.asarray(1), sightings)
+    found = ESTIMATE(joint, KINDS[kind], start, stored, use)
+    new = ADD_LANDMARK(joint, found, jnp.asarray(1), stored)
     # At the point where Gauss-Newton ends, the linear problem in plain NumPy.
     point = np.array([1.1, 5.1])
     for _ in range(20):
-        value, rows, by_point = slope_rows(kind, joint, point, [4, 5, 6, 7], differences)
+        value, rows, by_point = jacobian_rows(kind, joint, point, [4, 5, 6, 7], differences)
         weight = np.linalg.inv(rows @ np.asarray(joint.cov) @ rows.T)
         lhs = by_point.T @ weight @ by_point
         point = point - np.linalg.solve(lhs, by_point.T @ weight @ value)
-    value, rows, by_point = slope_rows(kind, joint, point, [4, 5, 6, 7], differences)
+    value, rows, by_point = jacobian_rows(kind, joint, point, [4, 5, 6, 7], differences)
     live = np.r_[0:5, 15:27]
     n = len(live)
     system = np.zeros((n + 6, n + 6))
@@ -273,10 +277,10 @@ def test_a_landmark_of_all_its_sightings_is_the_constrained_least_squares(kind, 
     np.testing.assert_allclose(
         new.landmarks[4:].reshape(-1), joint.landmarks[4:].reshape(-1) + moved[5:n], atol=1e-7
     )
-    assert fit.regular
+    assert found.regular
     step = moved[:n]
     cost = step @ system[:n, :n] @ step
-    np.testing.assert_allclose(fit.nis, cost, rtol=1e-4)
+    np.testing.assert_allclose(found.nis, cost, rtol=1e-4)
     assert new.alive[1]
 
 
@@ -287,9 +291,10 @@ def test_gaussians_are_told_apart_by_either_distance():
     d2 = np.array([0.25 / 0.08, 0.25 / 0.4, 4 / 0.02])
     log_det = [0.0, np.log(5) - np.log(3), 0.0]
     bhattacharyya = d2 / 4 + np.array(log_det)
+    gaussians = UncertainPoints(points, cov[None]), UncertainPoints(others, other_covs)
     for distance, by_hand in (("mahalanobis", d2), ("bhattacharyya", bhattacharyya)):
         for limit in (0.3, 0.7, 1.0, 4.0):
-            near = NEAR(distance, limit, points, cov[None], others, other_covs)
+            near = CLOSER(distance, limit, *gaussians)
             np.testing.assert_array_equal(near[0], by_hand < limit)
 
 
@@ -311,11 +316,6 @@ def world(kind, steps=120, **options):
     )
 
 
-def filter_of(scenario, capacity=5, **options):
-    options = {"sightings": 30, "hypotheses": 12} | options
-    return delayed_slam(scenario.motion, scenario.sensor, capacity, **options)
-
-
 def go(filter, log):
     return jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
 
@@ -331,7 +331,13 @@ RUNS = 40
 def many(request):
     """Of one kind, truths, logs and traces of all runs: one program for all tests."""
     scenario = world(request.param)
-    filter = filter_of(scenario)
+    filter = delayed_slam(
+        scenario.motion,
+        scenario.sensor,
+        5,
+        stored=StoredMeasurements(capacity=30),
+        hypotheses=Hypotheses(capacity=12),
+    )
 
     @jax.jit
     @jax.vmap
@@ -387,7 +393,7 @@ def test_the_covariance_stays_positive(drive):
 
 def test_the_filter_is_honest(many):
     truth, _, trace = many
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(trace) if leaf.dtype == float)
+    chex.assert_tree_all_finite(trace)
     found = judged(truth, trace.estimate, trace.info)
     assert found["error_landmarks"][0] < 0.2
     for name, dof in (("nees_pose", 3), ("nees_landmarks", 2), ("nis_per_dof", 1)):
@@ -397,13 +403,18 @@ def test_the_filter_is_honest(many):
         assert mean < 1.5 * dof, name
 
 
-def small(kind, **options):
+SMALL = {
+    "stored": StoredMeasurements(capacity=15),
+    "hypotheses": Hypotheses(capacity=6),
+    "promotion": Promotion(per_scan=1),
+}
+
+
+def small(kind, capacity=3):
     """A filter that compiles fast, and a short log of three landmarks."""
     scenario = world(kind, steps=60)
     scenario = dataclasses.replace(scenario, landmarks=scenario.landmarks[:3])
-    options = {"sightings": 15, "hypotheses": 6, "promotions": 1} | options
-    capacity = options.pop("capacity", 3)
-    return scenario, delayed_slam(scenario.motion, scenario.sensor, capacity, **options)
+    return scenario, delayed_slam(scenario.motion, scenario.sensor, capacity, **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -451,8 +462,9 @@ def test_float32_finds_the_landmarks(kind):
     truth, log = draw(scenario, 1)
     narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, log)
     trace = driven(filter, narrow)
+    chex.assert_tree_all_finite(trace)
     floats = [x for x in jax.tree.leaves(trace) if jnp.issubdtype(x.dtype, jnp.floating)]
-    assert all(x.dtype == np.float32 and np.isfinite(x).all() for x in floats)
+    assert all(x.dtype == np.float32 for x in floats)
     final = jax.tree.map(lambda x: np.asarray(x[-1]), trace.estimate)
     assert final.alive.sum() >= 2
     off = final.points - np.asarray(truth.landmarks)[final.tag]
@@ -467,7 +479,7 @@ def test_derivatives_reach_the_noise_and_are_finite():
 
     def likelihood(sigma):
         sensor = sensors.range_only(sigma[None, None] ** 2)
-        filter = delayed_slam(scenario.motion, sensor, 3, sightings=15, hypotheses=6, promotions=1)
+        filter = delayed_slam(scenario.motion, sensor, 3, **SMALL)
         trace = jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
         return trace.info.log_likelihood.sum()
 
@@ -482,23 +494,20 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward(kind):
     """A hypothesis formed and confirmed, a point fitted and entered, by means and covariances."""
     joint = table(kind)
     which = closest_point(kind, joint.landmarks[4:6])
-    born, parents = jnp.array([True, False]), jnp.array([[4, 5], [4, 4]])
-    sightings, use = jnp.array([4, 5, 6, 7, 4]), jnp.arange(5) < 4
+    stored, use = jnp.array([4, 5, 6, 7, 4]), jnp.arange(5) < 4
 
     def loss(landmarks, cov):
         start = joint._replace(landmarks=landmarks, cov=cov)
-        new = hypotheses.form(
-            start, LAYOUT, KINDS[kind], born, parents, jnp.array([which, 0]), jnp.zeros(2, int)
-        )
+        new = formed(kind, start, which)
         slots = jnp.array([2, 3])
-        found = hypotheses.misses(new, KINDS[kind], slots, jnp.array([6, 7]))
-        part = found.value[:, 0], found.by_point[:, 0], found.by_sight[:, 0]
-        constraint = hypotheses.constraints(new, slots, jnp.array([6, 6]), *part)
-        moved = hypotheses.move_hypotheses(new, LAYOUT, constraint, born)
-        fit = initial_estimate(start, KINDS[kind], jnp.array([1.1, 5.1]), sightings, use)
-        entered = add_landmark(start, fit, jnp.asarray(1), sightings)
-        parts = [(x.landmarks**2).sum() + (x.cov**2).sum() for x in (moved, entered)]
-        return sum(parts) + fit.nis
+        found = point_residuals(new, KINDS[kind], slots, jnp.array([6, 7]))
+        part = found.value[:, 0], found.by_point[:, 0], found.by_stored[:, 0]
+        constraint = constraints_of(new, slots, jnp.array([6, 6]), *part)
+        corrected = correct_hypotheses(new, LAYOUT, constraint, jnp.array([True, False]))
+        made = initial_estimate(start, KINDS[kind], jnp.array([1.1, 5.1]), stored, use)
+        entered = add_landmark(start, made, jnp.asarray(1), stored)
+        parts = [(x.landmarks**2).sum() + (x.cov**2).sum() for x in (corrected, entered)]
+        return sum(parts) + made.nis
 
     at = joint.landmarks, joint.cov
     rng = np.random.default_rng(0)
@@ -508,9 +517,10 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward(kind):
     def ways(at, along):
         return jax.grad(loss, argnums=(0, 1))(*at), jax.jvp(loss, at, along)[1]
 
-    slopes, forward = ways(at, along)
-    assert all(np.isfinite(slope).all() and slope.any() for slope in slopes)
-    reverse = sum((slope * way).sum() for slope, way in zip(slopes, along, strict=True))
+    gradient, forward = ways(at, along)
+    chex.assert_tree_all_finite(gradient)
+    assert all(part.any() for part in gradient)
+    reverse = sum((part * way).sum() for part, way in zip(gradient, along, strict=True))
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)
 
 
@@ -518,13 +528,13 @@ def test_without_names_intersections_find_the_landmarks():
     """Every bearing may be of any landmark; the names in the log are not looked at."""
     scenario = world("rays")
     gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)
-    filter = filter_of(
-        scenario,
+    filter = delayed_slam(
+        scenario.motion,
+        scenario.sensor,
         8,
-        hypotheses=40,
-        sightings=40,
-        persistence=6.0,
-        decay=0.7,
+        stored=StoredMeasurements(capacity=40),
+        hypotheses=Hypotheses(capacity=40, decay=0.7),
+        promotion=Promotion(persistence=6.0),
         associate=nearest(*gates),
     )
     truth, log = draw(scenario, 4)
@@ -540,19 +550,37 @@ def test_without_names_intersections_find_the_landmarks():
     ("options", "message"),
     [
         ({"sensor": sensors.range_bearing(np.eye(2))}, "one bearing or one range"),
-        ({"capacity": 0}, "capacity"),
-        ({"sightings": 0}, "sightings"),
-        ({"promotions": 1.5}, "promotions"),
-        ({"persistence": 0}, "persistence above 0"),
-        ({"decay": -1}, "decay not below 0"),
-        ({"spread": np.nan}, "spread above 0"),
-        ({"distance": "euclid"}, "unknown distance"),
-        ({"meet": 3}, "meet to be a Meeting"),
+        ({"capacity": 0}, "delayed_slam: capacity"),
+        ({"gate": 0}, "delayed_slam: expected a gate above 0"),
+        ({"triangulation": 3}, "delayed_slam: expected triangulation to be a Triangulation"),
+        ({"triangulation": rays}, "got the function rays: call it"),
+        ({"stored": 32}, "delayed_slam: expected stored to be a StoredMeasurements, got int"),
+        ({"hypotheses": 16}, "delayed_slam: expected hypotheses to be a Hypotheses, got int"),
+        ({"promotion": 2}, "delayed_slam: expected promotion to be a Promotion, got int"),
     ],
 )
 def test_bad_arguments_are_refused(options, message):
-    parts = {"sensor": CAMERA, "capacity": 3} | options
+    options = {"sensor": CAMERA, "capacity": 3} | options
     with pytest.raises(ValueError, match=message):
-        delayed_slam(
-            motion.increment(np.eye(2)), parts.pop("sensor"), parts.pop("capacity"), **parts
-        )
+        delayed_slam(motion.increment(np.eye(2)), **options)
+
+
+@pytest.mark.parametrize(
+    ("record", "options", "message"),
+    [
+        (StoredMeasurements, {"capacity": 0}, "capacity"),
+        (StoredMeasurements, {"spacing": -0.1}, "expected spacing not below 0"),
+        (Hypotheses, {"capacity": 0}, "capacity"),
+        (Hypotheses, {"patience": 0.5}, "patience"),
+        (Hypotheses, {"decay": -1}, "expected decay not below 0"),
+        (Hypotheses, {"spread": np.nan}, "expected spread above 0"),
+        (Hypotheses, {"same": 0}, "expected same above 0"),
+        (Hypotheses, {"distance": "euclid"}, "unknown distance 'euclid'"),
+        (Promotion, {"per_scan": 1.5}, "per_scan"),
+        (Promotion, {"persistence": 0}, "expected persistence above 0"),
+        (Promotion, {"lead": -1}, "expected lead not below 0"),
+    ],
+)
+def test_bad_settings_are_refused_where_they_are_made(record, options, message):
+    with pytest.raises(ValueError, match=f"^{record.__name__}: {message}"):
+        record(**options)

@@ -1,0 +1,179 @@
+"""What `delayed_slam` is told: three records with defaults, each checked when it is made."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from jaxslam import validation
+from jaxslam.association.known import known
+from jaxslam.filters.delayed.state import SIZE, TableLayout
+from jaxslam.filters.delayed.triangulation import Triangulation, triangulation_of
+from jaxslam.math.linalg import check_count, check_gate, is_concrete
+from jaxslam.math.stats import chi2_quantile
+from jaxslam.protocols import Associate, Motion, Sensor
+from jaxslam.sensors.suite import on_ground
+
+Distance = Literal["mahalanobis", "bhattacharyya"]
+
+
+@dataclass(frozen=True)
+class StoredMeasurements:
+    """How many measurements of no landmark are kept, and which.
+
+    Raises:
+        ValueError: on a capacity below 1 or a negative spacing.
+    """
+
+    capacity: int = 32
+    """W: where all slots are taken, the oldest stored measurement is marginalized out"""
+    spacing: float = 0.2
+    """[m] measurements of one identity are stored only from places at least so far from each other;
+    one from nearer is `Status.DEFERRED`"""
+
+    def __post_init__(self) -> None:
+        check_count("StoredMeasurements: capacity", self.capacity)
+        _check_not_negative(self, "spacing")
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Which intersections of stored measurements become hypotheses, and which of these are deleted.
+
+    Raises:
+        ValueError: on a count below 1, a spread or `same` not above 0, a negative decay, or an
+            unknown distance.
+    """
+
+    capacity: int = 16
+    """C: where all slots are taken, intersections are refused, and counted"""
+    spread: float = 0.3
+    """[1] the largest standard deviation of the intersection relative to the sensor, over their
+    distance, with which a hypothesis may begin: beyond, it is not Gaussian"""
+    distance: Distance = "mahalanobis"
+    """between intersection and hypothesis as Gaussians relative to the sensor: d² of mahalanobis,
+    or bhattacharyya"""
+    same: float | None = None
+    """[1] an intersection at less than this distance from a hypothesis is that hypothesis; default
+    the 99 % quantile of chi-square with two degrees of freedom for mahalanobis, 0.5 for
+    bhattacharyya"""
+    decay: float = 0.5
+    """persistence lost by a measurement of its tag that does not confirm it; deleted at 0, so
+    persistence / decay outliers in a row are survived"""
+    patience: int = 200
+    """scans without confirmation after which a hypothesis is deleted"""
+
+    def __post_init__(self) -> None:
+        check_count("Hypotheses: capacity", self.capacity)
+        check_count("Hypotheses: patience", self.patience)
+        _check_positive(self, "spread", "same")
+        _check_not_negative(self, "decay")
+        if self.distance not in get_args(Distance):
+            raise ValueError(f"Hypotheses: unknown distance {self.distance!r}")
+
+    @property
+    def same_below(self) -> float:
+        """`same`, or its default."""
+        if self.same is not None:
+            return self.same
+        return chi2_quantile(0.99, 2) if self.distance == "mahalanobis" else 0.5
+
+
+@dataclass(frozen=True)
+class Promotion:
+    """When a hypothesis becomes a landmark.
+
+    Raises:
+        ValueError: on a count below 1, a persistence or spread not above 0, or a negative lead.
+    """
+
+    persistence: float = 4.0
+    """the persistence needed: 1 of the intersection, and 1 of each confirmation"""
+    lead: float = 2.0
+    """by how much its persistence must exceed that of each hypothesis that excludes it"""
+    spread: float = 0.3
+    """[1] the largest standard deviation of its place relative to the sensor, over their distance,
+    with which it may become a landmark"""
+    per_scan: int = 2
+    """at most so many promotions a scan"""
+
+    def __post_init__(self) -> None:
+        check_count("Promotion: per_scan", self.per_scan)
+        _check_positive(self, "persistence", "spread")
+        _check_not_negative(self, "lead")
+
+
+@dataclass(frozen=True, eq=False)
+class DelayedSettings:
+    """What each step of `delayed_slam` takes beside the state and the scan."""
+
+    sensor: Sensor
+    """of the landmarks of the table, whose third parameter it ignores"""
+    triangulation: Triangulation
+    layout: TableLayout
+    associate: Associate
+    by_tag: bool
+    """identities are known: only measurements of one tag intersect"""
+    gate: float
+    """of squared Mahalanobis distances of one degree of freedom"""
+    stored: StoredMeasurements
+    hypotheses: Hypotheses
+    promotion: Promotion
+
+
+def delayed_settings(
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    *,
+    triangulation: Triangulation | None,
+    stored: StoredMeasurements | None,
+    hypotheses: Hypotheses | None,
+    promotion: Promotion | None,
+    gate: float | None,
+    associate: Associate | None,
+) -> DelayedSettings:
+    """The settings of `delayed_slam` from its arguments, checked; None is for the default."""
+    name = "delayed_slam"
+    validation.check_models(name, motion, sensor)
+    validation.check_parts(name, associate=associate)
+    if len(sensor.measurements) != 1 or len(sensor.landmark) != 2:
+        raise ValueError(
+            f"{name}: expected a sensor of one bearing or one range of points (x, y), got "
+            f"{sensor.name} with {sensor.measurements} of {sensor.landmark}"
+        )
+    check_count(f"{name}: capacity", capacity)
+    check_gate(name, gate)
+    triangulation = triangulation_of(sensor) if triangulation is None else triangulation
+    stored = StoredMeasurements() if stored is None else stored
+    hypotheses = Hypotheses() if hypotheses is None else hypotheses
+    promotion = Promotion() if promotion is None else promotion
+    validation.check_record(name, "triangulation", triangulation, Triangulation)
+    validation.check_record(name, "stored", stored, StoredMeasurements)
+    validation.check_record(name, "hypotheses", hypotheses, Hypotheses)
+    validation.check_record(name, "promotion", promotion, Promotion)
+    return DelayedSettings(
+        sensor=on_ground(sensor, SIZE),
+        triangulation=triangulation,
+        layout=TableLayout(capacity, hypotheses.capacity, stored.capacity),
+        associate=known() if associate is None else associate,
+        by_tag=associate is None,
+        gate=chi2_quantile(0.99, 1) if gate is None else gate,
+        stored=stored,
+        hypotheses=hypotheses,
+        promotion=promotion,
+    )
+
+
+def _check_positive(record: Any, *fields: str) -> None:
+    for field in fields:
+        value = getattr(record, field)
+        if value is not None and is_concrete(value) and not value > 0:
+            name = type(record).__name__
+            raise ValueError(f"{name}: expected {field} above 0, got {value}")
+
+
+def _check_not_negative(record: Any, *fields: str) -> None:
+    for field in fields:
+        value = getattr(record, field)
+        if is_concrete(value) and not value >= 0:
+            name = type(record).__name__
+            raise ValueError(f"{name}: expected {field} not below 0, got {value}")
