@@ -7,7 +7,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
@@ -154,38 +154,24 @@ def particle_localization(
 
     def update(state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
         state, scan = draw_start(state, key, settings), zero_padding(scan)
-        # Associate and weight.
         likelihood = jax.vmap(partial(scan_likelihood, scan=scan, sensors=sensors))(state.pose)
-        seen = state.log_weight + likelihood.log_density.sum(axis=1)
-        log_likelihood = normalized(seen)[1]
+        log_likelihood = normalized(state.log_weight + likelihood.log_density.sum(axis=1))[1]
         # Beside d², a weight has log |2πR|, which is the same for all.
         misfit = 0.5 * likelihood.counted.sum(axis=1)
-        weight, _, some = normalized(state.log_weight - misfit)
-        even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
-        weight = jnp.where(some, weight, even)
-        best = jnp.argmax(weight).astype(jnp.int32)
-        # Is the robot lost, and are the weights too uneven?
+        weight, some = weight_poses(state, misfit)
         ess = effective_size(weight)
-        state = update_averages(state, misfit, likelihood.measured[0].sum(), settings)
-        due = ess < threshold * state.active
-        if settings.injects:
-            due = due | (state.injection > 0)
-        # Report of the most likely particle.
-        own: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
-        info = info_of(
-            status_of(scan.valid, matched=own.matched, positive=own.positive, inside=own.inside),
-            own.matched,
-            size=own.dof,
-            slot=own.slot,
-            nis=weighted_nis(likelihood.nis, likelihood.matched, weight),
-            innovation=own.innovation,
-            innovation_cov=own.innovation_cov,
-            log_likelihood=log_likelihood,
-            exhausted=likelihood.exhausted.any(),
+        info = info_of_scan(scan, likelihood, weight, log_likelihood)
+        found = ParticleInfo(
+            ess=ess, underflow=~some, active=state.active, **state.events._asdict()
         )
-        events = state.events._asdict()
-        found = ParticleInfo(ess=ess, underflow=~some, active=state.active, **events)
-        state = state._replace(log_weight=weight, best=best, due=due, events=no_events())
+        state = update_averages(state, misfit, likelihood.measured[0].sum(), settings)
+        lost = settings.injects & (state.injection > 0)
+        state = state._replace(
+            log_weight=weight,
+            best=jnp.argmax(weight).astype(jnp.int32),
+            due=(ess < threshold * state.active) | lost,
+            events=no_events(),
+        )
         return state, with_extra(info, "particles", found)
 
     def estimate(state: PoseParticles) -> Estimate:
@@ -209,6 +195,38 @@ def particle_localization(
         estimate=estimate,
         chart=euclidean(),
         places=sensor.places if isinstance(sensor, Suite) else (),
+    )
+
+
+def weight_poses(
+    state: PoseParticles, misfit: Float[Array, "P"]
+) -> tuple[Float[Array, "P"], Bool[Array, ""]]:
+    """log w exp(-misfit) with Σ w = 1, equal for all in use where nothing is left, and whether
+    anything was."""
+    weight, _, some = normalized(state.log_weight - misfit)
+    even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
+    return jnp.where(some, weight, even), some
+
+
+def info_of_scan(
+    scan: Scan,
+    likelihood: ScanLikelihood,
+    log_weight: Float[Array, "P"],
+    log_likelihood: Float[Array, ""],
+) -> Info:
+    """What the most likely particle makes of a scan; nis is the mean by weight."""
+    best = jnp.argmax(log_weight)
+    own: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
+    return info_of(
+        status_of(scan.valid, matched=own.matched, positive=own.positive, inside=own.inside),
+        own.matched,
+        size=own.dof,
+        slot=own.slot,
+        nis=weighted_nis(likelihood.nis, likelihood.matched, log_weight),
+        innovation=own.innovation,
+        innovation_cov=own.innovation_cov,
+        log_likelihood=log_likelihood,
+        exhausted=likelihood.exhausted.any(),
     )
 
 
