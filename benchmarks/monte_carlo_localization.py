@@ -49,7 +49,7 @@ def carried(world, key):
 def filters_of(world, particles):
     """Filter, and what it is told of the start, by name."""
     blunt = sensors.relative_position(0.5**2 * np.eye(2))
-    anywhere = pose_state.box_moments(jnp.asarray(BOX))
+    anywhere = pose_state.uniform_pose_moments(jnp.asarray(BOX))
     known = jnp.array([0.0, 0.5 / np.deg2rad(1.5), np.pi]), jnp.zeros((3, 3))
     models = world.motion, world.sensor, world.landmarks
     gate = chi2_quantile(0.999, 2)
@@ -116,15 +116,15 @@ def measure(runs=20, particles=5000, out=None):
             elif part == "carried away" and name == "EKF, start, gate":
                 gate = {"high": 0.1}
             metrics.append(Metric(f"{name}, {part}: share found", found.mean(), **gate))
-    info = traces["particles"][1]
-    active = np.median(np.asarray(info.active), axis=0)
+    found = traces["particles"][1].extra["particles"]
+    active = np.median(np.asarray(found.active), axis=0)
     for part, at in (("anywhere", HALF - 1), ("carried away", 2 * HALF - 1)):
         metrics.append(Metric(f"particles in use, end of {part}", active[at], high=0.2 * particles))
-    injected = np.asarray(info.injected)
+    injected = np.asarray(found.injected)
     metrics.append(Metric("injected a run, before it is carried", injected[:, :HALF].sum(1).mean()))
     metrics.append(Metric("injected a run, after", injected[:, HALF:].sum(1).mean()))
-    metrics.append(Metric("steps in which no weight was left", float(info.underflow.sum())))
-    metrics.append(Metric("steps at the capacity, a run", float(info.capped.sum(1).mean())))
+    metrics.append(Metric("steps in which no weight was left", float(found.underflow.sum())))
+    metrics.append(Metric("steps at the capacity, a run", float(found.capped.sum(1).mean())))
     if out is not None:
         draw(traces, out)
     return metrics
@@ -148,7 +148,8 @@ def draw(traces, out):
 
     for (name, (error, _)), color in zip(traces.items(), colors, strict=True):
         band(above, np.maximum(error, 1e-3), color, name)
-    band(below, np.asarray(traces["particles"][1].active), colors[0], "particles in use")
+    found = traces["particles"][1].extra["particles"]
+    band(below, np.asarray(found.active), colors[0], "particles in use")
     above.set_ylabel("position error [m]")
     below.set_ylabel("particles in use")
     below.set_xlabel("time [s]")

@@ -124,25 +124,9 @@ class Info(NamedTuple):
     merged: Any = ()
     """(2,) int: the slot of two landmarks merged into one and the slot given up, or -1, -1; where
     the filter merges duplicates."""
-    ess: Any = ()
-    """() effective number of particles before resampling, of a filter that has particles."""
-    resampled: Any = ()
-    """() bool: the particles were resampled."""
-    underflow: Any = ()
-    """() bool: no particle had a weight left, and all were given the same; log_likelihood is then
-    0, not -∞."""
-    invalid: Any = ()
-    """() int: particles that a motion or a scan left with a pose that is not finite; they keep the
-    pose before, and weigh nothing."""
-    active: Any = ()
-    """() int: particles in use, of a filter that chooses their number."""
-    injected: Any = ()
-    """() int: particles drawn anew from the whole box before this step's motion, to find a robot
-    that is lost."""
-    capped: Any = ()
-    """() bool: the wanted number of particles was above the capacity."""
     extra: dict[str, Any] | None = None
-    """what one family, or one wrapper of a filter, alone says: its record by its name."""
+    """what one family, or one wrapper of a filter, alone says: its record by its name, as
+    "particles" for a `filters.particles.particle_info.ParticleInfo`."""
 
     @property
     def overflow(self) -> jax.Array:

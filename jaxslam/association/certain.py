@@ -1,4 +1,4 @@
-"""Association that looks only at landmarks whose measurement it can foretell well."""
+"""Association restricted to landmarks whose predicted measurement is tight."""
 
 import dataclasses
 
@@ -10,15 +10,15 @@ from jaxslam.types import Scan
 
 
 def certain(associate: Associate, spread: float) -> Associate:
-    """Another method, which gets to see a landmark only where √(tr S/Z) <= spread.
+    """Another method, restricted to landmarks with √(tr S/Z) <= spread.
 
-    S is the covariance of the innovation: after a long loop that of the first landmarks has grown
-    beyond the distances between landmarks, and judged one by one a measurement then fits a wrong
-    one. What is seen there becomes new landmarks at first; `filters.closing` finds which of the old
-    ones they are, together.
+    S is the covariance of the innovation. After a long loop that of the first landmarks exceeds the
+    distances between landmarks, and a measurement judged alone may then fit a wrong one.
+    Landmarks measured there become new ones at first; `filters.map_management.closing` finds
+    jointly which of the old ones they are.
 
     Args:
-        associate: the method; one that goes by tags alone, as `known`, does not ask what it sees.
+        associate: the method; one that goes by tags alone, as `known`, is not restricted.
         spread: in units of the measurement, which should all be of one kind.
     Raises:
         ValueError: on a spread not above 0.

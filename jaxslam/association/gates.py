@@ -1,10 +1,12 @@
-"""Two gates: what is near enough to be a landmark's, and what is far enough to be a new one's."""
+"""Gates of associations and of new landmarks, and mutually nearest pairs."""
 
 from numbers import Real
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Pairs, Prediction
@@ -31,17 +33,14 @@ def check_gates(name: str, gate: float, new_gate: float | None) -> float:
     return new_gate
 
 
-def far_from_all(pairs: Pairs, scan: Scan, new_gate: float) -> jax.Array:
-    """Whether a measurement lies beyond the gate of every landmark there is, (M,)."""
+def far_from_all(pairs: Pairs, scan: Scan, new_gate: float) -> Bool[Array, "M"]:
+    """Whether a measurement lies beyond the gate of every landmark there is."""
     near = pairs.possible & (pairs.distance <= new_gate)
     return scan.valid & ~near.any(axis=1)
 
 
-def mutual(score: jax.Array, allowed: jax.Array) -> jax.Array:
-    """The slot (M,) that is best for a measurement and for which it is the best, else -1.
-
-    score, allowed: (M, N); the lowest score is the best.
-    """
+def mutual(score: Float[Array, "M N"], allowed: Bool[Array, "M N"]) -> Int[Array, "M"]:
+    """The slot of the lowest score for a measurement that is also the slot's lowest, else -1."""
     if 0 in score.shape:
         return jnp.full(score.shape[0], -1, jnp.int32)
     score = jnp.where(allowed, score, jnp.inf)

@@ -1,4 +1,4 @@
-"""All measurements of a scan at once to different landmarks, at the least sum of distances."""
+"""Global nearest neighbour: all measurements of a scan at once, at the least sum of distances."""
 
 import jax.numpy as jnp
 

@@ -5,6 +5,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.association.gates import check_gates, far_from_all
 from jaxslam.math import linalg
@@ -12,8 +14,6 @@ from jaxslam.math.linalg import check_count
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Association, Pairs, Prediction
 from jaxslam.types import Scan
-
-Array = jax.Array
 
 
 def joint(
@@ -76,25 +76,23 @@ def _quantiles(probability: float, m: int, size_z: int) -> np.ndarray:
 
 
 class _Problem(NamedTuple):
-    slot: Array
-    """(M, K) candidates, the nearest first"""
-    fits: Array
-    """(M, K) bool"""
-    innovation: Array
-    """(M, K, Z)"""
-    cov: Array
-    """(M, K, Z, Z)"""
-    cross: Array
-    """(N, Z, N, Z)"""
-    levels: Array
-    """(M + 1,) what D² of k pairs may be"""
-    left: Array
-    """(M + 1,) how many measurements from the i-th on have candidates"""
-    cut: Array
-    """() bool: there were more candidates than K"""
+    slot: Int[Array, "M K"]
+    """candidates, the nearest first"""
+    fits: Bool[Array, "M K"]
+    innovation: Float[Array, "M K Z"]
+    cov: Float[Array, "M K Z Z"]
+    cross: Float[Array, "N Z N Z"]
+    levels: Float[Array, "M+1"]
+    """what D² of k pairs may be"""
+    left: Int[Array, "M+1"]
+    """how many measurements from the i-th on have candidates"""
+    cut: Bool[Array, ""]
+    """there were more candidates than K"""
 
 
-def _problem(pairs: Pairs, cross: Array, levels: Array, candidates: int) -> _Problem:
+def _problem(
+    pairs: Pairs, cross: Float[Array, "N Z N Z"], levels: Float[Array, "levels"], candidates: int
+) -> _Problem:
     m, n = pairs.distance.shape
     compatible = pairs.possible & (pairs.distance <= levels[1])
     order = jnp.argsort(jnp.where(compatible, pairs.distance, jnp.inf), axis=1)
@@ -115,24 +113,24 @@ def _problem(pairs: Pairs, cross: Array, levels: Array, candidates: int) -> _Pro
 
 
 class _Search(NamedTuple):
-    level: Array
-    """() the measurement to decide on; -1 when all is searched"""
-    option: Array
-    """(M,) which of its candidates comes next; K is none"""
-    chosen: Array
-    """(M,) slot of each measurement decided on, -1 for none"""
-    pairs: Array
-    """(M + 1,) how many there are among the first k"""
-    distance: Array
-    """(M + 1,) D² of the first k"""
-    inverse: Array
-    """(M·Z, M·Z) L⁻¹, rows of zeros where there is no pair"""
-    whitened: Array
-    """(M·Z,) L⁻¹ ν"""
-    best: Array
-    best_count: Array
-    best_distance: Array
-    nodes: Array
+    level: Int[Array, ""]
+    """the measurement to decide on; -1 when all is searched"""
+    option: Int[Array, "M"]
+    """which of its candidates comes next; K is none"""
+    chosen: Int[Array, "M"]
+    """slot of each measurement decided on, -1 for none"""
+    pairs: Int[Array, "M+1"]
+    """how many there are among the first k"""
+    distance: Float[Array, "M+1"]
+    """D² of the first k"""
+    inverse: Float[Array, "M*Z M*Z"]
+    """L⁻¹, rows of zeros where there is no pair"""
+    whitened: Float[Array, "M*Z"]
+    """L⁻¹ ν"""
+    best: Int[Array, "M"]
+    best_count: Int[Array, ""]
+    best_distance: Float[Array, ""]
+    nodes: Int[Array, ""]
 
 
 def _search(problem: _Problem, budget: int) -> _Search:
@@ -193,8 +191,10 @@ def _search(problem: _Problem, budget: int) -> _Search:
     return jax.lax.while_loop(lambda at: (at.level >= 0) & (at.nodes < budget), visit, start)
 
 
-def _block_row(problem: _Problem, at: _Search, which: Array) -> tuple[Array, Array, Array, Array]:
-    """What the next pair adds to L⁻¹ (Z, M·Z) and L⁻¹ ν (Z,), to D² (), and whether it is regular.
+def _block_row(
+    problem: _Problem, at: _Search, which: Int[Array, ""]
+) -> tuple[Float[Array, "Z MZ"], Float[Array, "Z"], Float[Array, ""], Bool[Array, ""]]:
+    """What the next pair adds to L⁻¹, L⁻¹ ν and D², and whether its block is positive definite.
 
     With W = L⁻¹ C, C the covariance of the pairs before with it, and B = S - WᵀW = l lᵀ: the new
     rows of L⁻¹ are l⁻¹ [-Wᵀ L⁻¹, I], and those of L⁻¹ ν are l⁻¹ (ν - Wᵀ L⁻¹ ν).

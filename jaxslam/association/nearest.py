@@ -1,4 +1,4 @@
-"""Each measurement to the landmark it is nearest to, every pair judged alone."""
+"""Nearest neighbour: each measurement to its nearest landmark, every pair judged alone."""
 
 from typing import Literal
 

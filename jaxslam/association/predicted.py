@@ -3,6 +3,9 @@
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.math.gaussians import gaussian_terms
 from jaxslam.protocols import Pairs, Prediction, Sensor
@@ -11,19 +14,20 @@ from jaxslam.types import Scan
 
 def predicted(
     sensor: Sensor,
-    tag: jax.Array,
-    alive: jax.Array,
-    measurements: Callable[[], tuple[jax.Array, jax.Array]],
-    cross: Callable[[], jax.Array],
+    tag: Int[Array, "N"],
+    alive: Bool[Array, "N"],
+    measurements: Callable[[], tuple[Float[Array, "N Z"], Float[Array, "N Z Z"] | None]],
+    cross: Callable[[], Float[Array, "N Z N Z"]],
 ) -> Prediction:
     """The `Prediction` of N landmarks, every measurement against every landmark for itself.
 
     ν_ij = z_i ⊖ ẑ_j, S_ij = H_j P H_jᵀ + R_i. What an association does not ask for is not computed.
 
     Args:
-        tag, alive: (N,) of the slots.
-        measurements: () -> ẑ (N, Z) and H_j P H_jᵀ (N, Z, Z).
-        cross: () -> H_i P H_jᵀ (N, Z, N, Z).
+        tag, alive: of the slots.
+        measurements: () -> ẑ and H_j P H_jᵀ; None instead of the latter where pose and map have no
+            error: then S_ij = R_i, which is factored once a measurement.
+        cross: () -> H_i P H_jᵀ.
     """
 
     def pairs(scan: Scan) -> Pairs:
@@ -31,8 +35,12 @@ def predicted(
         noise = jax.vmap(sensor.noise_cov)(scan.z)
         over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
         innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
-        cov = own[None] + noise[:, None]
-        terms = jax.vmap(jax.vmap(gaussian_terms))(innovation, cov)
+        if own is None:
+            cov = jnp.broadcast_to(noise[:, None], (*innovation.shape, innovation.shape[2]))
+            terms = jax.vmap(jax.vmap(gaussian_terms, in_axes=(0, None)))(innovation, noise)
+        else:
+            cov = own[None] + noise[:, None]
+            terms = jax.vmap(jax.vmap(gaussian_terms))(innovation, cov)
         possible = scan.valid[:, None] & alive[None, :] & terms.positive
         return Pairs(innovation, cov, terms.distance, terms.log_det, possible)
 

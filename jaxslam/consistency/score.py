@@ -33,11 +33,11 @@ DROPS = (
 )
 """What can keep a measurement from the map; each is counted."""
 
-EVENTS = (
-    *("removed", "merged", "reduced", "exhausted", "resampled", "underflow"),
-    *("invalid", "injected", "capped"),
-)
-"""Fields of `Info` that not every filter has; each is counted where it is there."""
+PARTICLE_EVENTS = ("resampled", "underflow", "invalid", "injected", "capped")
+"""Fields of `info.extra["particles"]`; each is counted where it is there."""
+
+EVENTS = ("removed", "merged", "reduced", "exhausted", *PARTICLE_EVENTS)
+"""These, and fields of `Info` that not every filter has; each is counted where it is there."""
 
 LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
 """Probabilities of the coverage curves."""
@@ -146,9 +146,10 @@ def _counted(info: Info) -> dict[str, np.ndarray]:
     at = np.asarray(info.status).reshape(runs, -1) + np.arange(runs)[:, None] * len(Status)
     became = np.bincount(at.ravel(), minlength=runs * len(Status)).reshape(runs, -1)
     out = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
+    particles = (info.extra or {}).get("particles")
     for name in EVENTS:
-        value = getattr(info, name)
-        if not isinstance(value, tuple):
+        value = getattr(particles if name in PARTICLE_EVENTS else info, name, None)
+        if value is not None and not isinstance(value, tuple):
             happened = value[..., 0] >= 0 if name == "merged" else value
             out[name] = happened.reshape(runs, -1).sum(axis=1)
     return out

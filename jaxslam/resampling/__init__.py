@@ -1,7 +1,6 @@
-"""Resampling: which particles go on, one method a file. `REGISTRY` is what their tests run over.
+"""Resampling methods: which particles are kept and copied. `REGISTRY` is what their tests run over.
 
-`soft` and `stop_gradient` make of such a method one that gradients pass; `kld` says how many
-particles are enough.
+`soft` and `stop_gradient` make a method differentiable; `kld` says how many particles suffice.
 """
 
 from jaxslam.protocols import Resample

@@ -4,18 +4,18 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.math.linalg import is_concrete
 from jaxslam.math.stats import normal_quantile
-
-Array = jax.Array
 
 # Bins are counted in int32, and a pose may be anywhere.
 _FARTHEST = float(2**30)
 
 
-def kld_bound(bins: Array, error: float, confidence: float) -> Array:
-    """Particles that k = `bins` occupied bins ask for, of any shape; 0 where k <= 1.
+def kld_bound(bins: Int[Array, "*K"], error: float, confidence: float) -> Float[Array, "*K"]:
+    """How many particles k = `bins` occupied bins ask for; 0 where k <= 1.
 
         n = (k-1)/(2ε) · (1 - 2/(9(k-1)) + √(2/(9(k-1))) z)³
 
@@ -35,8 +35,8 @@ def kld_bound(bins: Array, error: float, confidence: float) -> Array:
     return jnp.where(many, dof / (2 * error) * (1 - part + jnp.sqrt(part) * z) ** 3, 0.0)
 
 
-def bins_of(pose: Array, size: tuple[float, float, float]) -> Array:
-    """The bin (P, 3) int32 of each pose (P, 3): whole multiples of size (x [m], y [m], θ [rad]).
+def bins_of(pose: Float[Array, "P 3"], size: tuple[float, float, float]) -> Int[Array, "P 3"]:
+    """The bin of each pose, int32: whole multiples of size (x [m], y [m], θ [rad]).
 
     Headings from -π on, the last bin being narrower where size does not divide 2π.
     """
@@ -47,8 +47,8 @@ def bins_of(pose: Array, size: tuple[float, float, float]) -> Array:
     return jnp.floor(jnp.clip(at, -_FARTHEST, _FARTHEST)).astype(jnp.int32)
 
 
-def occupied(bins: Array) -> Array:
-    """How many different rows the first 1, 2, …, P of bins (P, 3) have, (P,) int32.
+def occupied(bins: Int[Array, "P 3"]) -> Int[Array, "P"]:
+    """How many different rows the first 1, 2, …, P of the bins have, int32.
 
     By sorting, O(P log P) in time and O(P) in memory however large the world is: of equal rows the
     sort, which is stable, puts the first drawn first.
@@ -63,14 +63,16 @@ def occupied(bins: Array) -> Array:
     return jnp.cumsum(first.astype(jnp.int32))
 
 
-def enough(bins: Array, least: int, error: float, confidence: float) -> tuple[Array, Array]:
-    """How many of P exchangeable draws suffice, () int32, and whether P were too few, ().
+def enough(
+    bins: Int[Array, "P 3"], least: int, error: float, confidence: float
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """How many of P exchangeable draws suffice, int32, and whether P were too few.
 
     Fox's loop in fixed shapes: the first m >= least that is no less than `kld_bound` of the bins
     that the first m draws occupy; P where there is none.
 
     Args:
-        bins: (P, 3) int, of the draws in the order in which they were drawn; an ordered sample (as
+        bins: of the draws in the order in which they were drawn; an ordered sample (as
             systematic resampling gives) has to be shuffled before.
     """
     count = bins.shape[0]

@@ -1,12 +1,14 @@
-"""The whole part of P w_j as copies, and only the rest by chance."""
+"""Residual resampling: the whole part of P w_j as copies, and the rest by chance."""
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
 
 from jaxslam.resampling.weights import at_points, weights_of
 
 
-def residual(log_weights: jax.Array, key: jax.Array) -> jax.Array:
+def residual(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
     """Ancestors (P,): ⌊P w_j⌋ copies of each j, then R = P - Σ ⌊P w_j⌋ independent draws with
     probabilities (P w_j - ⌊P w_j⌋)/R.
 
@@ -14,7 +16,7 @@ def residual(log_weights: jax.Array, key: jax.Array) -> jax.Array:
     for dynamic systems", JASA 93(443)). The copies come first, ascending.
 
     Args:
-        log_weights: (P,), of any scale; what is not finite is never drawn, unless nothing is.
+        log_weights: of any scale; what is not finite is never drawn, unless nothing is.
         key: a PRNG key, consumed.
     """
     weights = weights_of(log_weights)
@@ -23,7 +25,7 @@ def residual(log_weights: jax.Array, key: jax.Array) -> jax.Array:
     # P·(1/P) may be rounded to less than 1.
     copies = jnp.floor(share * (1 + 4 * float(jnp.finfo(share.dtype).eps)))
     rest = jnp.maximum(share - copies, 0.0)
-    place = jnp.arange(count)
-    copied = jnp.searchsorted(jnp.cumsum(copies), place.astype(share.dtype), side="right")
+    index = jnp.arange(count)
+    copied = jnp.searchsorted(jnp.cumsum(copies), index.astype(share.dtype), side="right")
     drawn = at_points(rest, jax.random.uniform(key, (count,), weights.dtype))
-    return jnp.where(place < copies.sum(), copied, drawn).astype(jnp.int32)
+    return jnp.where(index < copies.sum(), copied, drawn).astype(jnp.int32)

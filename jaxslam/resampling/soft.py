@@ -1,14 +1,14 @@
-"""Ancestors drawn from flattened weights, and what they weigh then: a gradient, though biased."""
+"""Soft resampling: ancestors drawn from flattened weights; its gradient is biased."""
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
 
 from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Differentiable, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import even, normalized
-
-Array = jax.Array
 
 
 def soft(share: float, resample: Resample = systematic) -> Differentiable:
@@ -33,7 +33,9 @@ def soft(share: float, resample: Resample = systematic) -> Differentiable:
     if is_concrete(share) and not 0 <= share <= 1:
         raise ValueError(f"soft: expected a share from 0 to 1, got {share}")
 
-    def method(log_weights: Array, key: Array) -> tuple[Array, Array]:
+    def method(
+        log_weights: Float[Array, "P"], key: Array
+    ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
         log_w = normalized(log_weights)[0]
         w = jnp.exp(log_w)
         q = share * w + (1 - share) / w.shape[0]

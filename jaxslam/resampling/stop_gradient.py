@@ -2,12 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
 
 from jaxslam.protocols import Differentiable, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import even, normalized
-
-Array = jax.Array
 
 
 def stop_gradient(resample: Resample = systematic) -> Differentiable:
@@ -23,7 +23,8 @@ def stop_gradient(resample: Resample = systematic) -> Differentiable:
     **Unbiased** for expectations, so that the gradient of the filter's estimate of the likelihood
     has the gradient of the likelihood for its mean, and that of its logarithm tends to the score
     with the number of particles (its bias is of order 1/P, as that of the logarithm itself). The
-    price is variance, which grows with the length of the log: all terms of a lost line are lost.
+    price is variance, which grows with the length of the log: all terms of a lineage that dies out
+    are lost.
 
     A caller must not normalize these weights again: their sum is 1, but its gradient is not 0.
 
@@ -31,7 +32,9 @@ def stop_gradient(resample: Resample = systematic) -> Differentiable:
         resample: how indices are drawn; unbiased, as those of `jaxslam.resampling` are.
     """
 
-    def method(log_weights: Array, key: Array) -> tuple[Array, Array]:
+    def method(
+        log_weights: Float[Array, "P"], key: Array
+    ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
         log_w, _, some = normalized(log_weights)
         ancestor = resample(jax.lax.stop_gradient(log_weights), key)
         chosen = jnp.where(some, log_w, 0.0)[ancestor]

@@ -1,12 +1,14 @@
-"""One draw, and P points at equal distances from it: the least noise for the least work."""
+"""Systematic resampling: one draw, and P points at equal distances from it."""
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
 
 from jaxslam.resampling.weights import at_points, weights_of
 
 
-def systematic(log_weights: jax.Array, key: jax.Array) -> jax.Array:
+def systematic(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
     """Ancestors (P,) where points (i + u)/P, one u uniform in [0, 1) for all, fall; ascending.
 
     The number of copies of j is P w_j rounded down or up, with mean P w_j: no particle of at least
@@ -14,7 +16,7 @@ def systematic(log_weights: jax.Array, key: jax.Array) -> jax.Array:
     nonlinear problems", IEE Proc. Radar Sonar Navig. 146(1)).
 
     Args:
-        log_weights: (P,), of any scale; what is not finite is never drawn, unless nothing is.
+        log_weights: of any scale; what is not finite is never drawn, unless nothing is.
         key: a PRNG key, consumed.
     """
     weights = weights_of(log_weights)

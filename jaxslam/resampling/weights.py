@@ -1,15 +1,22 @@
-"""What resampling methods share: weights from logarithms, and places in a cumulative sum."""
+"""What resampling methods share: weights from logarithms, and indices in a cumulative sum."""
+
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
+from jaxslam.math.xla import where_any
 from jaxslam.protocols import Differentiable, Resample
 
-Array = jax.Array
+_T = TypeVar("_T")
 
 
-def normalized(log_weights: Array) -> tuple[Array, Array, Array]:
-    """log w of Σ w = 1 (P,), log Σ exp(log_weights) (), and whether there was a sum, ().
+def normalized(
+    log_weights: Float[Array, "P"],
+) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
+    """log w of Σ w = 1, log Σ exp(log_weights), and whether there was a sum.
 
     What is not finite weighs nothing. Where nothing is left, all weigh 1/P and the flag is False:
     the caller counts it. The log of the sum is then 0.
@@ -28,35 +35,57 @@ def normalized(log_weights: Array) -> tuple[Array, Array, Array]:
     return jnp.where(some, out, even(log_weights)), highest + log_total, some
 
 
-def even(log_weights: Array) -> Array:
-    """log 1/P, (), for log-weights (P,)."""
+def even(log_weights: Float[Array, "P"]) -> Float[Array, ""]:
+    """log 1/P."""
     return -jnp.log(jnp.asarray(float(log_weights.shape[0]), log_weights.dtype))
 
 
 def survivors(
-    resample: Resample | Differentiable, log_weights: Array, key: Array
-) -> tuple[Array, Array]:
-    """The ancestor (P,) of each that goes on, and its log-weight (P,): 1/P unless the method,
-    being a `Differentiable`, says something else."""
+    resample: Resample | Differentiable, log_weights: Float[Array, "P"], key: Array
+) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
+    """The ancestor of each that goes on, and its log-weight: 1/P unless the method, being a
+    `Differentiable`, says something else."""
     found = resample(log_weights, key)
     if isinstance(found, tuple):
         return found
     return found, jnp.broadcast_to(even(log_weights), log_weights.shape)
 
 
-def weights_of(log_weights: Array) -> Array:
-    """w (P,) with Σ w = 1 of log-weights of any scale; even where all underflow."""
+def resampled_where(
+    due: Bool[Array, ""],
+    particles: _T,
+    log_weights: Float[Array, "P"],
+    resample: Resample | Differentiable,
+    key: Array,
+) -> tuple[_T, Float[Array, "P"]]:
+    """Particles, a tree of arrays (P, …), and their log-weights: resampled if due, else the same.
+
+    Of a batch in which nothing is due, nothing is copied.
+    """
+
+    def survive(carried: tuple[_T, Array]) -> tuple[_T, Array]:
+        particles, log_weights = carried
+        chosen, after = survivors(resample, log_weights, key)
+        ancestor = jnp.where(due, chosen, jnp.arange(log_weights.shape[0]))
+        copies: _T = jax.tree.map(lambda leaf: leaf[ancestor], particles)
+        return copies, jnp.where(due, after, log_weights)
+
+    return where_any(due, survive, lambda carried: carried, (particles, log_weights))
+
+
+def weights_of(log_weights: Float[Array, "P"]) -> Float[Array, "P"]:
+    """w with Σ w = 1 of log-weights of any scale; even where all underflow."""
     return jnp.exp(normalized(log_weights)[0])
 
 
-def effective_size(log_weights: Array) -> Array:
+def effective_size(log_weights: Float[Array, "P"]) -> Float[Array, ""]:
     """ESS = 1/Σ w², between 1 and P (Kong, Liu & Wong 1994, "Sequential imputations and Bayesian
     missing data problems", JASA 89(425))."""
     return 1.0 / (weights_of(log_weights) ** 2).sum()
 
 
-def at_points(weights: Array, points: Array) -> Array:
-    """The index (K,) int32 in whose share of the cumulative sum of weights (P,) points (K,) lie.
+def at_points(weights: Float[Array, "P"], points: Float[Array, "K"]) -> Int[Array, "K"]:
+    """The index in whose share of the cumulative sum of weights each point lies, int32.
 
     points are in [0, 1); the share of i is [W_{i-1}, W_i)/W_P, so that no zero weight is chosen,
     also where a point is rounded up to 1.

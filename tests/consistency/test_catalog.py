@@ -55,7 +55,7 @@ def test_what_draws_instead_of_linearizing_fits_scenarios(scenario):
     for name in catalog.PARTICLES:
         trace = jax.eval_shape(partial(go, name), truth, log)
         assert trace.estimate.pose.shape == (3, 3)
-        assert trace.info.invalid.shape == (3,)
+        assert trace.info.extra["particles"].invalid.shape == (3,)
         assert trace.estimate.tag.shape == (3, len(world.landmarks))
 
 

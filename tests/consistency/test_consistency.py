@@ -180,7 +180,7 @@ def test_the_verdict_tells_honest_from_dishonest(claimed, verdict):
 
 
 def test_a_deviation_that_is_rounding_is_no_covariance():
-    """The sample covariance of particles that are copies of one, as `mean_and_spread` rounds it."""
+    """The sample covariance of particles that are copies of one, as `weighted_pose_moments` rounds it."""
     trace, truth, _ = synthetic(np.random.default_rng(8), runs=8)
     trace.estimate.pose[:, 6] = [12.3, -4.567, 1.234]
     trace.estimate.pose_cov[:, 6] = np.diag([1.4e-29, 8.5e-31, 5.4e-32])

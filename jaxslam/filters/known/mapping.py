@@ -1,25 +1,28 @@
 """Mapping from known poses: landmarks that have nothing to do with one another."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.particles import landmark_ekf
-from jaxslam.filters.particles.proposal import look
-from jaxslam.filters.particles.slam_state import Particles, empty, moments
-from jaxslam.math import linalg
+from jaxslam.filters.particles.landmark_ekf import update_map
+from jaxslam.filters.particles.moments import slam_estimate
+from jaxslam.filters.particles.proposal import associate_particle, propose_pose
+from jaxslam.filters.particles.scan_association import zero_padding
+from jaxslam.filters.particles.settings import particle_map_settings
+from jaxslam.filters.particles.slam_state import (
+    SlamParticles,
+    as_only_particle,
+    initial_slam_particles,
+)
 from jaxslam.math.angles import wrap
-from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Filter, Life, Sensor
-from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
-
-Array = jax.Array
 
 
 def mapping(
@@ -37,7 +40,7 @@ def mapping(
     S = H C Hᵀ + R, and a measurement costs O(1) however large the map is. It is what one particle
     of `fastslam` does; no joint matrix exists.
 
-    The state is one particle of a `particles.Particles`. `log._replace(control=poses)` makes a log
+    The state is one particle of a `SlamParticles`. `log._replace(control=poses)` makes a log
     of recorded poses (T, 3) and scans; `as_prior` makes the map one that `ekf_slam` goes on from.
 
     Args:
@@ -48,61 +51,37 @@ def mapping(
         ValueError: on a capacity or births below 1, a gate not above 0, or a sensor that is a
             suite, absolute, or whose landmarks turn into points.
     """
-    validation.check_sensor("mapping", sensor)
-    validation.check_parts("mapping", associate=associate)
-    for name, value in (("capacity", capacity), ("births", births)):
-        if value is not None or name != "births":
-            linalg.check_count(f"mapping: {name}", value)
-    linalg.check_gate("mapping", gate)
-    if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
-        raise ValueError(
-            "mapping: expected one sensor of landmarks that stay what they are, not a suite, an "
-            f"absolute sensor or landmarks that turn into points, got {sensor.name}"
-        )
-    size_l, size_z = len(sensor.landmark), len(sensor.measurements)
-    seen_from = partial(
-        look,
-        sensor=sensor,
-        associate=associate or known_association(),
-        gate=gate,
-        edge=chi2_quantile(0.99, size_z),
+    name = "mapping"
+    validation.check_sensor(name, sensor)
+    settings = particle_map_settings(
+        name, sensor, capacity, associate=associate, gate=gate, births=births, life=life
     )
-    change_map = partial(landmark_ekf.after_scan, sensor=sensor, births=births, life=life)
 
-    def init(pose: Array, pose_cov: Array) -> Particles:
-        one: Particles = jax.tree.map(
-            lambda leaf: leaf[0], empty(pose, pose_cov, 1, capacity, size_l)._replace(best=())
-        )
-        one = one._replace(pose_cov=jnp.zeros_like(pose_cov))
+    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
+        known = jnp.zeros_like(pose_cov)
+        state = initial_slam_particles(pose, known, 1, capacity, len(sensor.landmark))
+        one: SlamParticles = jax.tree.map(lambda leaf: leaf[0], state._replace(best=None))
         return one if life is None else one._replace(life=life.init(pose, one.landmarks))
 
-    def predict(state: Particles, u: Array, key: Array) -> Particles:
+    def predict(state: SlamParticles, u: Float[Array, "3"], key: Array) -> SlamParticles:
         return state._replace(pose=jnp.concatenate([u[:2], wrap(u[2:])]))
 
-    def update(state: Particles, scan: Scan, key: Array) -> tuple[Particles, Info]:
-        # Padding may hold anything, and is multiplied by zero further down.
-        scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
-        _, _, fit, _, sight = seen_from(
-            state.pose,
-            state.pose_cov,
-            state.landmarks,
-            state.covs,
-            state.alive,
-            state.tag,
-            scan,
-        )
-        state, info = change_map(state, sight, scan)
-        return state, info._replace(log_likelihood=fit, exhausted=sight.exhausted)
+    def update(state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
+        scan = zero_padding(scan)
+        association = associate_particle(state, scan, settings)
+        # The pose is known, so that the proposal is where it was; the rest is of use.
+        proposed, innovations = propose_pose(state, association, scan, settings)
+        state, info = update_map(state, association, innovations, scan, settings)
+        return state, info._replace(log_likelihood=proposed.log_matched)
 
-    def estimate(state: Particles) -> Estimate:
-        alone: Particles = jax.tree.map(lambda leaf: leaf[None], state)
-        believed = moments(alone._replace(best=jnp.zeros((), jnp.int32)), sensor)
+    def estimate(state: SlamParticles) -> Estimate:
+        believed = slam_estimate(as_only_particle(state), sensor)
         return believed._replace(pose=state.pose, pose_cov=state.pose_cov)
 
     return Filter(
-        name="mapping",
+        name=name,
         control_size=3,
-        measurement_size=size_z,
+        measurement_size=len(sensor.measurements),
         init=init,
         predict=predict,
         update=update,
@@ -111,7 +90,12 @@ def mapping(
     )
 
 
-def as_prior(state: Particles, filter: Filter, pose: Array, pose_cov: Array) -> Joint:
+def as_prior(
+    state: SlamParticles,
+    filter: Filter,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
+) -> Joint:
     """The state of a filter that begins in this map, with nothing correlated yet.
 
     `run` begins in it by `dataclasses.replace(filter, init=partial(as_prior, final, filter))`.
@@ -125,10 +109,10 @@ def as_prior(state: Particles, filter: Filter, pose: Array, pose_cov: Array) -> 
             landmarks, holds a root of its covariance, is in another chart, or remembers where it
             linearized.
     """
-    if jnp.shape(pose) != (3,) or jnp.shape(pose_cov) != (3, 3):
+    if np.shape(pose) != (3,) or np.shape(pose_cov) != (3, 3):
         raise ValueError(
-            f"as_prior: expected a pose (3,) and covariance (3, 3), got {jnp.shape(pose)} and "
-            f"{jnp.shape(pose_cov)}"
+            f"as_prior: expected a pose (3,) and covariance (3, 3), got {np.shape(pose)} and "
+            f"{np.shape(pose_cov)}"
         )
     capacity, size = state.landmarks.shape
     kind = state.landmarks.dtype

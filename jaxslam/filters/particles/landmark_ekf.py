@@ -1,162 +1,210 @@
-"""What a scan does to one particle's map, from a pose that is drawn, hence known.
+"""The map of one particle after a scan, from a pose that is drawn, hence known.
 
-Everything here acts on one particle; `filters.fastslam` vmaps it.
+Everything here acts on one particle; `fastslam` vmaps it, `mapping` has but one.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.filters.particles.proposal import Sight
-from jaxslam.filters.particles.slam_state import Particles, moments
+from jaxslam.filters.particles.moments import slam_estimate
+from jaxslam.filters.particles.proposal import ParticleInnovations
+from jaxslam.filters.particles.scan_association import ParticleAssociation
+from jaxslam.filters.particles.settings import ParticleMapSettings
+from jaxslam.filters.particles.slam_state import SlamParticles, as_only_particle
 from jaxslam.filters.reporting import info_of, seen_before, status_of
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
+from jaxslam.math.gaussians import gaussian_terms
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Life, Sensor
 from jaxslam.slots import Joint
-from jaxslam.types import Info, Scan, Status
-
-Array = jax.Array
+from jaxslam.types import Estimate, Info, Scan, Status
 
 
-def after_scan(
-    own: Particles,
-    sight: Sight,
+def update_map(
+    particle: SlamParticles,
+    association: ParticleAssociation,
+    innovations: ParticleInnovations,
     scan: Scan,
-    *,
-    sensor: Sensor,
-    births: int | None,
-    life: Life | None,
-) -> tuple[Particles, Info]:
-    """One particle with its map corrected, then grown, then judged by its `Life`."""
-    landmarks, covs = correct(own.pose, own.landmarks, own.covs, scan.z, sight, sensor=sensor)
-    own = own._replace(landmarks=landmarks, covs=covs)
-    given_up = jnp.zeros_like(own.alive)
-    if life is not None and life.make_room is not None:
-        needed = sight.is_new.sum() - (~own.alive).sum()
-        measured = slots.concerned(sight.slot, sight.used, len(own.alive))
-        given_up = life.make_room(_joint(own), needed, measured)
-        own = _without(own, given_up)
-    at, granted, deferred, repeated, new, new_covs = where_any(
-        sight.is_new.any(),
-        lambda own: (
-            *births_of(sight, scan.tag, own.alive, births),
-            *start(own.pose, scan.z, sensor=sensor),
-        ),
-        lambda own: no_births(own, sight),
-        own,
-    )
-    into = jnp.where(granted, at, own.alive.shape[0])
+    settings: ParticleMapSettings,
+) -> tuple[SlamParticles, Info]:
+    """One particle with its landmarks corrected, new ones initialized, and judged by its `Life`.
+
+    The log-likelihood of the `Info` is left at 0.
+    """
+    particle = correct_landmarks(particle, association.slot, innovations.used, scan, settings)
+    particle, evicted = evict_for_new(particle, association, innovations.used, settings.life)
+    particle, new = initialize_landmarks(particle, association.is_new, scan, settings)
     status = status_of(
         scan.valid,
-        matched=sight.matched,
-        positive=sight.positive,
-        inside=sight.inside,
-        new=sight.is_new,
-        repeated=repeated,
-        granted=granted,
-        deferred=deferred,
+        matched=association.matched,
+        positive=innovations.positive,
+        inside=innovations.inside,
+        new=association.is_new,
+        repeated=new.repeated,
+        granted=new.granted,
+        deferred=new.deferred,
     )
-    own = own._replace(
-        landmarks=own.landmarks.at[into].set(new, mode="drop"),
-        covs=own.covs.at[into].set(new_covs, mode="drop"),
-        alive=own.alive.at[into].set(True, mode="drop"),
-        tag=own.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
-        lost=own.lost + (status == Status.OVERFLOW).sum().astype(jnp.int32),
-    )
+    overflow = (status == Status.OVERFLOW).sum().astype(jnp.int32)
+    particle = particle._replace(lost=particle.lost + overflow)
     info = info_of(
         status,
-        sight.matched,
+        association.matched,
         size=scan.z.shape[1],
-        slot=sight.slot,
-        born=at,
-        nis=sight.nis,
-        innovation=sight.innovation,
-        innovation_cov=sight.innovation_cov,
+        slot=association.slot,
+        born=new.slot,
+        nis=innovations.nis,
+        innovation=innovations.innovation,
+        innovation_cov=innovations.innovation_cov,
         log_likelihood=jnp.zeros((), scan.z.dtype),
+        exhausted=association.exhausted,
     )
-    if life is not None:
-        memory, dead = life.after(_joint(own), info, lambda: moments(_alone(own), sensor))
-        own = _without(own._replace(life=memory), dead)
-        info = info._replace(removed=given_up | dead)
-    return own, info
+    return remove_landmarks(particle, info, evicted, settings)
 
 
-def correct(
-    pose: Array, landmarks: Array, covs: Array, z: Array, sight: Sight, *, sensor: Sensor
-) -> tuple[Array, Array]:
-    """Each landmark measured, corrected by its own EKF from a pose that is known: the particle's.
+def correct_landmarks(
+    particle: SlamParticles,
+    slot: Int[Array, "M"],
+    used: Bool[Array, "M"],
+    scan: Scan,
+    settings: ParticleMapSettings,
+) -> SlamParticles:
+    """Each landmark measured, corrected by its own EKF from a pose that is known.
 
     With S = H_l C H_lᵀ + R: l ← l + C H_lᵀ S⁻¹ ν, C ← C - C H_lᵀ S⁻¹ H_l C.
     """
+    sensor, pose = settings.sensor, particle.pose
 
     def one(z: Array, landmark: Array, cov: Array) -> tuple[Array, Array]:
         by_landmark = jax.jacfwd(sensor.observe, argnums=1)(pose, landmark)
         hc = linalg.matmul(by_landmark, cov)
         s = linalg.symmetrize(linalg.matmul(hc, by_landmark.T) + sensor.noise_cov(z))
-        factor, _ = linalg.cholesky(s)
-        white = linalg.solve_lower(factor, sensor.residual(z, sensor.observe(pose, landmark)))
-        v = linalg.solve_lower(factor, hc)
-        return landmark + linalg.matmul(white[None], v)[0], cov - linalg.gram(v, v)
+        terms = gaussian_terms(sensor.residual(z, sensor.observe(pose, landmark)), s)
+        v = linalg.solve_lower(terms.factor, hc)
+        return landmark + linalg.matmul(terms.whitened[None], v)[0], cov - linalg.gram(v, v)
 
-    new, new_covs = jax.vmap(one)(z, landmarks[sight.slot], covs[sight.slot])
-    at = jnp.where(sight.used, sight.slot, landmarks.shape[0])
-    return landmarks.at[at].set(new, mode="drop"), covs.at[at].set(new_covs, mode="drop")
+    landmarks, covs = jax.vmap(one)(scan.z, particle.landmarks[slot], particle.covs[slot])
+    into = jnp.where(used, slot, particle.landmarks.shape[0])
+    return particle._replace(
+        landmarks=particle.landmarks.at[into].set(landmarks, mode="drop"),
+        covs=particle.covs.at[into].set(covs, mode="drop"),
+    )
 
 
-def start(pose: Array, z: Array, *, sensor: Sensor) -> tuple[Array, Array]:
-    """The landmarks (M, L) that z (M, Z) would begin, and their covariances (M, L, L).
+def evict_for_new(
+    particle: SlamParticles,
+    association: ParticleAssociation,
+    used: Bool[Array, "M"],
+    life: Life | None,
+) -> tuple[SlamParticles, Bool[Array, "N"]]:
+    """The particle without the landmarks that make room for new ones, and which those are."""
+    alive = particle.alive
+    if life is None or life.make_room is None:
+        return particle, jnp.zeros_like(alive)
+    needed = association.is_new.sum() - (~alive).sum()
+    measured = slots.concerned(association.slot, used, len(alive))
+    evicted = life.make_room(_as_joint(particle), needed, measured)
+    return _without_landmarks(particle, evicted), evicted
+
+
+class AllocatedSlots(NamedTuple):
+    """What becomes of the measurements of no landmark."""
+
+    slot: Int[Array, "M"]
+    """a free landmark slot, where granted"""
+    granted: Bool[Array, "M"]
+    deferred: Bool[Array, "M"]
+    """beyond the quota of a scan"""
+    repeated: Bool[Array, "M"]
+    """of a tag that occurs earlier in the scan"""
+
+
+def initialize_landmarks(
+    particle: SlamParticles, is_new: Bool[Array, "M"], scan: Scan, settings: ParticleMapSettings
+) -> tuple[SlamParticles, AllocatedSlots]:
+    """The particle with new landmarks in free slots, as many as fit."""
+    kind, m = particle.landmarks.dtype, is_new.shape[0]
+    capacity, size = particle.landmarks.shape
+
+    def initialize(own: SlamParticles) -> tuple[AllocatedSlots, Array, Array]:
+        allocated = allocate_slots(is_new, scan.tag, own.alive, settings.quota)
+        return allocated, *invert_scan(own.pose, scan.z, settings.sensor)
+
+    def nothing_new(own: SlamParticles) -> tuple[AllocatedSlots, Array, Array]:
+        no = jnp.zeros_like(is_new)
+        allocated = AllocatedSlots(jnp.zeros(m, jnp.int32), no, no, no)
+        return allocated, jnp.zeros((m, size), kind), jnp.zeros((m, size, size), kind)
+
+    new, landmarks, covs = where_any(is_new.any(), initialize, nothing_new, particle)
+    into = jnp.where(new.granted, new.slot, capacity)
+    particle = particle._replace(
+        landmarks=particle.landmarks.at[into].set(landmarks, mode="drop"),
+        covs=particle.covs.at[into].set(covs, mode="drop"),
+        alive=particle.alive.at[into].set(True, mode="drop"),
+        tag=particle.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
+    )
+    return particle, new
+
+
+def invert_scan(
+    pose: Float[Array, "3"], z: Float[Array, "M Z"], sensor: Sensor
+) -> tuple[Float[Array, "M L"], Float[Array, "M L L"]]:
+    """The landmarks that measurements would begin, and their covariances.
 
     l = g(x, z, s̄), C = G_z R G_zᵀ + G_s S G_sᵀ: the pose of a particle has no error.
     """
 
-    def one(z: Array) -> tuple[Array, Array]:
+    def one(z: Float[Array, "Z"]) -> tuple[Float[Array, "L"], Float[Array, "L L"]]:
         landmark, _, own = first_order.invert_at(sensor, pose, z, pose, z)
         return landmark, linalg.symmetrize(own)
 
     return jax.vmap(one)(z)
 
 
-def births_of(
-    sight: Sight, tag: Array, alive: Array, quota: int | None
-) -> tuple[Array, Array, Array, Array]:
-    """A free slot (M,) for each new landmark, and which are granted, deferred, repeated (M,)."""
-    m = tag.shape[0]
-    repeated = sight.is_new & seen_before(tag, sight.is_new)
-    wanted = sight.is_new & ~repeated
-    deferred = wanted & (jnp.cumsum(wanted) > (m if quota is None else quota))
+def allocate_slots(
+    is_new: Bool[Array, "M"], tag: Int[Array, "M"], alive: Bool[Array, "N"], quota: int | None
+) -> AllocatedSlots:
+    """A free slot for each new landmark, the first in the scan first."""
+    repeated = is_new & seen_before(tag, is_new)
+    wanted = is_new & ~repeated
+    deferred = wanted & (jnp.cumsum(wanted) > (tag.shape[0] if quota is None else quota))
     slot, granted = slots.allocate(alive, wanted & ~deferred)
-    return slot, granted, deferred, repeated
+    return AllocatedSlots(slot, granted, deferred, repeated)
 
 
-def no_births(own: Particles, sight: Sight) -> tuple[Array, ...]:
-    """What `births_of` and `start` say where nothing is new."""
-    m, size = sight.slot.shape[0], own.landmarks.shape[1]
-    none, kind = jnp.zeros_like(sight.is_new), own.landmarks.dtype
-    slot = jnp.zeros(m, jnp.int32)
-    return slot, none, none, none, jnp.zeros((m, size), kind), jnp.zeros((m, size, size), kind)
+def remove_landmarks(
+    particle: SlamParticles, info: Info, evicted: Bool[Array, "N"], settings: ParticleMapSettings
+) -> tuple[SlamParticles, Info]:
+    """The particle without the landmarks that its `Life` gives up; `Info.removed` has them all."""
+    life = settings.life
+    if life is None:
+        return particle, info
+
+    def alone() -> Estimate:
+        return slam_estimate(as_only_particle(particle), settings.sensor)
+
+    memory, dead = life.after(_as_joint(particle), info, alone)
+    particle = _without_landmarks(particle._replace(life=memory), dead)
+    return particle, info._replace(removed=evicted | dead)
 
 
-def _joint(own: Particles) -> Joint:
+def _as_joint(particle: SlamParticles) -> Joint:
     """As a `Life` sees it; the covariance is that of each landmark alone, (N, L, L)."""
+    own = particle
     return Joint(own.pose, own.landmarks, own.covs, own.alive, own.tag, lin=(), life=own.life)
 
 
-def _alone(own: Particles) -> Particles:
-    """This particle as if there were no other."""
-    alone: Particles = jax.tree.map(lambda x: x[None], own)
-    return alone._replace(
-        log_weight=jnp.zeros_like(alone.log_weight), best=jnp.zeros((), jnp.int32)
-    )
-
-
-def _without(own: Particles, dead: Array) -> Particles:
-    """The slots dead (N,) emptied."""
-    eye = jnp.eye(own.landmarks.shape[1], dtype=own.covs.dtype)
-    return own._replace(
-        landmarks=jnp.where(dead[:, None], 0.0, own.landmarks),
-        covs=jnp.where(dead[:, None, None], eye[None], own.covs),
-        alive=own.alive & ~dead,
-        tag=jnp.where(dead, -1, own.tag),
+def _without_landmarks(particle: SlamParticles, dead: Bool[Array, "N"]) -> SlamParticles:
+    """These slots emptied."""
+    eye = jnp.eye(particle.landmarks.shape[1], dtype=particle.covs.dtype)
+    return particle._replace(
+        landmarks=jnp.where(dead[:, None], 0.0, particle.landmarks),
+        covs=jnp.where(dead[:, None, None], eye[None], particle.covs),
+        alive=particle.alive & ~dead,
+        tag=jnp.where(dead, -1, particle.tag),
     )

@@ -1,193 +1,168 @@
-"""How well a scan fits one particle's pose in a known map.
+"""How likely a scan is from one pose in a known map.
 
-Everything here acts on one particle; `filters.particle_localization` vmaps it. The pose has no
-error of its own and the map none at all, so the covariance of an innovation is the sensor's noise.
+Everything here acts on one pose; `particle_localization` vmaps it. The pose has no error of its own
+and the map none at all, so the covariance of an innovation is the sensor's noise.
 """
 
-import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
-from jaxslam.math import linalg
-from jaxslam.protocols import Associate, Association, Pairs, Prediction, Sensor
+from jaxslam.association.predicted import predicted
+from jaxslam.filters.particles.gating import gate_distance
+from jaxslam.filters.particles.scan_association import ParticleAssociation, associate_scan
+from jaxslam.filters.particles.settings import KnownMapSensor
+from jaxslam.math.gaussians import GaussianTerms, gaussian_terms, log_density
+from jaxslam.protocols import Prediction
+from jaxslam.sensors.suite import split_scan
 from jaxslam.types import Scan
-
-Array = jax.Array
-
-_LOG_2PI = math.log(2 * math.pi)
 
 
 class ScanLikelihood(NamedTuple):
-    """A scan against one particle, place by place."""
+    """A scan against one pose, measurement by measurement."""
 
-    there: Array
-    """(M,) bool: a measurement that counts"""
-    slot: Array
-    """(M,) of the landmark measured, -1 where none"""
-    matched: Array
-    """(M,) bool"""
-    used: Array
-    """(M,) bool: matched, in the gate, and R positive definite"""
-    positive: Array
-    """(M,) bool: its R is positive definite"""
-    inside: Array
-    """(M,) bool: in the gate; without one, of a d² that did not overflow"""
-    innovation: Array
-    """(M, Z)"""
-    cov: Array
-    """(M, Z, Z) R"""
-    nis: Array
-    """(M,) d² = νᵀ R⁻¹ ν"""
-    counted: Array
-    """(M,) d² as the weight has it: the gate's where it is beyond, the edge's where of no landmark,
-    0 where there is no measurement"""
-    log_density: Array
-    """(M,) -(counted + log |2πR|)/2 of places matched to a landmark, else 0"""
-    exhausted: Array
-    """() bool, of the association"""
+    measured: Bool[Array, "*P M"]
+    """a measurement that counts"""
+    slot: Int[Array, "*P M"]
+    """of the landmark measured; -1 of an absolute sensor"""
+    matched: Bool[Array, "*P M"]
+    positive: Bool[Array, "*P M"]
+    """R is positive definite"""
+    inside: Bool[Array, "*P M"]
+    """in the gate; without one, of a d² that did not overflow"""
+    innovation: Float[Array, "*P M Z"]
+    innovation_cov: Float[Array, "*P M Z Z"]
+    """R"""
+    nis: Float[Array, "*P M"]
+    """d² = νᵀ R⁻¹ ν"""
+    dof: Int[Array, "*P M"]
+    """Z of the sensor"""
+    counted: Float[Array, "*P M"]
+    """d² as the weight has it: the gate's where it is beyond, `unmatched_distance` where of no
+    landmark, 0 where there is no measurement"""
+    log_density: Float[Array, "*P M"]
+    """-(counted + log |2πR|)/2 of measurements matched to a landmark, else 0"""
+    exhausted: Bool[Array, "*P"]
+    """of the association"""
 
 
 def scan_likelihood(
-    pose: Array,
-    scan: Scan,
-    *,
-    sensor: Sensor,
-    landmarks: Any,
-    tag: Any,
-    absolute: bool,
-    associate: Associate,
-    gate: float | None,
-    edge: float,
+    pose: Float[Array, "3"], scan: Scan, sensors: tuple[KnownMapSensor, ...]
 ) -> ScanLikelihood:
-    """`ScanLikelihood` of a scan with a pose (3,) in a map of landmarks (N, L) with tags (N,).
+    """The likelihood of a scan whose first measurement slots are the first sensor's, and so on.
 
-    A measurement outside the gate counts as one on the gate, and one that is of no landmark as one
-    at d² = edge: a particle gains nothing by explaining less. So with a gate no weight underflows
-    for a single outlier.
+    Raises ValueError if the scan does not have their slots.
     """
+    m, widest = scan.z.shape
+    counts = [m if each.measured is None else each.measured for each in sensors]
+    found = []
+    for each, own in zip(sensors, split_scan(scan, counts), strict=True):
+        size = len(each.sensor.measurements)
+        of_sensor = ignored_likelihood if each.ignored else sensor_likelihood
+        one, spare = of_sensor(pose, own._replace(z=own.z[:, :size]), each), widest - size
+        innovation = jnp.pad(one.innovation, [(0, 0), (0, spare)])
+        cov = jnp.pad(one.innovation_cov, [(0, 0), (0, spare), (0, spare)])
+        one = one._replace(innovation=innovation, innovation_cov=cov)
+        found.append(one._replace(exhausted=one.exhausted[None]))
+    whole: ScanLikelihood = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+    return whole._replace(exhausted=whole.exhausted.any())
+
+
+def sensor_likelihood(
+    pose: Float[Array, "3"], scan: Scan, settings: KnownMapSensor
+) -> ScanLikelihood:
+    """The likelihood of one sensor's measurements.
+
+    One outside the gate counts as one on the gate, and one that is of no landmark as one at d² =
+    `unmatched_distance`: a particle gains nothing by explaining less. So with a gate no weight
+    underflows for a single outlier.
+    """
+    sensor = settings.sensor
+    size_z, size_l = len(sensor.measurements), len(sensor.landmark)
     # In a suite an absolute sensor, whose landmarks have no parameters, shares the others' map.
-    landmarks = jnp.asarray(landmarks, pose.dtype)[:, : len(sensor.landmark)]
+    landmarks = jnp.asarray(settings.landmarks, pose.dtype)[:, :size_l]
+    slot, matched, _, exhausted = associate_known(pose, scan, landmarks, settings)
     noise = jax.vmap(sensor.noise_cov)(scan.z)
-    factor, positive = jax.vmap(linalg.cholesky)(noise)
-    if absolute:
-        slot, matched, exhausted = jnp.full_like(scan.tag, -1), scan.valid, jnp.asarray(False)
-    else:
-        found = Association(
-            *associate(_prediction(pose, scan, sensor, landmarks, tag, factor, positive), scan)
-        )
-        # The map is known: what would be a new landmark is of none.
-        matched = scan.valid & (found.slot >= 0) & ~found.is_new
-        slot, exhausted = jnp.where(matched, found.slot, -1), jnp.asarray(found.exhausted)
 
-    def place(z: Array, slot: Array, factor: Array) -> tuple[Array, Array]:
-        nu = sensor.residual(z, sensor.observe(pose, landmarks[jnp.maximum(slot, 0)]))
-        return nu, (linalg.solve_lower(factor, nu) ** 2).sum()
+    def compare(
+        z: Float[Array, "Z"], slot: Int[Array, ""], noise: Float[Array, "Z Z"]
+    ) -> tuple[Float[Array, "Z"], GaussianTerms]:
+        nu = sensor.residual(z, sensor.observe(pose, landmarks[slot]))
+        return nu, gaussian_terms(nu, noise)
 
-    nu, nis = jax.vmap(place)(scan.z, slot, factor)
-    there = jnp.isfinite(nis)
-    inside = there if gate is None else there & (nis <= gate)
-    counted = nis if gate is None else jnp.where(inside, nis, gate)
-    of_map = matched & positive
-    counted = jnp.where(of_map, counted, jnp.where(scan.valid, edge, 0.0))
-    log_det = jax.vmap(_log_det)(factor)
-    log_density = -0.5 * (counted + log_det + nu.shape[1] * _LOG_2PI)
+    nu, terms = jax.vmap(compare)(scan.z, slot, noise)
+    gated = gate_distance(terms.distance, settings.gate)
+    of_map = matched & terms.positive
+    unmatched = jnp.where(scan.valid, settings.unmatched_distance, 0.0)
+    counted = jnp.where(of_map, gated.counted, unmatched)
+    density = log_density(counted, terms.log_det, size_z)
     return ScanLikelihood(
-        there=scan.valid,
-        slot=slot,
+        measured=scan.valid,
+        slot=slot if sensor.landmark else jnp.full_like(slot, -1),
         matched=matched,
-        used=of_map & inside,
-        positive=positive,
-        inside=inside,
+        positive=terms.positive,
+        inside=gated.inside,
         innovation=jnp.where(matched[:, None], nu, 0.0),
-        cov=jnp.where(matched[:, None, None], noise, 0.0),
-        nis=jnp.where(matched, jnp.where(there, nis, 0.5 * float(jnp.finfo(nis.dtype).max)), 0.0),
+        innovation_cov=jnp.where(matched[:, None, None], noise, 0.0),
+        nis=jnp.where(matched, gated.reported, 0.0),
+        dof=jnp.full_like(slot, size_z),
         counted=counted,
-        log_density=jnp.where(of_map, log_density, 0.0),
+        log_density=jnp.where(of_map, density, 0.0),
         exhausted=exhausted,
     )
 
 
-def no_fit(pose: Array, scan: Scan) -> ScanLikelihood:
-    """Of places that are left alone, as those for other robots: nothing counts."""
+def ignored_likelihood(
+    pose: Float[Array, "3"], scan: Scan, settings: KnownMapSensor
+) -> ScanLikelihood:
+    """Of measurements that are left alone, as those of other robots: nothing counts."""
     m, size = scan.z.shape
-    zero, no = jnp.zeros(m, pose.dtype), jnp.zeros(m, bool)
+    zero, none, no = (jnp.zeros(m, kind) for kind in (pose.dtype, jnp.int32, bool))
     return ScanLikelihood(
-        there=no,
-        slot=jnp.full_like(scan.tag, -1),
+        measured=no,
+        slot=none,
         matched=no,
-        used=no,
         positive=no,
         inside=no,
         innovation=jnp.zeros((m, size), pose.dtype),
-        cov=jnp.zeros((m, size, size), pose.dtype),
+        innovation_cov=jnp.zeros((m, size, size), pose.dtype),
         nis=zero,
+        dof=jnp.full_like(none, size),
         counted=zero,
         log_density=zero,
         exhausted=jnp.asarray(False),
     )
 
 
-def in_order(
-    pose: Array, scan: Scan, parts: list[tuple[int, int, Callable[[Array, Scan], ScanLikelihood]]]
-) -> ScanLikelihood:
-    """A scan whose first places are the first part's, and so on: (places, Z, fit) each.
-
-    Raises ValueError if the scan does not have their places.
-    """
-    if sum(places for places, _, _ in parts) != scan.tag.shape[0]:
-        wanted = tuple(places for places, _, _ in parts)
-        raise ValueError(f"expected places {wanted} of a scan, got {scan.tag.shape[0]}")
-    fits, at = [], 0
-    for places, size, of_part in parts:
-        own: Scan = jax.tree.map(lambda leaf, a=at, n=places: leaf[a : a + n], scan)
-        found, spare = of_part(pose, own._replace(z=own.z[:, :size])), scan.z.shape[1] - size
-        wide = {
-            "innovation": jnp.pad(found.innovation, [(0, 0), (0, spare)]),
-            "cov": jnp.pad(found.cov, [(0, 0), (0, spare), (0, spare)]),
-        }
-        fits.append(found._replace(**wide, exhausted=found.exhausted[None]))
-        at += places
-    whole: ScanLikelihood = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *fits)
-    return whole._replace(exhausted=whole.exhausted.any())
-
-
-def _log_det(factor: Array) -> Array:
-    pivots = jnp.diagonal(factor)
-    return 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
-
-
-def _prediction(
-    pose: Array,
+def associate_known(
+    pose: Float[Array, "3"],
     scan: Scan,
-    sensor: Sensor,
-    landmarks: Array,
-    tag: Any,
-    factor: Array,
-    positive: Array,
+    landmarks: Float[Array, "N L"],
+    settings: KnownMapSensor,
+) -> ParticleAssociation:
+    """The association with a known map, which an absolute sensor does not need."""
+    if not settings.sensor.landmark:
+        none = jnp.zeros(scan.tag.shape, jnp.int32)
+        return ParticleAssociation(none, scan.valid, jnp.zeros_like(scan.valid), jnp.asarray(False))
+    prediction = predict_known(pose, landmarks, settings)
+    return associate_scan(prediction, scan, settings.associate)
+
+
+def predict_known(
+    pose: Float[Array, "3"], landmarks: Float[Array, "N L"], settings: KnownMapSensor
 ) -> Prediction:
-    """The map as an association may see it from a pose without error: S_ij = R_i."""
-    count = landmarks.shape[0]
+    """A known map as an association may see it from a pose without error: S_ij = R_i."""
+    sensor, count = settings.sensor, landmarks.shape[0]
+    size = len(sensor.measurements)
 
-    def pairs(scan: Scan) -> Pairs:
-        expected = jax.vmap(sensor.observe, (None, 0))(pose, landmarks)
-        over_slots = jax.vmap(sensor.residual, (None, 0))
-        nu = jax.vmap(over_slots, (0, None))(scan.z, expected)
-        white = jax.vmap(jax.vmap(linalg.solve_lower, (None, 0)))(factor, nu)
-        m, size = scan.z.shape
-        noise = jax.vmap(sensor.noise_cov)(scan.z)
-        return Pairs(
-            innovation=nu,
-            cov=jnp.broadcast_to(noise[:, None], (m, count, size, size)),
-            distance=(white**2).sum(axis=2),
-            log_det=jnp.broadcast_to(jax.vmap(_log_det)(factor)[:, None], (m, count)),
-            possible=jnp.broadcast_to((scan.valid & positive)[:, None], (m, count)),
-        )
+    def measurements() -> tuple[Float[Array, "N Z"], None]:
+        return jax.vmap(sensor.observe, (None, 0))(pose, landmarks), None
 
-    def cross() -> Array:
-        size = scan.z.shape[1]
+    def cross() -> Float[Array, "N Z N Z"]:
         return jnp.zeros((count, size, count, size), pose.dtype)
 
-    return Prediction(jnp.asarray(tag), jnp.ones(count, bool), pairs, cross)
+    alive = jnp.ones(count, bool)
+    return predicted(sensor, jnp.asarray(settings.tags), alive, measurements, cross)

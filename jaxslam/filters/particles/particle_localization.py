@@ -2,41 +2,45 @@
 
 import math
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.known.localization import checked_map
-from jaxslam.filters.particles import pose_state
-from jaxslam.filters.particles.likelihood import ScanLikelihood, in_order, no_fit, scan_likelihood
-from jaxslam.filters.particles.pose_state import Cloud
+from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
+from jaxslam.filters.particles.moments import weighted_nis
+from jaxslam.filters.particles.particle_info import ParticleInfo
+from jaxslam.filters.particles.pose_state import (
+    ParticleEvents,
+    PoseParticles,
+    active_mask,
+    draw_start,
+    initial_pose_particles,
+    no_events,
+    pose_particle_moments,
+)
+from jaxslam.filters.particles.proposal import sample_motion
+from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
+from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import (
-    check_numbers,
-    check_resample,
+    MonteCarloSettings,
     checked_box,
     checked_least,
+    known_map_sensors,
 )
-from jaxslam.filters.particles.slam_state import finite, over_particles
-from jaxslam.filters.reporting import info_of, status_of
-from jaxslam.math import linalg
-from jaxslam.math.stats import chi2_quantile
+from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.protocols import Associate, Differentiable, Filter, Motion, Resample, Sensor
 from jaxslam.resampling.kld import bins_of, enough
 from jaxslam.resampling.systematic import systematic
-from jaxslam.resampling.weights import effective_size, normalized, survivors
+from jaxslam.resampling.weights import effective_size, normalized
 from jaxslam.sensors.suite import Suite
 from jaxslam.types import Estimate, Info, Scan
-
-Array = jax.Array
-
-# The probability that a measurement of a landmark lies within d² = edge, where no gate says more.
-_NEAR = 0.99
 
 
 def particle_localization(
@@ -63,29 +67,29 @@ def particle_localization(
 
     Poses are drawn from the motion with its noise and weighted by the scan, p(z | x, map), the map
     being without error (Dellaert, Fox, Burgard & Thrun 1999; Thrun, Burgard & Fox, "Probabilistic
-    Robotics", table 8.2). The state is a `Cloud`. Particles are resampled before a motion, if
-    the last scan left ESS = 1/Σ w² below threshold · (particles in use); then so many of the draws
-    are used as the KLD bound asks for the bins that these occupy after the motion (Fox 2001;
-    `resampling.kld`), at most `particles`, of which the others weigh nothing (`Info.active`,
-    `Info.capped`).
+    Robotics", table 8.2). The state is a `PoseParticles`. Particles are resampled before a motion,
+    if the last scan left ESS = 1/Σ w² below threshold · (particles in use); then so many of the
+    draws are used as the KLD bound asks for the bins that these occupy after the motion (Fox 2001;
+    `resampling.kld`), at most `particles`, of which the others weigh nothing. In
+    `info.extra["particles"]`, a `ParticleInfo`, these are `active` and `capped`.
 
     A robot that was carried away is found again by particles from the whole box (table 8.3). With
-    c the average over the particles, by weight, of exp(-Σ d²/2m) over the m places of a scan,
+    c the average over the particles, by weight, of exp(-Σ d²/2m) over the m measurements of a scan,
 
         slow ← slow + α_slow (c - slow)     fast ← fast + α_fast (c - fast)
 
     each particle drawn is from the box with probability max(0, 1 - slack · fast/slow) instead
-    (`Info.injected`). c is the table's likelihood in units of its peak and per place, so that it
+    (`injected`). c is the table's likelihood in units of its peak and per measurement, so that it
     does not depend on how many landmarks are in view; the first scan sets both averages; scans
     without a measurement change nothing. slack above 1 injects less (Gutmann & Fox 2002).
 
     The estimate is that of the weighted particles after a scan, before anything is drawn anew:
-    `particles.mean_and_spread`, which is one point and one ellipse also where the particles are in
-    several places. Where all weights underflow, all in use become equal (`Info.underflow`). A
-    motion that leaves a pose which is not finite is undone, and the particle weighs nothing
-    (`Info.invalid`). What an `Info` says of places is said of the most likely particle, and nis is
-    the mean over the particles by weight, as of `fastslam`; log_likelihood is log Σ w p(scan | x)
-    of places matched to a landmark.
+    `moments.weighted_pose_moments`, which is one point and one ellipse also where the particles are
+    in several places. Where all weights underflow, all in use become equal (`underflow`). A motion
+    that leaves a pose which is not finite is undone, and the particle weighs nothing (`invalid`).
+    The measurements in an `Info` are those of the most likely particle, and nis is the mean over
+    the particles by weight, as of `fastslam`; log_likelihood is log Σ w p(scan | x) of measurements
+    matched to a landmark.
 
     Shapes are fixed, so that a step costs what its capacity does, however few particles are in use.
 
@@ -125,138 +129,53 @@ def particle_localization(
             within (0, 1), or rates that do not fit.
     """
     validation.check_models("particle_localization", motion, sensor)
-    validation.check_parts("particle_localization", associate=associate)
     points, names = checked_map("particle_localization", sensor, landmarks, tags)
-    least = checked_least(particles, least)
-    check_resample(resample)
-    check_numbers(threshold, gate, slack, forget, (bins, error, confidence))
-    limits = checked_box(box, start)
-    inject = limits is not None and forget is not None
-    parts = _parts(sensor, points, names, associate or known_association(), gate)
+    settings = MonteCarloSettings(
+        motion=motion,
+        particles=particles,
+        box=checked_box(box, start),
+        start=start,
+        resample=resample,
+        threshold=threshold,
+        bins=bins,
+        error=error,
+        confidence=confidence,
+        least=checked_least(particles, least),
+        rates=forget,
+        slack=slack,
+    )
+    sensors = known_map_sensors("particle_localization", sensor, points, names, associate, gate)
 
-    def look(pose: Array, scan: Scan) -> ScanLikelihood:
-        of_all = [(len(scan.tag) if n < 0 else n, size, of_one) for n, size, of_one in parts]
-        return in_order(pose, scan, of_all)
+    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PoseParticles:
+        return initial_pose_particles(pose, pose_cov, settings)
 
-    def init(pose: Array, pose_cov: Array) -> Cloud:
-        if start == "uniform":
-            pose, pose_cov = pose_state.box_moments(jnp.asarray(limits, pose.dtype))
-        return pose_state.begun(pose, pose_cov, particles)
+    def predict(state: PoseParticles, u: Float[Array, "U"], key: Array) -> PoseParticles:
+        return predict_particles(state, u, key, settings)
 
-    def begun(state: Cloud, key: Array) -> Cloud:
-        if start == "uniform":
-            first = pose_state.uniform(jnp.asarray(limits, state.pose.dtype), particles, key)
-        else:
-            first = pose_state.gaussian(state.pose, state.start_cov, key)
-        return state._replace(
-            pose=jnp.where(state.fresh, first, state.pose),
-            start_cov=jnp.zeros_like(state.start_cov),
-            fresh=jnp.asarray(False),
-        )
-
-    def renewed(state: Cloud, key: Array) -> tuple[Array, Array, Array]:
-        """P poses to go on with, in random order, their log-weights, and which are from the box."""
-        key_resample, key_order, key_which, key_box = jax.random.split(key, 4)
-        ancestor, log_weight = survivors(resample, state.log_weight, key_resample)
-        # Ancestors ascend, and only the first so many may be used.
-        order = jax.random.permutation(key_order, particles)
-        pose, log_weight = state.pose[ancestor[order]], log_weight[order]
-        new = jnp.zeros(particles, bool)
-        if inject:
-            new = jax.random.uniform(key_which, (particles,), pose.dtype) < state.lost
-            anywhere = pose_state.uniform(jnp.asarray(limits, pose.dtype), particles, key_box)
-            pose = jnp.where(new[:, None], anywhere, pose)
-            log_weight = jnp.where(new, -math.log(particles), log_weight)
-        return pose, log_weight, new
-
-    def predict(state: Cloud, u: Array, key: Array) -> Cloud:
-        key_start, key_renew, key_noise = jax.random.split(key, 3)
-        state = begun(state, key_start)
-        due = state.due
-        chosen, log_weight, new = renewed(state, key_renew)
-        old = jnp.where(due, chosen, state.pose)
-        normals = jax.random.normal(key_noise, (particles, len(motion.noises)), old.dtype)
-
-        def moved(pose: Array, normal: Array) -> Array:
-            return motion.step(pose, u, linalg.root_psd(motion.noise_cov(pose, u)) @ normal)
-
-        pose = jax.vmap(moved)(old, normals)
-        good = finite(pose)
-        pose = jnp.where(good[:, None], pose, old)
-        count, few = enough(bins_of(pose, bins), least, error, confidence)
-        active = jnp.where(due, count, state.active)
-        used = jnp.arange(particles) < active
-        log_weight = jnp.where(used, log_weight, -jnp.inf)
-        # The sum becomes 1; its gradient is the resampling method's.
-        log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
-        log_weight = jnp.where(due, log_weight, state.log_weight)
-        return state._replace(
-            pose=pose,
-            log_weight=jnp.where(good, log_weight, -jnp.inf),
-            active=active,
-            due=jnp.asarray(False),
-            lost=jnp.zeros_like(state.lost),
-            resampled=state.resampled | due,
-            injected=state.injected + (due & new & used).sum().astype(jnp.int32),
-            invalid=state.invalid + (used & ~good).sum().astype(jnp.int32),
-            capped=state.capped | (due & few),
-        )
-
-    def update(state: Cloud, scan: Scan, key: Array) -> tuple[Cloud, Info]:
-        state = begun(state, key)
-        # Padding may hold anything, and is multiplied by zero further down.
-        scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
-        fit = jax.vmap(look, (0, None))(state.pose, scan)
-        log_likelihood = normalized(state.log_weight + fit.log_density.sum(axis=1))[1]
+    def update(state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
+        state, scan = draw_start(state, key, settings), zero_padding(scan)
+        likelihood = jax.vmap(partial(scan_likelihood, scan=scan, sensors=sensors))(state.pose)
+        log_likelihood = normalized(state.log_weight + likelihood.log_density.sum(axis=1))[1]
         # Beside d², a weight has log |2πR|, which is the same for all.
-        off = 0.5 * fit.counted.sum(axis=1)
-        weight, _, some = normalized(state.log_weight - off)
-        even = -jnp.log(state.active.astype(weight.dtype))
-        weight = jnp.where(
-            some, weight, jnp.where(pose_state.in_use(state), even, jnp.full_like(weight, -jnp.inf))
-        )
-        best = jnp.argmax(weight).astype(jnp.int32)
+        misfit = 0.5 * likelihood.counted.sum(axis=1)
+        weight, some = weight_poses(state, misfit)
         ess = effective_size(weight)
-        fast, slow, lost = pose_state.averaged(state, off, fit.there[0].sum(), forget, slack)
-        due = ess < threshold * state.active
-        if inject:
-            due = due | (lost > 0)
-        own: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], fit)
-        info = info_of(
-            status_of(scan.valid, matched=own.matched, positive=own.positive, inside=own.inside),
-            own.matched,
-            size=jnp.concatenate(_dof(parts, len(scan.tag))),
-            slot=own.slot,
-            nis=over_particles(fit.nis, fit.matched, weight),
-            innovation=own.innovation,
-            innovation_cov=own.cov,
-            log_likelihood=log_likelihood,
-            exhausted=fit.exhausted.any(),
-            ess=ess,
-            resampled=state.resampled,
-            underflow=~some,
-            invalid=state.invalid,
-            active=state.active,
-            injected=state.injected,
-            capped=state.capped,
+        info = info_of_scan(scan, likelihood, weight, log_likelihood)
+        found = ParticleInfo(
+            ess=ess, underflow=~some, active=state.active, **state.events._asdict()
         )
-        none = jnp.zeros_like(state.injected)
+        state = update_averages(state, misfit, likelihood.measured[0].sum(), settings)
+        lost = settings.injects & (state.injection > 0)
         state = state._replace(
             log_weight=weight,
-            best=best,
-            fast=fast,
-            slow=slow,
-            due=due,
-            lost=lost,
-            resampled=jnp.asarray(False),
-            injected=none,
-            invalid=none,
-            capped=jnp.asarray(False),
+            best=jnp.argmax(weight).astype(jnp.int32),
+            due=(ess < threshold * state.active) | lost,
+            events=no_events(),
         )
-        return state, info
+        return state, with_extra(info, "particles", found)
 
-    def estimate(state: Cloud) -> Estimate:
-        pose, cov = pose_state.moments(state)
+    def estimate(state: PoseParticles) -> Estimate:
+        pose, cov = pose_particle_moments(state)
         return Estimate(
             pose=pose,
             pose_cov=cov,
@@ -279,38 +198,69 @@ def particle_localization(
     )
 
 
-def _parts(
-    sensor: Sensor, points: Any, names: np.ndarray, associate: Associate, gate: float | None
-) -> list[tuple[int, int, Any]]:
-    """(places, Z, likelihood) of each sensor of a suite; -1 places are all, of one alone."""
-
-    def part(one: Sensor, places: int) -> tuple[int, int, Any]:
-        size = len(one.measurements)
-        edge = chi2_quantile(_NEAR, size) if gate is None else gate
-        return (
-            places,
-            size,
-            partial(
-                scan_likelihood,
-                sensor=one,
-                landmarks=points,
-                tag=names,
-                absolute=not one.landmark,
-                associate=associate,
-                gate=gate,
-                edge=edge,
-            ),
-        )
-
-    if not isinstance(sensor, Suite):
-        return [part(sensor, -1)]
-    return [
-        (each.places, len(each.sensor.measurements), no_fit)
-        if each.sees == "robots"
-        else part(each.sensor, each.places)
-        for each in sensor.parts
-    ]
+def weight_poses(
+    state: PoseParticles, misfit: Float[Array, "P"]
+) -> tuple[Float[Array, "P"], Bool[Array, ""]]:
+    """log w exp(-misfit) with Σ w = 1, equal for all in use where nothing is left, and whether
+    anything was."""
+    weight, _, some = normalized(state.log_weight - misfit)
+    even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
+    return jnp.where(some, weight, even), some
 
 
-def _dof(parts: list[tuple[int, int, Any]], places: int) -> list[Array]:
-    return [jnp.full(places if n < 0 else n, size, jnp.int32) for n, size, _ in parts]
+def info_of_scan(
+    scan: Scan,
+    likelihood: ScanLikelihood,
+    log_weight: Float[Array, "P"],
+    log_likelihood: Float[Array, ""],
+) -> Info:
+    """What the most likely particle makes of a scan; nis is the mean by weight."""
+    best = jnp.argmax(log_weight)
+    own: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
+    return info_of(
+        status_of(scan.valid, matched=own.matched, positive=own.positive, inside=own.inside),
+        own.matched,
+        size=own.dof,
+        slot=own.slot,
+        nis=weighted_nis(likelihood.nis, likelihood.matched, log_weight),
+        innovation=own.innovation,
+        innovation_cov=own.innovation_cov,
+        log_likelihood=log_likelihood,
+        exhausted=likelihood.exhausted.any(),
+    )
+
+
+def predict_particles(
+    state: PoseParticles, u: Float[Array, "U"], key: Array, settings: MonteCarloSettings
+) -> PoseParticles:
+    """Resample where due, draw from the motion, and keep as many as the KLD bound asks for."""
+    key_start, key_renew, key_noise = jax.random.split(key, 3)
+    state = draw_start(state, key_start, settings)
+    due, particles = state.due, settings.particles
+    drawn = resample_and_inject(state, key_renew, settings)
+    old = jnp.where(due, drawn.pose, state.pose)
+    moved = sample_motion(settings.motion, old, u, key_noise)
+    good = jnp.isfinite(moved).all(axis=1)
+    pose = jnp.where(good[:, None], moved, old)
+    bins = bins_of(pose, settings.bins)
+    count, few = enough(bins, settings.least, settings.error, settings.confidence)
+    active = jnp.where(due, count, state.active)
+    used = jnp.arange(particles) < active
+    log_weight = jnp.where(used, drawn.log_weight, -jnp.inf)
+    # The sum becomes 1; its gradient is the resampling method's.
+    log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
+    log_weight = jnp.where(due, log_weight, state.log_weight)
+    before = state.events
+    return state._replace(
+        pose=pose,
+        log_weight=jnp.where(good, log_weight, -jnp.inf),
+        active=active,
+        due=jnp.asarray(False),
+        injection=jnp.zeros_like(state.injection),
+        events=ParticleEvents(
+            resampled=before.resampled | due,
+            injected=before.injected + (due & drawn.injected & used).sum().astype(jnp.int32),
+            invalid=before.invalid + (used & ~good).sum().astype(jnp.int32),
+            capped=before.capped | (due & few),
+        ),
+    )

@@ -5,125 +5,129 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.particles.slam_state import mean_and_spread
-from jaxslam.math import linalg
+from jaxslam.filters.particles.moments import weighted_pose_moments
+from jaxslam.filters.particles.settings import MonteCarloSettings
+from jaxslam.filters.particles.slam_state import draw_pose
 from jaxslam.math.angles import wrap
 
-Array = jax.Array
+
+class ParticleEvents(NamedTuple):
+    """What became of the particles since the last scan."""
+
+    resampled: Bool[Array, ""]
+    injected: Int[Array, ""]
+    """drawn from the box"""
+    invalid: Int[Array, ""]
+    """left without a finite pose by the motion"""
+    capped: Bool[Array, ""]
+    """more particles were wanted than there may be"""
 
 
-class Cloud(NamedTuple):
-    """P places for particles, of which the first `active` are in use; the others weigh nothing."""
+class PoseParticles(NamedTuple):
+    """P particles, of which the first `active` are in use; the others weigh nothing."""
 
-    pose: Array
-    """(P, 3), finite also where not in use"""
-    log_weight: Array
-    """(P,) Σ exp = 1, -inf where not in use"""
-    active: Array
-    """() int"""
-    best: Array
-    """() int: the most likely particle"""
-    fresh: Array
-    """() bool: nothing was drawn yet"""
-    start_cov: Array
-    """(3, 3) of the start while it is not drawn yet, then zero"""
-    fast: Array
-    """() short-term average of how well scans fit"""
-    slow: Array
-    """() long-term average of the same; both 0 before the first scan"""
-    due: Array
-    """() bool: to be resampled before the next motion"""
-    lost: Array
-    """() the probability of a particle to be drawn from the whole box then"""
-    resampled: Array
-    """() bool: what became of the particles since the last scan: resampled,"""
-    injected: Array
-    """() int: drawn from the box,"""
-    invalid: Array
-    """() int: left without a finite pose by the motion,"""
-    capped: Array
-    """() bool: and wanted beyond the capacity"""
+    pose: Float[Array, "P 3"]
+    """finite also where not in use"""
+    log_weight: Float[Array, "P"]
+    """Σ exp = 1, -inf where not in use"""
+    active: Int[Array, ""]
+    best: Int[Array, ""]
+    """the most likely particle"""
+    fresh: Bool[Array, ""]
+    """nothing was drawn yet"""
+    start_cov: Float[Array, "3 3"]
+    """of the start while it is not drawn yet, then zero"""
+    fast: Float[Array, ""]
+    """short-term average of how well scans fit"""
+    slow: Float[Array, ""]
+    """long-term average of the same; both 0 before the first scan"""
+    due: Bool[Array, ""]
+    """to be resampled before the next motion"""
+    injection: Float[Array, ""]
+    """the probability of a particle to be drawn from the whole box then"""
+    events: ParticleEvents
 
 
-def begun(pose: Array, start_cov: Array, particles: int) -> Cloud:
-    """P times the same pose (3,), not yet drawn from N(pose, start_cov) or a box of that spread."""
-    kind = pose.dtype
-    zero, no, none = jnp.zeros((), kind), jnp.asarray(False), jnp.zeros((), jnp.int32)
-    return Cloud(
+def no_events() -> ParticleEvents:
+    """Nothing became of the particles."""
+    no, none = jnp.asarray(False), jnp.zeros((), jnp.int32)
+    return ParticleEvents(resampled=no, injected=none, invalid=none, capped=no)
+
+
+def initial_pose_particles(
+    pose: Float[Array, "3"], start_cov: Float[Array, "3 3"], settings: MonteCarloSettings
+) -> PoseParticles:
+    """P times the same pose, not yet drawn from N(pose, start_cov), or from the box."""
+    kind, particles = pose.dtype, settings.particles
+    if settings.start == "uniform":
+        pose, start_cov = uniform_pose_moments(jnp.asarray(settings.box, kind))
+    zero, no = jnp.zeros((), kind), jnp.asarray(False)
+    return PoseParticles(
         pose=jnp.broadcast_to(pose, (particles, 3)),
         log_weight=jnp.full(particles, -math.log(particles), kind),
         active=jnp.asarray(particles, jnp.int32),
-        best=none,
+        best=jnp.zeros((), jnp.int32),
         fresh=jnp.asarray(True),
         start_cov=start_cov,
         fast=zero,
         slow=zero,
         due=no,
-        lost=zero,
-        resampled=no,
-        injected=none,
-        invalid=none,
-        capped=no,
+        injection=zero,
+        events=no_events(),
     )
 
 
-def in_use(state: Cloud) -> Array:
-    """Which places hold a particle, (P,) bool."""
+def draw_start(state: PoseParticles, key: Array, settings: MonteCarloSettings) -> PoseParticles:
+    """The state with its start drawn, where that was not done yet."""
+    if settings.start == "uniform":
+        box = jnp.asarray(settings.box, state.pose.dtype)
+        first = draw_uniform_poses(box, settings.particles, key)
+    else:
+        first = draw_gaussian_poses(state.pose, state.start_cov, key)
+    return state._replace(
+        pose=jnp.where(state.fresh, first, state.pose),
+        start_cov=jnp.zeros_like(state.start_cov),
+        fresh=jnp.asarray(False),
+    )
+
+
+def active_mask(state: PoseParticles) -> Bool[Array, "P"]:
+    """Which particles are in use."""
     return jnp.arange(state.pose.shape[0]) < state.active
 
 
-def moments(state: Cloud) -> tuple[Array, Array]:
-    """Mean (3,) and covariance (3, 3): `particles.mean_and_spread`, or what the start says."""
-    mean, spread = mean_and_spread(state.pose, state.log_weight, state.best)
+def pose_particle_moments(
+    state: PoseParticles,
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Mean and covariance of the pose: `weighted_pose_moments`, or what the start says."""
+    mean, spread = weighted_pose_moments(state.pose, state.log_weight, state.best)
     return mean, spread + state.start_cov
 
 
-def gaussian(pose: Array, cov: Array, key: Array) -> Array:
-    """Poses of N(pose, cov), as many as pose (P, 3) has; cov (3, 3) may be singular or zero."""
+def draw_gaussian_poses(
+    pose: Float[Array, "P 3"], cov: Float[Array, "3 3"], key: Array
+) -> Float[Array, "P 3"]:
+    """A pose of N(pose_p, cov) each; cov may be singular or zero."""
     normals = jax.random.normal(key, pose.shape, pose.dtype)
-    drawn = pose + linalg.matmul(normals, linalg.cholesky(cov)[0].T)
-    return jnp.concatenate([drawn[:, :2], wrap(drawn[:, 2:])], axis=1)
+    return jax.vmap(draw_pose, (0, None, 0))(pose, cov, normals)
 
 
-def uniform(box: Array, count: int, key: Array) -> Array:
-    """Poses (count, 3) in a box (2, 2), rows its lowest and highest (x, y); any heading."""
+def draw_uniform_poses(box: Float[Array, "2 2"], count: int, key: Array) -> Float[Array, "P 3"]:
+    """Poses in a box, rows its lowest and highest (x, y); any heading."""
     share = jax.random.uniform(key, (count, 3), box.dtype)
     low, high = box[0][None], box[1][None]
     heading = wrap(2 * math.pi * share[:, 2:])
     return jnp.concatenate([low + (high - low) * share[:, :2], heading], axis=1)
 
 
-def box_moments(box: Array) -> tuple[Array, Array]:
-    """Mean (3,) and covariance (3, 3) of `uniform`; of the heading, which has no mean, 0 ± π/√3."""
+def uniform_pose_moments(
+    box: Float[Array, "2 2"],
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Mean and covariance of `draw_uniform_poses`; of the heading, which has no mean, 0 ± π/√3."""
     width = box[1] - box[0]
     mean = jnp.concatenate([0.5 * (box[0] + box[1]), jnp.zeros(1, box.dtype)])
     variance = jnp.concatenate([width**2, jnp.full(1, 4 * math.pi**2, box.dtype)]) / 12
     return mean, jnp.diag(variance)
-
-
-def averaged(
-    state: Cloud, off: Array, places: Array, forget: tuple[float, float] | None, slack: float
-) -> tuple[Array, Array, Array]:
-    """The averages fast and slow (), and the share to inject (), after a scan of so many places.
-
-    See `particle_localization`. off: (P,) Σ d²/2; forget: the rates, slow first, or None.
-    """
-    if forget is None:
-        return state.fast, state.slow, jnp.zeros_like(state.fast)
-    there = jnp.isfinite(off)
-    each = jnp.where(there, jnp.exp(-jnp.where(there, off, 0.0) / jnp.maximum(places, 1)), 0.0)
-    fit = jax.lax.stop_gradient((jnp.exp(state.log_weight) * each).sum())
-    first = state.slow <= 0
-    slow, fast = (
-        jnp.where(first, fit, before + rate * (fit - before))
-        for before, rate in ((state.slow, forget[0]), (state.fast, forget[1]))
-    )
-    safe = jnp.where(slow > 0, slow, 1.0)
-    lost = jnp.where(slow > 0, jnp.maximum(0.0, 1 - slack * fast / safe), 0.0)
-    seen = places > 0
-    return (
-        jnp.where(seen, fast, state.fast),
-        jnp.where(seen, slow, state.slow),
-        jnp.where(seen, lost, jnp.zeros_like(lost)),
-    )

@@ -1,62 +1,175 @@
-"""What `particle_localization` refuses."""
+"""What the particle filters were told: records of settings, made and checked by the factories."""
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam import validation
+from jaxslam.association.known import known as known_association
 from jaxslam.math import linalg
+from jaxslam.math.stats import chi2_quantile
+from jaxslam.protocols import Associate, Differentiable, Life, Motion, Resample, Sensor
+from jaxslam.sensors.suite import Suite
+
+# The probability that a measurement of a landmark lies within d², where no gate says more.
+_NEAR = 0.99
 
 # Particles that are kept at least, where the caller does not say.
 _LEAST = 50
 
 
-def check_resample(resample: Any) -> None:
-    """A resampling method is a function."""
-    if not callable(resample):
+@dataclass(frozen=True, eq=False)
+class AssociationSettings:
+    """Which measurements of one sensor are of which landmarks, and which count."""
+
+    sensor: Sensor
+    associate: Associate
+    gate: float | None
+
+    @property
+    def unmatched_distance(self) -> float:
+        """d² that a measurement of no landmark counts with: the gate, or one that few exceed."""
+        if self.gate is not None:
+            return self.gate
+        return chi2_quantile(_NEAR, len(self.sensor.measurements))
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleMapSettings(AssociationSettings):
+    """How a scan corrects the map of one particle: of `fastslam`, and of `mapping`."""
+
+    quota: int | None
+    """new landmarks a scan at the most"""
+    life: Life | None
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMapSensor(AssociationSettings):
+    """One sensor in a known map, as `particle_localization` weighs by it."""
+
+    landmarks: ArrayLike
+    """(N, L)"""
+    tags: np.ndarray
+    """(N,) int32"""
+    measured: int | None
+    """measurement slots M of a scan that are its own; None for all"""
+    ignored: bool
+    """it measures other robots, and is left alone"""
+
+
+@dataclass(frozen=True, eq=False)
+class MonteCarloSettings:
+    """The particles of `particle_localization`: where they come from, and how many there are.
+
+    Raises ValueError on numbers that mean nothing.
+    """
+
+    motion: Motion
+    particles: int
+    box: np.ndarray | None
+    """(2, 2) lowest and highest (x, y)"""
+    start: Literal["gaussian", "uniform"]
+    resample: Resample | Differentiable
+    threshold: float
+    bins: tuple[float, float, float]
+    error: float
+    confidence: float
+    least: int
+    rates: tuple[float, float] | None
+    """of the long-term and of the short-term average"""
+    slack: float
+
+    def __post_init__(self) -> None:
+        name, bins, rates = "particle_localization", self.bins, self.rates
+        check_resampling(name, self.resample, self.threshold)
+        if np.shape(bins) != (3,) or not all(np.isfinite(b) and b > 0 for b in bins):
+            raise ValueError(f"{name}: expected bins of three sizes above 0, got {bins!r}")
+        if not self.error > 0:
+            raise ValueError(f"{name}: expected an error above 0, got {self.error}")
+        if not 0 < self.confidence < 1:
+            raise ValueError(
+                f"{name}: expected a confidence between 0 and 1, got {self.confidence}"
+            )
+        if linalg.is_concrete(self.slack) and not self.slack > 0:
+            raise ValueError(f"{name}: expected a slack above 0, got {self.slack}")
+        if rates is not None and not (np.shape(rates) == (2,) and 0 < rates[0] <= rates[1] <= 1):
+            raise ValueError(
+                f"{name}: expected forget = (slow, fast) with 0 < slow <= fast <= 1, got {rates!r}"
+            )
+
+    @property
+    def injects(self) -> bool:
+        """Whether a lost robot is looked for in the whole box."""
+        return self.box is not None and self.rates is not None
+
+
+def particle_map_settings(
+    name: str,
+    sensor: Sensor,
+    capacity: int,
+    *,
+    associate: Associate | None,
+    gate: float | None,
+    births: int | None,
+    life: Life | None,
+) -> ParticleMapSettings:
+    """The settings, or a ValueError that begins with a filter's name."""
+    validation.check_parts(name, associate=associate)
+    linalg.check_count(f"{name}: capacity", capacity)
+    if births is not None:
+        linalg.check_count(f"{name}: births", births)
+    if life is not None and not isinstance(life, Life):
+        raise ValueError(f"{name}: expected life to be a Life, as of life.existence, got {life!r}")
+    linalg.check_gate(name, gate)
+    if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
         raise ValueError(
-            f"particle_localization: expected resample to be a function, got {resample!r}"
+            f"{name}: expected one sensor of landmarks that stay what they are, not a suite, an "
+            f"absolute sensor or landmarks that turn into points, got {sensor.name}"
         )
+    return ParticleMapSettings(sensor, associate or known_association(), gate, births, life)
+
+
+def known_map_sensors(
+    name: str,
+    sensor: Sensor,
+    landmarks: ArrayLike,
+    tags: np.ndarray,
+    associate: Associate | None,
+    gate: float | None,
+) -> tuple[KnownMapSensor, ...]:
+    """The sensors of a suite, or the one that is none, in a map; or a ValueError."""
+    validation.check_parts(name, associate=associate)
+    linalg.check_gate(name, gate)
+
+    def one(sensor: Sensor, measured: int | None, ignored: bool) -> KnownMapSensor:
+        method = associate or known_association()
+        return KnownMapSensor(sensor, method, gate, landmarks, tags, measured, ignored)
+
+    if not isinstance(sensor, Suite):
+        return (one(sensor, None, False),)
+    return tuple(one(part.sensor, part.places, part.sees == "robots") for part in sensor.parts)
+
+
+def check_resampling(name: str, resample: Any, threshold: float) -> None:
+    """A resampling method is a function, and its threshold a share."""
+    if not callable(resample):
+        raise ValueError(f"{name}: expected resample to be a function, got {resample!r}")
+    if linalg.is_concrete(threshold) and not 0 <= threshold <= 1:
+        raise ValueError(f"{name}: expected a threshold from 0 to 1, got {threshold}")
 
 
 def checked_least(particles: int, least: int | None) -> int:
     """The least number of particles, which by default is 50, or the capacity."""
-    linalg.check_count("particle_localization: particles", particles)
+    name = "particle_localization"
+    linalg.check_count(f"{name}: particles", particles)
     if least is None:
         return min(_LEAST, particles)
-    linalg.check_count("particle_localization: least", least)
+    linalg.check_count(f"{name}: least", least)
     if least > particles:
-        raise ValueError(
-            f"particle_localization: expected least <= particles = {particles}, got {least}"
-        )
+        raise ValueError(f"{name}: expected least <= particles = {particles}, got {least}")
     return least
-
-
-def check_numbers(
-    threshold: float,
-    gate: float | None,
-    slack: float,
-    forget: tuple[float, float] | None,
-    bound: tuple[Any, float, float],
-) -> None:
-    """Numbers lie where they mean something; bound: bins, error and confidence."""
-    name = "particle_localization"
-    bins, error, confidence = bound
-    if np.shape(bins) != (3,) or not all(np.isfinite(b) and b > 0 for b in bins):
-        raise ValueError(f"{name}: expected bins of three sizes above 0, got {bins!r}")
-    if not error > 0:
-        raise ValueError(f"{name}: expected an error above 0, got {error}")
-    if not 0 < confidence < 1:
-        raise ValueError(f"{name}: expected a confidence between 0 and 1, got {confidence}")
-    if linalg.is_concrete(threshold) and not 0 <= threshold <= 1:
-        raise ValueError(f"{name}: expected a threshold from 0 to 1, got {threshold}")
-    linalg.check_gate(name, gate)
-    if linalg.is_concrete(slack) and not slack > 0:
-        raise ValueError(f"{name}: expected a slack above 0, got {slack}")
-    if forget is not None and not (np.shape(forget) == (2,) and 0 < forget[0] <= forget[1] <= 1):
-        raise ValueError(
-            f"{name}: expected forget = (slow, fast) with 0 < slow <= fast <= 1, got {forget!r}"
-        )
 
 
 def checked_box(box: ArrayLike | None, start: str) -> np.ndarray | None:

@@ -3,6 +3,7 @@
 import dataclasses
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +12,8 @@ import worlds
 
 from jaxslam import association, life, monte_carlo, motion, programs, resampling, sensors
 from jaxslam.filters import fastslam
-from jaxslam.filters.particles import slam_state
-from jaxslam.filters.particles.slam_state import Particles
+from jaxslam.filters.particles import moments
+from jaxslam.filters.particles.slam_state import SlamParticles
 from jaxslam.run import run
 from jaxslam.types import Scan, Status
 
@@ -91,7 +92,7 @@ def test_one_particle_without_process_noise_maps_from_the_known_path(proposal):
         np.testing.assert_allclose(trace.estimate.points[-1, slot], maps[tag][0], atol=1e-9)
     np.testing.assert_allclose(trace.info.log_likelihood.sum(), log_likelihood, atol=1e-8)
     assert np.all(np.asarray(trace.estimate.pose_cov) == 0)
-    assert not np.any(trace.info.resampled)
+    assert not np.any(trace.info.extra["particles"].resampled)
 
 
 def cloud(rng, count=7, capacity=3):
@@ -100,7 +101,7 @@ def cloud(rng, count=7, capacity=3):
     roots = rng.normal(size=(count, capacity, 2, 2))
     pose = rng.normal(size=(count, 3)) * 0.2 + [0, 0, np.pi]  # across the seam
     pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    return Particles(
+    return SlamParticles(
         pose=pose,
         pose_cov=np.zeros((count, 3, 3)),
         log_weight=log_weight,
@@ -118,7 +119,7 @@ def test_moments_of_the_pose_against_plain_arithmetic():
     state = cloud(np.random.default_rng(0))
     w = np.exp(state.log_weight)
     assert np.ptp(state.pose[:, 2]) > 6  # a plain mean of headings would be far off
-    mean, cov = jax.jit(slam_state.pose_moments)(state)
+    mean, cov = jax.jit(moments.slam_pose_moments)(state)
     theta = np.angle((w * np.exp(1j * state.pose[:, 2])).sum())
     np.testing.assert_allclose(mean, [*(w @ state.pose[:, :2]), theta], atol=1e-12)
     d = state.pose - np.asarray(mean)
@@ -134,7 +135,7 @@ def test_the_covariance_is_the_mean_square_of_truth_minus_mean():
     root = np.diag([0.3, 0.1, 0.05])
     draws = rng.normal(size=(20000, 7, 3)) @ root
     start = cloud(rng, 6)._replace(log_weight=np.full(6, -np.log(6)))
-    one = jax.jit(jax.vmap(lambda poses: slam_state.pose_moments(start._replace(pose=poses))))
+    one = jax.jit(jax.vmap(lambda poses: moments.slam_pose_moments(start._replace(pose=poses))))
     mean, cov = one(jnp.asarray(draws[:, :6]))
     error = draws[:, 6] - np.asarray(mean)
     np.testing.assert_allclose(np.asarray(cov).mean(0).diagonal(), error.var(0), rtol=0.04)
@@ -152,7 +153,7 @@ def test_the_map_is_a_mixture_by_slot_where_tags_agree():
     state.alive[other[1], 0], state.tag[other[1], 0] = False, -1
     state.tag[:, 1] = -1  # unknown: the most likely particle's own
     state.alive[best, 2], state.tag[best, 2] = False, -1
-    out = jax.jit(partial(slam_state.moments, sensor=worlds.ring(1).sensor))(state)
+    out = jax.jit(partial(moments.slam_estimate, sensor=worlds.ring(1).sensor))(state)
     keep = np.array([p not in other[:2] for p in range(7)])
     w = np.exp(state.log_weight) * keep
     w = w / w.sum()
@@ -171,7 +172,9 @@ def test_headings_that_cancel_have_no_mean_and_no_nan():
     state = cloud(np.random.default_rng(0), 2)._replace(log_weight=np.log([0.5, 0.5]))
     state.pose[:, 2] = [0.0, np.pi]
     mean, slope = jax.jit(
-        jax.value_and_grad(lambda pose: slam_state.pose_moments(state._replace(pose=pose))[0].sum())
+        jax.value_and_grad(
+            lambda pose: moments.slam_pose_moments(state._replace(pose=pose))[0].sum()
+        )
     )(state.pose)
     assert np.isfinite(mean)
     assert np.all(np.isfinite(slope))
@@ -254,7 +257,7 @@ def known_map(tags):
     tags = np.asarray(tags, np.int32)
     count, capacity = tags.shape
     alive = tags >= 0
-    return Particles(
+    return SlamParticles(
         pose=np.tile([0.0, 0.0, 0.1], (count, 1)),
         pose_cov=np.tile(np.diag([0.01, 0.01, 0.01]), (count, 1, 1)),
         log_weight=np.full(count, -np.log(count)),
@@ -277,7 +280,7 @@ def test_particles_of_different_maps_with_full_tables_lose_what_they_must_and_co
     np.testing.assert_array_equal(state.tag, [[0, 1], [0, 1], [5, 6]])
     assert np.all(state.alive)
     assert np.isfinite(np.asarray(state.log_weight)).all()
-    assert not info.resampled
+    assert not info.extra["particles"].resampled
     best = int(state.best)
     wanted = [
         [Status.FUSED, Status.OVERFLOW],
@@ -294,17 +297,17 @@ def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
     filter = of(world, 3, capacity=2)
     start = known_map([[0, 1]] * 3)
     after, info = updated(filter, start, scan_of([(0, 1e200, 0.0)]))
-    assert info.underflow
-    assert not info.resampled
+    assert info.extra["particles"].underflow
+    assert not info.extra["particles"].resampled
     np.testing.assert_array_equal(info.status, [Status.REJECTED, Status.EMPTY])
     np.testing.assert_allclose(np.exp(after.log_weight), 1 / 3)
     np.testing.assert_array_equal(after.landmarks, start.landmarks)
     assert np.all(np.abs(np.asarray(after.pose - start.pose)) < 1.0)  # drawn, and no more
     assert info.log_likelihood == 0.0
     out = jax.jit(filter.estimate)(after)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((info, out)))
+    chex.assert_tree_all_finite((info, out))
     _, info = updated(filter, start, scan_of([(0, 0.9, -0.4)]))
-    assert not info.underflow
+    assert not info.extra["particles"].underflow
 
 
 def strict():
@@ -356,13 +359,13 @@ def test_it_resamples_where_the_threshold_says():
     # ESS is at least 1, so this is never; 0 itself would be another program.
     never, _, _ = drive(world, of(world, COUNT, threshold=1e-9))
     often, _, _ = drive(world, of(world, COUNT, threshold=0.5))
-    assert not np.any(never.info.resampled)
-    ess = np.asarray(often.info.ess)
-    np.testing.assert_array_equal(often.info.resampled, ess < COUNT / 2)
+    assert not np.any(never.info.extra["particles"].resampled)
+    ess = np.asarray(often.info.extra["particles"].ess)
+    np.testing.assert_array_equal(often.info.extra["particles"].resampled, ess < COUNT / 2)
     assert 0 < np.sum(ess < COUNT / 2) < STEPS
     assert np.all((ess > 1 - 1e-9) & (ess < COUNT + 1e-9))
-    assert never.info.ess[-1] < often.info.ess[-1]
-    assert np.ptp(often.final.log_weight) == 0 or not often.info.resampled[-1]
+    assert never.info.extra["particles"].ess[-1] < often.info.extra["particles"].ess[-1]
+    assert np.ptp(often.final.log_weight) == 0 or not often.info.extra["particles"].resampled[-1]
 
 
 @jax.jit
@@ -383,7 +386,7 @@ def test_any_method_resamples_whole_particles(name):
         log_weight=np.array([-900.0, 0.0, -900.0]), lost=np.array([1, 2, 3], np.int32)
     )
     after, info = resampled_by(sorted(resampling.REGISTRY).index(name), state, scan_of([]))
-    assert info.resampled
+    assert info.extra["particles"].resampled
     np.testing.assert_array_equal(after.tag, [[1, 0]] * 3)
     np.testing.assert_array_equal(after.landmarks[:, 0], np.tile([2.0, 0.0], (3, 1)))
     np.testing.assert_array_equal(after.lost, [2, 2, 2])

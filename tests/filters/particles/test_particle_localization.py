@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,7 +54,7 @@ def test_many_particles_are_the_posterior_of_the_ekf():
     ours = drive(of(4000, least=4000), log, *start)
     mean, cov = np.asarray(theirs.estimate.pose[-1]), np.asarray(theirs.estimate.pose_cov[-1])
     error = np.asarray(ours.estimate.pose[-1]) - mean
-    effective = float(ours.info.ess[-1])
+    effective = float(ours.info.extra["particles"].ess[-1])
     assert effective > 200
     assert np.all(np.abs(error) < 5 * np.sqrt(cov.diagonal() / (effective / 4)))
     np.testing.assert_allclose(
@@ -62,7 +63,7 @@ def test_many_particles_are_the_posterior_of_the_ekf():
     np.testing.assert_allclose(
         ours.info.log_likelihood.sum(), theirs.info.log_likelihood.sum(), atol=0.5
     )
-    assert (np.asarray(ours.info.active) == 4000).all()
+    assert (np.asarray(ours.info.extra["particles"].active) == 4000).all()
     np.testing.assert_array_equal(ours.info.status, theirs.info.status)
     np.testing.assert_array_equal(ours.estimate.points, theirs.estimate.points)
 
@@ -106,7 +107,7 @@ def test_weights_are_the_scans_densities(gate):
     if gate == 16.0 and info.nis[4] > 16:
         wanted[4] = Status.REJECTED
     np.testing.assert_array_equal(info.status, wanted)
-    np.testing.assert_allclose(info.ess, w.sum() ** 2 / (w**2).sum(), rtol=1e-9)
+    np.testing.assert_allclose(info.extra["particles"].ess, w.sum() ** 2 / (w**2).sum(), rtol=1e-9)
     # the average of how well they fit, by 5 places
     np.testing.assert_allclose(after.fast, np.exp(-off / 10).mean(), rtol=1e-9)
     np.testing.assert_allclose(after.slow, after.fast)
@@ -175,14 +176,14 @@ def test_a_kidnapped_robot_is_found_again_and_by_the_ekf_it_is_not(carried):
     assert (off[:, 72:].max(axis=1) < 0.6).sum() >= 5
     assert ekf_off[39] < 0.3
     assert ekf_off[40:].min() > 1.0
-    injected = np.asarray(ours.info.injected)
+    injected = np.asarray(ours.info.extra["particles"].injected)
     assert (injected[:, 41:60].sum(axis=1) > 0).all()
     assert injected[:, 42:60].sum() > 5 * injected[:, 22:40].sum()
 
 
 def test_the_number_of_particles_follows_the_uncertainty(carried):
     ours, _, _ = carried
-    active = np.asarray(ours.info.active)
+    active = np.asarray(ours.info.extra["particles"].active)
     assert (active[:, 0] == 1000).all()
     assert (np.median(active[:, 10:40], axis=1) < 200).all()
     assert (active >= 50).all() and (active <= 1000).all()
@@ -244,13 +245,13 @@ def test_poses_that_are_not_finite_weigh_nothing_and_are_counted(kind):
     for trace in (some, every):
         for leaf in jax.tree.leaves((trace.estimate, trace.info, trace.probe[0])):
             assert np.isfinite(np.asarray(leaf, float)).all()
-    invalid = np.asarray(some.info.invalid)
+    invalid = np.asarray(some.info.extra["particles"].invalid)
     assert ((invalid > 0) & (invalid < 16)).all()
-    assert not np.any(some.info.underflow)
+    assert not np.any(some.info.extra["particles"].underflow)
     if kind == "localization":  # whose weights are those before resampling
         np.testing.assert_array_equal((np.exp(some.probe[1]) == 0).sum(axis=1), invalid)
-    np.testing.assert_array_equal(every.info.invalid, 16)
-    assert np.all(every.info.underflow)
+    np.testing.assert_array_equal(every.info.extra["particles"].invalid, 16)
+    assert np.all(every.info.extra["particles"].underflow)
     np.testing.assert_allclose(np.exp(every.probe[1]), 1 / 16)
     np.testing.assert_array_equal(every.estimate.pose, 0.0)  # as before
 
@@ -260,12 +261,12 @@ def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
     filter = of(4, BLUNT)
     start = filter.init(jnp.zeros(3), 0.01 * jnp.eye(3))
     after, info = jax.jit(filter.update)(start, scan, KEY)
-    assert info.underflow
+    assert info.extra["particles"].underflow
     np.testing.assert_allclose(np.exp(after.log_weight), 0.25)
     np.testing.assert_array_equal(info.status, [Status.REJECTED])
     assert info.log_likelihood == 0.0
     out = jax.jit(filter.estimate)(after)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((info, out)))
+    chex.assert_tree_all_finite((info, out))
 
 
 @pytest.mark.parametrize("count", [1, 7])
@@ -278,8 +279,8 @@ def test_without_any_noise_or_with_one_particle_it_is_dead_reckoning(count):
         pose = np.asarray(MOVE(pose, u, np.zeros(2)))
         np.testing.assert_allclose(ours, pose, atol=1e-12)
     np.testing.assert_allclose(trace.estimate.pose_cov, 0.0, atol=1e-24)
-    assert not np.any(trace.info.underflow)
-    np.testing.assert_array_equal(trace.info.active, count)
+    assert not np.any(trace.info.extra["particles"].underflow)
+    np.testing.assert_array_equal(trace.info.extra["particles"].active, count)
 
 
 # --- the house ----------------------------------------------------------------------------------
@@ -295,7 +296,7 @@ def test_the_start_is_reported_before_anything_is_drawn():
     out = jax.jit(lambda *at: anywhere.estimate(anywhere.init(*at)))(np.ones(3), np.zeros((3, 3)))
     np.testing.assert_allclose(out.pose, [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(out.pose_cov, np.diag([64, 64, 4 * np.pi**2]) / 12, rtol=1e-12)
-    draws = np.asarray(pose_state.uniform(jnp.asarray(BOX), 20000, KEY))
+    draws = np.asarray(pose_state.draw_uniform_poses(jnp.asarray(BOX), 20000, KEY))
     assert (draws[:, :2] > BOX[0]).all() and (draws[:, :2] < BOX[1]).all()
     np.testing.assert_allclose(np.cov(draws.T), out.pose_cov, atol=0.15)
 

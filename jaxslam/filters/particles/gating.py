@@ -1,0 +1,27 @@
+"""The gate on squared Mahalanobis distances, as the weight of a particle takes it."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+
+class GatedDistance(NamedTuple):
+    """A squared Mahalanobis distance d² after the gate, of any shape."""
+
+    inside: Bool[Array, "..."]
+    """within the gate; without one, d² is finite"""
+    counted: Float[Array, "..."]
+    """d² as the weight counts it: that of the gate where it lies beyond"""
+    reported: Float[Array, "..."]
+    """d², a large number where it is not finite"""
+
+
+def gate_distance(distance: Float[Array, "*M"], gate: float | None) -> GatedDistance:
+    """Whether d² passes the gate, and what of it a weight and an `Info` take."""
+    finite = jnp.isfinite(distance)
+    inside = finite if gate is None else finite & (distance <= gate)
+    counted = distance if gate is None else jnp.where(inside, distance, gate)
+    largest = 0.5 * float(jnp.finfo(distance.dtype).max)
+    return GatedDistance(inside, counted, jnp.where(finite, distance, largest))

@@ -1,0 +1,79 @@
+"""How Monte-Carlo localization finds a robot that was carried away: particles from the whole box.
+
+Thrun, Burgard & Fox, "Probabilistic Robotics", table 8.3, augmented MCL.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.filters.particles.pose_state import PoseParticles, draw_uniform_poses
+from jaxslam.filters.particles.settings import MonteCarloSettings
+from jaxslam.resampling.weights import survivors
+
+
+def update_averages(
+    state: PoseParticles,
+    misfit: Float[Array, "P"],
+    measured: Int[Array, ""],
+    settings: MonteCarloSettings,
+) -> PoseParticles:
+    """The state with its averages of how well scans fit, and the probability to inject.
+
+    Args:
+        misfit: Σ d²/2 of each particle.
+        measured: how many measurements the scan has.
+    """
+    if settings.rates is None:
+        return state._replace(injection=jnp.zeros_like(state.fast))
+    finite = jnp.isfinite(misfit)
+    exponent = -jnp.where(finite, misfit, 0.0) / jnp.maximum(measured, 1)
+    each = jnp.where(finite, jnp.exp(exponent), 0.0)
+    fit = jax.lax.stop_gradient((jnp.exp(state.log_weight) * each).sum())
+    first = state.slow <= 0
+    slow, fast = (
+        jnp.where(first, fit, before + rate * (fit - before))
+        for before, rate in zip((state.slow, state.fast), settings.rates, strict=True)
+    )
+    safe = jnp.where(slow > 0, slow, 1.0)
+    injection = jnp.where(slow > 0, jnp.maximum(0.0, 1 - settings.slack * fast / safe), 0.0)
+    some = measured > 0
+    return state._replace(
+        fast=jnp.where(some, fast, state.fast),
+        slow=jnp.where(some, slow, state.slow),
+        injection=jnp.where(some, injection, jnp.zeros_like(injection)),
+    )
+
+
+class DrawnPoses(NamedTuple):
+    """P poses to go on with, in random order."""
+
+    pose: Float[Array, "P 3"]
+    log_weight: Float[Array, "P"]
+    injected: Bool[Array, "P"]
+    """drawn from the box"""
+
+
+def resample_and_inject(
+    state: PoseParticles, key: Array, settings: MonteCarloSettings
+) -> DrawnPoses:
+    """Each pose that of a particle by its weight or, with the state's probability, from the box."""
+    particles = settings.particles
+    key_resample, key_order, key_which, key_box = jax.random.split(key, 4)
+    ancestor, log_weight = survivors(settings.resample, state.log_weight, key_resample)
+    # Ancestors ascend, and only the first so many may be used.
+    order = jax.random.permutation(key_order, particles)
+    pose, log_weight = state.pose[ancestor[order]], log_weight[order]
+    if not settings.injects:
+        return DrawnPoses(pose, log_weight, jnp.zeros(particles, bool))
+    injected = jax.random.uniform(key_which, (particles,), pose.dtype) < state.injection
+    anywhere = draw_uniform_poses(jnp.asarray(settings.box, pose.dtype), particles, key_box)
+    return DrawnPoses(
+        jnp.where(injected[:, None], anywhere, pose),
+        jnp.where(injected, -math.log(particles), log_weight),
+        injected,
+    )

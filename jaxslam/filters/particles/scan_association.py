@@ -1,0 +1,37 @@
+"""Which landmarks of one particle the measurements of a scan are of."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Int
+
+from jaxslam.protocols import Associate, Association, Prediction
+from jaxslam.types import Scan
+
+
+class ParticleAssociation(NamedTuple):
+    """The association of M measurements with the map of one particle."""
+
+    slot: Int[Array, "*P M"]
+    """of the landmark measured, 0 where none"""
+    matched: Bool[Array, "*P M"]
+    is_new: Bool[Array, "*P M"]
+    exhausted: Bool[Array, "*P"]
+    """the search ended at its budget"""
+
+
+def associate_scan(prediction: Prediction, scan: Scan, associate: Associate) -> ParticleAssociation:
+    """What the method finds, for the measurements that are there."""
+    found = Association(*associate(prediction, scan))
+    return ParticleAssociation(
+        slot=jnp.maximum(found.slot, 0),
+        matched=scan.valid & (found.slot >= 0) & ~found.is_new,
+        is_new=scan.valid & found.is_new,
+        exhausted=jnp.asarray(found.exhausted),
+    )
+
+
+def zero_padding(scan: Scan) -> Scan:
+    """The scan with zeros in its padding, which may hold anything and is multiplied by zero."""
+    return scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
