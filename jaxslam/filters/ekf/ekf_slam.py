@@ -13,12 +13,11 @@ from jaxslam.filters.ekf import to_points
 from jaxslam.filters.ekf.beliefs import moments
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import in_order, part_updates
-from jaxslam.filters.ekf.settings import check_chart, check_map_manager, check_numbers, check_parts
-from jaxslam.filters.map_management.merging import Duplicates, find_duplicate, told_apart
-from jaxslam.filters.map_management.merging import merge as merge_pair
+from jaxslam.filters.ekf.settings import check_chart, check_make_room, check_numbers, check_parts
+from jaxslam.filters.reporting import with_removed
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
-from jaxslam.math.xla import where_any
+from jaxslam.math.xla import change_where, where_any
 from jaxslam.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
@@ -40,8 +39,7 @@ def ekf_slam(
     births: int | None = None,
     square_root: bool = False,
     watch: bool = False,
-    life: Life | None = None,
-    merge: Duplicates | None = None,
+    make_room: Life | None = None,
 ) -> Filter:
     """Extended Kalman filter SLAM in a map of fixed capacity (Solà 2).
 
@@ -70,15 +68,17 @@ def ekf_slam(
             one. Default no limit.
         square_root: hold a root X of P = X Xᵀ instead of P, in which float32 goes as far as float64
             does in P; the same filter, dearer (the prediction is O(N³)).
-        life: which landmarks stay in the map (`jaxslam.life`); default all.
-        merge: take two landmarks for one (`filters.merging.duplicates`); default never.
+        make_room: removes landmarks from a full map before new ones enter it, by the memory that
+            `map_management.pruning` keeps of the same `Life`: for `pruning(filter, make_room)`
+            alone. Default none is removed.
         watch: keep a `slots.Watch` in the state, which campaigns report.
     Raises:
         ValueError: on models, charts, linearizers or associations that are none or of wrong sizes
             (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
             update, a chart or linearizer that does not fit the sensor's landmarks or one another,
-            a life that is none, Joseph's form of a square root, several iterations of a statistical
-            linearizer, or a linearizer of landmarks for a suite with an absolute sensor.
+            a make_room that makes none, Joseph's form of a square root, several iterations of a
+            statistical linearizer, or a linearizer of landmarks for a suite with an absolute
+            sensor; from `update`, on a make_room without `pruning`.
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
@@ -88,7 +88,7 @@ def ekf_slam(
     check_numbers("ekf_slam", capacity, update, gate, iterations, births)
     check_chart(sensor, chart)
     check_parts(sensor, chart, linearize, iterations, joseph, square_root)
-    check_map_manager(sensor, life, merge)
+    check_make_room(make_room)
     size_l, size_z = len(sensor.landmark), len(sensor.measurements)
     move = partial(
         propagate,
@@ -117,24 +117,17 @@ def ekf_slam(
         )
         if sensor.reduced is not None:
             joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
-        if merge is not None:
-            joint = joint._replace(apart=jnp.zeros((capacity, capacity), bool))
-        return joint if life is None else joint._replace(life=life.init(pose, joint.landmarks))
+        return joint
 
     def without(joint: Joint, dead: jax.Array) -> Joint:
-        def removed(joint: Joint) -> Joint:
-            # A root is made triangular anew; a run without a removal keeps its own to the bit.
-            less = slots.remove(joint, dead, square_root=square_root)
-            both: Joint = jax.tree.map(lambda a, b: jnp.where(dead.any(), a, b), less, joint)
-            return both
-
-        return where_any(dead.any(), removed, lambda joint: joint, joint)
+        remove = partial(slots.remove, dead=dead, square_root=square_root)
+        return change_where(dead.any(), remove, joint)
 
     options: dict[str, Any] = {
         "associate": associate,
         "update": update,
         "births": births,
-        "life": life,
+        "life": make_room,
         "without": without,
         "chart": chart,
         "linearize": linearize,
@@ -148,19 +141,14 @@ def ekf_slam(
         return move(joint, u)
 
     def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
-        joint, info, given_up = in_order(joint, scan, parts)
-        if merge is not None:
-            joint = joint._replace(apart=told_apart(joint, info, places))
-            kept, gone, same = find_duplicate(joint, chart, merge, square_root=square_root)
-
-            def merged(joint: Joint) -> Joint:
-                one = merge_pair(joint, chart, kept, gone, square_root=square_root)
-                both: Joint = jax.tree.map(lambda a, b: jnp.where(same, a, b), one, joint)
-                return both
-
-            joint = where_any(same, merged, lambda joint: joint, joint)
-            pair = jnp.where(same, jnp.stack([kept, gone]), -1).astype(jnp.int32)
-            info = info._replace(merged=pair)
+        if make_room is not None and joint.life is None:
+            raise ValueError(
+                f"ekf_slam: make_room={make_room.name} goes by the memory that pruning keeps: "
+                "pruning(ekf_slam(…, make_room=life), life)"
+            )
+        joint, info, evicted = in_order(joint, scan, parts)
+        if make_room is not None:
+            info = with_removed(info, evicted)
         if sensor.reduced is not None:
             which = to_points.ready(joint, sensor, square_root)
 
@@ -169,10 +157,6 @@ def ekf_slam(
 
             joint = where_any(which.any(), reduced, lambda joint: joint, joint)
             info = info._replace(reduced=which)
-        if life is not None:
-            memory, dead = life.after(joint, info, lambda: estimate(joint))
-            joint = without(joint._replace(life=memory), dead)
-            info = info._replace(removed=dead | given_up)
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:
@@ -190,4 +174,5 @@ def ekf_slam(
         chart=chart,
         places=places,
         square_root=square_root,
+        landmark=sensor.landmark,
     )

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam.filters.map_management.merging import Duplicates
 from jaxslam.math.linalg import check_count, check_gate
 from jaxslam.protocols import Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Suite
@@ -83,20 +82,10 @@ def check_parts(
         raise ValueError("ekf_slam: Joseph's form is of a covariance, not of its square root")
 
 
-def check_map_manager(sensor: Sensor, life: Life | None, merge: Duplicates | None) -> None:
-    """What decides which landmarks stay is of the right kind, and can be applied."""
-    if life is not None and not isinstance(life, Life):
+def check_make_room(make_room: Life | None) -> None:
+    """What makes room in a full map is a `Life` that does so."""
+    if make_room is not None and (not isinstance(make_room, Life) or make_room.make_room is None):
         raise ValueError(
-            f"ekf_slam: expected life to be a Life, as of life.existence, got {life!r}"
-        )
-    if merge is None:
-        return
-    if not isinstance(merge, Duplicates):
-        raise ValueError(
-            f"ekf_slam: expected merge to be a Duplicates, as of merging.duplicates, got {merge!r}"
-        )
-    if len(sensor.landmark) < 2 or "rho [1/m]" in sensor.landmark:
-        raise ValueError(
-            f"ekf_slam: two landmarks of the sensor {sensor.name} are not one where their "
-            "parameters agree, so they cannot be merged"
+            "ekf_slam: expected make_room to be a Life that makes room, as of "
+            f"life.existence(…, replace=True), got {make_room!r}"
         )

@@ -45,8 +45,8 @@ class Match(NamedTuple):
     """() bool: more pairs of points agreed than there was room for"""
 
 
-class Limits(NamedTuple):
-    """How far a search goes; made by `limits`."""
+class SearchLimits(NamedTuple):
+    """How far a search goes; made by `search_limits`."""
 
     single: tuple[float, float]
     """χ² of one and of two degrees of freedom"""
@@ -56,21 +56,24 @@ class Limits(NamedTuple):
     candidates: int
 
 
-def limits(name: str, places: int, probability: float, pairs: int, candidates: int) -> Limits:
-    """The limits of a search over M = places cluster points.
+def search_limits(
+    caller: str, size: int, probability: float, pairs: int, candidates: int
+) -> SearchLimits:
+    """The limits of a search over M = size cluster points.
 
-    Raises ValueError on a probability not between 0 and 1, or pairs or candidates below 1.
+    Raises ValueError, which names the caller, on a probability not between 0 and 1, or pairs or
+    candidates below 1.
     """
     if not 0 < probability < 1:
-        raise ValueError(f"{name}: expected a probability between 0 and 1, got {probability}")
-    check_count(f"{name}: pairs", pairs)
-    check_count(f"{name}: candidates", candidates)
-    joint = [chi2_quantile(probability, max(2 * n - 3, 1)) for n in range(places + 1)]
+        raise ValueError(f"{caller}: expected a probability between 0 and 1, got {probability}")
+    check_count(f"{caller}: pairs", pairs)
+    check_count(f"{caller}: candidates", candidates)
+    joint = [chi2_quantile(probability, max(2 * n - 3, 1)) for n in range(size + 1)]
     single = chi2_quantile(probability, 1), chi2_quantile(probability, 2)
-    return Limits(single, np.asarray(joint), pairs, candidates)
+    return SearchLimits(single, np.asarray(joint), pairs, candidates)
 
 
-def match(points: Points, bounds: Limits) -> Match:
+def match(points: Points, bounds: SearchLimits) -> Match:
     """The match that explains most cluster points, of several the one of least D².
 
     Each of a few pairs (a, b) of cluster points, the longest, is held against all pairs (j, l) of
@@ -112,7 +115,7 @@ def match(points: Points, bounds: Limits) -> Match:
     return best._replace(runner_up=other.astype(jnp.int32), exhausted=cut.any())
 
 
-def fit(points: Points, slot: Array, bounds: Limits) -> Match:
+def fit(points: Points, slot: Array, bounds: SearchLimits) -> Match:
     """One hypothesis as a whole: the frame by least squares, without pairs that do not fit.
 
     r_i = T z_i - m_i over the pairs, Σ their joint covariance: min rᵀ Σ⁻¹ r over T, to first order

@@ -4,10 +4,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxslam.association.gates import mutual
-
-Array = jax.Array
 
 
 class Points(NamedTuple):
@@ -64,9 +63,8 @@ def agreements(points: Points, a: Array, b: Array, gate: float) -> tuple[Array, 
     n = length.shape[0]
     every = jnp.arange(n)
     own = points.among[every, :, every]
-    mixed = points.among.transpose(0, 2, 1, 3)
-    spread = own[:, None] + own[None, :] - mixed - mixed.transpose(0, 1, 3, 2)
-    variance = jnp.einsum("jlx,jlxy,jly->jl", v, spread, v)
+    there_covs = difference_covs(own, own, points.among.transpose(0, 2, 1, 3))
+    variance = jnp.einsum("jlx,jlxy,jly->jl", v, there_covs, v)
     at = points.own[jnp.stack([a, b])][:, :, jnp.stack([a, b])]
     near = at[0, :, 0] + at[1, :, 1] - at[0, :, 1] - at[1, :, 0]
     cross = u @ (points.shared[b] - points.shared[a]).reshape(2, -1)
@@ -122,9 +120,8 @@ def scored(
     with_map = with_map + jnp.einsum("xy,iynw->ixnw", rotation, points.shared)
     with_map = with_map.transpose(0, 2, 1, 3)
     at = jnp.arange(n)
-    spread = cov[:, None] + points.among[at, :, at][None] - with_map
-    spread = spread - with_map.transpose(0, 1, 3, 2)
-    distance, regular = squared(placed[:, None] - points.map[None, :], spread)
+    error_covs = difference_covs(cov, points.among[at, :, at], with_map)
+    distance, regular = squared(placed[:, None] - points.map[None, :], error_covs)
     free = (every != a) & (every != b)
     left = (at != j) & (at != k)
     fits = points.allowed & regular & (distance <= gate) & free[:, None] & left[None, :]
@@ -149,3 +146,10 @@ def squared(error: Array, cov: Array) -> tuple[Array, Array]:
     x, y = error[..., 0], error[..., 1]
     squared = (q * x * x - 2 * r * x * y + p * y * y) / jnp.where(regular, det, 1.0)
     return jnp.where(regular, squared, 0.0), regular
+
+
+def difference_covs(
+    a: Float[Array, "M 2 2"], b: Float[Array, "N 2 2"], cross: Float[Array, "M N 2 2"]
+) -> Float[Array, "M N 2 2"]:
+    """cov(x_i - y_j) of all pairs, by the covariances of x, of y and of x_i with y_j."""
+    return a[:, None] + b[None] - cross - cross.transpose(0, 1, 3, 2)

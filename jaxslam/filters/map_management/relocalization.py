@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.filters.ekf.coordinates import cov_of_coordinates, with_cov_of_coordinates
-from jaxslam.filters.map_management.geometric_matching import Match, limits, match, solve
+from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits, solve
 from jaxslam.filters.map_management.point_pairs import Points
 from jaxslam.math import linalg
 from jaxslam.math.linalg import check_count, check_covariance
@@ -105,7 +105,7 @@ def relocalize(
         if np.shape(value) != shape:
             raise ValueError(f"relocalize: expected shape {shape}, got {np.shape(value)}")
     check_policy("relocalize", least, margin)
-    bounds = limits("relocalize", m, probability, pairs, candidates)
+    bounds = search_limits("relocalize", m, probability, pairs, candidates)
     if n < 2 or m < 2:
         return _judged(_nothing(m, jnp.result_type(points)), least, margin)
     own = jnp.zeros((m, 2, m, 2), seen.dtype)

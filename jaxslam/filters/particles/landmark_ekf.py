@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxslam import slots
 from jaxslam.filters.particles.proposal import Sight
 from jaxslam.filters.particles.slam_state import Particles, moments
-from jaxslam.filters.reporting import info_of, seen_before, status_of
+from jaxslam.filters.reporting import info_of, seen_before, status_of, with_removed
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
@@ -79,7 +79,7 @@ def after_scan(
     if life is not None:
         memory, dead = life.after(_joint(own), info, lambda: moments(_alone(own), sensor))
         own = _without(own._replace(life=memory), dead)
-        info = info._replace(removed=given_up | dead)
+        info = with_removed(info, given_up | dead)
     return own, info
 
 
