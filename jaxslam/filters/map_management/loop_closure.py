@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.ekf.coordinates import cov_of_coordinates
+from jaxslam.filters.map_management.alignment import with_unit_blocks
 from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
 from jaxslam.filters.map_management.merging import squared_distance
-from jaxslam.filters.map_management.point_pairs import Points, difference_covs
+from jaxslam.filters.map_management.point_pairs import PointSets, difference_covs
 from jaxslam.filters.map_management.relocalization import check_points, check_policy
 from jaxslam.filters.map_management.successive import merge_histories
 from jaxslam.life.recency import Recency
@@ -162,7 +163,7 @@ def search(
     levels = jnp.asarray(
         [0.0, *(chi2_quantile(settings.drift, 2 * n) for n in range(1, settings.cluster + 1))]
     )
-    bounds = search_limits(
+    limits = search_limits(
         "close_loop", settings.cluster, settings.probability, settings.pairs, settings.candidates
     )
     cov = cov_of_coordinates(joint, chart)[3:, 3:].reshape(capacity, 2, capacity, 2)
@@ -174,10 +175,10 @@ def search(
     )
     distance = jax.vmap(jax.vmap(squared_distance))(delta, delta_covs)
     allowed = candidates & (distance <= levels[1])
-    points = Points(joint.landmarks[recent], joint.landmarks, own, cov, shared, allowed)
+    points = PointSets(joint.landmarks[recent], joint.landmarks, own, cov, shared, allowed)
 
     def compare(_: Any) -> tuple[Array, Closing]:
-        found = match(points, bounds)
+        found = match(points, limits)
         likely = _joint_distance(delta, points, found) <= levels[found.explained]
         enough = found.explained >= settings.least
         ok = enough & (found.explained - found.runner_up >= settings.margin) & likely
@@ -206,14 +207,13 @@ def _merge_all(joint: Joint, chart: Chart, old: Int[Array, "M"], recent: Int[Arr
     return jax.lax.scan(one, joint, (old, recent))[0]
 
 
-def _joint_distance(delta: Float[Array, "M N 2"], points: Points, found: Match) -> Float[Array, ""]:
+def _joint_distance(
+    delta: Float[Array, "M N 2"], points: PointSets, found: Match
+) -> Float[Array, ""]:
     """δᵀ cov(δ)⁻¹ δ over all pairs found, with the drift in it."""
-    m = found.slot.shape[0]
-    there, at = found.slot >= 0, jnp.maximum(found.slot, 0)
-    crossed = points.shared[:, :, at]
-    cov = points.own + points.among[at][:, :, at] - crossed - crossed.transpose(2, 3, 0, 1)
-    both = there[:, None, None, None] & there[None, None, :, None]
-    unit = jnp.eye(2 * m, dtype=cov.dtype).reshape(m, 2, m, 2)
-    cov = jnp.where(jnp.broadcast_to(both, cov.shape), cov, unit).reshape(2 * m, 2 * m)
+    m, there, at = found.slot.shape[0], found.slot >= 0, jnp.maximum(found.slot, 0)
+    crossed = points.cross_cov[:, :, at]
+    cov = points.cluster_cov + points.map_cov[at][:, :, at]
+    cov = with_unit_blocks(cov - crossed - crossed.transpose(2, 3, 0, 1), there)
     error = jnp.where(there[:, None], delta[jnp.arange(m), at], 0.0).reshape(2 * m)
-    return squared_distance(error, linalg.symmetrize(cov))
+    return squared_distance(error, linalg.symmetrize(cov.reshape(2 * m, 2 * m)))
