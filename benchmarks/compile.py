@@ -1,7 +1,7 @@
 """What a first run waits for: `python -m benchmarks.compile [--only NAMES] [--quick]`.
 
 Seconds of tracing, lowering and XLA's compilation of one `run` of every filter of the catalogue, of
-`delayed_slam`, `team_slam`, an EKF with `life` and merging, the smoother and the batch solution,
+`delayed_slam`, `team_slam`, an EKF with merging and pruning, the smoother and the batch solution,
 and of gradients through runs of an EKF; how many programs XLA compiled when the same was run again
 with every noise, gate and map value changed (asked: none); and what a second call of `run` costs
 beyond its program. Compilation does not depend on the number of steps. Idle machine, please.
@@ -21,7 +21,8 @@ from benchmarks.delayed import named
 from benchmarks.gate import Metric, alone
 from jaxslam import catalog, life, motion, programs, sensors, smoothing, team
 from jaxslam.filters import ekf_slam, team_slam
-from jaxslam.filters.map_management.merging import duplicates
+from jaxslam.filters.map_management.merging import merging
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.protocols import Filter
 from jaxslam.run import run
 from jaxslam.sensors import Part, suite
@@ -76,14 +77,8 @@ def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
         there = world(scale)
         keeps = life.existence(there.visible, detected=0.9 * scale, patience=50)
         count = len(there.landmarks)
-        return there, ekf_slam(
-            there.motion,
-            there.sensor,
-            count,
-            update="joint",
-            life=keeps,
-            merge=duplicates(0.5 * scale),
-        )
+        plain = ekf_slam(there.motion, there.sensor, count, update="joint")
+        return there, pruning(merging(plain, 0.5 * scale), keeps)
 
     def smoother(make: Callable[..., Any]) -> Callable[[float], tuple[Scenario, Any]]:
         def of(scale: float) -> tuple[Scenario, Any]:

@@ -63,7 +63,7 @@ def by_particles(
 ) -> Filter:
     """FastSLAM of 50 particles; of the options of `ekf_slam`, those that it has too."""
     asked = scenario.filter_options | options
-    mine = {name: asked[name] for name in ("gate", "associate", "births", "life") if name in asked}
+    mine = {name: asked[name] for name in ("gate", "associate", "births") if name in asked}
     capacity = int(np.shape(scenario.landmarks)[0])
     return fastslam(
         scenario.motion, scenario.sensor, capacity, SLAM_PARTICLES, proposal=proposal, **mine

@@ -279,7 +279,7 @@ the weights before. Its sum must be left alone: its gradient may be part of the 
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """Which landmarks stay in the map: the guide's map manager, asked after every scan."""
+    """Which landmarks stay in the map: the rule that `pruning` asks after every scan."""
 
     name: str
     init: Callable[[Array, Array], Any]
@@ -313,6 +313,9 @@ class Filter:
     """how many places of a scan each sensor has, in order; () where all are of one sensor."""
     square_root: bool = False
     """whether its state is a `slots.Joint` with a root of the covariance."""
+    landmark: tuple[str, ...] = ()
+    """what a landmark of its `slots.Joint` holds, with units, as `Sensor.landmark`; () where its
+    state is none."""
 
     def __post_init__(self) -> None:
         _check_fields(self, ("init", "predict", "update", "estimate"))

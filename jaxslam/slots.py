@@ -33,13 +33,13 @@ class Joint(NamedTuple):
     """a `Watch` of the directions that should stay unobservable, where one is kept"""
     last: Any = ()
     """the `Last` motion, where the chart keeps it apart"""
-    life: Any = ()
-    """the memory of the filter's `Life`, where it has one"""
+    life: Any = None
+    """the memory of a `Life`, of a filter that is pruned"""
     reduced: Any = ()
     """(N,) bool: the slot holds a point (x, y), and padding in the rest of its L coordinates; of
     a sensor whose landmarks may become points"""
-    apart: Any = ()
-    """(N, N) bool: landmarks that a scan measured both, of a filter that merges others"""
+    co_observed: jax.Array | None = None
+    """(N, N) bool: pairs of landmarks that one scan measured, of a filter that merges others"""
 
 
 class Last(NamedTuple):
@@ -272,5 +272,7 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
         tag=jnp.where(dead, -1, joint.tag),
         watch=watch,
         reduced=jax.tree.map(lambda was: was & ~dead, joint.reduced),
-        apart=jax.tree.map(lambda was: was & ~dead[:, None] & ~dead[None, :], joint.apart),
+        co_observed=jax.tree.map(
+            lambda was: was & ~dead[:, None] & ~dead[None, :], joint.co_observed
+        ),
     )

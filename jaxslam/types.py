@@ -117,13 +117,8 @@ class Info(NamedTuple):
     """Σ log N(innovation; 0, S) over fused places."""
     exhausted: Any = ()
     """() bool: the search for the best association ended at its budget; or nothing."""
-    removed: Any = ()
-    """(N,) bool: slots whose landmark was removed, where the filter has a `Life`."""
     reduced: Any = ()
     """(N,) bool: slots whose landmark became a point, where the sensor's may."""
-    merged: Any = ()
-    """(2,) int: the slot of two landmarks merged into one and the slot given up, or -1, -1; where
-    the filter merges duplicates."""
     extra: dict[str, Any] | None = None
     """what one family, or one wrapper of a filter, alone says: its record by its name, as
     "particles" for a `filters.particles.particle_info.ParticleInfo`."""

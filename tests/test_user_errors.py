@@ -11,7 +11,8 @@ import jaxslam
 from jaxslam import association, charts, filters, life, linearize, motion, sensors, smoothing, team
 from jaxslam.filters import reporting
 from jaxslam.filters.map_management import merging
-from jaxslam.filters.map_management.closing import _OPTIONS, closing
+from jaxslam.filters.map_management.closing import closing
+from jaxslam.filters.map_management.loop_closure import loop_settings
 from jaxslam.protocols import Free, Sensor
 from jaxslam.types import Log, Scan
 from jaxslam.validation import check_models, checked_estimate, state_and_info
@@ -236,19 +237,21 @@ def test_localization_is_named_by_its_own_name():
 
 
 def test_a_compressed_filter_refuses_to_merge():
-    with pytest.raises(ValueError, match=r"^compressed_ekf_slam: does not take merge"):
-        FACTORIES["compressed_ekf_slam"](MOVE, SEES, merge=merging.duplicates(1.0))
+    with pytest.raises(ValueError, match=r"^compressed_ekf_slam: does not take make_room"):
+        FACTORIES["compressed_ekf_slam"](MOVE, SEES, make_room=life.recency())
+    with pytest.raises(ValueError, match=r"^merging: two landmarks of compressed_ekf_slam"):
+        merging.merging(FACTORIES["compressed_ekf_slam"](MOVE, SEES), 1.0)
 
 
 def test_closing_checks_its_options_when_it_is_made():
-    ekf = filters.ekf_slam(MOVE, SEES, 3, life=life.recency())
+    ekf = filters.ekf_slam(MOVE, SEES, 3)
     with pytest.raises(ValueError, match=r"^closing: expected options of close_loop, got leest"):
         closing(ekf, leest=3)
     with pytest.raises(ValueError, match="least"):
         closing(ekf, least=2)
     with pytest.raises(ValueError, match="drift"):
         closing(ekf, drift=1.0)
-    assert _OPTIONS["least"] == 5
+    assert loop_settings("closing", {}).least == 5
 
 
 def test_calibration_is_reached_from_the_package():

@@ -16,6 +16,7 @@ from jaxslam import association, charts, motion, plot, sensors
 from jaxslam.consistency.associations import identities
 from jaxslam.filters import ekf_slam
 from jaxslam.filters.map_management.closing import closing
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.simulation.scenarios import between_ranges
@@ -91,7 +92,7 @@ def methods(scenario):
         "known": make(),
         "nearest": make(associate=association.nearest(GATE)),
         "joint": make(associate=association.joint(0.99, budget=500)),
-        "cluster": closing(make(associate=near, life=recency()), **OPTIONS),
+        "cluster": closing(pruning(make(associate=near), recency()), **OPTIONS),
     }
 
 
@@ -133,11 +134,11 @@ def one(scenario, filter, key):
         "drift": (drift**2).sum(),
     }
     picture = trace.estimate.pose[:, :2], truth.pose[:, :2], trace.estimate.points[-1]
-    counts = (
-        jnp.stack([trace.final.closings, trace.final.merged, trace.final.doubles])
-        if hasattr(trace.final, "closings")
-        else jnp.zeros(3, int)
-    )
+    closings = (info.extra or {}).get("closing")
+    counts = jnp.zeros(3, int)
+    if closings is not None:
+        kinds = (closings.merged > 0, closings.merged, closings.duplicates)
+        counts = jnp.stack([each.sum() for each in kinds])
     return out, (*picture, trace.estimate.alive[-1], counts)
 
 
@@ -162,7 +163,7 @@ def measure(runs=RUNS, names=None):
             "drift [m]": np.sqrt(each["drift"].mean()),
             "closings": float(pictures[name][4][:, 0].mean()),
             "merged": float(pictures[name][4][:, 1].mean()),
-            "doubles": float(pictures[name][4][:, 2].mean()),
+            "duplicates": float(pictures[name][4][:, 2].mean()),
             "worst [m]": np.sqrt(each["error"].max()),
         }
     return table, pictures

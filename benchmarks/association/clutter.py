@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from jaxslam import association, motion, plot
 from jaxslam.filters import ekf_slam
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import existence
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.monte_carlo import monte_carlo
@@ -53,7 +54,7 @@ def measure(clutter, noise):
     life = existence(near(0.8 * REACH), patience=20)
     filters = {"known": ekf_slam(*parts)}
     for name, method in METHODS.items():
-        filters[name] = ekf_slam(*parts, associate=method, life=life)
+        filters[name] = pruning(ekf_slam(*parts, associate=method), life)
     campaign = monte_carlo(scenario, filters, RUNS, jax.random.key(0))
     out = {}
     for name, summary in campaign.filters.items():

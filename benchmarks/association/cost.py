@@ -17,7 +17,8 @@ from jaxslam.filters import ekf_slam
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
-from jaxslam.filters.map_management.merging import duplicates
+from jaxslam.filters.map_management.merging import merging
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
@@ -83,9 +84,8 @@ def compile_seconds():
 
     def loss(noise, log, method):
         sensor = dataclasses.replace(world.sensor, noise_cov=lambda z: noise)
-        filter = ekf_slam(
-            world.motion, sensor, COUNT, associate=METHODS[method], life=near, merge=duplicates(0.3)
-        )
+        plain = ekf_slam(world.motion, sensor, COUNT, associate=METHODS[method], make_room=near)
+        filter = pruning(merging(plain, 0.3), near)
         trace = run(filter, log, world.pose, world.pose_cov, jax.random.key(0))
         return trace.info.log_likelihood.sum(), trace
 

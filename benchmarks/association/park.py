@@ -37,6 +37,7 @@ import jaxslam
 from jaxslam import association, charts, datasets, motion, plot, sensors
 from jaxslam.calibration import calibrate
 from jaxslam.filters import ekf_slam
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Status
@@ -103,7 +104,7 @@ def calibration_of(data):
     """The four parameters, without identities."""
     log = jax.tree.map(jnp.asarray, data.log)
     near, local = association.nearest(GATE), recency(patience=PATIENCE)
-    filter = filter_of(LOCAL, near, *NARROW, life=local)
+    filter = pruning(filter_of(LOCAL, near, *NARROW), local)
 
     def info(p):
         own = log._replace(control=corrected(p, log.control))

@@ -37,7 +37,8 @@ PARTICLE_EVENTS = ("resampled", "underflow", "invalid", "injected", "capped")
 """Fields of `info.extra["particles"]`; each is counted where it is there."""
 
 EVENTS = ("removed", "merged", "reduced", "exhausted", *PARTICLE_EVENTS)
-"""These, and fields of `Info` that not every filter has; each is counted where it is there."""
+"""Fields of `Info`, or of the records in `Info.extra` that `_happened` knows, that not every filter
+has; each is counted where it is there."""
 
 LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
 """Probabilities of the coverage curves."""
@@ -146,13 +147,21 @@ def _counted(info: Info) -> dict[str, np.ndarray]:
     at = np.asarray(info.status).reshape(runs, -1) + np.arange(runs)[:, None] * len(Status)
     became = np.bincount(at.ravel(), minlength=runs * len(Status)).reshape(runs, -1)
     out = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
-    particles = (info.extra or {}).get("particles")
     for name in EVENTS:
-        value = getattr(particles if name in PARTICLE_EVENTS else info, name, None)
+        value = _happened(info, name)
         if value is not None and not isinstance(value, tuple):
-            happened = value[..., 0] >= 0 if name == "merged" else value
-            out[name] = happened.reshape(runs, -1).sum(axis=1)
+            out[name] = value.reshape(runs, -1).sum(axis=1)
     return out
+
+
+def _happened(info: Info, name: str) -> Any:
+    """How often one of `EVENTS` happened, (R, T, …); None where the filter has no such event."""
+    extra = info.extra or {}
+    if name == "removed":
+        return extra["pruning"].removed if "pruning" in extra else None
+    if name == "merged":
+        return extra["merging"].pair[..., 0] >= 0 if "merging" in extra else None
+    return getattr(extra.get("particles") if name in PARTICLE_EVENTS else info, name, None)
 
 
 def _covered(nees: Nees, dof: int) -> np.ndarray:

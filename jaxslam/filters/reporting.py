@@ -1,6 +1,6 @@
 """From gate to `Status` to `Info`: the one table that every filter reports by."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -175,3 +175,16 @@ def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
 def with_extra(info: Info, name: str, record: Any) -> Info:
     """The info with a record of what one family or wrapper alone says, by its name."""
     return info._replace(extra={**(info.extra or {}), name: record})
+
+
+class Pruned(NamedTuple):
+    """Which landmarks left the map; `info.extra["pruning"]`."""
+
+    removed: jax.Array
+    """(N,) bool: slots whose landmark was removed in this step"""
+
+
+def with_removed(info: Info, removed: jax.Array) -> Info:
+    """The info with slots removed (N,) bool, besides those that it names already."""
+    before = (info.extra or {}).get("pruning", Pruned(jnp.zeros_like(removed)))
+    return with_extra(info, "pruning", Pruned(before.removed | removed))

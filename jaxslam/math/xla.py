@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import jax
+import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
 _T = TypeVar("_T")
@@ -100,3 +101,15 @@ def where_any(
     Of a run whose own flag is not set, both must give the same numbers.
     """
     return cast(_U, jax.lax.cond(anywhere(flag), work, otherwise, state))
+
+
+def change_where(flag: jax.Array, change: Callable[[_T], _T], state: _T) -> _T:
+    """change(state) of a run whose flag () is set, else the state to the bit.
+
+    Computed only where the flag is set in any run of the batch.
+    """
+
+    def changed(state: _T) -> _T:
+        return cast(_T, jax.tree.map(lambda a, b: jnp.where(flag, a, b), change(state), state))
+
+    return where_any(flag, changed, lambda state: state, state)

@@ -8,6 +8,7 @@ import pytest
 from jaxslam import association, motion, run, sensors
 from jaxslam.calibration import calibrate
 from jaxslam.filters import ekf_slam
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
 from jaxslam.types import Info, Log, Scan
 
@@ -86,8 +87,8 @@ def test_odometry_is_calibrated_without_identities():
     logs = [drive(seed) for seed in range(4)]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *logs)
     model, sensor = motion.pose_increment(NOISE), sensors.relative_position(R)
-    near, life = association.nearest(11.8), recency(patience=20)
-    filter = ekf_slam(model, sensor, 20, associate=near, life=life, update="joint")
+    near, local = association.nearest(11.8), recency(patience=20)
+    filter = pruning(ekf_slam(model, sensor, 20, associate=near, update="joint"), local)
 
     def info(p):
         def one(log):

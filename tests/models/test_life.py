@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from jaxslam import association, life, motion, run, sensors, slots
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import eif_slam, ekf_slam
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life.existence import Existence
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan, Status
@@ -32,9 +33,19 @@ def log_of(seen):
     return Log(np.zeros((len(seen), 2)), scan)
 
 
+def managed(manager, capacity, **options):
+    """An EKF pruned by the manager, which makes room in it too if it does so at all."""
+    make_room = manager if manager.make_room else None
+    return pruning(ekf_slam(MOTION, SENSOR, capacity, make_room=make_room, **options), manager)
+
+
+def removed_in(trace):
+    return trace.info.extra["pruning"].removed
+
+
 @cache
 def driver(**options):
-    filter = ekf_slam(MOTION, SENSOR, 3, life=life.existence(always), **options)
+    filter = managed(life.existence(always), 3, **options)
 
     @jax.jit
     def go(log):
@@ -49,7 +60,7 @@ def test_a_landmark_that_is_not_seen_again_is_removed_when_its_odds_say_so():
     trace = jax.device_get(driver()(log_of(seen)))
     loss = math.log(0.1 / 0.9)
     misses = math.ceil(math.log(0.05 / 0.95) / loss)  # from even odds to a probability of 0.05
-    removed = np.asarray(trace.info.removed)
+    removed = removed_in(trace)
     assert list(np.argwhere(removed)[0]) == [misses, 1]
     assert removed.sum() == 1
     assert list(trace.estimate.tag[-1]) == [0, -1, -1]
@@ -87,19 +98,19 @@ def test_patience_is_for_the_provisional_alone():
     seen = np.full((12, 2), -1)
     seen[:3, 0], seen[0, 1] = 0, 1
     manager = life.existence(lambda pose, landmark: jnp.asarray(False), patience=5)
-    filter = ekf_slam(MOTION, SENSOR, 3, life=manager)
+    filter = managed(manager, 3)
     trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
-    assert list(np.argwhere(trace.info.removed)[0]) == [5, 1]
+    assert list(np.argwhere(removed_in(trace))[0]) == [5, 1]
     assert list(trace.estimate.alive[-1]) == [True, False, False]
 
 
 def test_a_landmark_known_too_badly_is_removed():
-    filter = ekf_slam(MOTION, SENSOR, 3, life=life.existence(always, spread=0.5))
+    filter = managed(life.existence(always, spread=0.5), 3)
     seen = np.array([[0, 1]])
     exact = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
-    assert not exact.info.removed.any()
+    assert not removed_in(exact).any()
     lost = run(filter, log_of(seen), np.zeros(3), np.eye(3), KEY)
-    np.testing.assert_array_equal(lost.info.removed[0], [True, True, False])
+    np.testing.assert_array_equal(removed_in(lost)[0], [True, True, False])
     np.testing.assert_array_equal(lost.final.cov[3:, 3:], np.eye(6))
 
 
@@ -108,11 +119,11 @@ def test_a_full_map_refuses_or_gives_up_the_least_likely(replace):
     # 0 is confirmed, 1 provisional and missed once, 2 comes into a map of two.
     seen = np.array([[0, 1], [0, -1], [0, 2]])
     never = life.existence(always, remove=0.01, replace=replace)
-    filter = ekf_slam(MOTION, SENSOR, 2, life=never)
+    filter = managed(never, 2)
     trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
     if replace:
         assert trace.info.status[2, 1] == Status.BORN
-        np.testing.assert_array_equal(trace.info.removed[2], [False, True])
+        np.testing.assert_array_equal(removed_in(trace)[2], [False, True])
         assert list(trace.estimate.tag[-1]) == [0, 2]
         assert int(trace.final.life.seen[1]) == 1
     else:
@@ -122,10 +133,10 @@ def test_a_full_map_refuses_or_gives_up_the_least_likely(replace):
 
 def test_a_full_map_of_confirmed_landmarks_refuses_in_any_case():
     seen = np.array([[0], [0], [0], [1]])
-    filter = ekf_slam(MOTION, SENSOR, 1, life=life.existence(always, replace=True))
+    filter = managed(life.existence(always, replace=True), 1)
     trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
     assert trace.info.status[3, 0] == Status.OVERFLOW
-    assert not trace.info.removed.any()
+    assert not removed_in(trace).any()
 
 
 def test_gradients_pass_through_births_and_deaths():
@@ -136,10 +147,10 @@ def test_gradients_pass_through_births_and_deaths():
     def loss(sigma):
         sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
         method = association.nearest(9.0, 25.0)
-        filter = ekf_slam(MOTION, sensor, 3, life=life.existence(always), associate=method)
+        filter = pruning(ekf_slam(MOTION, sensor, 3, associate=method), life.existence(always))
         trace = run(filter, log, np.zeros(3), np.eye(3) * 1e-4, KEY)
         likely = trace.info.log_likelihood.sum()
-        return likely + (trace.estimate.points[-1] ** 2).sum(), trace.info.removed
+        return likely + (trace.estimate.points[-1] ** 2).sum(), removed_in(trace)
 
     both = jax.jit(jax.value_and_grad(loss, has_aux=True))
     (_, removed), slope = both(0.05)
@@ -155,14 +166,14 @@ def test_batches_and_float32():
     batch = jax.vmap(driver())(logs)
     for i in range(2):
         alone = driver()(jax.tree.map(lambda x, i=i: x[i], logs))
-        np.testing.assert_array_equal(batch.info.removed[i], alone.info.removed)
+        np.testing.assert_array_equal(removed_in(batch)[i], removed_in(alone))
         np.testing.assert_array_equal(batch.estimate.tag[i], alone.estimate.tag)
     small = jax.tree.map(
         lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, log_of(seen[0])
     )
     trace = driver()(small)
     assert trace.probe.log_odds.dtype == np.float32
-    np.testing.assert_array_equal(trace.info.removed, batch.info.removed[0])
+    np.testing.assert_array_equal(removed_in(trace), removed_in(batch)[0])
 
 
 def test_a_root_does_not_change_because_another_run_loses_a_landmark():
@@ -172,13 +183,13 @@ def test_a_root_does_not_change_because_another_run_loses_a_landmark():
     go = driver(covariance="square_root")
     beside = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), one, other))
     twice = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), other, other))
-    assert beside.info.removed[0].any()
+    assert removed_in(beside)[0].any()
     np.testing.assert_array_equal(beside.final.cov[1], twice.final.cov[1])
 
 
 def test_nothing_ever_seen():
     trace = driver()(log_of(np.full((12, 2), -1)))
-    assert not trace.info.removed.any()
+    assert not removed_in(trace).any()
     assert not trace.estimate.alive.any()
 
 
@@ -205,7 +216,7 @@ def test_a_landmark_that_the_scan_measured_stays_in_a_full_map():
     manager = life.existence(lambda pose, point: jnp.asarray(False), replace=True)
     trace = jax.jit(
         lambda log: run(
-            ekf_slam(MOTION, SENSOR, 2, life=manager),
+            managed(manager, 2),
             log,
             jnp.zeros(3),
             jnp.zeros((3, 3)),
@@ -213,16 +224,38 @@ def test_a_landmark_that_the_scan_measured_stays_in_a_full_map():
         )
     )(log)
     assert (np.asarray(trace.info.status[1:, 0]) == Status.FUSED).all()
-    np.testing.assert_array_equal(trace.info.removed[1], [False, True])
+    np.testing.assert_array_equal(removed_in(trace)[1], [False, True])
     np.testing.assert_array_equal(trace.estimate.tag[-1], [0, 2])
-    assert not trace.info.removed[2:].any()
+    assert not removed_in(trace)[2:].any()
 
 
 def test_what_is_no_manager_is_refused():
     with pytest.raises(ValueError, match="function"):
         life.existence(None)
-    with pytest.raises(ValueError, match="Life"):
-        ekf_slam(MOTION, SENSOR, 3, life=life.existence)
+    plain, manager = ekf_slam(MOTION, SENSOR, 3), life.existence(always)
+    with pytest.raises(ValueError, match="pruning: expected life to be a Life"):
+        pruning(plain, life.existence)
+    with pytest.raises(ValueError, match=r"pruning: the state of eif_slam is no slots.Joint"):
+        pruning(eif_slam(MOTION, SENSOR, 3), manager).init(np.zeros(3), np.eye(3))
+    for wrong in (life.existence, manager):
+        with pytest.raises(ValueError, match="ekf_slam: expected make_room to be a Life that"):
+            ekf_slam(MOTION, SENSOR, 3, make_room=wrong)
+
+
+def test_making_room_takes_a_filter_and_a_manager_that_know_of_each_other():
+    manager = life.existence(always, replace=True)
+    forgetful, ignorant = (
+        ekf_slam(MOTION, SENSOR, 3, make_room=manager),
+        ekf_slam(MOTION, SENSOR, 3),
+    )
+    scan = jax.tree.map(lambda leaf: leaf[0], log_of([[0, 1]]).scan)
+    for filter, message in (
+        (forgetful, "ekf_slam: make_room=existence goes by the memory that pruning keeps"),
+        (pruning(ignorant, manager), "pruning: existence makes room in a full map"),
+    ):
+        state = filter.init(np.zeros(3), np.eye(3))
+        with pytest.raises(ValueError, match=message):
+            jax.eval_shape(filter.update, state, scan, KEY)
 
 
 @pytest.mark.parametrize(

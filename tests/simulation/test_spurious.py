@@ -12,6 +12,7 @@ import worlds
 from jaxslam import association, life, monte_carlo, sensors
 from jaxslam.consistency.associations import associations, identities
 from jaxslam.filters import ekf_slam
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Estimate, Info, Scan, Status, Trace
 
@@ -138,7 +139,7 @@ def ruined():
     filters = {
         "trusting": ekf_slam(*parts),
         "careful": ekf_slam(*parts, associate=METHODS["nearest"]),
-        "with a life": ekf_slam(*parts, life=manager),
+        "with a life": pruning(ekf_slam(*parts), manager),
     }
     return monte_carlo(world, filters, 6, jax.random.key(0)).filters
 

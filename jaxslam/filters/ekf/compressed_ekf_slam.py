@@ -60,7 +60,7 @@ def compressed_ekf_slam(
         area: landmarks K that are worked on; at least the places of a scan.
         options: those of `ekf_slam` in the Euclidean chart, whose landmarks stand still, with a
             linearizer that remembers nothing (at_estimate, unscented), but for associate, watch,
-            life, merge and the covariance "square_root".
+            make_room and the covariance "square_root".
     Raises:
         ValueError: as `ekf_slam`; on an area below 1, an option that is not for this filter; and,
             when a scan has more places than the area, from `update`.
@@ -68,7 +68,7 @@ def compressed_ekf_slam(
     validation.check_models("compressed_ekf_slam", motion, sensor)
     check_count("compressed_ekf_slam: capacity", capacity)
     check_count("compressed_ekf_slam: area", area)
-    for name in ("associate", "watch", "life", "merge"):
+    for name in ("associate", "watch", "make_room"):
         if options.get(name):
             raise ValueError(f"compressed_ekf_slam: does not take {name}")
     check_covariance("compressed_ekf_slam", options.get("covariance", "plain"), ("plain", "joseph"))

@@ -10,19 +10,18 @@ from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf import to_points
 from jaxslam.filters.ekf.beliefs import moments
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import turns_of, update_by_scan, without
+from jaxslam.filters.ekf.scan import turns_of, update_by_scan
 from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
     Update,
+    check_make_room,
     check_numbers,
     check_settings,
 )
-from jaxslam.filters.map_management.merging import Duplicates, find_duplicate, told_apart
-from jaxslam.filters.map_management.merging import merge as merge_pair
+from jaxslam.filters.reporting import with_removed
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
-from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
@@ -43,8 +42,7 @@ def ekf_slam(
     covariance: Covariance = "plain",
     births: int | None = None,
     watch: bool = False,
-    life: Life | None = None,
-    merge: Duplicates | None = None,
+    make_room: Life | None = None,
 ) -> Filter:
     """Extended Kalman filter SLAM in a map of fixed capacity (Solà 2).
 
@@ -73,16 +71,17 @@ def ekf_slam(
             as float64 does in P; the same filter, dearer (the prediction is O(N³)).
         births: at most so many new landmarks a scan, the rest `Status.DEFERRED`; the guide starts
             one. Default no limit.
-        life: which landmarks stay in the map (`jaxslam.life`); default all.
-        merge: take two landmarks for one (`filters.merging.duplicates`); default never.
+        make_room: removes landmarks from a full map before new ones enter it, by the memory that
+            `map_management.pruning` keeps of the same `Life`: for `pruning(filter, make_room)`
+            alone. Default none is removed.
         watch: keep a `slots.Watch` in the state, which campaigns report.
     Raises:
         ValueError: on models, charts, linearizers or associations that are none or of wrong sizes
             (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
             update or covariance, a chart or linearizer that does not fit the sensor's landmarks or
-            one another, a life that is none, a square root in a chart that keeps the last motion
-            apart, several iterations of a statistical linearizer, or a linearizer of landmarks for
-            a suite with an absolute sensor.
+            one another, a make_room that makes none, a square root in a chart that keeps the last
+            motion apart, several iterations of a statistical linearizer, or a linearizer of
+            landmarks for a suite with an absolute sensor; from `update`, on a make_room without `pruning`.
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
@@ -97,34 +96,32 @@ def ekf_slam(
         iterations=iterations,
         covariance=covariance,
         births=births,
-        life=life,
+        make_room=make_room,
     )
     check_settings(settings)
-    check_map_manager(sensor, life, merge)
+    check_make_room(make_room)
     chart, square_root = settings.chart, settings.square_root
     turns = turns_of(sensor, settings)
     places = sensor.places if isinstance(sensor, Suite) else ()
 
     def init(pose: jax.Array, pose_cov: jax.Array) -> Joint:
-        joint = initial_state(pose, pose_cov, capacity, settings, watch=watch)
-        if merge is not None:
-            joint = joint._replace(apart=jnp.zeros((capacity, capacity), bool))
-        return joint if life is None else joint._replace(life=life.init(pose, joint.landmarks))
+        return initial_state(pose, pose_cov, capacity, settings, watch=watch)
 
     def predict(joint: Joint, u: jax.Array, key: jax.Array) -> Joint:
         return propagate(joint, u, motion, settings)
 
     def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
+        if make_room is not None and joint.life is None:
+            raise ValueError(
+                f"ekf_slam: make_room={make_room.name} goes by the memory that pruning keeps: "
+                "pruning(ekf_slam(…, make_room=life), life)"
+            )
         joint, info, evicted = update_by_scan(joint, scan, turns)
-        if merge is not None:
-            joint, info = with_duplicates_merged(joint, info, merge, places, settings)
+        if make_room is not None:
+            info = with_removed(info, evicted)
         if sensor.reduced is not None:
             joint, which = to_points.reduced_where_ready(joint, sensor, square_root)
             info = info._replace(reduced=which)
-        if life is not None:
-            memory, dead = life.after(joint, info, lambda: estimate(joint))
-            joint = without(joint._replace(life=memory), dead, square_root=square_root)
-            info = info._replace(removed=dead | evicted)
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:
@@ -142,6 +139,7 @@ def ekf_slam(
         chart=chart,
         places=places,
         square_root=square_root,
+        landmark=sensor.landmark,
     )
 
 
@@ -174,40 +172,3 @@ def initial_state(
     if sensor.reduced is not None:
         joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
     return joint
-
-
-def with_duplicates_merged(
-    joint: Joint, info: Info, rule: Duplicates, places: tuple[int, ...], settings: EkfSettings
-) -> tuple[Joint, Info]:
-    """The map after the merge of the two landmarks that are most likely one, where there are."""
-    chart, square_root = settings.chart, settings.square_root
-    joint = joint._replace(apart=told_apart(joint, info, places))
-    kept, gone, same = find_duplicate(joint, chart, rule, square_root=square_root)
-
-    def merged(joint: Joint) -> Joint:
-        one = merge_pair(joint, chart, kept, gone, square_root=square_root)
-        both: Joint = jax.tree.map(lambda a, b: jnp.where(same, a, b), one, joint)
-        return both
-
-    joint = where_any(same, merged, lambda joint: joint, joint)
-    pair = jnp.where(same, jnp.stack([kept, gone]), -1).astype(jnp.int32)
-    return joint, info._replace(merged=pair)
-
-
-def check_map_manager(sensor: Sensor, life: Life | None, merge: Duplicates | None) -> None:
-    """What decides which landmarks stay is of the right kind, and can be applied."""
-    if life is not None and not isinstance(life, Life):
-        raise ValueError(
-            f"ekf_slam: expected life to be a Life, as of life.existence, got {life!r}"
-        )
-    if merge is None:
-        return
-    if not isinstance(merge, Duplicates):
-        raise ValueError(
-            f"ekf_slam: expected merge to be a Duplicates, as of merging.duplicates, got {merge!r}"
-        )
-    if len(sensor.landmark) < 2 or "rho [1/m]" in sensor.landmark:
-        raise ValueError(
-            f"ekf_slam: two landmarks of the sensor {sensor.name} are not one where their "
-            "parameters agree, so they cannot be merged"
-        )

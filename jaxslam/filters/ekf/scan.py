@@ -164,11 +164,11 @@ def _with_room(
     settings: EkfSettings,
 ) -> tuple[Joint, Bool[Array, "N"]]:
     """The map without the landmarks that `Life.make_room` gives up for new ones, and which."""
-    if settings.life is None or settings.life.make_room is None:
+    if settings.make_room is None or settings.make_room.make_room is None:
         return joint, jnp.zeros_like(joint.alive)
     needed = wanted.sum() - (~joint.alive).sum()
     measured = slots.concerned(slot, used, len(joint.alive))
-    evicted = settings.life.make_room(joint, needed, measured)
+    evicted = settings.make_room.make_room(joint, needed, measured)
     return without(joint, evicted, square_root=settings.square_root), evicted
 
 

@@ -37,7 +37,7 @@ class EkfSettings:
     covariance: Covariance = "plain"
     births: int | None = None
     """new landmarks a scan, at most; None for no limit, 0 for none at all"""
-    life: Life | None = None
+    make_room: Life | None = None
     """which landmarks make room for new ones"""
     absolute: bool = False
     """every valid measurement corrects the robot, whatever its tag"""
@@ -125,4 +125,13 @@ def check_settings(settings: EkfSettings) -> None:
         raise ValueError(
             f"ekf_slam: the chart {chart.name} keeps the last motion apart, which has no square "
             "root here"
+        )
+
+
+def check_make_room(make_room: Life | None) -> None:
+    """What makes room in a full map is a `Life` that does so."""
+    if make_room is not None and (not isinstance(make_room, Life) or make_room.make_room is None):
+        raise ValueError(
+            "ekf_slam: expected make_room to be a Life that makes room, as of "
+            f"life.existence(…, replace=True), got {make_room!r}"
         )

@@ -1,78 +1,103 @@
 """Two landmarks of a map that are one: found by a joint chi-square test, merged by a constraint."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam import slots, validation
 from jaxslam.filters.ekf.coordinates import retracted
+from jaxslam.filters.map_management.wrapping import joint_of
+from jaxslam.filters.reporting import with_extra
 from jaxslam.math import linalg
+from jaxslam.math.gaussians import gaussian_terms
 from jaxslam.math.linalg import is_concrete
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Chart
+from jaxslam.math.xla import change_where
+from jaxslam.protocols import Chart, Filter
 from jaxslam.slots import Joint
-from jaxslam.types import Info, Status
-
-Array = jax.Array
+from jaxslam.types import Info, Scan, Status
 
 
-class Duplicates(NamedTuple):
-    """Which two landmarks `ekf_slam(merge=…)` takes for one; see `duplicates`."""
+class Merged(NamedTuple):
+    """Which landmarks became one; `info.extra["merging"]`."""
 
-    reach: float
-    probability: float
+    pair: Int[Array, "2"]
+    """the slot of the landmark kept and the slot freed, or -1, -1 where none were merged"""
 
 
-def duplicates(reach: float, probability: float = 0.95) -> Duplicates:
-    """After each scan, merge the pair of landmarks that is most likely one, if it may be one.
+def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
+    """The filter, which after each scan merges the two landmarks that are most likely duplicates.
 
-    It may where the two are within reach, the joint test passes at this probability, and no scan
-    has measured both: a landmark gives one measurement a scan.
+    Two landmarks may be duplicates if they are within reach, the joint test of their difference
+    passes (`closest_pair`), and no scan of one sensor measured both: a landmark gives a sensor one
+    measurement a scan. The pairs that were measured together are `Joint.co_observed`;
+    `info.extra["merging"]` is a `Merged`.
 
     Args:
-        reach: [m] true landmarks do not stand as near to one another. A test alone cannot tell two
-            landmarks from one where their difference is known worse than that.
+        filter: whose state is a `slots.Joint`.
+        reach: [m] no two true landmarks stand as near to one another. The test alone cannot tell
+            two landmarks from one where their difference is known worse than that.
         probability: of merging two that are one, by the test.
     Raises:
-        ValueError: on a reach not above 0 or a probability outside 0 to 1.
+        ValueError: on a reach not above 0, a probability outside 0 to 1, landmarks that may be one
+            although their parameters differ (an inverse depth); from `init`, on another state.
     """
     if not reach > 0:
-        raise ValueError(f"duplicates: expected a reach above 0, got {reach}")
+        raise ValueError(f"merging: expected a reach above 0, got {reach}")
     if not 0 < probability < 1:
-        raise ValueError(f"duplicates: expected 0 < probability < 1, got {probability}")
-    return Duplicates(reach, probability)
+        raise ValueError(f"merging: expected 0 < probability < 1, got {probability}")
+    if len(filter.landmark) < 2 or "rho [1/m]" in filter.landmark:
+        raise ValueError(
+            f"merging: two landmarks of {filter.name} with parameters {filter.landmark} are not "
+            "one where their parameters agree, so they cannot be merged"
+        )
+    gate = chi2_quantile(probability, len(filter.landmark))
+
+    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        joint = joint_of("merging", filter, filter.init(pose, pose_cov))
+        capacity = joint.alive.shape[0]
+        return joint._replace(co_observed=jnp.zeros((capacity, capacity), bool))
+
+    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        found = filter.update(joint, scan, key)
+        joint, info = validation.state_and_info(f"merging: {filter.name}", joint, scan, found)
+        together = co_observed(joint, info, filter.places)
+        joint = joint._replace(co_observed=together)
+        form = {"square_root": filter.square_root}
+        kept, freed, distance = closest_pair(joint, filter.chart, reach, ~together, **form)
+        same = distance <= gate
+        joint = change_where(
+            same, lambda joint: merge(joint, filter.chart, kept, freed, **form), joint
+        )
+        return joint, with_extra(info, "merging", merged_pair(same, kept, freed))
+
+    name = f"merging {filter.name}"
+    return dataclasses.replace(filter, name=name, init=init, update=update)
 
 
-def told_apart(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Array:
-    """(N, N) bool: which landmarks one sensor measured together, in this scan or one before.
+def merged_pair(same: Bool[Array, ""], kept: Int[Array, ""], freed: Int[Array, ""]) -> Merged:
+    """The record of two landmarks that were merged, if they were the same."""
+    return Merged(jnp.where(same, jnp.stack([kept, freed]), -1).astype(jnp.int32))
+
+
+def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[Array, "N N"]:
+    """Which pairs of landmarks one sensor measured together, in this scan or one before.
 
     places: how many of a scan each sensor has; () where all are of one.
     """
     capacity = joint.alive.shape[0]
-    both: Array = joint.apart
-    at = 0
-    for count in places or info.status.shape[-1:]:
-        both = both | _together(info.status[at : at + count], info.slot[at : at + count], capacity)
-        at += count
-    return both
-
-
-def _together(status: Array, slot: Array, capacity: int) -> Array:
-    """(N, N) bool: both slots were corrected or born."""
-    seen = (status == Status.FUSED) | (status == Status.BORN)
-    here = slots.concerned(slot, seen, capacity)
-    return here[:, None] & here[None, :]
-
-
-def find_duplicate(
-    joint: Joint, chart: Chart, rule: Duplicates, *, square_root: bool = False
-) -> tuple[Array, Array, Array]:
-    """Slots i < j of two landmarks that are taken for one, and whether there are such."""
-    i, j, distance = closest_pair(
-        joint, chart, rule.reach, allowed=~joint.apart, square_root=square_root
-    )
-    return i, j, distance <= chi2_quantile(rule.probability, joint.landmarks.shape[1])
+    before = joint.co_observed
+    pairs = jnp.zeros((capacity, capacity), bool) if before is None else before
+    measured = (info.status == Status.FUSED) | (info.status == Status.BORN)
+    end = 0
+    for count in places or info.status.shape:
+        begin, end = end, end + count
+        here = slots.concerned(info.slot[begin:end], measured[begin:end], capacity)
+        pairs = pairs | (here[:, None] & here[None, :])
+    return pairs
 
 
 def closest_pair(
@@ -108,24 +133,25 @@ def closest_pair(
     blocks = whole[3:, 3:].reshape(capacity, size, capacity, size)
     # Of coordinates: l_i = A_i dx + B_i dl_i, so cov(l_i, l_j) has four terms.
     with_robot = jnp.einsum("nij,jmk,mlk->nmil", by_robot, cross, by_landmark)
-    apart = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)
-    cov = apart + with_robot + with_robot.transpose(1, 0, 3, 2)
+    own_errors = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)
+    cov = own_errors + with_robot + with_robot.transpose(1, 0, 3, 2)
     cov = cov + jnp.einsum("nij,jk,mlk->nmil", by_robot, robot, by_robot)
     own = cov[jnp.arange(capacity), jnp.arange(capacity)]
-    spread = own[:, None] + own[None, :] - cov - cov.transpose(1, 0, 2, 3)
-
-    def distance(delta: Array, cov: Array) -> Array:
-        factor, positive = linalg.cholesky(cov)
-        return jnp.where(positive, (linalg.solve_lower(factor, delta) ** 2).sum(), jnp.inf)
-
+    delta_covs = own[:, None] + own[None, :] - cov - cov.transpose(1, 0, 2, 3)
     pairs = joint.alive[:, None] & joint.alive[None, :]
     pairs = pairs & (jnp.arange(capacity)[:, None] < jnp.arange(capacity)[None, :])
     pairs = pairs & ((delta**2).sum(axis=2) <= reach**2)
     if allowed is not None:
         pairs = pairs & allowed
-    each = jnp.where(pairs, jax.vmap(jax.vmap(distance))(delta, spread), jnp.inf)
+    each = jnp.where(pairs, jax.vmap(jax.vmap(squared_distance))(delta, delta_covs), jnp.inf)
     best = jnp.argmin(each)
     return best // capacity, best % capacity, each.reshape(-1)[best]
+
+
+def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Float[Array, ""]:
+    """errorᵀ cov⁻¹ error; infinite where the covariance is not positive definite."""
+    terms = gaussian_terms(error, cov)
+    return jnp.where(terms.positive, terms.distance, jnp.inf)
 
 
 def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False) -> Joint:
@@ -155,15 +181,15 @@ def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool =
     cov = rows - linalg.gram(v, v)
     if square_root:
         cov = linalg.root_psd(cov)
-    apart = joint.apart
-    if not isinstance(apart, tuple):  # what was measured together with either
-        either = ok & (apart[i] | apart[j])
-        apart = apart.at[i].set(apart[i] | either).at[:, i].set(apart[i] | either)
+    together = joint.co_observed
+    if together is not None:  # of the landmark kept: what was measured together with either
+        with_one = together[i] | (ok & (together[i] | together[j]))
+        together = together.at[i].set(with_one).at[:, i].set(with_one)
     merged = joint._replace(
         pose=pose,
         landmarks=landmarks,
         cov=jnp.where(ok, cov, joint.cov),
-        apart=apart,
+        co_observed=together,
     )
     return slots.remove(
         merged, ok & (jnp.arange(joint.alive.shape[0]) == j), square_root=square_root

@@ -1,37 +1,32 @@
-"""Pairs of cluster points against pairs of map points: `filters.matching`'s hypotheses."""
+"""Hypotheses of a geometric match: a pair of cluster points is a pair of map points."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.association.gates import mutual
 
-Array = jax.Array
+
+class PointSets(NamedTuple):
+    """M cluster points z and N map points m, with their joint covariance."""
+
+    cluster: Float[Array, "M 2"]
+    map: Float[Array, "N 2"]
+    cluster_cov: Float[Array, "M 2 M 2"]
+    map_cov: Float[Array, "N 2 N 2"]
+    cross_cov: Float[Array, "M 2 N 2"]
+    """of cluster with map"""
+    allowed: Bool[Array, "M N"]
+    """which map points a cluster point may be"""
 
 
-class Points(NamedTuple):
-    """M cluster points and N map points with their joint covariance."""
+def longest_pairs(points: PointSets, count: int) -> tuple[Int[Array, "P"], Int[Array, "P"]]:
+    """Ends a, b of long pairs of cluster points, at most `count`, each point's share limited.
 
-    cluster: Array
-    """(M, 2)"""
-    map: Array
-    """(N, 2)"""
-    own: Array
-    """(M, 2, M, 2)"""
-    among: Array
-    """(N, 2, N, 2)"""
-    shared: Array
-    """(M, 2, N, 2) of cluster with map"""
-    allowed: Array
-    """(M, N) bool: pairs that may be"""
-
-
-def longest_pairs(points: Points, count: int) -> tuple[Array, Array]:
-    """Ends a, b (P,) of long pairs of cluster points, each point's share limited.
-
-    A spurious point far out would be an end of the longest pairs all. So each time a point is used
-    halves the length of its further pairs.
+    A spurious point far out would be an end of all the longest pairs. So each use of a point halves
+    the length of its further pairs.
     """
     m = points.cluster.shape[0]
     there = points.allowed.any(axis=1)
@@ -52,100 +47,158 @@ def longest_pairs(points: Points, count: int) -> tuple[Array, Array]:
     return jax.lax.scan(take, start, None, length=count)[1]
 
 
-def agreements(points: Points, a: Array, b: Array, gate: float) -> tuple[Array, Array]:
-    """Of all map pairs (j, l): (s - m)²/var(s - m) (N, N), and whether it is within the gate."""
+def equal_lengths(
+    points: PointSets, a: Int[Array, ""], b: Int[Array, ""], gate: float
+) -> tuple[Float[Array, "N N"], Bool[Array, "N N"]]:
+    """Test all map pairs (j, k) for the length of the cluster pair (a, b).
+
+    With s = |z_b - z_a| and r = |m_k - m_j|: (s - r)²/var(s - r), and whether it is within the gate
+    of a pair that may be and has a direction.
+    """
     eps = jnp.finfo(points.map.dtype).eps
-    here = points.cluster[b] - points.cluster[a]
-    s = jnp.sqrt((here**2).sum() + jnp.finfo(here.dtype).tiny)
-    u = here / s
-    there = points.map[None, :] - points.map[:, None]
-    length = jnp.sqrt((there**2).sum(axis=2) + jnp.finfo(there.dtype).tiny)
-    v = there / length[:, :, None]
-    n = length.shape[0]
-    every = jnp.arange(n)
-    own = points.among[every, :, every]
-    mixed = points.among.transpose(0, 2, 1, 3)
-    spread = own[:, None] + own[None, :] - mixed - mixed.transpose(0, 1, 3, 2)
-    variance = jnp.einsum("jlx,jlxy,jly->jl", v, spread, v)
-    at = points.own[jnp.stack([a, b])][:, :, jnp.stack([a, b])]
-    near = at[0, :, 0] + at[1, :, 1] - at[0, :, 1] - at[1, :, 0]
-    cross = u @ (points.shared[b] - points.shared[a]).reshape(2, -1)
+    n = points.map.shape[0]
+    every, ends = jnp.arange(n), jnp.stack([a, b])
+    s, u = _length_and_direction(points.cluster[b] - points.cluster[a])
+    r, v = _length_and_direction(points.map[None, :] - points.map[:, None])
+    own = points.map_cov[every, :, every]
+    map_covs = difference_covs(own, own, points.map_cov.transpose(0, 2, 1, 3))
+    variance = jnp.einsum("jlx,jlxy,jly->jl", v, map_covs, v)
+    blocks = points.cluster_cov[ends][:, :, ends]
+    cluster_cov = blocks[0, :, 0] + blocks[1, :, 1] - blocks[0, :, 1] - blocks[1, :, 0]
+    cross = u @ (points.cross_cov[b] - points.cross_cov[a]).reshape(2, -1)
     cross = cross.reshape(n, 2)
     both = (v * (cross[None, :] - cross[:, None])).sum(axis=2)
     # Exact points may differ by what rounding leaves of their distance.
-    variance = variance + u @ near @ u - 2 * both + (8 * eps * (s + length)) ** 2
-    test = (s - length) ** 2 / jnp.maximum(variance, jnp.finfo(s.dtype).tiny)
+    variance = variance + u @ cluster_cov @ u - 2 * both + (8 * eps * (s + r)) ** 2
+    test = (s - r) ** 2 / jnp.maximum(variance, jnp.finfo(s.dtype).tiny)
     possible = points.allowed[a][:, None] & points.allowed[b][None, :]
     possible = possible & (every[:, None] != every[None, :]) & (a != b)
     # A pair no longer than its own uncertainty has no direction.
-    directed = (s**2 > 9 * u @ near @ u) & (s > 0)
+    directed = (s**2 > 9 * u @ cluster_cov @ u) & (s > 0)
     return test, possible & directed & (variance > 0) & (test <= gate)
 
 
-def scored(
-    points: Points, a: Array, b: Array, j: Array, k: Array, test: Array, gate: float
-) -> tuple[Array, Array, Array]:
-    """Slots (M,) that cluster points have if a is j and b is k, how many, and Σ d²; see `match`."""
-    m, n = points.allowed.shape
-    here, there = points.cluster[b] - points.cluster[a], points.map[k] - points.map[j]
-    tiny = jnp.finfo(here.dtype).tiny
-    s, length = jnp.sqrt((here**2).sum() + tiny), jnp.sqrt((there**2).sum() + tiny)
-    u, v = here / s, there / length
-    c, d = (u * v).sum(), u[0] * v[1] - u[1] * v[0]
-    rotation = jnp.stack([jnp.stack([c, -d]), jnp.stack([d, c])])
-    middle = 0.5 * (points.cluster[a] + points.cluster[b])
-    arm = (points.cluster - middle[None, :]) @ rotation.T
-    placed = arm + 0.5 * (points.map[j] + points.map[k])[None, :]
-    # dθ = v⊥·(δm_k - δm_j)/|m| - v⊥·R(δz_b - δz_a)/|s|, and T z_i moves by arm⊥ dθ.
-    swing = across(arm)[:, :, None] * across(v)[None, None, :]
-    half = 0.5 * jnp.eye(2, dtype=arm.dtype)[None]
-    by_map = jnp.stack([half - swing / length, half + swing / length], axis=1)
-    by_ends = jnp.stack([-half + swing / s, -half - swing / s], axis=1) @ rotation
-    ends, slots = jnp.stack([a, b]), jnp.stack([j, k])
-    # Errors of T z_i are G of those of z_a, z_b, m_j, m_k, plus R of its own.
-    g = jnp.concatenate([by_ends, by_map], axis=1).transpose(0, 2, 1, 3).reshape(m, 2, 8)
-    own_ends = points.own[ends].reshape(4, m, 2)
-    own_map = points.shared[:, :, slots].reshape(m, 2, 4).transpose(2, 0, 1)
-    with_own = jnp.concatenate([own_ends, own_map]).transpose(1, 0, 2)  # (m, 8, 2)
-    mixed = points.shared[ends][:, :, slots].reshape(4, 4)
-    top = jnp.concatenate([points.own[ends][:, :, ends].reshape(4, 4), mixed], axis=1)
-    low = jnp.concatenate([mixed.T, points.among[slots][:, :, slots].reshape(4, 4)], axis=1)
-    base = jnp.concatenate([top, low])
-    every = jnp.arange(m)
-    alone = rotation @ points.own[every, :, every] @ rotation.T
-    crossed = g @ with_own @ rotation.T
-    cov = g @ base @ g.transpose(0, 2, 1) + alone + crossed + crossed.transpose(0, 2, 1)
-    rows = jnp.concatenate(
-        [points.shared[ends].reshape(4, n * 2), points.among[slots].reshape(4, -1)]
-    )
-    with_map = (g.reshape(2 * m, 8) @ rows).reshape(m, 2, n, 2)
-    with_map = with_map + jnp.einsum("xy,iynw->ixnw", rotation, points.shared)
-    with_map = with_map.transpose(0, 2, 1, 3)
-    at = jnp.arange(n)
-    spread = cov[:, None] + points.among[at, :, at][None] - with_map
-    spread = spread - with_map.transpose(0, 1, 3, 2)
-    distance, regular = squared(placed[:, None] - points.map[None, :], spread)
-    free = (every != a) & (every != b)
-    left = (at != j) & (at != k)
+def extend_pair(
+    points: PointSets,
+    ends: Int[Array, "2"],
+    slots: Int[Array, "2"],
+    test: Float[Array, ""],
+    gate: float,
+) -> tuple[Int[Array, "M"], Int[Array, ""], Float[Array, ""]]:
+    """The map points of all cluster points, if those of the ends a, b are the slots j, k.
+
+    Each other cluster point is the map point that is nearest to T z_i, and to which it is the
+    nearest, where d² of δ = T z_i - m is within the gate.
+
+    Args:
+        ends, slots: a, b and j, k.
+        test: () of the lengths, as of `equal_lengths`; infinite where they do not agree.
+        gate: of d², χ² of two degrees of freedom.
+    Returns:
+        The map point (M,) of each cluster point, -1 for none; how many; Σ d² with the test.
+    """
+    frame = frame_of_pair(points, ends, slots)
+    covs, cross_covs = moved_covs(points, ends, slots, frame)
+    every, at = jnp.arange(len(points.cluster)), jnp.arange(len(points.map))
+    error_covs = difference_covs(covs, points.map_cov[at, :, at], cross_covs)
+    error = frame.moved[:, None] - points.map[None, :]
+    distance, regular = squared_distances(error, error_covs)
+    free = (every != ends[0]) & (every != ends[1])
+    left = (at != slots[0]) & (at != slots[1])
     fits = points.allowed & regular & (distance <= gate) & free[:, None] & left[None, :]
     slot = mutual(distance, fits)
-    sum_of = jnp.where(slot >= 0, distance[every, jnp.maximum(slot, 0)], 0.0).sum()
-    slot = slot.at[a].set(j.astype(jnp.int32)).at[b].set(k.astype(jnp.int32))
+    total = jnp.where(slot >= 0, distance[every, jnp.maximum(slot, 0)], 0.0).sum()
+    slot = slot.at[ends].set(slots.astype(jnp.int32))
     agreed = jnp.isfinite(test)
     slot = jnp.where(agreed, slot, -1)
-    return slot, (slot >= 0).sum(), jnp.where(agreed, test + sum_of, 0.0)
+    return slot, (slot >= 0).sum(), jnp.where(agreed, test + total, 0.0)
 
 
-def across(points: Array) -> Array:
-    """(..., 2) turned by 90°."""
+class PairFrame(NamedTuple):
+    """The rigid motion T that carries a cluster pair onto a map pair, midpoint onto midpoint."""
+
+    rotation: Float[Array, "2 2"]
+    moved: Float[Array, "M 2"]
+    """T z_i"""
+    jacobians: Float[Array, "M 2 8"]
+    """of T z_i, through T, by z_a, z_b, m_j and m_k"""
+
+
+def frame_of_pair(points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"]) -> PairFrame:
+    """T of cluster points a, b = ends and map points j, k = slots.
+
+    dθ = v⊥·(δm_k - δm_j)/|m_k - m_j| - v⊥·R(δz_b - δz_a)/|z_b - z_a|, with v the direction of the
+    map pair; T z_i moves by it times the arm from the midpoint, turned by 90°.
+    """
+    (z_a, z_b), (m_j, m_k) = points.cluster[ends], points.map[slots]
+    s, u = _length_and_direction(z_b - z_a)
+    r, v = _length_and_direction(m_k - m_j)
+    c, d = (u * v).sum(), u[0] * v[1] - u[1] * v[0]
+    rotation = jnp.stack([jnp.stack([c, -d]), jnp.stack([d, c])])
+    arm = (points.cluster - (0.5 * (z_a + z_b))[None, :]) @ rotation.T
+    swing = turned(arm)[:, :, None] * turned(v)[None, None, :]
+    half = 0.5 * jnp.eye(2, dtype=arm.dtype)[None]
+    by_map = jnp.stack([half - swing / r, half + swing / r], axis=1)
+    by_ends = jnp.stack([-half + swing / s, -half - swing / s], axis=1) @ rotation
+    jacobians = jnp.concatenate([by_ends, by_map], axis=1).transpose(0, 2, 1, 3)
+    return PairFrame(
+        rotation=rotation,
+        moved=arm + (0.5 * (m_j + m_k))[None, :],
+        jacobians=jacobians.reshape(len(points.cluster), 2, 8),
+    )
+
+
+def moved_covs(
+    points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"], frame: PairFrame
+) -> tuple[Float[Array, "M 2 2"], Float[Array, "M N 2 2"]]:
+    """Covariances of T z_i, and with the map: errors are G of z_a, z_b, m_j, m_k, and R of z_i."""
+    (m, n), g, rotation = points.allowed.shape, frame.jacobians, frame.rotation
+    own, cross, of_map = points.cluster_cov, points.cross_cov, points.map_cov
+    # Of the four points that fix T: with one another (8, 8), with each z_i, with the map.
+    mixed = cross[ends][:, :, slots].reshape(4, 4)
+    top = jnp.concatenate([own[ends][:, :, ends].reshape(4, 4), mixed], axis=1)
+    low = jnp.concatenate([mixed.T, of_map[slots][:, :, slots].reshape(4, 4)], axis=1)
+    base = jnp.concatenate([top, low])
+    base_own = jnp.concatenate(
+        [own[ends].reshape(4, m, 2), cross[:, :, slots].reshape(m, 2, 4).transpose(2, 0, 1)]
+    )
+    base_map = jnp.concatenate([cross[ends].reshape(4, n * 2), of_map[slots].reshape(4, -1)])
+    every = jnp.arange(m)
+    alone = rotation @ own[every, :, every] @ rotation.T
+    crossed = g @ base_own.transpose(1, 0, 2) @ rotation.T
+    covs = g @ base @ g.transpose(0, 2, 1) + alone + crossed + crossed.transpose(0, 2, 1)
+    with_map = (g.reshape(2 * m, 8) @ base_map).reshape(m, 2, n, 2)
+    with_map = with_map + jnp.einsum("xy,iynw->ixnw", rotation, cross)
+    return covs, with_map.transpose(0, 2, 1, 3)
+
+
+def turned(points: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    """Turned by 90°."""
     return jnp.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
-def squared(error: Array, cov: Array) -> tuple[Array, Array]:
-    """eᵀ P⁻¹ e of (…, 2) and (…, 2, 2), and whether P is positive definite; 0 where it is not."""
+def squared_distances(
+    error: Float[Array, "*batch 2"], cov: Float[Array, "*batch 2 2"]
+) -> tuple[Float[Array, "*batch"], Bool[Array, "*batch"]]:
+    """eᵀ P⁻¹ e in closed form, 0 where P is not positive definite, and whether it is."""
     p, q, r = cov[..., 0, 0], cov[..., 1, 1], cov[..., 0, 1]
     det = p * q - r * r
-    regular = (p > 0) & (q > 0) & (det > 4 * jnp.finfo(cov.dtype).eps * p * q)
+    positive = (p > 0) & (q > 0) & (det > 4 * jnp.finfo(cov.dtype).eps * p * q)
     x, y = error[..., 0], error[..., 1]
-    squared = (q * x * x - 2 * r * x * y + p * y * y) / jnp.where(regular, det, 1.0)
-    return jnp.where(regular, squared, 0.0), regular
+    squared = (q * x * x - 2 * r * x * y + p * y * y) / jnp.where(positive, det, 1.0)
+    return jnp.where(positive, squared, 0.0), positive
+
+
+def difference_covs(
+    a: Float[Array, "M 2 2"], b: Float[Array, "N 2 2"], cross: Float[Array, "M N 2 2"]
+) -> Float[Array, "M N 2 2"]:
+    """cov(x_i - y_j) of all pairs, by the covariances of x, of y and of x_i with y_j."""
+    return a[:, None] + b[None] - cross - cross.transpose(0, 1, 3, 2)
+
+
+def _length_and_direction(
+    delta: Float[Array, "*batch 2"],
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch 2"]]:
+    """|δ|, positive, and δ/|δ|."""
+    length = jnp.sqrt((delta**2).sum(axis=-1) + jnp.finfo(delta.dtype).tiny)
+    return length, delta / length[..., None]

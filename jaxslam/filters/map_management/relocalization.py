@@ -1,44 +1,44 @@
-"""A lost robot: its pose is forgotten, found again in its map by geometry, and enters anew."""
+"""A lost robot: its pose is forgotten, found again in its map by geometry, and initialized anew."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxslam.filters.ekf.coordinates import cov_of_coordinates, with_cov_of_coordinates
-from jaxslam.filters.map_management.geometric_matching import Match, limits, match, solve
-from jaxslam.filters.map_management.point_pairs import Points
+from jaxslam.filters.map_management.alignment import align
+from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
+from jaxslam.filters.map_management.point_pairs import PointSets
 from jaxslam.math import linalg
 from jaxslam.math.linalg import check_count, check_covariance
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
 
-Array = jax.Array
-
 
 class Relocalization(NamedTuple):
     """Where a scan was taken."""
 
-    pose: Array
-    """(3,) of the robot [m, m, rad]; zeros where nothing agreed"""
-    slot: Array
-    """(M,) int32: the landmark of each measurement, -1 for none"""
-    explained: Array
-    """() int: measurements that fit jointly"""
-    runner_up: Array
-    """() int: as many would fit at another place"""
-    distance: Array
-    """() D² of those explained, χ² of 2·explained - 3 degrees of freedom"""
-    ok: Array
-    """() bool: enough is explained, and clearly more than at any other place"""
-    exhausted: Array
-    """() bool: more pairs agreed than were tried"""
+    pose: Float[Array, "3"]
+    """of the robot [m, m, rad]; zeros where nothing agreed"""
+    slot: Int[Array, "M"]
+    """the landmark of each measurement, -1 for none"""
+    explained: Int[Array, ""]
+    """measurements that fit jointly"""
+    runner_up: Int[Array, ""]
+    """as many would fit at another place"""
+    distance: Float[Array, ""]
+    """D² of those explained, χ² of 2·explained - 3 degrees of freedom"""
+    ok: Bool[Array, ""]
+    """enough is explained, and clearly more than at any other place"""
+    exhausted: Bool[Array, ""]
+    """more pairs agreed than were tried"""
 
 
-def seen_points(sensor: Sensor, scan: Scan) -> tuple[Array, Array]:
-    """A scan as points (M, 2) in the robot's frame, and their covariances (M, 2, 2).
+def seen_points(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[Array, "M 2 2"]]:
+    """A scan as points in the robot's frame, and their covariances.
 
     p = position(invert(0, z)), P = J R Jᵀ with J = ∂p/∂z; zeros and identity where not valid.
     Raises ValueError for a sensor without landmarks, or one whose measurement leaves the position
@@ -52,8 +52,8 @@ def seen_points(sensor: Sensor, scan: Scan) -> tuple[Array, Array]:
     def point(z: Array) -> Array:
         return sensor.position(sensor.invert(origin, z, rest))
 
-    slope = jax.vmap(jax.jacfwd(point))(z)
-    covs = slope @ jax.vmap(sensor.noise_cov)(z) @ slope.transpose(0, 2, 1)
+    jacobian = jax.vmap(jax.jacfwd(point))(z)
+    covs = jacobian @ jax.vmap(sensor.noise_cov)(z) @ jacobian.transpose(0, 2, 1)
     there = scan.valid[:, None, None]
     points = jnp.where(scan.valid[:, None], jax.vmap(point)(z), 0.0)
     return points, jnp.where(there, covs, jnp.eye(2, dtype=z.dtype)[None])
@@ -75,10 +75,10 @@ def relocalize(
 ) -> Relocalization:
     """Where in a map a scan was taken, without any prior: by distances between pairs of points.
 
-    `matching.match` has the search. Another hypothesis is one that shares fewer than two of the
-    best one's pairs, for two pairs fix a pose; the scan is ambiguous where such a one explains
-    almost as much, as in a symmetric map. Errors of the map that are common to all of it (where its
-    origin is) do not count, its cross-covariances see to that.
+    `geometric_matching.match` has the search. Another hypothesis is one that shares fewer than two
+    of the best one's pairs, for two pairs fix a pose; the scan is ambiguous where such a one
+    explains almost as much, as in a symmetric map. Errors of the map that are common to all of it
+    (where its origin is) do not count: its cross-covariances see to that.
 
     Args:
         points: (N, 2) the map [m].
@@ -105,22 +105,24 @@ def relocalize(
         if np.shape(value) != shape:
             raise ValueError(f"relocalize: expected shape {shape}, got {np.shape(value)}")
     check_policy("relocalize", least, margin)
-    bounds = limits("relocalize", m, probability, pairs, candidates)
+    limits = search_limits("relocalize", m, probability, pairs, candidates)
     if n < 2 or m < 2:
         return _judged(_nothing(m, jnp.result_type(points)), least, margin)
     own = jnp.zeros((m, 2, m, 2), seen.dtype)
     own = own.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
     shared = jnp.zeros((m, 2, n, 2), seen.dtype)
-    parts = Points(seen, points, own, cov.reshape(n, 2, n, 2), shared, valid[:, None] & alive[None])
-    return _judged(match(parts, bounds), least, margin)
+    parts = PointSets(
+        seen, points, own, cov.reshape(n, 2, n, 2), shared, valid[:, None] & alive[None]
+    )
+    return _judged(match(parts, limits), least, margin)
 
 
-def check_policy(name: str, least: int, margin: int) -> None:
+def check_policy(caller: str, least: int, margin: int) -> None:
     """Raise ValueError unless least >= 3 and margin >= 1: two points fit too often by chance."""
-    check_count(f"{name}: least", least)
-    check_count(f"{name}: margin", margin)
+    check_count(f"{caller}: least", least)
+    check_count(f"{caller}: margin", margin)
     if least < 3:
-        raise ValueError(f"{name}: expected least >= 3, got {least}")
+        raise ValueError(f"{caller}: expected least >= 3, got {least}")
 
 
 def _judged(found: Match, least: int, margin: int) -> Relocalization:
@@ -136,15 +138,17 @@ def _judged(found: Match, least: int, margin: int) -> Relocalization:
     )
 
 
-def _nothing(places: int, dtype: jnp.dtype) -> Match:
+def _nothing(size: int, dtype: jnp.dtype) -> Match:
     none = jnp.zeros((), jnp.int32)
-    nobody = jnp.full(places, -1, jnp.int32)
+    nobody = jnp.full(size, -1, jnp.int32)
     zero = jnp.zeros((), dtype)
     return Match(jnp.zeros(3, dtype), nobody, none, zero, none, jnp.asarray(False))
 
 
-def map_of(joint: Joint, chart: Chart, *, square_root: bool = False) -> tuple[Array, Array, Array]:
-    """Points (N, 2), joint covariance (2N, 2N) in coordinates, and alive (N,), for `relocalize`.
+def map_of(
+    joint: Joint, chart: Chart, *, square_root: bool = False
+) -> tuple[Float[Array, "N 2"], Float[Array, "2*N 2*N"], Bool[Array, "N"]]:
+    """Points, their joint covariance in coordinates, and which are alive, for `relocalize`.
 
     Raises ValueError unless the landmarks are points.
     """
@@ -153,7 +157,7 @@ def map_of(joint: Joint, chart: Chart, *, square_root: bool = False) -> tuple[Ar
     return joint.landmarks, cov[3:, 3:], joint.alive
 
 
-def lost(joint: Joint, chart: Chart, pose_cov: Array, *, square_root: bool = False) -> Joint:
+def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool = False) -> Joint:
     """The state of a robot that no longer knows where it is; its map knows what it knew.
 
     In coordinates P_RR ← pose_cov, P_RM ← 0, P_MM as it is: the pose is marginalized out and given
@@ -173,7 +177,7 @@ def lost(joint: Joint, chart: Chart, pose_cov: Array, *, square_root: bool = Fal
 def relocated(
     joint: Joint,
     chart: Chart,
-    slot: Array,
+    slot: Int[Array, "M"],
     seen: Array,
     seen_covs: Array,
     *,
@@ -207,11 +211,11 @@ def relocated(
     shared = jnp.zeros((m, 2, capacity, 2), cov.dtype)
     allowed = (slot >= 0)[:, None] & joint.alive[None]
     slot = jnp.where((slot >= 0) & joint.alive[jnp.maximum(slot, 0)], slot, -1)
-    found = solve(Points(seen, joint.landmarks, own, among, shared, allowed), slot)
+    found = align(PointSets(seen, joint.landmarks, own, among, shared, allowed), slot)
     there = (slot >= 0)[:, None]
     rows = jnp.where(there[:, :, None], among[jnp.maximum(slot, 0)].reshape(m, 2, -1), 0.0)
     rows = linalg.solve_lower(found.factor, rows.reshape(2 * m, -1))
-    by = linalg.solve_lower(found.factor, found.slope)
+    by = linalg.solve_lower(found.factor, found.jacobian)
     white = linalg.solve_lower(found.factor, found.residual)
     normal = by.T @ by
     ok = found.regular & ((slot >= 0).sum() >= 2) & linalg.cholesky(normal)[1]
@@ -230,11 +234,13 @@ def relocated(
     return kept
 
 
-def check_points(name: str, joint: Joint, chart: Chart) -> None:
+def check_points(caller: str, joint: Joint, chart: Chart) -> None:
     """Raise ValueError unless landmarks are points, and nothing remembers where the robot was."""
     if joint.landmarks.shape[1] != 2:
-        raise ValueError(f"{name}: expected landmarks (x, y), got {joint.landmarks.shape[1]} each")
+        raise ValueError(
+            f"{caller}: expected landmarks (x, y), got {joint.landmarks.shape[1]} each"
+        )
     if chart.motion_apart:
-        raise ValueError(f"{name}: the chart {chart.name} keeps the last motion apart")
+        raise ValueError(f"{caller}: the chart {chart.name} keeps the last motion apart")
     if jax.tree.leaves(joint.lin):
-        raise ValueError(f"{name}: a linearizer with a memory of former poses cannot forget them")
+        raise ValueError(f"{caller}: a linearizer with a memory of former poses cannot forget them")

@@ -16,7 +16,7 @@ from jaxslam.filters.particles.proposal import ParticleInnovations
 from jaxslam.filters.particles.scan_association import ParticleAssociation
 from jaxslam.filters.particles.settings import ParticleMapSettings
 from jaxslam.filters.particles.slam_state import SlamParticles, as_only_particle
-from jaxslam.filters.reporting import info_of, seen_before, status_of
+from jaxslam.filters.reporting import info_of, seen_before, status_of, with_removed
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import gaussian_terms
@@ -180,7 +180,7 @@ def allocate_slots(
 def remove_landmarks(
     particle: SlamParticles, info: Info, evicted: Bool[Array, "N"], settings: ParticleMapSettings
 ) -> tuple[SlamParticles, Info]:
-    """The particle without the landmarks that its `Life` gives up; `Info.removed` has them all."""
+    """The particle without the landmarks that its `Life` gives up; `Pruned.removed` names them."""
     life = settings.life
     if life is None:
         return particle, info
@@ -190,7 +190,7 @@ def remove_landmarks(
 
     memory, dead = life.after(_as_joint(particle), info, alone)
     particle = _without_landmarks(particle._replace(life=memory), dead)
-    return particle, info._replace(removed=evicted | dead)
+    return particle, with_removed(info, evicted | dead)
 
 
 def _as_joint(particle: SlamParticles) -> Joint:

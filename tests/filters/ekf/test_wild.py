@@ -9,7 +9,8 @@ import pytest
 
 from jaxslam import association, life, motion, run, sensors
 from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.merging import duplicates
+from jaxslam.filters.map_management.merging import merging
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Log, Scan, Status
 
@@ -38,14 +39,10 @@ def program(maker, capacity):
     )
 
     def one(log, *gates):
-        filter = ekf_slam(
-            MOTION,
-            SENSOR,
-            capacity,
-            associate=MAKERS[maker](*gates),
-            life=manager,
-            merge=duplicates(0.3),
+        plain = ekf_slam(
+            MOTION, SENSOR, capacity, associate=MAKERS[maker](*gates), make_room=manager
         )
+        filter = pruning(merging(plain, 0.3), manager)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0))
 
     return jax.jit(one)
@@ -107,9 +104,8 @@ def test_everything_stays_finite_and_nothing_is_lost_uncounted(method, capacity)
         status = np.asarray(trace.info.status)
         np.testing.assert_array_equal(status != Status.EMPTY, log.scan.valid, err_msg=name)
         born = (status == Status.BORN).sum()
-        left = (
-            np.asarray(trace.info.removed).sum() + (np.asarray(trace.info.merged)[:, 0] >= 0).sum()
-        )
+        extra = trace.info.extra
+        left = extra["pruning"].removed.sum() + (extra["merging"].pair[:, 0] >= 0).sum()
         assert born - left == np.asarray(trace.final.alive).sum(), name
         cov = np.asarray(trace.final.cov)
         assert np.linalg.eigvalsh(cov).min() > -1e-12, name
@@ -128,7 +124,7 @@ def test_what_the_worlds_hold_is_found(method):
 
 def test_clutter_alone_confirms_nothing_for_long():
     trace = go("joint", 6, "nothing but clutter")
-    removed = np.asarray(trace.info.removed).sum()
+    removed = trace.info.extra["pruning"].removed.sum()
     assert removed > 50  # it comes and goes …
     confirmed = np.asarray(trace.final.life.confirmed) & np.asarray(trace.final.alive)
     assert confirmed.sum() <= 2  # … and little of it is believed

@@ -9,8 +9,10 @@ import pytest
 
 from jaxslam import association, charts, motion, programs, sensors, slots
 from jaxslam.filters import eif_slam, ekf_slam
-from jaxslam.filters.map_management.closing import close_loop, closing
+from jaxslam.filters.map_management.closing import closing
+from jaxslam.filters.map_management.loop_closure import close_loop
 from jaxslam.filters.map_management.merging import merge
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
 from jaxslam.life.recency import Recency
 from jaxslam.protocols import Pairs, Prediction
@@ -108,7 +110,8 @@ def test_a_symmetric_old_map_is_ambiguous():
 
 def test_recency_remembers():
     model = motion.pose_increment(1e-4 * np.eye(3))
-    filter = ekf_slam(model, sensors.relative_position(0.01 * np.eye(2)), 4, life=recency())
+    plain = ekf_slam(model, sensors.relative_position(0.01 * np.eye(2)), 4)
+    filter = pruning(plain, recency())
     state = jax.jit(filter.init)(np.zeros(3), np.zeros((3, 3)))
     update = jax.jit(filter.update)
     key = jax.random.key(0)
@@ -123,7 +126,7 @@ def test_recency_remembers():
     np.testing.assert_array_equal(life.born, [1, 2, 0, 0])
     np.testing.assert_array_equal(life.last, [2, 3, 0, 0])
     np.testing.assert_array_equal(life.seen, [2, 2, 0, 0])
-    assert not info.removed.any()
+    assert not info.extra["pruning"].removed.any()
 
 
 def test_recency_with_patience_forgets():
@@ -164,13 +167,15 @@ def test_a_whole_run_ends_with_each_landmark_once(name):
     rng = np.random.default_rng(2)
     points = rng.uniform(-6, 6, (8, 2))
     filter = closing(
-        ekf_slam(
-            motion.pose_increment(np.diag([0.05, 0.05, 0.008]) ** 2),
-            sensors.relative_position(0.05**2 * np.eye(2)),
-            20,
-            chart=charts.REGISTRY[name](),
-            associate=association.certain(association.nearest(9.21, 30.0), 0.4),
-            life=recency(),
+        pruning(
+            ekf_slam(
+                motion.pose_increment(np.diag([0.05, 0.05, 0.008]) ** 2),
+                sensors.relative_position(0.05**2 * np.eye(2)),
+                20,
+                chart=charts.REGISTRY[name](),
+                associate=association.certain(association.nearest(9.21, 30.0), 0.4),
+            ),
+            recency(),
         ),
         window=10,
         cluster=8,
@@ -180,7 +185,7 @@ def test_a_whole_run_ends_with_each_landmark_once(name):
     )
     predict, update = jax.jit(filter.predict), jax.jit(filter.update)
     state = jax.jit(filter.init)(np.zeros(3), np.zeros((3, 3)))
-    pose, key = np.zeros(3), jax.random.key(0)
+    pose, key, reports = np.zeros(3), jax.random.key(0), []
     for step in range(140):
         u = np.array([0.5, 0.0, 2 * np.pi / 120])
         w = u + rng.normal(size=3) * [0.05, 0.05, 0.008]
@@ -192,8 +197,11 @@ def test_a_whole_run_ends_with_each_landmark_once(name):
         scan = Scan(z, np.full(8, -1), valid)
         state = predict(state, u, key)
         state, info = update(state, scan, key)
-    assert int(state.closings) >= 1 and int(state.merged) + int(state.doubles) >= 8
-    assert int(state.joint.alive.sum()) == 8
+        reports.append(info.extra["closing"])
+    closings = jax.tree.map(lambda *leaves: np.stack(leaves), *reports)
+    assert (closings.merged > 0).sum() >= 1
+    assert closings.merged.sum() + closings.duplicates.sum() >= 8
+    assert int(state.alive.sum()) == 8
     estimate = jax.jit(filter.estimate)(state)
     error = np.asarray(estimate.pose) - pose
     error[2] = np.arctan2(np.sin(error[2]), np.cos(error[2]))
@@ -213,7 +221,7 @@ def test_refusals():
         with pytest.raises(ValueError, match=message):
             close_loop(joint, EUCLIDEAN, **options)
     with pytest.raises(ValueError, match="recency"):
-        close_loop(joint._replace(life=()), EUCLIDEAN)
+        close_loop(joint._replace(life=None), EUCLIDEAN)
     with pytest.raises(ValueError, match="spread"):
         association.certain(association.nearest(9.0), 0.0)
     plain = ekf_slam(motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2)), 3)
@@ -225,7 +233,7 @@ def test_refusals():
         closing(plain).init(jnp.zeros(3), jnp.eye(3))
     models = motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2)), 3
     with pytest.raises(ValueError, match="root"):
-        closing(ekf_slam(*models, life=recency(), covariance="square_root"))
+        closing(pruning(ekf_slam(*models, covariance="square_root"), recency()))
     with pytest.raises(ValueError, match="Joint"):
         closing(eif_slam(*models)).init(jnp.zeros(3), jnp.eye(3))
 
@@ -233,5 +241,5 @@ def test_refusals():
 def test_a_filter_of_several_sensors_keeps_its_places():
     one = sensors.relative_position(np.eye(2))
     both = sensors.suite((one, 2), (one, 2))
-    filter = ekf_slam(motion.pose_increment(np.eye(3)), both, 4, life=recency())
+    filter = pruning(ekf_slam(motion.pose_increment(np.eye(3)), both, 4), recency())
     assert closing(filter).places == filter.places == (2, 2)

@@ -10,7 +10,7 @@ import pytest
 
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.merging import closest_pair, duplicates, merge
+from jaxslam.filters.map_management.merging import closest_pair, merge, merging
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
 
@@ -143,8 +143,9 @@ def seen_twice(together=False, steps=8, dtype=np.float64):
 
 
 @cache
-def merging_driver(chart="euclidean", dtype=np.float64, **options):
+def driver(chart="euclidean", dtype=np.float64, merged=True, **options):
     filter = ekf_slam(MOTION, SENSOR, 4, chart=charts.REGISTRY[chart](), **options)
+    filter = merging(filter, 0.5) if merged else filter
     start = np.zeros(3, dtype), np.zeros((3, 3), dtype), KEY
     return filter, jax.jit(lambda log: run(filter, log, *start, probe=lambda joint: joint))
 
@@ -153,7 +154,8 @@ def state_at(trace, step):
     return jax.tree.map(lambda leaf: leaf[step], jax.device_get(trace.probe))
 
 
-RULE = duplicates(0.5)
+def pairs_in(trace):
+    return np.asarray(trace.info.extra["merging"].pair)
 
 
 @pytest.mark.parametrize(
@@ -162,15 +164,15 @@ RULE = duplicates(0.5)
 )
 def test_a_filter_merges_what_it_holds_twice(options):
     log = seen_twice()
-    _, go = merging_driver(merge=RULE, **options)
+    _, go = driver(**options)
     trace = jax.device_get(go(log))
-    merged = np.asarray(trace.info.merged)
+    merged = pairs_in(trace)
     at = int(np.argmax(merged[:, 0] >= 0))
     assert at >= 4 and list(merged[at]) == [0, 2]
     assert (merged[:at] == -1).all()
     assert not trace.estimate.alive[at, 2]
     # The same as the filter without, and a merge by hand.
-    plain, go_plain = merging_driver(**options)
+    plain, go_plain = driver(merged=False, **options)
     before = state_at(go_plain(log), at)
     chart = charts.REGISTRY[options.get("chart", "euclidean")]()
     square_root = plain.square_root
@@ -182,40 +184,40 @@ def test_a_filter_merges_what_it_holds_twice(options):
 
 
 def test_what_one_scan_measures_twice_is_two():
-    _, go = merging_driver(merge=RULE)
+    _, go = driver()
     trace = go(seen_twice(together=True))
-    assert (trace.info.merged == -1).all()
+    assert (pairs_in(trace) == -1).all()
     assert trace.estimate.alive[-1, :3].all()
-    apart = np.asarray(trace.final.apart)
-    np.testing.assert_array_equal(apart[:3, :3], True)
-    assert not apart[3].any()
+    together = np.asarray(trace.final.co_observed)
+    np.testing.assert_array_equal(together[:3, :3], True)
+    assert not together[3].any()
 
 
-def test_what_was_measured_beside_either_is_apart_from_the_merged():
-    _, go = merging_driver(merge=RULE)
+def test_what_was_measured_beside_either_is_another_than_the_merged():
+    _, go = driver()
     trace = go(seen_twice())
-    at = int(np.argmax(np.asarray(trace.info.merged)[:, 0] >= 0))
-    apart = state_at(trace, at).apart
-    assert apart[0, 1] and apart[1, 0]
-    assert not apart[2].any() and not apart[:, 2].any()
+    at = int(np.argmax(pairs_in(trace)[:, 0] >= 0))
+    together = state_at(trace, at).co_observed
+    assert together[0, 1] and together[1, 0]
+    assert not together[2].any() and not together[:, 2].any()
 
 
 def test_far_landmarks_and_none_are_left_alone():
     log = seen_twice()
     far = log._replace(scan=log.scan._replace(z=log.scan.z + np.array([[0, 0], [0, 0], [0, 1.0]])))
-    _, go = merging_driver(merge=RULE)
-    assert (go(far).info.merged == -1).all()
+    _, go = driver()
+    assert (pairs_in(go(far)) == -1).all()
     nothing = Scan(*(np.zeros_like(part) for part in log.scan))._replace(tag=log.scan.tag * 0 - 1)
     trace = go(log._replace(scan=nothing))
-    assert (trace.info.merged == -1).all()
+    assert (pairs_in(trace) == -1).all()
     assert np.isfinite(trace.final.cov).all()
 
 
 def test_merging_in_float32_and_its_gradient():
     log = seen_twice(dtype=np.float32)
-    _, go = merging_driver(merge=RULE, dtype=np.float32)
+    _, go = driver(dtype=np.float32)
     trace = go(log)
-    assert trace.final.cov.dtype == np.float32 and (np.asarray(trace.info.merged)[:, 0] >= 0).any()
+    assert trace.final.cov.dtype == np.float32 and (pairs_in(trace)[:, 0] >= 0).any()
 
     def points(z):
         return go(log._replace(scan=log.scan._replace(z=z))).estimate.points
@@ -224,29 +226,31 @@ def test_merging_in_float32_and_its_gradient():
     assert np.isfinite(along(log.scan.z, np.ones_like(log.scan.z))).all()
 
 
-def test_refusals_of_duplicates():
+def test_refusals_of_merging():
+    plain = ekf_slam(MOTION, SENSOR, 3)
     for bad in ({"reach": 0.0}, {"reach": 1.0, "probability": 1.0}):
-        with pytest.raises(ValueError, match="duplicates: expected"):
-            duplicates(**bad)
-    with pytest.raises(ValueError, match="to be a Duplicates"):
-        ekf_slam(MOTION, SENSOR, 3, merge=0.5)
+        with pytest.raises(ValueError, match="merging: expected"):
+            merging(plain, **bad)
     rays = sensors.bearing_inverse_depth(np.eye(1))
     for sensor in (rays, sensors.compass(np.eye(1))):
         with pytest.raises(ValueError, match="cannot be merged"):
-            ekf_slam(MOTION, sensor, 3, merge=RULE)
+            merging(ekf_slam(MOTION, sensor, 3), 0.5)
+    other = dataclasses.replace(plain, init=lambda pose, pose_cov: pose)
+    with pytest.raises(ValueError, match=r"merging: the state of ekf_slam is no slots.Joint"):
+        merging(other, 0.5).init(np.zeros(3), np.eye(3))
 
 
 @pytest.mark.parametrize("covariance", ["plain", "square_root"])
 def test_landmarks_that_differ_stay_two_in_either_form(covariance):
     """0.45 m apart, known to centimetres, and seen by turns: only their distance tells them apart."""
     sensor = sensors.range_bearing(np.diag([0.02, 0.01]) ** 2)
-    filter = ekf_slam(MOTION, sensor, 4, merge=duplicates(0.5), covariance=covariance)
+    filter = merging(ekf_slam(MOTION, sensor, 4, covariance=covariance), 0.5)
     z = np.array([[[2.0, 0.0]], [[2.0, 0.225]]] * 5)
     scan = Scan(z, np.array([[0], [1]] * 5, np.int32), np.ones((10, 1), bool))
     log = Log(np.zeros((10, 3)), scan)
     start = np.zeros(3), np.zeros((3, 3)), KEY
     trace = jax.jit(lambda log: run(ekf_slam_still(filter), log, *start))(log)
-    assert (np.asarray(trace.info.merged) == -1).all()
+    assert (pairs_in(trace) == -1).all()
     assert trace.estimate.alive[-1].sum() == 2
 
 

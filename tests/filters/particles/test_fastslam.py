@@ -343,7 +343,9 @@ def test_negative_evidence_removes_a_landmark_from_every_map():
     assert trace.final.life.log_odds.shape == (8, 6)
     np.testing.assert_array_equal(np.sort(trace.final.tag), [[-1, 0, 1, 2, 3, 4]] * 8)
     # log(0.1/0.9) a miss: at the second the odds fall below 0.05/0.95
-    np.testing.assert_array_equal(trace.info.removed.sum(axis=1), [0, 0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(
+        trace.info.extra["pruning"].removed.sum(axis=1), [0, 0, 1, 0, 0, 0]
+    )
     dead = ~np.asarray(trace.final.alive)
     np.testing.assert_array_equal(np.asarray(trace.final.landmarks)[dead], 0.0)
     np.testing.assert_array_equal(

@@ -1,0 +1,219 @@
+"""Loops closed at the scale of a map: recent landmarks, together, are found to be old ones."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.filters.ekf.coordinates import cov_of_coordinates
+from jaxslam.filters.map_management.alignment import with_unit_blocks
+from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
+from jaxslam.filters.map_management.merging import squared_distance
+from jaxslam.filters.map_management.point_pairs import PointSets, difference_covs
+from jaxslam.filters.map_management.relocalization import check_points, check_policy
+from jaxslam.filters.map_management.successive import merge_histories
+from jaxslam.life.recency import Recency
+from jaxslam.math import linalg
+from jaxslam.math.linalg import check_count
+from jaxslam.math.stats import chi2_quantile
+from jaxslam.math.xla import change_where
+from jaxslam.protocols import Chart
+from jaxslam.slots import Joint
+
+
+class Closing(NamedTuple):
+    """What one search for a closed loop found; `info.extra["closing"]`."""
+
+    explained: Int[Array, ""]
+    """recent landmarks that are old ones under the best hypothesis"""
+    runner_up: Int[Array, ""]
+    """the same under any other hypothesis"""
+    likely: Bool[Array, ""]
+    """the filter's own covariance, drift included, allows the best hypothesis"""
+    merged: Int[Array, ""]
+    """pairs of landmarks merged by the search, 0 or explained"""
+    exhausted: Bool[Array, ""]
+    """more pairs agreed than were tried"""
+    refused: Bool[Array, ""]
+    """enough is explained, but not clearly more than by another hypothesis, or it is unlikely"""
+    duplicates: Int[Array, ""]
+    """landmarks merged one by one, 0 or 1, by `closing(…, reach=…)`"""
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopSettings:
+    """How `close_loop` searches."""
+
+    window: int = 50
+    """scans: a landmark is recent if one of the last so many measured it"""
+    cluster: int = 12
+    """recent landmarks that are compared, those measured last"""
+    sightings: int = 1
+    """by how many scans they must have been measured"""
+    least: int = 5
+    """pairs that must agree, at least 3"""
+    margin: int = 2
+    """by how many more than under any other hypothesis"""
+    probability: float = 0.99
+    """of each chi-square test of the geometry"""
+    drift: float = 0.9999
+    """probability that the true pairs lie within the filter's covariance"""
+    pairs: int = 8
+    """of recent landmarks whose distances are looked for; long ones"""
+    candidates: int = 64
+    """agreeing pairs of old landmarks that are tried with each, the best"""
+
+
+def loop_settings(caller: str, options: Mapping[str, Any]) -> LoopSettings:
+    """The settings with these options.
+
+    Raises ValueError, which names the caller, on an unknown option, counts below 1, least below 3,
+    or probabilities not between 0 and 1.
+    """
+    unknown = sorted(set(options) - {field.name for field in dataclasses.fields(LoopSettings)})
+    if unknown:
+        raise ValueError(f"{caller}: expected options of close_loop, got {', '.join(unknown)}")
+    settings = LoopSettings(**options)
+    for name in ("window", "cluster", "sightings"):
+        check_count(f"{caller}: {name}", getattr(settings, name))
+    check_policy(caller, settings.least, settings.margin)
+    if not 0 < settings.drift < 1:
+        raise ValueError(f"{caller}: expected a drift between 0 and 1, got {settings.drift}")
+    search_limits(
+        caller, settings.cluster, settings.probability, settings.pairs, settings.candidates
+    )
+    return settings
+
+
+def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
+    """Raise ValueError unless landmarks are points, and times are kept of when each was seen."""
+    check_points(caller, joint, chart)
+    if not isinstance(joint.life, Recency):
+        raise ValueError(f"{caller}: expected a filter with times, pruning(…, life.recency())")
+
+
+def close_loop(joint: Joint, chart: Chart, **options: Any) -> tuple[Joint, Closing]:
+    """Match the cluster of recent landmarks with the old map, and merge what is the same.
+
+    A landmark is recent if it was measured within the last `window` scans, and it may be an old one
+    only if it was born after that was last measured: landmarks observed over overlapping periods
+    cannot be duplicates. The pair must agree with the joint covariance of both, δ = l_i - l_k,
+    δᵀ cov(δ)⁻¹ δ <= χ²(2, drift), and of these `geometric_matching.match` finds the most whose
+    geometry agrees, whatever the drift. They are merged (`merging.merge`) if they are enough,
+    clearly more than any other hypothesis has, and D² of all δ together is at most χ²(2n, drift).
+    The old slot keeps the landmark.
+
+    The joint compatibility of Neira & Tardós 2001, on relative geometry first, so that a large
+    error of the heading bends nothing; the map is joined as by Castellanos, Neira, Tardós, "Limits
+    to the consistency of EKF-based SLAM", IAV 2004, one cluster at a time.
+
+    Args:
+        joint: whose `life` is that of `life.recency()`.
+        options: fields of `LoopSettings`.
+    Raises:
+        ValueError: as `loop_settings`; on a life that is not recency, or a chart, linearizer or
+            landmarks that `lost` refuses.
+    """
+    settings = loop_settings("close_loop", options)
+    check_recency("close_loop", joint, chart)
+    recent, candidates = recent_cluster(joint, settings)
+    old, report = change_where(
+        candidates.any(axis=1).sum() >= settings.least,
+        lambda _: search(joint, chart, recent, candidates, settings),
+        (jnp.full(recent.shape, -1, jnp.int32), no_closing()),
+    )
+    joint = change_where(
+        report.merged > 0, lambda joint: _merge_all(joint, chart, old, recent), joint
+    )
+    return joint, report
+
+
+def no_closing() -> Closing:
+    """The report where nothing was searched for."""
+    none, no = jnp.zeros((), jnp.int32), jnp.asarray(False)
+    return Closing(none, none, no, none, no, no, none)
+
+
+def recent_cluster(
+    joint: Joint, settings: LoopSettings
+) -> tuple[Int[Array, "M"], Bool[Array, "M N"]]:
+    """Slots of the M recent landmarks measured last, and which old landmarks each may be."""
+    known: Recency = joint.life
+    capacity = joint.landmarks.shape[0]
+    recent = joint.alive & (known.now - known.last <= settings.window)
+    recent = recent & (known.seen >= settings.sightings)
+    order = jnp.where(recent, known.last, -1) * capacity + jnp.arange(capacity)
+    _, cluster = jax.lax.top_k(order, min(settings.cluster, capacity))
+    later = known.born[cluster][:, None] > known.last[None, :]
+    return cluster, recent[cluster][:, None] & joint.alive[None, :] & later
+
+
+def search(
+    joint: Joint,
+    chart: Chart,
+    recent: Int[Array, "M"],
+    candidates: Bool[Array, "M N"],
+    settings: LoopSettings,
+) -> tuple[Int[Array, "M"], Closing]:
+    """The old slot of each recent landmark, -1 where none are to be merged, and the report."""
+    capacity, m = joint.landmarks.shape[0], recent.shape[0]
+    levels = jnp.asarray(
+        [0.0, *(chi2_quantile(settings.drift, 2 * n) for n in range(1, settings.cluster + 1))]
+    )
+    limits = search_limits(
+        "close_loop", settings.cluster, settings.probability, settings.pairs, settings.candidates
+    )
+    cov = cov_of_coordinates(joint, chart)[3:, 3:].reshape(capacity, 2, capacity, 2)
+    own, shared = cov[recent][:, :, recent], cov[recent]
+    every, each = jnp.arange(capacity), jnp.arange(m)
+    delta = joint.landmarks[recent][:, None] - joint.landmarks[None]
+    delta_covs = difference_covs(
+        own[each, :, each], cov[every, :, every], shared.transpose(0, 2, 1, 3)
+    )
+    distance = jax.vmap(jax.vmap(squared_distance))(delta, delta_covs)
+    allowed = candidates & (distance <= levels[1])
+    points = PointSets(joint.landmarks[recent], joint.landmarks, own, cov, shared, allowed)
+
+    def compare(_: Any) -> tuple[Array, Closing]:
+        found = match(points, limits)
+        likely = _joint_distance(delta, points, found) <= levels[found.explained]
+        enough = found.explained >= settings.least
+        ok = enough & (found.explained - found.runner_up >= settings.margin) & likely
+        report = Closing(
+            explained=found.explained,
+            runner_up=found.runner_up,
+            likely=likely,
+            merged=jnp.where(ok, found.explained, 0),
+            exhausted=found.exhausted,
+            refused=enough & ~ok,
+            duplicates=jnp.zeros((), jnp.int32),
+        )
+        return jnp.where(ok, found.slot, -1), report
+
+    nothing = jnp.full(m, -1, jnp.int32), no_closing()
+    return change_where(allowed.any(axis=1).sum() >= settings.least, compare, nothing)
+
+
+def _merge_all(joint: Joint, chart: Chart, old: Int[Array, "M"], recent: Int[Array, "M"]) -> Joint:
+    """Each recent landmark made the old one, one pair after the other; -1 for none."""
+
+    def one(joint: Joint, pair: tuple[Array, Array]) -> tuple[Joint, None]:
+        kept, freed = pair
+        return merge_histories(joint, chart, jnp.where(kept >= 0, kept, freed), freed), None
+
+    return jax.lax.scan(one, joint, (old, recent))[0]
+
+
+def _joint_distance(
+    delta: Float[Array, "M N 2"], points: PointSets, found: Match
+) -> Float[Array, ""]:
+    """δᵀ cov(δ)⁻¹ δ over all pairs found, with the drift in it."""
+    m, there, at = found.slot.shape[0], found.slot >= 0, jnp.maximum(found.slot, 0)
+    crossed = points.cross_cov[:, :, at]
+    cov = points.cluster_cov + points.map_cov[at][:, :, at]
+    cov = with_unit_blocks(cov - crossed - crossed.transpose(2, 3, 0, 1), there)
+    error = jnp.where(there[:, None], delta[jnp.arange(m), at], 0.0).reshape(2 * m)
+    return squared_distance(error, linalg.symmetrize(cov.reshape(2 * m, 2 * m)))

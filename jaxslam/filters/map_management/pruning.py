@@ -1,0 +1,54 @@
+"""A filter that removes landmarks from its map by a rule, after each scan."""
+
+import dataclasses
+
+from jaxtyping import Array, Float
+
+from jaxslam import slots, validation
+from jaxslam.filters.map_management.wrapping import joint_of
+from jaxslam.filters.reporting import with_removed
+from jaxslam.math.xla import change_where
+from jaxslam.protocols import Filter, Life
+from jaxslam.slots import Joint
+from jaxslam.types import Info, Scan
+
+
+def pruning(filter: Filter, life: Life) -> Filter:
+    """The filter, whose map loses the landmarks that a rule gives up after each scan.
+
+    The rule's memory is `Joint.life`. `info.extra["pruning"].removed` (N,) bool tells the slots.
+
+    A rule that makes room in a full map acts between association and new landmarks, so the filter
+    has to know it: `pruning(ekf_slam(…, make_room=life), life)`.
+
+    Args:
+        filter: whose state is a `slots.Joint`.
+        life: as of `jaxslam.life`.
+    Raises:
+        ValueError: on a life that is none; from `init`, on another state; from `update`, on a life
+            that makes room, of which the filter does not know.
+    """
+    validation.check_record("pruning", "life", life, Life)
+
+    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        joint = joint_of("pruning", filter, filter.init(pose, pose_cov))
+        return joint._replace(life=life.init(pose, joint.landmarks))
+
+    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        found = filter.update(joint, scan, key)
+        joint, info = validation.state_and_info(f"pruning: {filter.name}", joint, scan, found)
+        if life.make_room is not None and "pruning" not in (info.extra or {}):
+            raise ValueError(
+                f"pruning: {life.name} makes room in a full map, which {filter.name} has to know: "
+                "pruning(ekf_slam(…, make_room=life), life)"
+            )
+        memory, dead = life.after(joint, info, lambda: filter.estimate(joint))
+        joint = change_where(
+            dead.any(),
+            lambda joint: slots.remove(joint, dead, square_root=filter.square_root),
+            joint._replace(life=memory),
+        )
+        return joint, with_removed(info, dead)
+
+    name = f"pruning {filter.name}"
+    return dataclasses.replace(filter, name=name, init=init, update=update)

@@ -1,0 +1,13 @@
+"""What the map managers that wrap a filter ask of it."""
+
+from typing import Any
+
+from jaxslam.protocols import Filter
+from jaxslam.slots import Joint
+
+
+def joint_of(manager: str, filter: Filter, state: Any) -> Joint:
+    """The filter's state; ValueError, which names the manager, unless it is a `slots.Joint`."""
+    if not isinstance(state, Joint):
+        raise ValueError(f"{manager}: the state of {filter.name} is no slots.Joint")
+    return state
