@@ -8,7 +8,7 @@ from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf import to_points
-from jaxslam.filters.ekf.beliefs import moments
+from jaxslam.filters.ekf.coordinates import estimate_of
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import turns_of, update_by_scan, without
 from jaxslam.filters.ekf.settings import (
@@ -128,8 +128,7 @@ def ekf_slam(
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:
-        cov = joint.cov @ joint.cov.T if square_root else joint.cov
-        return moments(joint._replace(cov=cov), sensor, chart)
+        return estimate_of(joint, sensor, chart, square_root=square_root)
 
     return Filter(
         name="ekf_slam",

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxslam import slots, validation
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.ekf.beliefs import moments
+from jaxslam.filters.ekf.coordinates import estimate_of
 from jaxslam.filters.information import canonical
 from jaxslam.filters.reporting import seen_before
 from jaxslam.math import linalg
@@ -131,7 +131,7 @@ def eif_slam(
     def estimate(state: Canonical) -> Estimate:
         cov = linalg.inverse_psd(state.omega)
         joint = Joint(state.pose, state.landmarks, cov, state.alive, state.tag, ())
-        return moments(joint, sensor, euclidean())
+        return estimate_of(joint, sensor, euclidean())
 
     return Filter(
         name="eif_slam",
