@@ -170,6 +170,8 @@ class Chart:
     """whether a correction splits off what it says of the last motion, and moves the robot by that
     in a world that stands still: the way of a map that is composed with the motion afterwards. Its
     moves must add up: retract by one error and then by another is retract by their sum."""
+    landmark_size: int | None = None
+    """numbers L of the landmarks it acts on; None where any."""
 
     def __post_init__(self) -> None:
         _check_fields(self, ("retract", "local"), optional=("basis",))
@@ -216,6 +218,11 @@ class Linearizer:
     """(joint, born (N,) bool) -> memory, after new landmarks entered the map."""
     euclidean: bool = False
     """whether it is meant for the Euclidean chart and landmarks that are points (x, y) alone."""
+    iterates: bool = True
+    """whether a correction may linearize again at its result; a fit to a covariance may not."""
+    own_landmarks: bool = False
+    """whether it linearizes at landmarks other than the estimates, and so is for maps with errors
+    alone."""
 
     def __post_init__(self) -> None:
         _check_fields(self, ("init", "motion", "observe", "invert", "born"))

@@ -36,4 +36,4 @@ def left_invariant() -> Chart:
             landmark=turn,
         )
 
-    return Chart(name="left_invariant", retract=retract, local=local, basis=basis)
+    return Chart("left_invariant", retract, local, basis, landmark_size=2)

@@ -57,4 +57,4 @@ def right_invariant(rays: bool = False) -> Chart:
             landmark=None,
         )
 
-    return Chart(name=name, retract=retract, local=local, basis=basis)
+    return Chart(name, retract, local, basis, landmark_size=size)

@@ -41,4 +41,11 @@ def robocentric() -> Chart:
         cross = jnp.stack([-c, s, landmark[1], -s, -c, -landmark[0]])
         return Basis(pose=by_pose.reshape(3, 3), cross=cross.reshape(2, 3), landmark=turn)
 
-    return Chart(name="robocentric", retract=retract, local=local, basis=basis, motion_apart=True)
+    return Chart(
+        name="robocentric",
+        retract=retract,
+        local=local,
+        basis=basis,
+        motion_apart=True,
+        landmark_size=2,
+    )

@@ -46,4 +46,5 @@ def at_truth(truth: Truth) -> Linearizer:
         observe=observe_at,
         invert=invert_at,
         born=lambda joint, born: joint.lin,
+        own_landmarks=True,
     )

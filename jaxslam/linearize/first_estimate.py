@@ -65,4 +65,5 @@ def first_estimate() -> Linearizer:
         invert=invert_at,
         born=born,
         euclidean=True,
+        own_landmarks=True,
     )

@@ -70,4 +70,5 @@ def observability() -> Linearizer:
         invert=invert_at,
         born=born,
         euclidean=True,
+        own_landmarks=True,
     )

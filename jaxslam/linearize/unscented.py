@@ -121,6 +121,7 @@ def unscented(alpha: float | None = None) -> Linearizer:
         observe=observe_at,
         invert=invert_at,
         born=lambda joint, born: joint.lin,
+        iterates=False,
     )
 
 

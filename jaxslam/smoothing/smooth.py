@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.ekf.beliefs import moments
+from jaxslam.filters.ekf.coordinates import estimate_of
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
@@ -104,7 +104,7 @@ def solution(
     poses = poses.at[:, 2].set(wrap(poses[:, 2]))
     landmarks = jnp.where(joint.alive[:, None], joint.landmarks + policy.landmarks, 0.0)
     last = joint._replace(pose=poses[-1], landmarks=landmarks, cov=found.cov)
-    at_end = moments(last, sensor, euclidean())
+    at_end = estimate_of(last, sensor, euclidean())
     steps = path.shape[0] - 1
     always = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), at_end)
     estimate = always._replace(pose=poses[1:], pose_cov=found.covs[1:])

@@ -8,7 +8,7 @@ from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf import to_points
-from jaxslam.filters.ekf.beliefs import moments
+from jaxslam.filters.ekf.coordinates import estimate_of
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import turns_of, update_by_scan
 from jaxslam.filters.ekf.settings import (
@@ -81,7 +81,8 @@ def ekf_slam(
             update or covariance, a chart or linearizer that does not fit the sensor's landmarks or
             one another, a make_room that makes none, a square root in a chart that keeps the last
             motion apart, several iterations of a statistical linearizer, or a linearizer of
-            landmarks for a suite with an absolute sensor; from `update`, on a make_room without `pruning`.
+            landmarks for a suite with an absolute sensor; from `update`, on a make_room without
+            `pruning`.
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
@@ -125,8 +126,7 @@ def ekf_slam(
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:
-        cov = joint.cov @ joint.cov.T if square_root else joint.cov
-        return moments(joint._replace(cov=cov), sensor, chart)
+        return estimate_of(joint, sensor, chart, square_root=square_root)
 
     return Filter(
         name="ekf_slam",

@@ -78,6 +78,12 @@ def check_covariance(filter: str, covariance: str, forms: tuple[str, ...]) -> No
         raise ValueError(f"{filter}: expected covariance {expected}, got {covariance!r}")
 
 
+def check_iterations(filter: str, linearize: Linearizer, iterations: int) -> None:
+    """A linearizer that does not iterate is asked for one pass alone."""
+    if iterations > 1 and not linearize.iterates:
+        raise ValueError(f"{filter}: the linearizer {linearize.name} does not iterate")
+
+
 def check_chart(sensor: Sensor, chart: Chart) -> None:
     """The chart acts on landmarks of the sensor's size."""
     pose, landmark = jnp.zeros(3), jnp.zeros(len(sensor.landmark))
@@ -112,8 +118,7 @@ def check_settings(settings: EkfSettings) -> None:
             f"ekf_slam: the linearizer {linearize.name} is for landmarks alone, and the suite "
             f"{sensor.name} has an absolute sensor"
         )
-    if linearize.name == "unscented" and settings.iterations > 1:
-        raise ValueError("ekf_slam: the linearizer unscented does not iterate")
+    check_iterations("ekf_slam", linearize, settings.iterations)
     if sensor.reduced is not None and chart.basis is not None:
         ground = jnp.zeros(len(sensor.landmark))
         if chart.basis(jnp.zeros(3), ground).landmark is not None:

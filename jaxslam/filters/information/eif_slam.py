@@ -7,7 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.ekf.beliefs import moments
+from jaxslam.filters.ekf.coordinates import estimate_of
 from jaxslam.filters.information import canonical
 from jaxslam.filters.information.settings import InformationSettings
 from jaxslam.filters.information.tag_association import associate_by_table
@@ -115,7 +115,7 @@ def eif_slam(
     def estimate(state: CanonicalState) -> Estimate:
         cov = linalg.inverse_psd(state.omega)
         joint = Joint(state.pose, state.landmarks, cov, state.alive, state.tag, ())
-        return moments(joint, sensor, euclidean())
+        return estimate_of(joint, sensor, euclidean())
 
     return canonical.information_filter(settings, init, predict, update, estimate)
 

@@ -18,6 +18,7 @@ from jaxslam.filters.ekf.settings import (
     EkfSettings,
     Update,
     check_covariance,
+    check_iterations,
     check_numbers,
 )
 from jaxslam.linearize.at_estimate import at_estimate
@@ -87,10 +88,9 @@ def localization(
     linearize = linearize or at_estimate()
     check_numbers("localization", capacity, update, gate, iterations, None)
     check_covariance("localization", covariance, ("plain", "joseph"))
-    if linearize.euclidean or linearize.name == "at_truth":
+    if linearize.own_landmarks:
         raise ValueError(f"localization: the linearizer {linearize.name} is for maps with errors")
-    if linearize.name == "unscented" and iterations > 1:
-        raise ValueError("localization: the linearizer unscented does not iterate")
+    check_iterations("localization", linearize, iterations)
     settings = EkfSettings(
         sensor=sensor,
         chart=chart,
@@ -198,10 +198,10 @@ def _of_pose(chart: Chart) -> Chart:
     if chart.motion_apart:
         raise ValueError(f"localization: the chart {chart.name} composes a map with the motion")
     whole_basis = chart.basis
-    dummy = 4 if chart.name.endswith("rays") else 2
+    size = 2 if chart.landmark_size is None else chart.landmark_size
 
     def ground(landmark: Array) -> Array:
-        return jnp.zeros(dummy, landmark.dtype)
+        return jnp.zeros(size, landmark.dtype)
 
     def retract(pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
         at = ground(landmark)
