@@ -58,7 +58,7 @@ class Scenario:
     filter_options: dict[str, Any] = field(default_factory=dict)
     """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
     draw: Callable[["Scenario", jax.Array], tuple[Truth, Log]] | None = None
-    """(scenario, key) -> truth, log: a world of another kind (`team.world`); None for `simulate`'s
+    """(scenario, key) -> truth, log: a world of another kind (`team_world`); None for `simulate`'s
     own."""
     published: dict[str, dict[str, float]] = field(default_factory=dict)
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
