@@ -99,7 +99,7 @@ def _drive(
         state, info = state_and_info(f"run: {filter.name}", found)
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        return state, (filter.estimate(state), info, () if probe is None else probe(state))
+        return state, (filter.estimate(state), info, None if probe is None else probe(state))
 
     # What a scan runs cannot be merged with its own recomputation, so no barrier is needed.
     body = jax.checkpoint(step, prevent_cse=False)

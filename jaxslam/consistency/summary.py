@@ -1,4 +1,7 @@
-"""What a campaign says of a filter: averages, bands and intervals from the scores of its runs."""
+"""`summarize` returns the `Summary` of one filter: averages, bands, intervals and a verdict.
+
+Called by `monte_carlo.campaign` on the tally of each filter; reports and plots read the summaries.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,7 @@
-"""The scores of a campaign so far, however its runs came in: blocks in any order and of any size.
+"""`condense` returns what is kept of a block of scores, and a `Tally` adds such blocks up.
+
+Called by `monte_carlo`: `block` condenses, `campaign` adds in any order and keeps the tallies, and
+`summary.summarize` takes them.
 
 Sums over runs are taken in pairs of float64 (106 bits), so that what they are rounded to does not
 depend on how the runs were divided; Knuth's two-sum, and the sums of Dekker 1971 ("A floating-point

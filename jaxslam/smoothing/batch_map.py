@@ -199,7 +199,7 @@ def batch_map(
         if tolerance is not None and info.exhausted.shape[0] > 0:
             cut_short = info.exhausted.at[-1].max(search.ending != Ending.CONVERGED)
             info = info._replace(exhausted=cut_short)
-        return Trace(estimate, info, solved, ())
+        return Trace(estimate, info, solved, None)
 
     return forward.compiled_once(filter, pose, pose_cov, solve)
 

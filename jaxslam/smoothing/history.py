@@ -117,7 +117,7 @@ def filtered(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike, key
         return state.before, state.ahead, state.map_ahead, state.joint.pose, state.joint.landmarks
 
     trace = run(filter, log, pose, pose_cov, key, probe=seen)
-    return History(trace._replace(final=trace.final.joint, probe=()), *trace.probe)
+    return History(trace._replace(final=trace.final.joint, probe=None), *trace.probe)
 
 
 def roots_of(motion: Motion, history: History, control: Array) -> Array:

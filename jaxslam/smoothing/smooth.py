@@ -89,7 +89,7 @@ def smooth(
         path = jnp.concatenate([begin[None], history.after])
         estimate, solved = solution(sensor, chain, policy, path, final)
         smoothed = Smoothed(*solved, history.trace.estimate)
-        return Trace(estimate, counted(history.trace.info, used), smoothed, ())
+        return Trace(estimate, counted(history.trace.info, used), smoothed, None)
 
     return forward.compiled_once(filter, pose, pose_cov, solve)
 
