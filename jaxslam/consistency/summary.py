@@ -31,7 +31,7 @@ POSITIVE = ("nees", "nis", "square", "noncredibility")
 
 @dataclass(frozen=True)
 class Summary:
-    """What a campaign says of one filter."""
+    """The consistency of one filter over the runs of a campaign."""
 
     verdict: str
     """consistent, optimistic, pessimistic, diverged, incomplete or undecided; see `judge`."""
@@ -80,7 +80,7 @@ class Summary:
 
 
 def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Summary:
-    """Averages, bands and verdict from the scores of a campaign (host numbers, float64).
+    """The averages, bands and verdict of one filter, from its tally (host numbers, float64).
 
     bound: position [m²] and heading [rad²], (T,) each, the mean conditional bound over the runs.
     """
