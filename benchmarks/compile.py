@@ -27,6 +27,7 @@ from jaxslam.protocols import Filter
 from jaxslam.run import run
 from jaxslam.sensors import Part, suite
 from jaxslam.simulation.scenarios import circle
+from jaxslam.simulation.team_world import team_world
 from jaxslam.simulation.worlds import Scenario, simulate
 
 GATE, DELAYED_GATE = 8.0, 10.0
@@ -55,7 +56,7 @@ def crew(scale: float) -> tuple[Scenario, Filter]:
     robots = [team.Robot(moves, sees), team.Robot(moves, sees, second)]
     points = 3.0 * scale * np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=1)
     controls = np.tile([0.12, 0.1, 0.12, -0.1], (STEPS, 1))
-    return team.world(robots, points, controls), team_slam(robots, 8)
+    return team_world(robots, points, controls), team_slam(robots, 8)
 
 
 def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:

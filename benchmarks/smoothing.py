@@ -34,7 +34,7 @@ from jaxslam import datasets, monte_carlo
 from jaxslam.filters import ekf_slam
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.smoothing import batch_map, smooth
-from jaxslam.smoothing.batch_map import Ending
+from jaxslam.smoothing.gauss_newton import Ending
 
 TOL = 1e-6
 ROWS = (

@@ -23,7 +23,7 @@ from benchmarks.real_data import DATA
 from jaxslam import datasets, se2
 from jaxslam.consistency import align_map
 from jaxslam.filters import ekf_slam, team_slam
-from jaxslam.simulation.team import poses
+from jaxslam.team import poses
 from jaxslam.types import Status
 
 FIGURE = Path(__file__).parent / "figures" / "team.png"

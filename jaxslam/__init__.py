@@ -23,11 +23,13 @@ from jaxslam import (
     sensors,
     slots,
     smoothing,
+    team,
 )
 from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.run import run
-from jaxslam.simulation import scenarios, spurious, team
+from jaxslam.simulation import scenarios, spurious
+from jaxslam.simulation.team_world import team_world
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.verify import linearity, verify_jacobians
 from jaxslam.verify.linearity import linearity_index
@@ -60,6 +62,7 @@ __all__ = [
     "spurious",
     "stats",
     "team",
+    "team_world",
     "uncertain_poses",
     "verify_jacobians",
 ]

@@ -1,4 +1,4 @@
-"""Parameters of the models from a filter's own innovations: what a robot does wrongly each time."""
+"""Calibration of model parameters (systematic errors) from a filter's own innovations."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,7 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from jaxslam import programs
 from jaxslam.math import linalg
@@ -15,18 +16,17 @@ from jaxslam.types import Info, Status
 
 
 class Calibration(NamedTuple):
-    """What `calibrate` found, and how it went there."""
+    """The parameters that `calibrate` found, their covariance, and its iterates."""
 
-    parameters: NDArray[np.float64]
-    """(P,)"""
-    cov: NDArray[np.float64]
-    """(P, P) (JᵀJ)⁻¹, as honest as the filter's noise"""
-    path: NDArray[np.float64]
-    """(iterations + 1, P) parameters from the start on"""
-    misfit: NDArray[np.float64]
-    """(iterations,) Σ ‖w‖² / dof before each step"""
-    dof: NDArray[np.int64]
-    """(iterations,) components of fused measurements, before each step"""
+    parameters: Float[np.ndarray, "P"]
+    cov: Float[np.ndarray, "P P"]
+    """(JᵀJ)⁻¹, as honest as the filter's noise"""
+    path: Float[np.ndarray, "iterations+1 P"]
+    """parameters from the start on"""
+    misfit: Float[np.ndarray, "iterations"]
+    """Σ ‖w‖² / dof before each step"""
+    dof: Int[np.ndarray, "iterations"]
+    """components of fused measurements, before each step"""
     converged: bool
     """whether the last step was small enough"""
 
@@ -38,7 +38,7 @@ def calibrate(
     iterations: int = 10,
     tolerance: float = 0.01,
 ) -> Calibration:
-    """Parameters at which the innovations of a run no longer tell about them.
+    """The parameters at which the innovations of a run hold no more information on them.
 
     Gauss-Newton on Σ ‖w(p)‖², w = L⁻¹ ν with S = L Lᵀ, over all fused measurements:
 
@@ -50,11 +50,11 @@ def calibrate(
     Gaussian noise and S does not depend on p it is the maximum of the likelihood.
 
     Associations are made anew at each p and not differentiated. They need not be given: a filter
-    with `association.nearest` and `life.recency(patience=…)` keeps a local map, in which neighbours
-    in time are told apart whatever the drift, and no loop is closed, rightly or wrongly.
+    with `association.nearest` and `life.recency(patience=…)` keeps a local map, in which landmarks
+    seen close in time are associated whatever the drift, and no loop is closed.
 
-    Several places of a scan are whitened each by its own S; in a joint update what they share
-    beyond the map is not looked at, which costs a little precision.
+    Each measurement of a scan is whitened by its own S; the correlation between those of one joint
+    update is left out, which costs a little precision.
 
     Args:
         info: p (P,) -> the `Info` of a run, `lambda p: jaxslam.run(…).info`, where p may enter the
@@ -66,8 +66,8 @@ def calibrate(
         `Calibration`; look at `converged`.
     Raises:
         ValueError: on a start that is not a finite vector, iterations below 1, a tolerance not
-            above 0; where a run fuses nothing, or its innovations are not finite or do not tell the
-            parameters apart.
+            above 0; where a run fuses nothing, or its innovations are not finite or do not
+            distinguish the parameters.
     """
     p = np.atleast_1d(np.asarray(start, np.float64))
     if p.ndim != 1 or not p.size or not np.isfinite(p).all():
@@ -76,7 +76,10 @@ def calibrate(
     if not tolerance > 0:
         raise ValueError(f"calibrate: expected a tolerance above 0, got {tolerance}")
 
-    def white(p: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    def whitened(
+        p: Float[Array, "P"],
+    ) -> tuple[Float[Array, "K"], tuple[Float[Array, "K"], Int[Array, ""]]]:
+        """w, twice, since one is differentiated; and its degrees of freedom."""
         found = info(p)
         fused = found.status == Status.FUSED
         count, size = fused.size, found.innovation.shape[-1]
@@ -89,20 +92,22 @@ def calibrate(
         w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
         return w, (w, jnp.where(fused, found.dof, 0).sum())
 
-    step = jax.jacfwd(white, has_aux=True)
+    step = jax.jacfwd(whitened, has_aux=True)
     path, misfit, dofs, converged = [p], [], [], False
     for _ in range(iterations):
-        slope, (w, dof) = jax.device_get(programs.call(step, (), jnp.asarray(p)))
-        slope, w, dof = np.asarray(slope, np.float64), np.asarray(w, np.float64), int(dof)
+        jacobian, (w, dof) = jax.device_get(programs.call(step, (), jnp.asarray(p)))
+        jacobian, w, dof = np.asarray(jacobian, np.float64), np.asarray(w, np.float64), int(dof)
         if not dof:
             raise ValueError(f"calibrate: no measurement is fused at {p}")
-        if not (np.isfinite(slope).all() and np.isfinite(w).all()):
-            raise ValueError(f"calibrate: the innovations or their slopes are not finite at {p}")
-        # Columns of unit length: whether parameters are told apart does not depend on their units.
-        length = np.linalg.norm(slope, axis=0)
-        left, values, right = np.linalg.svd(slope / np.where(length > 0, length, 1.0), False)
+        if not (np.isfinite(jacobian).all() and np.isfinite(w).all()):
+            raise ValueError(
+                f"calibrate: the innovations or their derivatives are not finite at {p}"
+            )
+        # Columns of unit length: whether parameters can be distinguished does not depend on units.
+        length = np.linalg.norm(jacobian, axis=0)
+        left, values, right = np.linalg.svd(jacobian / np.where(length > 0, length, 1.0), False)
         if values[-1] <= len(p) * np.sqrt(np.finfo(np.float64).eps) * values[0]:
-            raise ValueError(f"calibrate: the innovations do not tell the parameters apart at {p}")
+            raise ValueError(f"calibrate: the innovations do not distinguish the parameters at {p}")
         inverse = right.T / values / length[:, None]
         cov = inverse @ inverse.T
         move = -inverse @ (left.T @ w)

@@ -101,7 +101,7 @@ def _drive(
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
         estimate = checked_estimate(name, filter.estimate(state))
-        return state, (estimate, info, () if probe is None else probe(state))
+        return state, (estimate, info, None if probe is None else probe(state))
 
     # What a scan runs cannot be merged with its own recomputation, so no barrier is needed.
     body = jax.checkpoint(step, prevent_cse=False)

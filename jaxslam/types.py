@@ -78,9 +78,9 @@ class Truth(NamedTuple):
     """landmarks in view for which the scan had no place."""
     start: Float[Array, "3"]
     """true pose before the first control."""
-    origin: Any = ()
-    """(T, M) int: the tag of the landmark each measurement is truly of, -1 of none; in a world with
-    `spurious` data alone."""
+    origin: Int[Array, "T M"] | None = None
+    """the tag of the landmark each measurement is truly of, -1 of none; None but in a world with
+    `spurious` data."""
 
 
 class Estimate(NamedTuple):
@@ -143,7 +143,7 @@ class Trace(NamedTuple):
     final: Any
     """the filter's own state at the end."""
     probe: Any
-    """what the caller's probe saw after each update, leading T; () without one."""
+    """what the caller's probe saw after each update, leading T; None without one."""
 
 
 def check_log(

@@ -16,7 +16,7 @@ PACKAGE = Path(jaxslam.__file__).parent
 FLOORS = [
     "math programs",
     "types protocols slots noise derivatives",
-    "motion sensors charts linearize association resampling life validation",
+    "motion sensors charts linearize association resampling life validation team",
     "run filters smoothing simulation",
     "consistency monte_carlo verify catalog calibration",
     "datasets results cli __main__",

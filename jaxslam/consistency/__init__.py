@@ -2,17 +2,17 @@
 
 from jaxslam.consistency.alignment import align_map
 from jaxslam.consistency.bound import (
-    Slopes,
+    RunJacobians,
     conditional_bound,
     final_covariance,
+    jacobians_at_truth,
     posterior_bound,
-    slopes_at_truth,
     van_trees,
 )
 from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.intervals import LEVEL, Measure, interval, lopsided, positive_interval
 from jaxslam.consistency.nees import DOF, mean_pose_nees, own_error_of
-from jaxslam.consistency.score import LANDMARK_DOF, LEVELS, Score, score
+from jaxslam.consistency.score import LANDMARK_DOF, LEVELS, Score, monitor_of, score
 from jaxslam.consistency.statistics import LAGS, Statistics, statistics
 from jaxslam.consistency.summary import Summary, summarize
 from jaxslam.consistency.tally import Tally, condense
@@ -25,8 +25,8 @@ __all__ = [
     "LEVEL",
     "LEVELS",
     "Measure",
+    "RunJacobians",
     "Score",
-    "Slopes",
     "Statistics",
     "Summary",
     "Tally",
@@ -37,15 +37,16 @@ __all__ = [
     "credibility",
     "final_covariance",
     "interval",
+    "jacobians_at_truth",
     "judge",
     "lopsided",
     "mean_pose_nees",
+    "monitor_of",
     "own_error_of",
     "positive_interval",
     "posterior_bound",
     "power_of",
     "score",
-    "slopes_at_truth",
     "statistics",
     "summarize",
     "van_trees",

@@ -1,17 +1,20 @@
-"""A map from data against surveyed points, whose frame it does not share."""
+"""The error of a map whose frame is not that of the surveyed points it is compared with."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxslam.math import se2
 from jaxslam.types import Estimate
 
 
-def align_map(estimate: Estimate, true_points: np.ndarray) -> tuple[np.ndarray, float]:
-    """The pose (3,) that carries a map onto surveyed points best, and the RMSE [m] it leaves.
+def align_map(
+    estimate: Estimate, true_points: Float[np.ndarray, "N 2"]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """The pose that carries a map onto surveyed points best, and the RMSE [m] that remains.
 
-    estimate: of one time, landmarks tagged; true_points (N, 2) by tag. The frame of a map made from
+    estimate: of one time, landmarks tagged. true_points: by tag. The frame of a map made from
     data is that of the robot's start, so only its shape can be compared (`se2.align`). Raises
     ValueError if the map is empty.
     """

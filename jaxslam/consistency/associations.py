@@ -1,20 +1,21 @@
-"""How often a filter takes a measurement for one of the landmark it is of."""
+"""How often a filter associates a measurement with the landmark that was truly measured."""
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int
 
 from jaxslam.types import Status, Trace
 
 
-def identities(trace: Trace, origin: jax.Array) -> jax.Array:
-    """What each slot truly holds after each step, (T, N): the origin of the measurement its
-    landmark was born of, -1 for nothing. Tags may be wrong, and are not looked at.
+def identities(trace: Trace, origin: Int[Array, "T M"]) -> Int[Array, "T N"]:
+    """The true landmark in each slot after each step: the origin of the measurement it was
+    initialized by, -1 for none. Tags may be wrong, and are not looked at.
 
-    origin: (T, M), `Truth.origin`.
+    origin: `Truth.origin`.
     """
     count = trace.estimate.alive.shape[1]
 
-    def step(held: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+    def step(held: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:
         status, slot, origin = row
         at = jnp.where(status == Status.BORN, slot, count)
         held = held.at[at].set(origin, mode="drop")
@@ -26,13 +27,14 @@ def identities(trace: Trace, origin: jax.Array) -> jax.Array:
 
 
 def associations(
-    trace: Trace, origin: jax.Array, held: jax.Array
-) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Sums and their weights, of one run; held (T, N): its `identities`.
+    trace: Trace, origin: Int[Array, "T M"], held: Int[Array, "T N"]
+) -> dict[str, tuple[Array, Array]]:
+    """Precision, recall and false landmarks of one run, each as a sum and its weight.
 
-    precision: corrections by a measurement of the very landmark, over all corrections. recall:
-    the same over the measurements of landmarks that were in the map before the step.
-    false_landmarks: those of the final map that are nothing's, or were there before.
+    precision: corrections by a measurement of that landmark, over all corrections. recall: the same
+    over the measurements of landmarks that were in the map before the step. false_landmarks: those
+    of the final map that are of no true landmark, or of one that an earlier slot holds. held: the
+    `identities` of the run.
     """
     info = trace.info
     fused = info.status == Status.FUSED

@@ -1,4 +1,4 @@
-"""Cramér-Rao bounds: one of estimators that are unbiased given the truth, one of all estimators."""
+"""Cramér-Rao bounds on estimators that are unbiased given the truth, and on all estimators."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import derivatives
 from jaxslam.consistency.score import snapshot_steps
@@ -20,9 +21,8 @@ from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Estimate, Log, Truth
 
 
-def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: jax.Array) -> Estimate:
-    """The Cramér-Rao bound given a true trajectory; as `Estimate`s, (T,), of which the covariances
-    mean something.
+def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: Array) -> Estimate:
+    """The Cramér-Rao bound given a true trajectory, as the covariances of an `Estimate` (T,).
 
     It bounds the covariance of estimators that are unbiased *given that trajectory and map*; the
     average over runs of such estimators' mean square errors lies above the average of the bounds. A
@@ -34,8 +34,8 @@ def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: jax.Array
     J_{k+1} = D22 - D21 (J_k + D11)⁻¹ D12, D11 = FᵀQ⁻¹F, D12 = -FᵀQ⁻¹, D22 = Q⁻¹ + HᵀR⁻¹H, here with
     the Jacobians of one trajectory in place of their means. Its inverse is the covariance of the
     Kalman filter of that linear system, which also exists for a singular Q or P0; so this runs the
-    ideal EKF without gate and with every birth allowed. The noise of a measurement is what the
-    sensor states for what it measured.
+    ideal EKF without gate and without a quota of new landmarks. The noise of a measurement is what
+    the sensor states for what it measured.
     """
     options: dict[str, Any] = scenario.filter_options | {"gate": None, "births": None}
     capacity = truth.landmarks.shape[0]
@@ -47,8 +47,8 @@ def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: jax.Array
 
 def posterior_bound(
     scenario: Scenario, truth: Truth, log: Log, steps: Sequence[int] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (K,), and at each the bound (3, 3) on the mean square pose error of all estimators.
+) -> tuple[Int[np.ndarray, "K"], Float[np.ndarray, "K 3 3"]]:
+    """Steps, and at each of them the bound on the mean square pose error of all estimators.
 
     The posterior (van Trees) bound: information is averaged over the worlds and then inverted. The
     recursion over states needs Q⁻¹, which the noise of a robot seldom has; so the bound is taken
@@ -82,72 +82,73 @@ def posterior_bound(
     at = snapshot_steps(total) if steps is None else np.asarray(steps, int)
     if at.size == 0 or at.min() < 0 or at.max() >= total:
         raise ValueError(f"posterior_bound: expected steps within 0 and {total - 1}, got {steps}")
-    found = jax.device_get(jax.jit(jax.vmap(partial(slopes_at_truth, scenario)))(truth, log))
+    runs = jax.device_get(jax.jit(jax.vmap(partial(jacobians_at_truth, scenario)))(truth, log))
     start = np.asarray(jax.jit(root_psd)(jnp.asarray(scenario.pose_cov, truth.pose.dtype)))
-    slopes: Any = 0.0
+    by_p: Any = 0.0
     information: Any = 0.0
     for i in range(count):
-        rows = list(_by_parameters(jax.tree.map(lambda leaf, i=i: leaf[i], found), start, at))
-        slopes = slopes + np.stack([slope for slope, _ in rows]) / count
+        rows = list(_by_parameters(jax.tree.map(lambda leaf, i=i: leaf[i], runs), start, at))
+        by_p = by_p + np.stack([a for a, _ in rows]) / count
         information = information + np.stack([gained for _, gained in rows]) / count
-    random = 3 + total * found.by_noise.shape[3]
+    random = 3 + total * runs.by_noise.shape[3]
     prior = np.diag((np.arange(information.shape[1]) < random).astype(float))
-    return at, np.stack([_inverted(a, prior + j) for a, j in zip(slopes, information, strict=True)])
+    return at, np.stack([_inverted(a, prior + j) for a, j in zip(by_p, information, strict=True)])
 
 
 def van_trees(
-    slopes: np.ndarray, jacobians: np.ndarray, noise_covs: np.ndarray, prior: np.ndarray
-) -> np.ndarray:
+    target_jacobians: Float[np.ndarray, "draws K P"],
+    jacobians: Float[np.ndarray, "draws M P"],
+    noise_covs: np.ndarray,
+    prior: Float[np.ndarray, "P P"],
+) -> Float[np.ndarray, "K K"]:
     """The posterior Cramér-Rao bound (K, K) on the mean square error of g(p) ∈ Rᴷ, z = h(p) + v.
 
     E ∂g/∂p (prior + E (∂h/∂p)ᵀ R⁻¹ (∂h/∂p))⁻¹ (E ∂g/∂p)ᵀ, E over draws of p (van Trees 1968, 2.4).
 
     Args:
-        slopes: ∂g/∂p (draws, K, P); jacobians: ∂h/∂p (draws, M, P).
+        target_jacobians: ∂g/∂p of each draw. jacobians: ∂h/∂p.
         noise_covs: R (M, M), or (draws, M, M).
-        prior: information on p (P, P): P0⁻¹ of a normal prior, 0 of what has none. A direction that
+        prior: information on p: P0⁻¹ of a normal prior, 0 of what has none. A direction that
             nothing tells is left out, and must not matter to g.
     """
-    weighed = np.linalg.solve(noise_covs, jacobians)
-    gained = (np.swapaxes(jacobians, 1, 2) @ weighed).mean(axis=0)
-    return _inverted(np.mean(slopes, axis=0), prior + gained)
+    scaled = np.linalg.solve(noise_covs, jacobians)
+    gained = (np.swapaxes(jacobians, 1, 2) @ scaled).mean(axis=0)
+    return _inverted(np.mean(target_jacobians, axis=0), prior + gained)
 
 
-class Sights(NamedTuple):
-    """The Jacobians of what one sensor measured in a run, at the truth."""
+class SensorJacobians(NamedTuple):
+    """The Jacobians of one sensor's measurements in a run, at the truth."""
 
-    by_pose: Any
-    """(T, M, Z, 3)"""
-    by_landmark: Any
-    """(T, M, Z, L)"""
-    noise_cov: Any
-    """(T, M, Z, Z)"""
-    tag: Any
-    """(T, M) which landmark"""
-    valid: Any
-    """(T, M) whether anything was measured there"""
+    by_pose: Float[Array, "T M Z 3"]
+    by_landmark: Float[Array, "T M Z L"]
+    noise_cov: Float[Array, "T M Z Z"]
+    tag: Int[Array, "T M"]
+    """which landmark"""
+    valid: Bool[Array, "T M"]
+    """whether anything was measured there"""
 
 
-class Slopes(NamedTuple):
-    """The Jacobians of one run at the truth."""
+class RunJacobians(NamedTuple):
+    """The Jacobians of the models along the true path of one run."""
 
-    by_pose: Any
-    """(T, 3, 3) of the motion"""
-    by_noise: Any
-    """(T, 3, W) times √Q"""
-    measured: list[Sights]
-    """by sensor"""
-    landmarks: Any
-    """(N, L)"""
+    by_pose: Float[Array, "T 3 3"]
+    """of the motion"""
+    by_noise: Float[Array, "T 3 W"]
+    """of the motion, times √Q"""
+    sensors: list[SensorJacobians]
+    landmarks: Float[Array, "N L"]
 
 
-def slopes_at_truth(scenario: Scenario, truth: Truth, log: Log) -> Slopes:
-    """The Jacobians of one run of one robot, nothing spurious, identities known. For `vmap`."""
+def jacobians_at_truth(scenario: Scenario, truth: Truth, log: Log) -> RunJacobians:
+    """The Jacobians of the models along the true path of one run; traceable, for `vmap` over runs.
+
+    For the world of one robot, nothing spurious, tags known.
+    """
     motion, dtype = scenario.motion, truth.pose.dtype
     old = jnp.concatenate([truth.start[None], truth.pose[:-1]])
     still = jnp.zeros(len(motion.noises), dtype)
 
-    def moved(old: jax.Array, new: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def moved(old: Array, new: Array, u: Array) -> tuple[Array, Array]:
         by_pose, by_noise = derivatives.motion_jacobians(motion, old, u)
         ahead = motion.step(old, u, still)
         root = root_psd(motion.noise_cov(old, u))
@@ -160,12 +161,12 @@ def slopes_at_truth(scenario: Scenario, truth: Truth, log: Log) -> Slopes:
         if isinstance(sensor, Suite)
         else [(sensor, log.scan.tag.shape[1])]
     )
-    measured: list[Sights] = []
+    sensors: list[SensorJacobians] = []
     first = 0
     for model, places in parts:
         size = len(model.measurements)
 
-        def seen(pose: jax.Array, z: jax.Array, tag: jax.Array, model: Any = model) -> Any:
+        def seen(pose: Array, z: Array, tag: Array, model: Any = model) -> Any:
             landmark = truth.landmarks[tag][: len(model.landmark)]
             return *derivatives.observe_jacobians(model, pose, landmark), model.noise_cov(z)
 
@@ -173,35 +174,37 @@ def slopes_at_truth(scenario: Scenario, truth: Truth, log: Log) -> Slopes:
         tag = jnp.maximum(tag, 0)
         found = jax.vmap(jax.vmap(seen, (None, 0, 0)))(truth.pose, z[:, :, :size], tag)
         by_pose_there, by_landmark, noise_cov = found
-        measured.append(Sights(by_pose_there, by_landmark, noise_cov, tag, valid))
+        sensors.append(SensorJacobians(by_pose_there, by_landmark, noise_cov, tag, valid))
         first += places
-    return Slopes(by_pose, by_noise, measured, truth.landmarks)
+    return RunJacobians(by_pose, by_noise, sensors, truth.landmarks)
 
 
-def final_covariance(slopes: Slopes, pose_cov: np.ndarray) -> np.ndarray:
-    """The covariance (3, 3) of the last pose in `conditional_bound`, of one run, by NumPy.
+def final_covariance(
+    jacobians: RunJacobians, pose_cov: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The covariance of the last pose in `conditional_bound`, of one run, by NumPy.
 
     The Kalman filter of the linear system that the Jacobians make. A landmark begins with its first
     measurement, where that determines it, and otherwise with a deviation of 100 times the map's
     reach. A billionth of the reach is added to the noise of measurements, which may be none.
     """
-    count, size = slopes.landmarks.shape
-    reach = 1.0 + float(np.max(np.abs(slopes.landmarks), initial=0.0))
+    count, size = jacobians.landmarks.shape
+    reach = 1.0 + float(np.max(np.abs(jacobians.landmarks), initial=0.0))
     cov = np.zeros((3 + count * size,) * 2)
     cov[:3, :3] = pose_cov
     known = np.zeros(count, bool)
-    for t in range(len(slopes.by_pose)):
-        cov[:3] = slopes.by_pose[t] @ cov[:3]
-        cov[:, :3] = cov[:, :3] @ slopes.by_pose[t].T
-        cov[:3, :3] += slopes.by_noise[t] @ slopes.by_noise[t].T
-        for sights in slopes.measured:
-            for i in np.flatnonzero(sights.valid[t]):
-                by_pose, by_landmark = sights.by_pose[t, i], sights.by_landmark[t, i]
-                noise = sights.noise_cov[t, i] + (1e-9 * reach) ** 2 * np.eye(len(by_pose))
-                begin = 3 + int(sights.tag[t, i]) * size
+    for t in range(len(jacobians.by_pose)):
+        cov[:3] = jacobians.by_pose[t] @ cov[:3]
+        cov[:, :3] = cov[:, :3] @ jacobians.by_pose[t].T
+        cov[:3, :3] += jacobians.by_noise[t] @ jacobians.by_noise[t].T
+        for seen in jacobians.sensors:
+            for i in np.flatnonzero(seen.valid[t]):
+                by_pose, by_landmark = seen.by_pose[t, i], seen.by_landmark[t, i]
+                noise = seen.noise_cov[t, i] + (1e-9 * reach) ** 2 * np.eye(len(by_pose))
+                begin = 3 + int(seen.tag[t, i]) * size
                 own = slice(begin, begin + by_landmark.shape[1])
-                if by_landmark.shape[1] and not known[sights.tag[t, i]]:
-                    known[sights.tag[t, i]] = True
+                if by_landmark.shape[1] and not known[seen.tag[t, i]]:
+                    known[seen.tag[t, i]] = True
                     if by_landmark.shape == (size, size) and np.linalg.cond(by_landmark) < 1e6:
                         by = np.linalg.inv(by_landmark)
                         cov[own] = -by @ by_pose @ cov[:3]
@@ -218,49 +221,51 @@ def final_covariance(slopes: Slopes, pose_cov: np.ndarray) -> np.ndarray:
 
 
 def _by_parameters(
-    found: Slopes, start: np.ndarray, at: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """∂x_t/∂p (3, P), and what was gained until then (P, P), at each step of at."""
-    steps, _, width = found.by_noise.shape
-    count, size = found.landmarks.shape
+    run: RunJacobians, start: Float[np.ndarray, "3 3"], at: Int[np.ndarray, "K"]
+) -> Iterator[tuple[Float[np.ndarray, "3 P"], Float[np.ndarray, "P P"]]]:
+    """∂x_t/∂p, and the information that the scans until then hold on p, at each step of at."""
+    steps, _, width = run.by_noise.shape
+    count, size = run.landmarks.shape
     map_at = 3 + steps * width
-    slope = np.zeros((3, map_at + count * size))
-    slope[:, :3] = start
-    gained = np.zeros((slope.shape[1],) * 2)
+    by_p = np.zeros((3, map_at + count * size))
+    by_p[:, :3] = start
+    information = np.zeros((by_p.shape[1],) * 2)
     kept = {}
-    white = [_whitened(sights) for sights in found.measured]
+    white = [_whitened(sensor) for sensor in run.sensors]
     for t in range(steps):
-        slope = found.by_pose[t] @ slope
-        slope[:, 3 + t * width : 3 + (t + 1) * width] = found.by_noise[t]
-        for (by_pose, by_landmark), sights in zip(white, found.measured, strict=True):
-            rows = by_pose[t] @ slope
-            for i, place in enumerate(sights.tag[t]):
-                begin = map_at + int(place) * size
+        by_p = np.asarray(run.by_pose[t]) @ by_p
+        by_p[:, 3 + t * width : 3 + (t + 1) * width] = run.by_noise[t]
+        for (by_pose, by_landmark), sensor in zip(white, run.sensors, strict=True):
+            rows = by_pose[t] @ by_p
+            for i, tag in enumerate(sensor.tag[t]):
+                begin = map_at + int(tag) * size
                 rows[i, :, begin : begin + by_landmark.shape[3]] += by_landmark[t, i]
-            rows = rows.reshape(-1, slope.shape[1])
-            gained += rows.T @ rows
+            rows = rows.reshape(-1, by_p.shape[1])
+            information += rows.T @ rows
         if t in at:
-            kept[t] = slope.copy(), gained.copy()
+            kept[t] = by_p.copy(), information.copy()
     return iter([kept[t] for t in at])
 
 
-def _whitened(sights: Sights) -> list[np.ndarray]:
-    """The Jacobians by pose and landmark in units of the noise; zero where nothing was measured."""
-    there = sights.valid[:, :, None, None]
-    noise = np.where(there, sights.noise_cov, np.eye(sights.noise_cov.shape[2]))
+def _whitened(sensor: SensorJacobians) -> list[np.ndarray]:
+    """R^{-1/2} times the Jacobians by pose and landmark; zero where nothing was measured."""
+    there = sensor.valid[:, :, None, None]
+    noise = np.where(there, sensor.noise_cov, np.eye(sensor.noise_cov.shape[2]))
     try:
         factor = np.linalg.cholesky(noise)
     except np.linalg.LinAlgError:
         raise ValueError("posterior_bound: a measurement noise is not positive definite") from None
-    return [np.where(there, np.linalg.solve(factor, by), 0.0) for by in sights[:2]]
+    return [np.where(there, np.linalg.solve(factor, by), 0.0) for by in sensor[:2]]
 
 
-def _inverted(slope: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """A J⁺ Aᵀ (K, K), J scaled to a unit diagonal, a direction of no information left out."""
+def _inverted(
+    jacobian: Float[np.ndarray, "K P"], information: Float[np.ndarray, "P P"]
+) -> Float[np.ndarray, "K K"]:
+    """A J⁺ Aᵀ, J scaled to a unit diagonal, a direction of no information left out."""
     size = np.sqrt(np.diagonal(information))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
     values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
     there = values > len(values) * np.finfo(float).eps * values[-1]
-    root = (slope * unit) @ vectors[:, there] / np.sqrt(values[there])
+    root = (jacobian * unit) @ vectors[:, there] / np.sqrt(values[there])
     bound: np.ndarray = root @ root.T
     return bound

@@ -1,12 +1,15 @@
-"""How far a claimed covariance is from the actual one: Li & Zhao's noncredibility."""
+"""The noncredibility of Li & Zhao: how far a claimed covariance is from the actual one."""
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 
 def credibility(
-    errors: np.ndarray, covs: np.ndarray, regular: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Each run's noncredibility index and inclination, (runs,) each, NaN for a run without one.
+    errors: Float[np.ndarray, "runs K n"],
+    covs: Float[np.ndarray, "runs K n n"],
+    regular: Bool[np.ndarray, "runs K"],
+) -> tuple[Float[np.ndarray, "runs"], Float[np.ndarray, "runs"]] | None:
+    """Each run's noncredibility index and inclination, NaN for a run without one.
 
     At each step, with the actual mean square error Σ = mean over runs of e eᵀ and the ratio
     ρ = (eᵀ P⁻¹ e)/(eᵀ Σ⁻¹ e) of a run, the index is the mean of 10 |log10 ρ| and the inclination
@@ -14,10 +17,9 @@ def credibility(
     one. X. R. Li, Z. Zhao, "Measuring estimator's credibility: noncredibility index", FUSION 2006.
 
     Args:
-        errors: (runs, K, n).
-        covs: (runs, K, n, n) as claimed.
-        regular: (runs, K) whether that has an inverse; the others are left out, and so is one
-            that is not positive definite for all that, or an error of 0.
+        covs: as claimed.
+        regular: whether that covariance has an inverse; the others are left out, and so is one
+            that is not positive definite all the same, or an error of 0.
     Returns:
         None unless some step has at least 2n + 2 runs: Σ is made of them.
     """

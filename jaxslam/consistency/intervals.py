@@ -1,4 +1,4 @@
-"""A figure averaged over independent runs, with its interval."""
+"""Averages over independent runs, with their confidence intervals."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,11 +11,11 @@ LEVEL = 0.95
 """of every band and interval."""
 
 SKEW = 1.5
-"""The spread of a run's average NEES is known as badly as that of so many times fewer normals."""
+"""The factor by which the skewness of a run's average NEES reduces degrees of freedom."""
 
 
 class Measure(NamedTuple):
-    """A figure over all runs, with its 95 % interval from the spread between runs."""
+    """An average over all runs, with its 95 % interval from the spread between runs."""
 
     value: float
     low: float

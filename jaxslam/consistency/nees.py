@@ -1,6 +1,5 @@
-"""The NEES of a pose, eᵀ P⁻¹ e with e = truth - estimate, of its blocks, and in own coordinates.
-
-It is taken on the host, by NumPy in float64: nothing of it is compiled.
+"""The NEES eᵀ P⁻¹ e of a pose and of its blocks, e = truth - estimate, in (x, y, θ) and in the
+filter's own error coordinates; on the host, by NumPy in float64.
 """
 
 from typing import NamedTuple
@@ -8,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.types import Trace, Truth
@@ -20,16 +20,18 @@ ROUNDING = 32
 
 
 class Nees(NamedTuple):
-    """Of a block of the error at each step."""
+    """The NEES of one block of the pose error, at each step."""
 
-    value: np.ndarray
+    value: Float[np.ndarray, "..."]
     """0 where there is none."""
-    regular: np.ndarray
-    """bool: whether there is one"""
+    regular: Bool[np.ndarray, "..."]
+    """whether there is one"""
 
 
-def pose_error(truth: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """truth - estimate (…, 3), heading wrapped to (-π, π]."""
+def pose_error(
+    truth: Float[np.ndarray, "*steps 3"], pose: Float[np.ndarray, "*steps 3"]
+) -> Float[np.ndarray, "*steps 3"]:
+    """truth - estimate, heading wrapped to (-π, π]."""
     error = np.asarray(truth, np.float64) - np.asarray(pose, np.float64)
     turn = error[..., 2]
     error[..., 2] = turn - 2 * np.pi * np.ceil((turn - np.pi) / (2 * np.pi))
@@ -37,9 +39,12 @@ def pose_error(truth: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def block_nees(
-    pose: np.ndarray, error: np.ndarray, own: np.ndarray, cov: np.ndarray
+    pose: Float[np.ndarray, "*steps 3"],
+    error: Float[np.ndarray, "*steps 3"],
+    own: Float[np.ndarray, "*steps 3"],
+    cov: Float[np.ndarray, "*steps 3 3"],
 ) -> dict[str, Nees]:
-    """NEES (…,), and where there is one, of the blocks of `DOF` and of the own error ("own").
+    """The NEES of each block of `DOF`, and of the error in the filter's own coordinates ("own").
 
     There is none where the claimed covariance is singular, i.e. some direction is known exactly: a
     pivot of its Cholesky factor is at most 100 n·eps, in units of which x and y have one. And none
@@ -49,8 +54,9 @@ def block_nees(
     of one of 1e27.
 
     Args:
-        pose: (…, 3) as estimated; error, own: (…, 3); cov: (…, 3, 3) as claimed. eps is that of the
-            dtype of cov.
+        pose: as estimated.
+        error, own: in (x, y, θ), and in the filter's coordinates.
+        cov: as claimed. eps is that of its dtype.
     """
     eps = float(np.finfo(cov.dtype).eps)
     with np.errstate(all="ignore"):
@@ -75,13 +81,11 @@ def block_nees(
 
 
 def mean_pose_nees(
-    truth: np.ndarray, pose: np.ndarray, cov: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The mean over time of each run's pose NEES, and whether there is one, (R,) each.
-
-    Args:
-        truth, pose: (R, T, 3); cov: (R, T, 3, 3), what the filter claims.
-    """
+    truth: Float[np.ndarray, "R T 3"],
+    pose: Float[np.ndarray, "R T 3"],
+    cov: Float[np.ndarray, "R T 3 3"],
+) -> tuple[Float[np.ndarray, "R"], Bool[np.ndarray, "R"]]:
+    """The mean over time of each run's pose NEES, and whether there is one."""
     error = pose_error(truth, pose)
     nees, regular = block_nees(pose, error, error, cov)["pose"]
     count = regular.sum(axis=1)
@@ -89,14 +93,14 @@ def mean_pose_nees(
     return nees.sum(axis=1) / np.maximum(count, 1), finite & (count > 0)
 
 
-def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> jax.Array:
-    """The pose error in the filter's coordinates, brought to (x, y, θ) by its basis, (T, 3).
+def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Float[Array, "T 3"]:
+    """The pose error in the filter's coordinates, brought to (x, y, θ) by its basis.
 
     ξᵀ P_ξ⁻¹ ξ = (E ξ)ᵀ P⁻¹ (E ξ) with P = E P_ξ Eᵀ as the filter reports it.
     """
     ground = jnp.zeros(len(sensor.landmark), truth.pose.dtype)
 
-    def one(pose: jax.Array, true_pose: jax.Array) -> jax.Array:
+    def one(pose: Array, true_pose: Array) -> Array:
         dx, _ = chart.local(pose, ground, true_pose, ground)
         return dx if chart.basis is None else chart.basis(pose, ground).pose @ dx
 
@@ -104,8 +108,8 @@ def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> ja
 
 
 def _unit(pose: np.ndarray, cov: np.ndarray, eps: float) -> list[np.ndarray]:
-    """1/σ of x, y and θ: the units in which a pose covariance is judged. x and y, both metres, have
-    one; 0 where the deviation is rounding."""
+    """1/σ of x, y and θ, which scale a pose covariance to a unit diagonal; x and y, both metres,
+    share one. 0 where the deviation is rounding."""
     x, y, heading = (np.maximum(cov[..., i, i].astype(np.float64), 0.0) for i in range(3))
     reach = np.abs(pose[..., :2]).max(axis=-1)
 

@@ -1,4 +1,7 @@
-"""What one run says of a filter: the numbers that a campaign adds up or keeps, run by run.
+"""`score` returns what each run says of a filter, the numbers that a campaign adds up or keeps.
+
+Called by `monte_carlo.block` on the results of a block of runs; `tally.condense` takes what it
+returns.
 
 A run's error is compared with the covariance the filter claims for it. With e = truth - estimate,
 heading wrapped, NEES = eᵀ P⁻¹ e has mean dof for an honest filter; it is *not* divided by dof
@@ -11,10 +14,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.consistency.nees import DOF, Nees, block_nees, pose_error
 from jaxslam.consistency.statistics import Statistics
 from jaxslam.math.stats import chi2_quantile
+from jaxslam.slots import Watch
 from jaxslam.types import Info, Status, Trace, Truth
 
 LANDMARK_DOF = 2
@@ -33,12 +38,12 @@ DROPS = (
 )
 """What can keep a measurement from the map; each is counted."""
 
-PARTICLE_EVENTS = ("resampled", "underflow", "invalid", "injected", "capped")
-"""Fields of `info.extra["particles"]`; each is counted where it is there."""
-
-EVENTS = ("removed", "merged", "reduced", "exhausted", *PARTICLE_EVENTS)
-"""Fields of `Info`, or of the records in `Info.extra` that `_happened` knows, that not every filter
-has; each is counted where it is there."""
+EVENTS = (
+    *("removed", "merged", "reduced", "exhausted", "resampled", "underflow"),
+    *("invalid", "injected", "capped"),
+)
+"""Fields of `Info`, or of the records in `Info.extra`, that not every filter has; each is counted
+where it is there."""
 
 LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
 """Probabilities of the coverage curves."""
@@ -50,8 +55,8 @@ SNAPSHOTS = 25
 class Score(NamedTuple):
     """Of many runs (leading R). Of a run that is not finite, the rest means nothing."""
 
-    finite: np.ndarray
-    """(R,) bool: every number of the run is finite."""
+    finite: Bool[np.ndarray, "R"]
+    """every number of the run is finite."""
     measures: dict[str, tuple[np.ndarray, np.ndarray]]
     """each run's own averages: what is averaged, and over how much; there is none over 0."""
     snapshots: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -66,17 +71,20 @@ def snapshot_steps(steps: int) -> np.ndarray:
 
 
 def score(
-    trace: Trace, truth: Truth, found: Statistics, own_error: np.ndarray | None = None
+    trace: Trace,
+    truth: Truth,
+    found: Statistics,
+    own_error: Float[np.ndarray, "R T 3"] | None = None,
 ) -> Score:
-    """Score many runs, by NumPy in float64; every array is the host's and has leading R.
+    """The scores of R runs, by NumPy in float64; every array is the host's and has leading R.
 
     Args:
         trace: of the estimate only poses and their covariances are looked at, of the final state
-            its `watch`, where it has one, and of `probe` then what that had learnt after each step
-            (R, T, 3, 3).
+            its observability monitor (`monitor_of`), and where it has one, of `probe` the
+            information of that after each step (R, T, 3, 3).
         found: `statistics` of each run.
-        own_error: (R, T, 3) the pose errors in the filter's own coordinates (see `own_error_of`),
-            by default those in (x, y, θ).
+        own_error: the pose errors in the filter's own coordinates (see `own_error_of`), by default
+            those in (x, y, θ).
     """
     info, (pose, cov) = trace.info, map(np.asarray, trace.estimate[:2])
     error = pose_error(np.asarray(truth.pose), pose)
@@ -94,8 +102,8 @@ def score(
     }
     measures: dict[str, tuple[Any, Any]] = dict(found.associations)
     sums: dict[str, np.ndarray] = {}
-    watch = getattr(trace.final, "watch", ())
-    if watch:
+    watch = monitor_of(trace.final)
+    if watch is not None:
         gained, dimensions = _null_space(watch, trace.probe)
         curves["rotation_information"] = gained
         measures["rotation_information"] = gained[:, -1], 1
@@ -113,7 +121,7 @@ def score(
     measures["square_landmarks"] = found.landmark_squares[:, 0], found.landmark_squares[:, 1]
     measures["nis_per_dof"] = curves["nis"].sum(axis=1), curves["nis_dof"].sum(axis=1)
     measures["log_likelihood"] = info.log_likelihood.sum(axis=1, dtype=np.float64), 1
-    sums["autocorrelation"] = found.autocorrelation
+    sums["autocorrelation"] = np.asarray(found.autocorrelation)
     measures["autocorrelation"] = found.autocorrelation[:, 0, 0], found.autocorrelation[:, 0, 1]
 
     sums |= _counted(info)
@@ -135,37 +143,37 @@ def score(
     )
 
 
-def _finite(rows: Any) -> np.ndarray:
-    """(R,) whether every number of a run is finite."""
+def _finite(rows: np.ndarray) -> Bool[np.ndarray, "..."]:
+    """Whether every number of a run is finite, (R,); () of a number that all runs share."""
     out: np.ndarray = np.isfinite(rows)
     return out.reshape(len(out), -1).all(axis=1) if out.ndim else out
 
 
-def _counted(info: Info) -> dict[str, np.ndarray]:
-    """(R,) how many measurements became what, and how often each of `EVENTS` happened."""
+def _counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
+    """How many measurements became what, and how often each of `EVENTS` happened."""
     runs = len(info.status)
     at = np.asarray(info.status).reshape(runs, -1) + np.arange(runs)[:, None] * len(Status)
     became = np.bincount(at.ravel(), minlength=runs * len(Status)).reshape(runs, -1)
     out = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
     for name in EVENTS:
-        value = _happened(info, name)
-        if value is not None and not isinstance(value, tuple):
-            out[name] = value.reshape(runs, -1).sum(axis=1)
+        happened = _event(info, name)
+        if happened is not None:
+            out[name] = happened.reshape(runs, -1).sum(axis=1)
     return out
 
 
-def _happened(info: Info, name: str) -> Any:
-    """How often one of `EVENTS` happened, (R, T, …); None where the filter has no such event."""
-    extra = info.extra or {}
-    if name == "removed":
-        return extra["pruning"].removed if "pruning" in extra else None
-    if name == "merged":
-        return extra["merging"].pair[..., 0] >= 0 if "merging" in extra else None
-    return getattr(extra.get("particles") if name in PARTICLE_EVENTS else info, name, None)
+def _event(info: Info, name: str) -> np.ndarray | None:
+    """How often one of `EVENTS` happened (R, T, …); None where the filter has no such event."""
+    field = "pair" if name == "merged" else name
+    for record in (info, *(info.extra or {}).values()):
+        found = jax.tree.leaves(getattr(record, name, getattr(record, field, None)))
+        if found:
+            return np.asarray(found[0][..., 0] >= 0 if name == "merged" else found[0])
+    return None
 
 
-def _covered(nees: Nees, dof: int) -> np.ndarray:
-    """(R, LEVELS): at how many steps the truth lies in the ellipsoid of that probability."""
+def _covered(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
+    """At how many steps the truth lies in the ellipsoid of each of the probabilities `LEVELS`."""
     runs, bins = len(nees.value), len(LEVELS) + 1
     radii = [chi2_quantile(p, dof) for p in LEVELS]
     beyond = np.searchsorted(radii, np.where(nees.regular, nees.value, np.inf))
@@ -175,9 +183,16 @@ def _covered(nees: Nees, dof: int) -> np.ndarray:
     return out
 
 
-def _null_space(watch: Any, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information gained along a turn of the whole frame by each step (R, T), and the dimension of
-    the unobservable subspace of the filter's linearized system, (R,).
+def monitor_of(state: Any) -> Watch | None:
+    """The observability monitor that a filter keeps in its state; None where it keeps none."""
+    return getattr(state, "watch", None) or None
+
+
+def _null_space(
+    watch: Watch, information: Float[np.ndarray, "R T 3 3"]
+) -> tuple[Float[np.ndarray, "R T"], Int[np.ndarray, "R"]]:
+    """Information gained along a turn of the whole frame by each step, and the dimension of the
+    unobservable subspace of the filter's linearized system.
 
     A direction is unobservable if what was gained along it is rounding: below eps^(3/4) of the
     same sum of squares with absolute values.

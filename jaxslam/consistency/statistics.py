@@ -1,9 +1,13 @@
-"""What a score needs of a run's maps and innovations: sums, taken in one pass over its steps."""
+"""`statistics` returns what a score needs of one run's maps and innovations: sums over its steps.
+
+Compiled and called by `monte_carlo.programs`; `score` takes what it returns.
+"""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.consistency.associations import associations, identities
 from jaxslam.math import linalg
@@ -14,34 +18,34 @@ LAGS = 10
 """The autocorrelation of innovations is taken up to so many steps."""
 
 _UNROLLED = 4
-"""Places of a scan that are looked at in one piece of compiled code."""
+"""Measurement slots that are looked at in one piece of compiled code."""
 
 
 class Statistics(NamedTuple):
     """Of one run; with a leading axis, of many."""
 
-    finite: Any
-    """() bool: every number of its estimates and infos is finite."""
-    landmark_nees: Any
-    """(T,) summed over the landmarks of the map."""
-    regular_landmarks: Any
-    """(T,) how many of them have one."""
-    landmark_squares: Any
-    """(2,) of the final map, unaligned: Σ |p̂ - p|² [m²], and over how many landmarks that is."""
-    autocorrelation: Any
-    """(LAGS, 3) of whitened innovations: Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and how many
+    finite: Bool[Array, ""]
+    """every number of its estimates and infos is finite."""
+    landmark_nees: Float[Array, "T"]
+    """summed over the landmarks of the map."""
+    regular_landmarks: Float[Array, "T"]
+    """how many of them have a NEES."""
+    landmark_squares: Float[Array, "2"]
+    """of the final map, unaligned: Σ |p̂ - p|² [m²], and over how many landmarks that is."""
+    autocorrelation: Float[Array, "LAGS 3"]
+    """of whitened innovations: Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and how many
     products of numbers that is. Of the same landmark at t and t + l, w = L⁻¹ν with S = L Lᵀ;
-    without landmarks, of one place."""
-    associations: dict[str, tuple[Any, Any]]
+    without a map, of one measurement slot."""
+    associations: dict[str, tuple[Array, Array]]
     """of a world of spurious data; see `associations.associations`."""
 
 
 class _Sums(NamedTuple):
-    poison: jax.Array
-    """0 times every number so far: NaN once one was not finite"""
-    recent: list[jax.Array]
+    poison: Array
+    """() 0 times every number so far: NaN once one was not finite"""
+    recent: list[Array]
     """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and whether there is one"""
-    pairs: list[jax.Array]
+    pairs: list[Array]
     """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
 
 
@@ -49,15 +53,15 @@ def statistics(trace: Trace, truth: Truth, sensor: Sensor) -> Statistics:
     """The sums over one run that `score` is made of. For `vmap`, over runs."""
     estimate, info = trace.estimate, trace.info
     held = jnp.where(estimate.alive, estimate.tag, -1)
-    found: dict[str, tuple[Any, Any]] = {}
-    if not isinstance(truth.origin, tuple):
+    found: dict[str, tuple[Array, Array]] = {}
+    if truth.origin is not None:
         held = identities(trace, truth.origin)
         found = associations(trace, truth.origin, held)
     points = jax.vmap(sensor.position)(truth.landmarks)
     size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
     dtype = estimate.pose.dtype
 
-    def step(sums: _Sums, row: tuple[Estimate, Info, jax.Array]) -> tuple[_Sums, Any]:
+    def step(sums: _Sums, row: tuple[Estimate, Info, Array]) -> tuple[_Sums, Any]:
         estimate, info, held = row
         off = points[jnp.maximum(held, 0)] - estimate.points
         nees, regular = _planar_nees(off, estimate.point_covs)
@@ -104,7 +108,7 @@ def statistics(trace: Trace, truth: Truth, sensor: Sensor) -> Statistics:
     )
 
 
-def _numbers(tree: Any) -> jax.Array:
+def _numbers(tree: Any) -> Float[Array, "K"]:
     """Every floating-point number of a tree, in one row."""
     leaves = map(jnp.asarray, jax.tree.leaves(tree))
     return jnp.concatenate(
@@ -112,8 +116,10 @@ def _numbers(tree: Any) -> jax.Array:
     )
 
 
-def _planar_nees(error: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """eᵀ P⁻¹ e (N,) of e (N, 2) and P (N, 2, 2), and whether P is regular: 1 - ρ² > 200 eps.
+def _planar_nees(
+    error: Float[Array, "N 2"], cov: Float[Array, "N 2 2"]
+) -> tuple[Float[Array, "N"], Bool[Array, "N"]]:
+    """The NEES eᵀ P⁻¹ e of each landmark, and whether P is regular: 1 - ρ² > 200 eps.
 
     a²/p₁ + (b - a p₁₂/p₁)²/(p₂(1 - ρ²)); 0 where P is not regular or e not finite.
     """
@@ -128,12 +134,14 @@ def _planar_nees(error: jax.Array, cov: jax.Array) -> tuple[jax.Array, jax.Array
     return jnp.where(regular, nees, 0.0), regular
 
 
-def _white(estimate: Estimate, info: Info) -> list[jax.Array]:
-    """(N,) each, by landmark, or by place where there are none: the numbers of the whitened
-    innovation w of the first place fused with it, |w|², and 1; 0 where there is none."""
+def _white(estimate: Estimate, info: Info) -> list[Array]:
+    """The numbers of the whitened innovation w, |w|², and 1 where there is one, else 0; (N,) each.
+
+    By landmark, of the first measurement fused with it; by measurement slot where there is no map.
+    """
     fused = info.status == Status.FUSED
 
-    def whiten(nu: jax.Array, cov: jax.Array) -> jax.Array:
+    def whiten(nu: Array, cov: Array) -> Array:
         return linalg.solve_lower(linalg.cholesky(cov)[0], nu)
 
     white = jax.vmap(whiten)(info.innovation, info.innovation_cov)
@@ -144,7 +152,7 @@ def _white(estimate: Estimate, info: Info) -> list[jax.Array]:
         return rows
     slot = jnp.where(fused, info.slot, -1)
 
-    def place(kept: list[jax.Array], at: tuple[list[jax.Array], jax.Array]) -> tuple[Any, None]:
+    def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[Any, None]:
         row, slot = at
         mine = jnp.arange(count) == slot
         return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None

@@ -1,4 +1,7 @@
-"""What a campaign says of a filter: averages, bands and intervals from the scores of its runs."""
+"""`summarize` returns the `Summary` of one filter: averages, bands, intervals and a verdict.
+
+Called by `monte_carlo.campaign` on the tally of each filter; reports and plots read the summaries.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -28,7 +31,7 @@ POSITIVE = ("nees", "nis", "square", "noncredibility")
 
 @dataclass(frozen=True)
 class Summary:
-    """What a campaign says of one filter."""
+    """The consistency of one filter over the runs of a campaign."""
 
     verdict: str
     """consistent, optimistic, pessimistic, diverged, incomplete or undecided; see `judge`."""
@@ -77,7 +80,7 @@ class Summary:
 
 
 def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Summary:
-    """Averages, bands and verdict from the scores of a campaign (host numbers, float64).
+    """The averages, bands and verdict of one filter, from its tally (host numbers, float64).
 
     bound: position [m²] and heading [rad²], (T,) each, the mean conditional bound over the runs.
     """

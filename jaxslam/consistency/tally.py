@@ -1,4 +1,7 @@
-"""The scores of a campaign so far, however its runs came in: blocks in any order and of any size.
+"""`condense` returns what is kept of a block of scores, and a `Tally` adds such blocks up.
+
+Called by `monte_carlo`: `block` condenses, `campaign` adds in any order and keeps the tallies, and
+`summary.summarize` takes them.
 
 Sums over runs are taken in pairs of float64 (106 bits), so that what they are rounded to does not
 depend on how the runs were divided; Knuth's two-sum, and the sums of Dekker 1971 ("A floating-point
@@ -18,14 +21,14 @@ SHOTS = 2048
 
 
 class Sum(NamedTuple):
-    """high + low, where low is what rounding high left over."""
+    """A sum high + low, where low is the rounding error of high."""
 
     high: np.ndarray
     low: np.ndarray
 
 
 def plus(a: Sum, b: Sum) -> Sum:
-    """a + b, to about 2⁻¹⁰⁴ of |a| + |b|."""
+    """The sum a + b, to about 2⁻¹⁰⁴ of |a| + |b|."""
     high, rest = _two_sum(a.high, b.high)
     low, last = _two_sum(a.low, b.low)
     high, rest = _renormalized(high, rest + low)
@@ -47,27 +50,27 @@ def total(rows: np.ndarray) -> Sum:
 
 
 def condense(scores: Score, first: int, limit: float) -> dict[str, np.ndarray]:
-    """What a tally keeps of runs first, first + 1, … (leading axis), as named arrays.
+    """The arrays that a tally keeps of runs first, first + 1, … (leading axis), by name.
 
     limit [m]: a finite run is divergent when its final position error exceeds it.
     """
     runs, finite = len(scores.finite), np.asarray(scores.finite)
 
-    def lost_left_out(rows: np.ndarray) -> np.ndarray:
+    def without_lost(rows: np.ndarray) -> np.ndarray:
         rows = np.asarray(rows)
         return np.where(finite.reshape(-1, *(1,) * (rows.ndim - 1)), rows, np.zeros_like(rows))
 
-    snapshots = [lost_left_out(leaf) for leaf in scores.snapshots]
+    snapshots = [without_lost(leaf) for leaf in scores.snapshots]
     far = np.sqrt((snapshots[0][:, -1, :2] ** 2).sum(axis=1)) > limit
     out = {"finite": finite, "divergent": finite & far}
     for name, (whole, weight) in scores.measures.items():
-        whole, weight = lost_left_out(whole), lost_left_out(weight).astype(whole.dtype)
+        whole, weight = without_lost(whole), without_lost(weight).astype(whole.dtype)
         out[f"defined/{name}"] = weight > 0
         out[f"measure/{name}"] = whole / np.where(weight > 0, weight, 1)
     kept = max(min(runs, SHOTS - first), 0)
     for i, leaf in enumerate(snapshots):
         out[f"snapshot/{i}"] = leaf[:kept]
-    return out | condensed_sums({name: lost_left_out(rows) for name, rows in scores.sums.items()})
+    return out | condensed_sums({name: without_lost(rows) for name, rows in scores.sums.items()})
 
 
 def condensed_sums(per_run: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -79,7 +82,7 @@ def condensed_sums(per_run: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 class Tally:
-    """Blocks of condensed scores, added in any order."""
+    """The sum of condensed blocks of scores, added in any order."""
 
     def __init__(self) -> None:
         self._sums: dict[str, Sum] = {}
@@ -87,7 +90,7 @@ class Tally:
         self._runs: dict[int, int] = {}
 
     def add(self, first: int, runs: int, block: dict[str, np.ndarray]) -> None:
-        """What `condense` made of runs first … first + runs - 1."""
+        """Add what `condense` returned of runs first … first + runs - 1."""
         kept = {}
         for name, value in block.items():
             kind, _, what = name.partition("/")
@@ -99,7 +102,7 @@ class Tally:
         self._blocks[first], self._runs[first] = kept, runs
 
     def merge(self, other: "Tally") -> None:
-        """The blocks of another tally, of other runs."""
+        """Add the blocks of another tally, of other runs."""
         for name, value in other._sums.items():
             self._sums[name] = plus(self._sums[name], value) if name in self._sums else value
         self._blocks |= other._blocks
@@ -181,7 +184,7 @@ def _joined(parts: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def _two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """a + b rounded, and exactly what rounding left over."""
+    """a + b rounded, and the exact error of that rounding."""
     high = a + b
     of_b = high - a
     return high, (a - (high - of_b)) + (b - of_b)

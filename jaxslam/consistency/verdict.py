@@ -18,17 +18,17 @@ from jaxslam.math.stats import normal_quantile, truncated_chi2_mean
 from jaxslam.types import Status
 
 TESTS = {"nees_pose": "pose NEES", "nis_per_dof": "NIS / dof"}
-"""The measures that are tested, and how they are called."""
+"""The measures that are tested, and their names in messages."""
 
 TOLERANCE = 0.01
-"""What an interval does not reach beyond, relative to the honest value, counts as that value."""
+"""An interval that ends so near the honest value, relative to it, counts as reaching it."""
 
 POWER = 0.9
-"""How often what is called noticed is noticed."""
+"""The probability with which an effect that is called noticeable is noticed."""
 
 
 class Verdict(NamedTuple):
-    """What `judge` says."""
+    """The verdict on a filter, what it rests on, and what it could not have noticed."""
 
     word: str
     """consistent, optimistic, pessimistic, diverged, incomplete or undecided"""
@@ -95,7 +95,7 @@ def judge(
 
 
 def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
-    """In words what a campaign that rejects nothing would have noticed; "" where it is nothing."""
+    """A sentence on what a campaign that rejects nothing would have noticed; "" where nothing."""
     parts = []
     for name, (low, high) in noticed.items():
         above, below = f"from a {TESTS[name]} of {high:.3g} on", f"below {low:.3g}"

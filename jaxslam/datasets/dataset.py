@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
-from jaxslam.simulation.team import Robot
+from jaxslam.team import Robot
 from jaxslam.types import Log, Scan, check_log
 
 

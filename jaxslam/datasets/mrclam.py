@@ -13,7 +13,7 @@ from jaxslam.datasets.lines import TextFile
 from jaxslam.motion import unicycle
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import Part, range_bearing, suite
-from jaxslam.simulation.team import Robot, motion_of, sensors_of
+from jaxslam.team import Robot, motion_of, sensors_of
 from jaxslam.types import Log, Scan
 
 SOURCE = (

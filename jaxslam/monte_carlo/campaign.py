@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.math.linalg import check_count, check_key
-from jaxslam.monte_carlo.block import BOUND, Glimpse, Programs
+from jaxslam.monte_carlo.block import BOUND, BlockRunner, Glimpse
 from jaxslam.monte_carlo.blockwise import Library
 from jaxslam.monte_carlo.candidates import (
     check_dtype,
@@ -30,6 +30,7 @@ from jaxslam.monte_carlo.candidates import (
 )
 from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.pieces import cores, missing
+from jaxslam.monte_carlo.plan import Plan, Promises
 from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
@@ -144,6 +145,48 @@ def monte_carlo(
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """
+    _check(scenario, filters, runs, key, block, workers, devices, keep)
+    began, runs = time.perf_counter(), int(runs)
+    devices = jax.local_devices() if devices is None else list(devices)
+    dtype = check_dtype(dtype)
+    if workers is None:
+        workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 1
+    names = (*filters, BOUND)
+    tallies = {name: Tally() for name in names}
+    if keep is not None:
+        told = identity or fingerprint(scenario, filters, key, devices[0].platform, bound, dtype)
+        keep.claim(told)
+        _add_kept(tallies, keep, runs)
+    size = int(block or fitting_block(scenario, filters, devices[0]))
+    plan = Plan(scenario, filters, key, devices, size, bound, dtype, library)
+    todo = share(missing(tallies[BOUND].pieces(), runs, plan.wide))
+    work = _Work(workers, keep, progress, glimpse, {name: Tally() for name in names})
+    try:
+        work.in_blocks_that_fit(plan, todo)
+        interrupted = False
+    except KeyboardInterrupt:
+        interrupted = True
+    for name, tally in (work.own if interrupted else gathered(work.own)).items():
+        tallies[name].merge(tally)
+    campaign = None
+    if tallies[BOUND].pieces():
+        campaign = _summed_up(plan, tallies, work, time.perf_counter() - began)
+    if interrupted or campaign is None:
+        raise Interrupted(campaign, runs)
+    return campaign
+
+
+def _check(
+    scenario: Scenario,
+    filters: Mapping[str, Candidate],
+    runs: int,
+    key: jax.Array,
+    block: int | None,
+    workers: int | None,
+    devices: Sequence[jax.Device] | None,
+    keep: Keep | None,
+) -> None:
+    """Raise ValueError on arguments that `monte_carlo` does not take."""
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
         if value is not None:
             check_count(f"monte_carlo: {name}", value)
@@ -158,10 +201,8 @@ def monte_carlo(
         raise ValueError(
             f"monte_carlo: expected devices as of jax.local_devices(), got {devices!r}"
         )
-    devices = jax.local_devices() if devices is None else list(devices)
-    if not devices:
+    if devices is not None and not devices:
         raise ValueError("monte_carlo: expected at least one device")
-    dtype = check_dtype(dtype)
     if keep is not None and not all(
         callable(getattr(keep, name, None)) for name in ("claim", "save", "blocks")
     ):
@@ -169,122 +210,80 @@ def monte_carlo(
             "monte_carlo: expected keep as of jaxslam.store.create(folder) or .resume(folder), "
             f"got {keep!r}"
         )
-    began = time.perf_counter()
-    runs = int(runs)
-    if workers is None:
-        workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 1
-    names = (*filters, BOUND)
-    tallies, own = ({name: Tally() for name in names} for _ in range(2))
-    if keep is not None:
-        keep.claim(
-            identity or fingerprint(scenario, filters, key, devices[0].platform, bound, dtype)
-        )
-        for first, count, arrays in keep.blocks():
-            if first + count > runs:  # sums over a block cannot be taken apart
-                raise ValueError(
-                    f"monte_carlo: runs up to {first + count} are kept: expected at least as many "
-                    f"runs, got {runs}"
-                )
-            _add(tallies, first, count, _by_filter(arrays, names))
-    block = block or fitting_block(scenario, filters, devices[0])
-    size = int(block)
-    kept = tallies[names[0]].pieces()
-    todo = share(missing(kept, runs, size * len(devices)))
-    work = _Work(
-        scenario, filters, key, devices, bound, workers, keep, progress, glimpse, dtype, library
+
+
+def _summed_up(plan: Plan, tallies: dict[str, Tally], work: "_Work", seconds: float) -> Campaign:
+    """The campaign of the runs in the tallies."""
+    scenario = plan.scenario
+    done = sum(count for _, count in tallies[BOUND].pieces())
+    limit = tallies[BOUND].first("limit")
+    bound = {name: total / done for name, total in tallies[BOUND].sums.items()} or None
+    summaries = {name: summarize(tallies[name], bound) for name in plan.filters}
+    steps = max(scenario.steps, 1)
+    return Campaign(
+        scenario=scenario.name,
+        source=scenario.source,
+        published=scenario.published,
+        steps=scenario.steps,
+        runs=done,
+        dtype=str(limit.dtype),
+        divergence_limit=float(limit),
+        filters=_qualified(summaries, scenario),
+        seconds=seconds,
+        compile_seconds=work.compile_seconds,
+        step_seconds={name: seconds / steps for name, seconds in work.run_seconds.items()},
+        first=work.first,
     )
-    interrupted = False
-    while True:
-        try:
-            work.go(own, todo, size)
-            break
-        except KeyboardInterrupt:
-            interrupted = True
-            break
-        except (jax.errors.JaxRuntimeError, MemoryError) as error:
-            if not (isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)):
-                raise
-            if size == 1:
-                raise MemoryError(
-                    "monte_carlo: out of memory with one run a device (block=1); fewer steps, "
-                    "landmarks or filters at a time may fit"
-                ) from error
-            warnings.warn(
-                f"monte_carlo: out of memory with block={size}; going on with block={size // 2}",
-                stacklevel=2,
-            )
-            size //= 2
-    for name, tally in own.items() if interrupted else gathered(own).items():
-        tallies[name].merge(tally)
-    done = sum(count for _, count in tallies[names[0]].pieces())
-    campaign = None
-    if done:
-        limit = tallies[BOUND].first("limit")
-        sums = tallies[BOUND].sums
-        least = {name: total / done for name, total in sums.items()} or None
-        campaign = Campaign(
-            scenario=scenario.name,
-            source=scenario.source,
-            published=scenario.published,
-            steps=scenario.steps,
-            runs=done,
-            dtype=str(limit.dtype),
-            divergence_limit=float(limit),
-            filters=_qualified(
-                {name: summarize(tallies[name], least) for name in filters}, scenario
-            ),
-            seconds=time.perf_counter() - began,
-            compile_seconds=work.compile_seconds,
-            step_seconds={
-                name: seconds / max(scenario.steps, 1) for name, seconds in work.run_seconds.items()
-            },
-            first=work.first,
-        )
-    if interrupted or campaign is None:
-        raise Interrupted(campaign, runs)
-    return campaign
 
 
 @dataclass
 class _Work:
-    """What computes the missing blocks of a campaign."""
+    """Computes the missing blocks of a campaign, and keeps count."""
 
-    scenario: Scenario
-    filters: Mapping[str, Candidate]
-    key: jax.Array
-    devices: Sequence[jax.Device]
-    bound: bool
     workers: int
     keep: Keep | None
     progress: Callable[[int, int], None] | None
     glimpse: Glimpse | None
-    dtype: Any
-    library: Library | None
+    own: dict[str, Tally]
+    """what this process has computed, by filter"""
     compile_seconds: float = 0.0
     run_seconds: dict[str, float] = field(default_factory=dict)
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
 
-    def go(self, own: dict[str, Tally], todo: Sequence[tuple[int, int]], size: int) -> None:
-        """Add those of the pieces that are not yet in the tallies, in blocks of size a device."""
+    def in_blocks_that_fit(self, plan: Plan, todo: Sequence[tuple[int, int]]) -> None:
+        """Compute the pieces, in blocks of half the size each time that memory does not suffice."""
+        while True:
+            try:
+                return self.go(plan, todo)
+            except (jax.errors.JaxRuntimeError, MemoryError) as error:
+                if not (isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)):
+                    raise
+                if plan.block == 1:
+                    raise MemoryError(
+                        "monte_carlo: out of memory with one run a device (block=1); fewer steps, "
+                        "landmarks or filters at a time may fit"
+                    ) from error
+                half = plan.block // 2
+                warnings.warn(
+                    f"monte_carlo: out of memory with block={plan.block}; going on with "
+                    f"block={half}",
+                    stacklevel=3,
+                )
+                plan = replace(plan, block=half)
+
+    def go(self, plan: Plan, todo: Sequence[tuple[int, int]]) -> None:
+        """Add those of the pieces that are not yet there to the tallies."""
         if not todo:
             return
-        before, wide = own[next(iter(own))].pieces(), size * len(self.devices)
+        before = self.own[BOUND].pieces()
         queue = [
             piece
             for first, count in todo
-            for piece in missing([(0, first), *before], first + count, wide)
+            for piece in missing([(0, first), *before], first + count, plan.wide)
         ][::-1]
-        programs = Programs(
-            list(self.filters),
-            self.key,
-            size,
-            len(self.devices),
-            self.bound,
-            self.glimpse,
-            self.dtype,
-            self.library,
-            with_first=any(first == 0 for first, _ in queue),
-        )
+        plan = replace(plan, with_first=any(first == 0 for first, _ in queue))
+        promises = Promises(list(plan.filters))
+        runner = BlockRunner(plan, promises, self.glimpse)
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
         early = len(queue) > self.workers
@@ -295,14 +294,14 @@ class _Work:
             try:
                 while queue and len(flight) <= self.workers:
                     first, count = queue.pop()
-                    block = pool.submit(programs.block, first, count, early, not flight)
+                    block = pool.submit(runner.block, first, count, early, not flight)
                     flight[block] = first, count
                 began = time.perf_counter()
-                compile_programs(programs, self.scenario, self.filters, self.devices)
+                compile_programs(plan, promises)
                 self.compile_seconds += time.perf_counter() - began
             except BaseException as error:
                 stop = error
-                programs.give_up(error)
+                promises.give_up(error)
             while flight:
                 try:
                     for future in wait(flight, return_when=FIRST_COMPLETED).done:
@@ -311,14 +310,14 @@ class _Work:
                             continue
                         found = future.result()
                         if self.keep is not None:
-                            self.keep.save(first, _flat(found, own), count)
-                        _add(own, first, count, found)
+                            self.keep.save(first, _flat(found, self.own), count)
+                        _add(self.own, first, count, found)
                         done += count
                         if self.progress is not None:
                             self.progress(done, total)
                     while queue and stop is None and len(flight) <= self.workers:
                         first, count = queue.pop()
-                        block = pool.submit(programs.block, first, count, True, False)
+                        block = pool.submit(runner.block, first, count, True, False)
                         flight[block] = first, count
                 except BaseException as error:
                     if stop is not None:
@@ -326,8 +325,8 @@ class _Work:
                     stop = error  # what is at work is finished, and kept
                     for future in flight:
                         future.cancel()
-        self.run_seconds = programs.run_seconds()
-        self.first |= programs.first
+        self.run_seconds = runner.run_seconds()
+        self.first |= runner.first
         if stop is not None:
             raise stop
 
@@ -352,6 +351,17 @@ def _qualified(found: dict[str, Summary], scenario: Scenario) -> dict[str, Summa
         else one
         for name, one in found.items()
     }
+
+
+def _add_kept(tallies: dict[str, Tally], keep: Keep, runs: int) -> None:
+    """Add the blocks kept; ValueError where there are runs beyond those asked for."""
+    for first, count, arrays in keep.blocks():
+        if first + count > runs:  # sums over a block cannot be taken apart
+            raise ValueError(
+                f"monte_carlo: runs up to {first + count} are kept: expected at least as many "
+                f"runs, got {runs}"
+            )
+        _add(tallies, first, count, _by_filter(arrays, tallies))
 
 
 def _add(

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxslam import programs
 from jaxslam.charts.euclidean import euclidean
+from jaxslam.consistency import monitor_of
 from jaxslam.math.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.run import run
@@ -179,16 +180,19 @@ def check_called(name: str, candidate: Callable[..., Any]) -> None:
 
 
 def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tuple[Estimator, Chart]:
-    """What runs, and the chart of its errors."""
+    """The estimator that a candidate is, and the chart of its errors.
+
+    Its probe is what the filter's observability monitor has gained, where it keeps one.
+    """
     method = candidate if isinstance(candidate, Filter) else candidate(truth)
     if not isinstance(method, Filter):
         return method, euclidean()
 
-    def learnt(state: Any) -> Any:
-        watch = getattr(state, "watch", ())
-        return watch.information if watch else ()
+    def gained(state: Any) -> jax.Array | None:
+        watch = monitor_of(state)
+        return None if watch is None else watch.information
 
     def drive(log: Log, key: jax.Array) -> Any:
-        return run(method, log, scenario.pose, scenario.pose_cov, key, probe=learnt)
+        return run(method, log, scenario.pose, scenario.pose_cov, key, probe=gained)
 
     return drive, method.chart

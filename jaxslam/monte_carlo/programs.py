@@ -1,151 +1,178 @@
-"""The programs of a campaign: a block of runs, drawn, filtered and scored on every device.
+"""The programs of a campaign: a block of B runs, drawn, filtered and scored on every device.
 
-Each takes the campaign's key, the numbers of its runs, and every number that models, filters and
-map were made of (`jaxslam.programs`): one compilation serves all blocks, seeds, noises and map
-values, in this campaign and the next. Runs are divided over the devices with `shard_map`: no device
-ever waits for another.
+    program                        takes                       returns
+
+    draw                           key, numbers (B,)           truth, log (B, …)
+     ├─> drive, one a filter       key, numbers, truth, log    `FilterResults` (T, B, …)
+     │    └─> statistics           truth, estimate, info       `Statistics` (B, …)
+     ├─> bound, where asked for    key, numbers, truth, log    variances (B, T)
+     └─> jacobians, else           truth, log of run 0         `RunJacobians` (T, …)
+
+Estimates and infos have axes (T, B, …), as the loop over time leaves them. The bound, or else the
+Jacobians, of run 0 give the divergence limit (`limit.divergence_limit`). Filters whose results have
+the same shapes share one statistics program.
+
+Each program takes the campaign's key, the numbers of its runs, and every number that models,
+filters and map were made of (`jaxslam.programs`): one compilation serves all blocks, seeds, noises
+and map values, in this campaign and the next. Runs are divided over the devices with `shard_map`:
+no device ever waits for another.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jaxslam.consistency import (
-    Slopes,
     Statistics,
     conditional_bound,
-    final_covariance,
+    jacobians_at_truth,
+    monitor_of,
     own_error_of,
-    slopes_at_truth,
     statistics,
 )
-from jaxslam.monte_carlo.block import Programs, numbers
 from jaxslam.monte_carlo.blockwise import Blockwise
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
-from jaxslam.protocols import Candidate
+from jaxslam.monte_carlo.limit import divergence_limit
+from jaxslam.monte_carlo.plan import Plan, Promises, run_numbers
+from jaxslam.protocols import Candidate, Sensor
 from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.slots import Watch
 from jaxslam.types import Estimate, Info, Log, Trace, Truth
 
+World = tuple[Truth, Log]
 
-class Driven(NamedTuple):
-    """What a filter made of a log, as far as it is scored."""
+
+class FilterResults(NamedTuple):
+    """What a filter made of the logs of a block, as far as it is scored."""
 
     estimate: Estimate
+    """(T, B, …)"""
     info: Info
-    own_error: jax.Array
-    watch: Any
-    probe: Any
+    """(T, B, …)"""
+    own_error: Float[Array, "T B 3"]
+    """the pose error in the filter's own coordinates"""
+    watch: Watch | None
+    """(B, …) its observability monitor at the end, where it keeps one"""
+    information: Float[Array, "T B 3 3"] | None
+    """what that monitor had gained after each step"""
 
 
-_BY_TIME: Any = Driven(*cast(Any, (1, 1, 1, 0, 1)))
-"""Which axis of what a filter made goes over runs: that of time comes first, as its loop has it."""
+_RUN_AXES = cast(Any, FilterResults)(1, 1, 1, 0, 1)
+"""The axis of `FilterResults` that goes over the runs."""
 
 
-def compile_programs(
-    promised: Programs,
-    scenario: Scenario,
-    filters: Mapping[str, Candidate],
-    devices: Sequence[jax.Device],
-) -> None:
-    """Fill in the programs, each compiled while the next is traced; back when all are there.
+def compile_programs(plan: Plan, promises: Promises) -> None:
+    """Fill in all promises, each program compiled while the next one is traced."""
+    with contextlib.closing(Blockwise(plan.devices, plan.wide, plan.library)) as blockwise:
+        compiling = _Compiling(plan, promises, blockwise)
+        world = compiling.draw()
+        compiling.filters(world)
+        last = compiling.limit(world)
+        for promise in (*promises.drives.values(), *promises.statistics.values(), last):
+            promise.result()
+        if not promises.complete.done():
+            promises.complete.set_result(None)
+        if not plan.with_first:
+            which = run_numbers(0, plan.wide)
+            drawn = promises.draw.result()(plan.key, which)
+            promises.limit.set_result(divergence_limit(plan, promises, which, drawn))
 
-    Filters whose results have the same shapes share the program that sums them up.
-    """
-    key, wide = promised.key, promised.wide
-    maker = Blockwise(devices, wide, promised.library)
 
-    def draw(key: jax.Array, which: jax.Array) -> tuple[Truth, Log]:
-        world: tuple[Truth, Log] = jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
-        return rounded(world, promised.dtype)
+class _Compiling(NamedTuple):
+    """Starts the compilations; its methods take and return the shapes of what programs pass on."""
 
-    def drive(
-        candidate: Candidate, key: jax.Array, which: jax.Array, world: tuple[Truth, Log]
-    ) -> Driven:
-        def one(i: jax.Array, truth: Truth, log: Log) -> Driven:
-            method, chart = estimator_of(candidate, truth, scenario)
-            trace = method(log, _keys(key, i)[1])
-            own = own_error_of(chart, scenario.sensor, trace, truth)
-            watch = getattr(trace.final, "watch", ())
-            return Driven(trace.estimate, trace.info, own, watch, trace.probe if watch else ())
+    plan: Plan
+    promises: Promises
+    blockwise: Blockwise
 
-        driven: Driven = jax.vmap(one, out_axes=_BY_TIME)(which, *world)
-        return driven
+    def draw(self) -> World:
+        """Start `draw_worlds`."""
+        plan = self.plan
+        draw = partial(draw_worlds, plan.scenario, plan.dtype)
+        given = plan.key, run_numbers(0, plan.wide)
+        world = self._start(self.promises.draw, "draw", draw, given, (None, 0), quick=True)
+        return cast(World, world)
 
-    def read(truth: Truth, estimate: Estimate, info: Info) -> Statistics:
-        def one(truth: Truth, estimate: Estimate, info: Info) -> Statistics:
-            return statistics(Trace(estimate, info, (), ()), truth, scenario.sensor)
+    def filters(self, world: World) -> None:
+        """Start `drive_filter` and `run_statistics` of each filter.
 
-        found: Statistics = jax.vmap(one, in_axes=(0, 1, 1))(truth, estimate, info)
-        return found
+        A filter comes before the statistics of the one before it: `BlockRunner` wants them so.
+        """
+        before: tuple[str, FilterResults] | None = None
+        for name, candidate in self.plan.filters.items():
+            results = self._drive(name, candidate, world)
+            if before is not None:
+                self._statistics(*before, world)
+            before = name, results
+        if before is not None:
+            self._statistics(*before, world)
 
-    def least(key: jax.Array, which: jax.Array, world: tuple[Truth, Log]) -> dict[str, jax.Array]:
-        def one(i: jax.Array, truth: Truth, log: Log) -> jax.Array:
-            return conditional_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov
+    def limit(self, world: World) -> Future[Any]:
+        """Start what the divergence limit comes from; the promise of it."""
+        plan, promises = self.plan, self.promises
+        if plan.limit_by_bound:
+            bound = partial(bound_variances, plan.scenario)
+            given = plan.key, run_numbers(0, plan.wide), world
+            self._start(promises.bound, "conditional bound", bound, given, (None, 0, 0))
+            return promises.bound
+        one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), world)
+        jacobians = partial(jacobians_at_truth, plan.scenario)
+        self._start(
+            promises.jacobians, "jacobians", jacobians, one, (None, None), out=None, quick=True
+        )
+        return promises.jacobians
 
-        cov = jax.vmap(one)(which, *world)
-        position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)
-        return {"position": position, "heading": cov[:, :, 2, 2]}
+    def _drive(self, name: str, candidate: Candidate, world: World) -> FilterResults:
+        plan = self.plan
+        drive = partial(drive_filter, plan.scenario, candidate)
+        results = self._start(
+            self.promises.drives[name],
+            f"drive {name}",
+            drive,
+            (plan.key, run_numbers(0, plan.wide), world),
+            (None, 0, 0),
+            out=_RUN_AXES,
+            more=(candidate,),
+        )
+        return cast(FilterResults, results)
 
-    def program(promise: Future[Any], name: str, *what: Any, straight: bool = False) -> Any:
-        """Have the promise kept by `Blockwise.program`; the shapes of its results."""
-        label = name if promised.dtype is None else f"{name}, {promised.dtype}"
-        made = maker.program(label, *what, straight=straight)
+    def _statistics(self, name: str, results: FilterResults, world: World) -> None:
+        found = partial(run_statistics, self.plan.scenario.sensor)
+        given = world[0], results.estimate, results.info
+        self._start(self.promises.statistics[name], "statistics", found, given, (0, 1, 1))
+
+    def _start(
+        self,
+        promise: Future[Any],
+        name: str,
+        function: Callable[..., Any],
+        given: tuple[Any, ...],
+        axes: tuple[Any, ...],
+        *,
+        out: Any = 0,
+        more: tuple[Any, ...] = (),
+        quick: bool = False,
+    ) -> Any:
+        """Have `Blockwise.program` keep the promise; the shapes of the results.
+
+        given: arrays or shapes. axes: those that go over the runs, of the arguments. out: of the
+        results. more: what the function is made of beside the scenario.
+        """
+        label = name if self.plan.dtype is None else f"{name}, {self.plan.dtype}"
+        objects = self.plan.scenario, *more
+        made = self.blockwise.program(label, objects, function, axes, out, *given, straight=quick)
         made.program.add_done_callback(partial(_keep, promise))
         return made.shapes
 
-    which = numbers(0, wide)
-    try:
-        world = program(
-            promised.draw, "draw", (scenario,), draw, (None, 0), 0, key, which, straight=True
-        )
-
-        def scored(name: str, driven: Any) -> None:
-            promise, made = promised.statistics[name], (world[0], driven.estimate, driven.info)
-            program(promise, "statistics", (scenario,), read, (0, 1, 1), 0, *made)
-
-        # Each filter before the statistics of the one before it: `Programs.block` wants them so.
-        before: tuple[str, Any] | None = None
-        for name, candidate in filters.items():
-            one = partial(drive, candidate)
-            promise, of = promised.drives[name], (scenario, candidate)
-            about = f"drive {name}", of, one, (None, 0, 0), _BY_TIME
-            driven = program(promise, *about, key, which, world)
-            if before is not None:
-                scored(*before)
-            before = name, driven
-        if before is not None:
-            scored(*before)
-        # Without a bound, the Jacobians of run 0 tell the divergence limit; where there are none to
-        # be had, the ideal filter does, as of the bound.
-        plain = scenario.draw is None and scenario.spurious is None
-        slow = promised.bound or not plain
-        last: Future[Any] = promised.least if slow else promised.slopes
-        spread_of = _spread_of_bound if slow else partial(_spread_of_slopes, scenario)
-        promised.limit_of = partial(_divergence_limit, scenario, world[0].pose.dtype, spread_of)
-        if slow:
-            promised.slopes.set_result(None)
-            program(last, "least", (scenario,), least, (None, 0, 0), 0, key, which, world)
-        else:
-            one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), world)
-            slopes = partial(slopes_at_truth, scenario)
-            program(last, "slopes", (scenario,), slopes, (None, None), None, *one, straight=True)
-        for promise in (*promised.drives.values(), *promised.statistics.values(), last):
-            promise.result()
-        promised.complete()
-        if not promised.with_first:
-            drawn = promised.draw.result()(key, which)
-            promised.limit.set_result(promised.found_limit(which, drawn, {}))
-    finally:
-        maker.close()
-
 
 def _keep(promise: Future[Any], compiling: Future[Any]) -> None:
-    """The promise is kept as the compilation turns out, unless that was cancelled."""
+    """Pass on how a compilation turned out, unless it was cancelled."""
     if compiling.cancelled() or promise.done():
         return
     error = compiling.exception()
@@ -155,24 +182,55 @@ def _keep(promise: Future[Any], compiling: Future[Any]) -> None:
         promise.set_exception(error)
 
 
-def _keys(key: jax.Array, i: jax.Array) -> jax.Array:
+# --- what the programs compute, of the runs which (B,) ------------------------------------------
+
+
+def draw_worlds(scenario: Scenario, dtype: Any, key: Array, which: Int[Array, "B"]) -> World:
+    """The truths and logs (B, …) of these runs, floating-point numbers in the dtype."""
+    world: World = jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
+    return rounded(world, dtype)
+
+
+def drive_filter(
+    scenario: Scenario, candidate: Candidate, key: Array, which: Int[Array, "B"], world: World
+) -> FilterResults:
+    """What a filter makes of the logs of these runs."""
+
+    def one(i: Array, truth: Truth, log: Log) -> FilterResults:
+        method, chart = estimator_of(candidate, truth, scenario)
+        trace = method(log, _keys(key, i)[1])
+        own = own_error_of(chart, scenario.sensor, trace, truth)
+        watch = monitor_of(trace.final)
+        information = None if watch is None else trace.probe
+        return FilterResults(trace.estimate, trace.info, own, watch, information)
+
+    results: FilterResults = jax.vmap(one, out_axes=_RUN_AXES)(which, *world)
+    return results
+
+
+def run_statistics(sensor: Sensor, truth: Truth, estimate: Estimate, info: Info) -> Statistics:
+    """The statistics (B, …) of each run."""
+
+    def one(truth: Truth, estimate: Estimate, info: Info) -> Statistics:
+        return statistics(Trace(estimate, info, None, None), truth, sensor)
+
+    found: Statistics = jax.vmap(one, in_axes=(0, 1, 1))(truth, estimate, info)
+    return found
+
+
+def bound_variances(
+    scenario: Scenario, key: Array, which: Int[Array, "B"], world: World
+) -> dict[str, Float[Array, "B T"]]:
+    """The conditional Cramér-Rao bound of each run: position [m²] and heading [rad²] by step."""
+
+    def one(i: Array, truth: Truth, log: Log) -> Array:
+        return conditional_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov
+
+    cov = jax.vmap(one)(which, *world)
+    position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)
+    return {"position": position, "heading": cov[:, :, 2, 2]}
+
+
+def _keys(key: Array, i: Array) -> Array:
     """The keys of run i: of its world, and of its filter."""
     return jax.random.split(jax.random.fold_in(key, i))
-
-
-def _spread_of_bound(least: Mapping[str, np.ndarray]) -> float:
-    """[m²] of run 0's last position. least: of a block whose first run it is, (runs, T)."""
-    return float(least["position"][0, -1])
-
-
-def _spread_of_slopes(scenario: Scenario, slopes: Slopes) -> float:
-    return float(np.trace(final_covariance(slopes, np.asarray(scenario.pose_cov))[:2, :2]))
-
-
-def _divergence_limit(
-    scenario: Scenario, dtype: Any, spread_of: Callable[[Any], float], found: Any
-) -> np.ndarray:
-    """5 σ of the ideal spread of run 0, or, in a world without noise, what rounding can do."""
-    spread = max(spread_of(found), 0.0) ** 0.5
-    reach = 1.0 + float(np.max(np.abs(np.asarray(scenario.landmarks)), initial=0.0))
-    return np.asarray(max(5 * spread, 1000 * float(jnp.finfo(dtype).eps) * reach), dtype)

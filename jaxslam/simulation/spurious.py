@@ -1,21 +1,20 @@
-"""What sensors get wrong beyond noise: clutter, misses, outliers, wrong labels."""
+"""Sensor faults beyond noise: clutter, missed detections, outliers and wrong tags."""
 
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.math.linalg import is_concrete, root_psd
 from jaxslam.protocols import Sensor
 from jaxslam.types import Scan
 
-Array = jax.Array
-
 
 @dataclass(frozen=True)
 class Spurious:
-    """How often a scan is wrong; Williams, "sensors aren't perfect".
+    """The rates of sensor faults.
 
     A false measurement is that of a point drawn uniformly from a square of half-width `reach`
     around the robot. Raises ValueError on a probability outside 0 to 1, a negative clutter, or
@@ -23,14 +22,14 @@ class Spurious:
     """
 
     clutter: float = 0.0
-    """false measurements a scan, on average: binomial, over 2·clutter further places, rounded up"""
+    """false measurements a scan, on average: binomial, over 2·clutter further slots, rounded up"""
     missed: float = 0.0
     """probability that a landmark in view is not measured"""
     outliers: float = 0.0
     """probability that a measurement is false, though its tag is right"""
     mislabelled: float = 0.0
-    """probability that a tag is wrong: those of a scan that are, trade tags in a circle (one alone
-    keeps its own)"""
+    """probability that a tag is wrong: the wrong ones of a scan are permuted in a cycle (a single
+    one keeps its own)"""
     reach: float = 0.0
     """[m]"""
 
@@ -47,18 +46,18 @@ class Spurious:
 
     @property
     def places(self) -> int:
-        """Further places of a scan, for clutter."""
+        """How many measurement slots clutter adds to a scan."""
         return int(np.ceil(2 * self.clutter))
 
 
 def spoil(
-    spurious: Spurious, sensor: Sensor, pose: Array, scan: Scan, key: Array
-) -> tuple[Scan, Array]:
-    """A scan of M places made at a pose, with things gone wrong, and what each place truly is of.
+    spurious: Spurious, sensor: Sensor, pose: Float[Array, "3"], scan: Scan, key: Array
+) -> tuple[Scan, Int[Array, "M"]]:
+    """A scan made at a pose with sensor faults put in, and the true origin of each measurement.
 
     Returns:
-        A scan of M + spurious.places places, clutter last and with tag -1; and the tag (M + …,)
-        of the landmark each was truly measured of, -1 for none.
+        A scan of spurious.places more measurement slots, clutter last and with tag -1; and the tag
+        of the landmark that was truly measured in each, -1 for none.
     """
     scan = jax.tree.map(jnp.asarray, scan)
     m = scan.tag.shape[0]
@@ -66,28 +65,27 @@ def spoil(
     key_missed, key_outlier, key_label, key_clutter, key_false = keys
     valid = scan.valid & ~jax.random.bernoulli(key_missed, spurious.missed, (m,))
     outlier = valid & jax.random.bernoulli(key_outlier, spurious.outliers, (m,))
-    mistaken = valid & jax.random.bernoulli(key_label, spurious.mislabelled, (m,))
+    mislabelled = valid & jax.random.bernoulli(key_label, spurious.mislabelled, (m,))
     false = _false_measurements(spurious, sensor, pose, m + spurious.places, key_false)
     z = jnp.where(outlier[:, None], false[:m], scan.z)
     origin = jnp.where(valid & ~outlier, scan.tag, -1)
     share = spurious.clutter / max(spurious.places, 1)
     there = jax.random.bernoulli(key_clutter, share, (spurious.places,))
-    nobody = jnp.full(spurious.places, -1, scan.tag.dtype)
+    no_tag = jnp.full(spurious.places, -1, scan.tag.dtype)
     spoilt = Scan(
-        z=jnp.concatenate([jnp.where(valid[:, None], z, 0.0), _only(false[m:], there)]),
-        tag=jnp.concatenate([jnp.where(valid, _traded(scan.tag, mistaken), -1), nobody]),
+        z=jnp.concatenate(
+            [jnp.where(valid[:, None], z, 0.0), jnp.where(there[:, None], false[m:], 0.0)]
+        ),
+        tag=jnp.concatenate([jnp.where(valid, _permuted(scan.tag, mislabelled), -1), no_tag]),
         valid=jnp.concatenate([valid, there]),
     )
-    return spoilt, jnp.concatenate([origin, nobody])
-
-
-def _only(z: Array, there: Array) -> Array:
-    return jnp.where(there[:, None], z, 0.0)
+    return spoilt, jnp.concatenate([origin, no_tag])
 
 
 def _false_measurements(
-    spurious: Spurious, sensor: Sensor, pose: Array, count: int, key: Array
-) -> Array:
+    spurious: Spurious, sensor: Sensor, pose: Float[Array, "3"], count: int, key: Array
+) -> Float[Array, "count Z"]:
+    """Measurements of random points around the robot."""
     key_point, key_noise = jax.random.split(key)
     points = jax.random.uniform(
         key_point, (count, 2), pose.dtype, minval=-spurious.reach, maxval=spurious.reach
@@ -102,8 +100,8 @@ def _false_measurements(
     return jax.vmap(one)(points, normals)
 
 
-def _traded(tag: Array, mistaken: Array) -> Array:
-    """Each mistaken place has the tag of the next one."""
-    places = jnp.argsort(~mistaken, stable=True)  # those mistaken, first
-    following = jnp.cumsum(mistaken) % jnp.maximum(mistaken.sum(), 1)
-    return jnp.where(mistaken, tag[places[following]], tag)
+def _permuted(tag: Int[Array, "M"], wrong: Bool[Array, "M"]) -> Int[Array, "M"]:
+    """The tags, each wrong one replaced by that of the next wrong slot."""
+    slots = jnp.argsort(~wrong, stable=True)  # the wrong ones first
+    following = jnp.cumsum(wrong) % jnp.maximum(wrong.sum(), 1)
+    return jnp.where(wrong, tag[slots[following]], tag)

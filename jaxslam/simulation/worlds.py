@@ -1,4 +1,5 @@
-"""The world generator: a scenario and a key give a truth and the log a robot would record in it."""
+"""The world generator: `simulate` draws a truth and the log a robot records, from a scenario and a
+key."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,6 +9,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
@@ -19,15 +21,18 @@ from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Log, Scan, Truth
 from jaxslam.validation import check_record
 
+Visible = Callable[[jax.Array, jax.Array], jax.Array]
+"""(pose, l) -> () bool: whether a sensor reports the landmark from there."""
 
-def everywhere(pose: jax.Array, landmark: jax.Array) -> jax.Array:
-    """Every landmark is seen from every pose."""
+
+def everywhere(pose: Float[Array, "3"], landmark: Float[Array, "L"]) -> Bool[Array, ""]:
+    """The field of view in which every landmark is seen from every pose."""
     return jnp.asarray(True)
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """An experiment: models, world, controls, and how the filters under test are set up.
+    """A simulated experiment: models, world, controls, and options of the filters under test.
 
     Arrays are held on the host in float64 and enter a simulation in the dtype JAX is set to.
     Raises ValueError on inconsistent shapes or values that are not finite.
@@ -47,18 +52,18 @@ class Scenario:
     noise_on: Literal["robot", "odometry"] = "robot"
     """"robot": the noise moves the true robot, and the log holds the nominal control. "odometry":
     the true robot follows the nominal control, and the noise is on the control in the log."""
-    visible: Callable[[jax.Array, jax.Array], jax.Array] = everywhere
-    """(pose, l) -> (): whether the sensor reports the landmark from there."""
+    visible: Visible = everywhere
+    """the sensor's field of view."""
     places: int | None = None
-    """M measurement places a scan; default N. The lowest tags first get a place, and the landmarks
+    """M measurement slots of a scan; default N. The lowest tags get a slot first, and the landmarks
     in view beyond M are counted in `Truth.missed`."""
     spurious: Spurious | None = None
     """clutter, misses, outliers and wrong labels; where given, if only as `Spurious()`, the truth
     says which landmark each measurement is of, and associations are scored."""
     filter_options: dict[str, Any] = field(default_factory=dict)
     """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
-    draw: Callable[["Scenario", jax.Array], tuple[Truth, Log]] | None = None
-    """(scenario, key) -> truth, log: a world of another kind (`team.world`); None for `simulate`'s
+    draw: Callable[["Scenario", Array], tuple[Truth, Log]] | None = None
+    """(scenario, key) -> truth, log: a world of another kind (`team_world`); None for `simulate`'s
     own."""
     published: dict[str, dict[str, float]] = field(default_factory=dict)
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
@@ -88,8 +93,8 @@ class Scenario:
         return int(np.shape(self.controls)[0])
 
 
-def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
-    """Draw one world history: true poses and the log of noisy controls or motion, and noisy scans.
+def simulate(scenario: Scenario, key: Array) -> tuple[Truth, Log]:
+    """One random history of a world: the truth, and the log of controls and noisy scans.
 
     Traceable, so `jax.vmap(partial(simulate, scenario))(keys)` draws a batch. Called outside a
     trace it is compiled once for a structure, as `run` is. The filters of a campaign all get the
@@ -100,30 +105,20 @@ def simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
     return programs.call(_simulate, (scenario,), key)
 
 
-def _simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
+def _simulate(scenario: Scenario, key: Array) -> tuple[Truth, Log]:
+    """Draw the start, the path, the scans, and what is spurious in them."""
     if scenario.draw is not None:
         return scenario.draw(scenario, key)
     dtype = jnp.result_type(float)
     controls = jnp.asarray(scenario.controls, dtype)
     landmarks = jnp.asarray(scenario.landmarks, dtype)
-    if scenario.spurious is None:
-        key_motion, key_scan, key_start = jax.random.split(key, 3)
-    else:
-        key_motion, key_scan, key_start, key_spoil = jax.random.split(key, 4)
+    # Three keys where nothing is spurious: faults do not change what is drawn without them.
+    keys = jax.random.split(key, 3 if scenario.spurious is None else 4)
+    key_motion, key_scan, key_start = keys[:3]
     start = drawn_near(jnp.asarray(scenario.pose, dtype), scenario.pose_cov, key_start)
     poses, logged = drive(scenario.motion, start, controls, key_motion, scenario.noise_on)
     if isinstance(scenario.sensor, Suite):
-        tags = jnp.arange(landmarks.shape[0])
-        seen = {"landmarks": (landmarks, tags), "robots": (landmarks[:0], tags[:0])}
-        scans = [
-            part_scan(part, scenario.visible, poses, *seen[part.sees], part_key)
-            for part, part_key in zip(
-                scenario.sensor.parts,
-                jax.random.split(key_scan, len(scenario.sensor.parts)),
-                strict=True,
-            )
-        ]
-        scan, missed = side_by_side(scans, len(scenario.sensor.measurements))
+        scan, missed = _suite_scans(scenario, scenario.sensor, poses, landmarks, key_scan)
         return Truth(poses, landmarks, missed, start), Log(logged, scan)
     places = scenario.places or landmarks.shape[0]
     scan, missed = scans_of(
@@ -132,24 +127,42 @@ def _simulate(scenario: Scenario, key: jax.Array) -> tuple[Truth, Log]:
     truth = Truth(poses, landmarks, missed, start)
     if scenario.spurious is not None:
         wrong = partial(spoil, scenario.spurious, scenario.sensor)
-        scan, origin = jax.vmap(wrong)(poses, scan, jax.random.split(key_spoil, scenario.steps))
+        scan, origin = jax.vmap(wrong)(poses, scan, jax.random.split(keys[3], scenario.steps))
         truth = truth._replace(origin=origin)
     return truth, Log(logged, scan)
 
 
+def _suite_scans(
+    scenario: Scenario,
+    sensors: Suite,
+    poses: Float[Array, "T 3"],
+    landmarks: Float[Array, "N L"],
+    key: Array,
+) -> tuple[Scan, Int[Array, "T"]]:
+    """The scans of all sensors of a lone robot, side by side; it sees no other robot."""
+    tags = jnp.arange(landmarks.shape[0])
+    targets = {"landmarks": (landmarks, tags), "robots": (landmarks[:0], tags[:0])}
+    keys = jax.random.split(key, len(sensors.parts))
+    scans = [
+        part_scan(part, scenario.visible, poses, *targets[part.sees], part_key)
+        for part, part_key in zip(sensors.parts, keys, strict=True)
+    ]
+    return side_by_side(scans, len(sensors.measurements))
+
+
 def scans_of(
     sensor: Sensor,
-    visible: Callable[[jax.Array, jax.Array], jax.Array],
+    visible: Visible,
     places: int,
-    poses: jax.Array,
-    targets: jax.Array,
-    on: jax.Array | None,
-    key: jax.Array,
-) -> tuple[Scan, jax.Array]:
-    """Scans with leading T of one sensor, and how many targets in view had no place, (T,).
+    poses: Float[Array, "T 3"],
+    targets: Float[Array, "*time C L"],
+    on: Bool[Array, "T"] | None,
+    key: Array,
+) -> tuple[Scan, Int[Array, "T"]]:
+    """The scans (T, …) of one sensor, and how many targets in view had no measurement slot.
 
-    poses (T, 3); targets (C, L), or (T, C, L) where they move; tags are their rows. on: (T,) bool,
-    when it measures, None for always.
+    targets: (C, L), or (T, C, L) where they move; tags are their rows. on: when the sensor
+    measures, None for always.
     """
     count = targets.shape[-2]
     places = min(places, count)
@@ -164,7 +177,7 @@ def scans_of(
         tag, valid = jnp.broadcast_to(jnp.arange(count), seen.shape), seen
     keys = jax.random.split(key, poses.shape[0])
 
-    def measure(pose: jax.Array, tags: jax.Array, targets: jax.Array, key: jax.Array) -> jax.Array:
+    def measure(pose: Array, tags: Array, targets: Array, key: Array) -> Array:
         exact = jax.vmap(sensor.observe, (None, 0))(pose, targets[tags])
         noise = jax.vmap(_draw)(jax.vmap(sensor.noise_cov)(exact), _normals(key, exact))
         return jax.vmap(sensor.residual)(exact + noise, jnp.zeros_like(exact))
@@ -180,15 +193,15 @@ def scans_of(
 
 def part_scan(
     part: Part,
-    visible: Callable[[jax.Array, jax.Array], jax.Array],
-    poses: jax.Array,
-    targets: jax.Array,
-    tags: jax.Array,
-    key: jax.Array,
-) -> tuple[Scan, jax.Array]:
-    """`scans_of` the sensor of a part, in its places and at its rate; tags (C,) of the targets.
+    visible: Visible,
+    poses: Float[Array, "T 3"],
+    targets: Float[Array, "*time C L"],
+    tags: Int[Array, "C"],
+    key: Array,
+) -> tuple[Scan, Int[Array, "T"]]:
+    """The `scans_of` one part of a suite, in its measurement slots and at its rate.
 
-    An absolute sensor has no tag. Without targets nothing is measured.
+    tags: of the targets. An absolute sensor has no tag. Without targets nothing is measured.
     """
     step = jnp.arange(poses.shape[0])
     if targets.shape[-2] == 0:
@@ -204,7 +217,7 @@ def part_scan(
     scan, missed = scans_of(part.sensor, field, part.places, poses, targets, on, key)
     tag = jnp.where(scan.valid, tags[jnp.maximum(scan.tag, 0)], -1).astype(jnp.int32)
     spare = part.places - tag.shape[1]
-    if spare > 0:  # more places than there are targets
+    if spare > 0:  # more slots than there are targets
         scan = Scan(
             z=jnp.pad(scan.z, [(0, 0), (0, spare), (0, 0)]),
             tag=jnp.pad(tag, [(0, 0), (0, spare)], constant_values=-1),
@@ -214,8 +227,9 @@ def part_scan(
     return scan._replace(tag=tag), missed
 
 
-def side_by_side(scans: list[tuple[Scan, jax.Array]], size_z: int) -> tuple[Scan, jax.Array]:
-    """One scan of all places, z padded with zeros to size_z; what had no place, added up."""
+def side_by_side(scans: list[tuple[Scan, Array]], size_z: int) -> tuple[Scan, Int[Array, "T"]]:
+    """The scans of several sensors as one, z padded with zeros to size_z; and how many targets had
+    no measurement slot."""
     z = [jnp.pad(s.z, [(0, 0), (0, 0), (0, size_z - s.z.shape[2])]) for s, _ in scans]
     scan = Scan(
         z=jnp.concatenate(z, axis=1),
@@ -225,25 +239,23 @@ def side_by_side(scans: list[tuple[Scan, jax.Array]], size_z: int) -> tuple[Scan
     return scan, jnp.stack([missed for _, missed in scans]).sum(axis=0)
 
 
-def drawn_near(pose: jax.Array, cov: ArrayLike, key: jax.Array) -> jax.Array:
-    """A pose (3,) from the normal distribution of that mean and covariance (3, 3)."""
+def drawn_near(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
+    """A random pose, from the normal distribution of that mean and covariance (3, 3)."""
     start = pose + _draw(jnp.asarray(cov, pose.dtype), _normals(key, pose))
     return start.at[2].set(wrap(start[2]))
 
 
 def drive(
     motion: Motion,
-    start: jax.Array,
-    controls: jax.Array,
-    key: jax.Array,
+    start: Float[Array, "3"],
+    controls: Float[Array, "T U"],
+    key: Array,
     noise_on: str = "robot",
-) -> tuple[jax.Array, jax.Array]:
-    """True poses (T, 3) and the controls (T, U) that the robot's log shows."""
+) -> tuple[Float[Array, "T 3"], Float[Array, "T U"]]:
+    """The true poses, and the controls that the robot's log shows."""
     normals = _normals(key, jnp.zeros((controls.shape[0], len(motion.noises)), controls.dtype))
 
-    def step(
-        pose: jax.Array, row: tuple[jax.Array, jax.Array]
-    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    def step(pose: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         u, normal = row
         w = _draw(motion.noise_cov(pose, u), normal)
         if noise_on == "robot":
@@ -257,12 +269,13 @@ def drive(
     return history
 
 
-def _normals(key: jax.Array, like: jax.Array) -> jax.Array:
+def _normals(key: Array, like: Array) -> Array:
+    """Standard normals, as many as there are in `like`."""
     return jax.random.normal(key, like.shape, like.dtype)
 
 
-def _draw(cov: jax.Array, normal: jax.Array) -> jax.Array:
-    """N(0, cov) from standard normals; cov may be singular or zero."""
+def _draw(cov: Float[Array, "W W"], normal: Float[Array, "W"]) -> Float[Array, "W"]:
+    """A draw of N(0, cov) from standard normals; cov may be singular or zero."""
     return root_psd(cov) @ normal
 
 

@@ -1,29 +1,27 @@
-"""The path of a solved chain and what is known of it, forward."""
+"""The means and covariances of the poses of a solved chain, in one pass forward."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxslam.math import linalg
 from jaxslam.smoothing.chain import Chain, Gain, Policy, Step
 
-Array = jax.Array
-
 
 class Marginals(NamedTuple):
-    """Of the Gaussian that a chain is: each pose, and the last pose with the map."""
+    """The marginals of the Gaussian of a chain: of each pose, and of the last pose with the map."""
 
-    path: Array
-    """(T+1, 3) δx, from the start on"""
-    covs: Array
-    """(T+1, 3, 3)"""
-    cov: Array
-    """(D, D) of the last pose and the map, D = 3 + NL; unit variance at dead slots"""
+    path: Float[Array, "T+1 3"]
+    """δx, from the start on"""
+    covs: Float[Array, "T+1 3 3"]
+    cov: Float[Array, "D D"]
+    """of the last pose and the map, D = 3 + NL; unit variance at dead slots"""
 
 
 def marginals(chain: Chain, policy: Policy) -> Marginals:
-    """Means and covariances of the poses, O(T N) and one triangular system of 3T columns.
+    """The means and covariances of the poses: O(T N), and one triangular system of 3T columns.
 
     With n standard normal and M = R Rᵀ the matrix of the gain,
 

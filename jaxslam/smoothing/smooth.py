@@ -5,31 +5,36 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.coordinates import estimate_of
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
-from jaxslam.smoothing import history as forward
 from jaxslam.smoothing.chain import Chain, Policy, eliminate
+from jaxslam.smoothing.forward_pass import (
+    ForwardPass,
+    compiled_once,
+    forward_filter,
+    in_one_dtype,
+    run_forward,
+)
+from jaxslam.smoothing.linearization import chain_of, noise_roots
 from jaxslam.smoothing.marginals import marginals
 from jaxslam.types import Estimate, Info, Log, Status, Trace
-
-Array = jax.Array
 
 
 class Smoothed(NamedTuple):
     """The `final` of a smoother's trace."""
 
-    start: Array
-    """(3,) pose before the first control"""
-    start_cov: Array
-    """(3, 3)"""
+    start: Float[Array, "3"]
+    """pose before the first control"""
+    start_cov: Float[Array, "3 3"]
     joint: Joint
     """the last pose and the map, which a filter may go on from"""
-    regular: Array
-    """() bool: the information on the map is positive definite; else covariances mean nothing"""
+    regular: Bool[Array, ""]
+    """the information on the map is positive definite; else covariances mean nothing"""
     filtered: Estimate
     """with leading T, of the filter that went first"""
 
@@ -51,14 +56,14 @@ def smooth(
     the filter took them, so the last pose and the map are the filter's own, to rounding, and every
     pose before knows what came after. The recursion of Rauch, Tung & Striebel 1965 ("Maximum
     likelihood estimates of linear dynamic systems", AIAA Journal 3(8)) would keep T covariances of
-    the map and invert each, where landmarks are yet to be born and the noise of a motion may be
-    singular; `chain.eliminate` gives the same numbers from the Jacobians alone, O(T N²). A landmark
-    has no prior, and its birth is a measurement of it.
+    the map and invert each, where landmarks may not be initialized yet and the noise of a motion
+    may be singular; `chain.eliminate` gives the same numbers from the Jacobians alone, O(T N²). A
+    landmark has no prior: its initialization is a measurement of it.
 
     What it returns maps (log, key) to a `Trace`: estimates with leading T, the poses smoothed and
-    the map, which stands still, the same final one at every step; the filter's infos, where a place
-    whose noise is singular becomes `Status.SINGULAR`, since it cannot be smoothed with; and
-    a `Smoothed`.
+    the map, which stands still, the same final one at every step; the filter's infos, where a
+    measurement whose noise is singular becomes `Status.SINGULAR`, since it cannot be smoothed with;
+    and a `Smoothed`.
 
         estimator = smooth(world.motion, world.sensor, 20, world.pose, world.pose_cov)
         trace = estimator(log, jax.random.key(0))
@@ -73,32 +78,34 @@ def smooth(
             with more parameters than are measured and have a prior (rays); and, when called, as
             `run` does.
     """
-    filter = forward.filter_of(
+    filter = forward_filter(
         motion, sensor, capacity, name="smooth", associate=associate, gate=gate, births=births
     )
 
     def solve(log: Log, key: Array) -> Trace:
-        history = forward.filtered(filter, log, pose, pose_cov, key)
-        log = in_one_width(log)
-        root = jnp.asarray(pose_cov, log.control.dtype)
-        roots = forward.roots_of(motion, history, log.control)
-        chain, used = forward.chain_of(motion, sensor, history, log, root, roots)
-        final = history.trace.final
+        passed = run_forward(filter, log, pose, pose_cov, key)
+        log = in_one_dtype(log)
+        mean, cov = (jnp.asarray(given, log.control.dtype) for given in (pose, pose_cov))
+        roots = noise_roots(motion, passed, log.control)
+        chain, used = chain_of(motion, sensor, passed, log, cov, roots)
+        final = passed.trace.final
         policy = eliminate(chain, final.alive)
-        begin = jnp.asarray(pose, log.control.dtype)
-        path = jnp.concatenate([begin[None], history.after])
-        estimate, solved = solution(sensor, chain, policy, path, final)
-        smoothed = Smoothed(*solved, history.trace.estimate)
-        return Trace(estimate, counted(history.trace.info, used), smoothed, ())
+        path = jnp.concatenate([mean[None], passed.corrected])
+        estimate, smoothed = solution(sensor, chain, policy, path, final, passed)
+        return Trace(estimate, with_singular(passed.trace.info, used), smoothed, None)
 
-    return forward.compiled_once(filter, pose, pose_cov, solve)
+    return compiled_once(filter, pose, pose_cov, solve)
 
 
 def solution(
-    sensor: Sensor, chain: Chain, policy: Policy, path: Array, joint: Joint
-) -> tuple[Estimate, tuple[Array, Array, Joint, Array]]:
-    """The optimum of a chain about a path (T+1, 3) and the map of a joint, as estimates; and the
-    first fields of a `Smoothed`."""
+    sensor: Sensor,
+    chain: Chain,
+    policy: Policy,
+    path: Float[Array, "poses 3"],
+    joint: Joint,
+    passed: ForwardPass,
+) -> tuple[Estimate, Smoothed]:
+    """The estimates at the optimum of a chain about a path and the map of a joint."""
     found = marginals(chain, policy)
     poses = path + found.path
     poses = poses.at[:, 2].set(wrap(poses[:, 2]))
@@ -108,18 +115,12 @@ def solution(
     steps = path.shape[0] - 1
     always = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), at_end)
     estimate = always._replace(pose=poses[1:], pose_cov=found.covs[1:])
-    return estimate, (poses[0], found.covs[0], last, policy.regular)
+    filtered = passed.trace.estimate
+    return estimate, Smoothed(poses[0], found.covs[0], last, policy.regular, filtered)
 
 
-def counted(info: Info, used: Array) -> Info:
-    """The filter's infos, with the status of what it used and a smoother cannot."""
+def with_singular(info: Info, used: Bool[Array, "T M"]) -> Info:
+    """The filter's infos, SINGULAR where it used a measurement that a smoother cannot use."""
     taken = (info.status == Status.FUSED) | (info.status == Status.BORN)
     status = jnp.where(taken & ~used, Status.SINGULAR, info.status)
     return info._replace(status=status.astype(info.status.dtype))
-
-
-def in_one_width(log: Log) -> Log:
-    """Arrays, controls and measurements in the wider dtype of the two, as `run` computes."""
-    log = jax.tree.map(jnp.asarray, log)
-    dtype = jnp.result_type(log.control, log.scan.z)
-    return Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))

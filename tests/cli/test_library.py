@@ -47,7 +47,7 @@ def test_a_campaign_runs_from_what_another_has_compiled():
         "draw",
         "drive ekf",
         "statistics",
-        "slopes",
+        "jacobians",
     }
     traced.clear()
     programs.clear()  # as in another process

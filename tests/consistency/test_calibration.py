@@ -138,8 +138,8 @@ def test_what_is_empty_does_not_count_and_a_number_will_do():
         (plain, 1.0, {"tolerance": 0.0}, "tolerance"),
         (lambda p: plain(p[0], status=3), 1.0, {}, "no measurement is fused"),
         (lambda p: plain(jnp.log(p[0])), -1.0, {}, "not finite"),
-        (lambda p: plain(p[0] + p[1]), [1.0, 2.0], {}, "apart"),
-        (lambda p: plain(p[0] * 0), 1.0, {}, "apart"),
+        (lambda p: plain(p[0] + p[1]), [1.0, 2.0], {}, "distinguish"),
+        (lambda p: plain(p[0] * 0), 1.0, {}, "distinguish"),
     ],
 )
 def test_refusals(info, start, options, message):

@@ -223,8 +223,8 @@ def test_the_bounds_obey_tichavskys_recursion():
     steps, own = consistency.posterior_bound(world, *alone, steps=[0, 7, 14])
     np.testing.assert_allclose(own, bounds[0, steps], rtol=1e-7, atol=1e-12)
     truth, bound = jax.tree.map(lambda leaf: leaf[0], truths), bounds[0]
-    slopes = jax.jit(partial(consistency.slopes_at_truth, world))
-    found = jax.device_get(slopes(truth, jax.tree.map(lambda leaf: leaf[0], logs)))
+    jacobians = jax.jit(partial(consistency.jacobians_at_truth, world))
+    found = jax.device_get(jacobians(truth, jax.tree.map(lambda leaf: leaf[0], logs)))
     last = consistency.final_covariance(found, world.pose_cov)
     np.testing.assert_allclose(last, bound[-1], rtol=1e-4, atol=1e-9)
     n = 3 + 12

@@ -15,8 +15,9 @@ from jaxslam import catalog, filters, motion, run, sensors, simulate, store
 from jaxslam.filters import reporting
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
-from jaxslam.monte_carlo.block import Programs
+from jaxslam.monte_carlo.block import BlockRunner
 from jaxslam.monte_carlo.candidates import fitting_block, without_noise
+from jaxslam.monte_carlo.plan import Plan, Promises
 from jaxslam.types import Status
 
 WORLD = worlds.ring()
@@ -161,11 +162,11 @@ def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_fours):
     tried = []
     compile_programs = campaign_module.compile_programs
 
-    def little_memory(programs, *arguments):
-        tried.append(programs.wide)
-        if programs.wide > 4:
+    def little_memory(plan, promises):
+        tried.append(plan.wide)
+        if plan.wide > 4:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
-        compile_programs(programs, *arguments)
+        compile_programs(plan, promises)
 
     monkeypatch.setattr(campaign_module, "compile_programs", little_memory)
     with pytest.warns(UserWarning, match="going on with block=") as warned:
@@ -220,10 +221,11 @@ def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it(
 
 
 def test_steps_are_timed_while_nothing_is_compiled():
-    programs = Programs(["a", "b"], worlds.key(), 2, 1, bound=False)
-    programs._spent["a"] += [(False, 8.0), (True, 1.0), (True, 3.0)]
-    programs._spent["b"] += [(False, 4.0)]
-    assert programs.run_seconds() == {"a": 1.0, "b": 2.0}
+    plan = Plan(WORLD, {"a": EKF, "b": EKF}, worlds.key(), jax.devices()[:1], block=2)
+    runner = BlockRunner(plan, Promises([]))
+    runner._spent["a"] += [(False, 8.0), (True, 1.0), (True, 3.0)]
+    runner._spent["b"] += [(False, 4.0)]
+    assert runner.run_seconds() == {"a": 1.0, "b": 2.0}
 
 
 def test_every_filter_gets_the_same_draws(in_fours):

@@ -15,7 +15,7 @@ from jaxslam import filters, motion, run, sensors, simulate
 from jaxslam.math.stats import chi2_band
 from jaxslam.protocols import Free, Motion, Sensor
 from jaxslam.smoothing import batch_map, smooth
-from jaxslam.smoothing.batch_map import Ending
+from jaxslam.smoothing.gauss_newton import Ending
 from jaxslam.types import Log, Scan, Status
 
 KEY = jax.random.key(0)

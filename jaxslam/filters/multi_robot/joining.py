@@ -8,8 +8,8 @@ from jaxslam import slots
 from jaxslam.filters.multi_robot import pose_initialization
 from jaxslam.filters.multi_robot.pose_initialization import Entry, Sightings
 from jaxslam.protocols import Sensor
-from jaxslam.simulation.team import Robot
 from jaxslam.slots import Joint
+from jaxslam.team import Robot
 from jaxslam.types import Scan
 
 Array = jax.Array

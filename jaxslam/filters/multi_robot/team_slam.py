@@ -21,8 +21,8 @@ from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import check_count, check_gate
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Chart, Filter
-from jaxslam.simulation.team import Robot, check_team, poses, sizes
 from jaxslam.slots import Joint
+from jaxslam.team import Robot, check_team, poses, sizes
 from jaxslam.types import Estimate, Info, Scan, Status
 
 Array = jax.Array

@@ -15,6 +15,7 @@ from jaxslam import charts, filters, motion, sensors, team
 from jaxslam.filters import ekf_slam, team_slam
 from jaxslam.filters.multi_robot import pose_initialization
 from jaxslam.sensors import Part, suite
+from jaxslam.simulation import team_world
 from jaxslam.simulation.scenarios import between_ranges
 from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Log, Scan, Status
@@ -52,7 +53,7 @@ def world(robots, steps=40, **options):
     points = np.stack([radius * np.cos(around), 1.0 + radius * np.sin(around)], axis=1)
     turns = [4 * np.pi / 100, -0.1, 0.15][: len(robots)]
     controls = np.tile(np.ravel([(0.12, turn) for turn in turns]), (steps, 1))
-    return team.world(robots, points, controls, **options)
+    return team_world.team_world(robots, points, controls, **options)
 
 
 @cache
@@ -339,7 +340,7 @@ def test_a_world_is_the_same_whatever_is_reported():
     @jax.jit
     def all_of_them(key):
         truths, logs = zip(*(simulate(scenario, key) for scenario in scenarios), strict=True)
-        return truths, logs, team.histories(scenarios[0], robots, key)
+        return truths, logs, team_world.histories(scenarios[0], robots, key)
 
     truths, logs, (starts, paths, _) = all_of_them(jax.random.key(0))
     for log in logs[1:]:

@@ -1,0 +1,121 @@
+"""The nonlinear least-squares problem of a path and a map: its cost, and a step from an iterate.
+
+The unknowns are the noises of the start and of the motions, in units of their own standard
+deviations, and the map; the path is what the motions make of the noises. So the models hold
+exactly at every iterate, and noise that cannot move the pose in every direction is no special case.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.math import linalg
+from jaxslam.math.angles import wrap
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.smoothing.chain import Chain, Policy, Start, Step
+from jaxslam.smoothing.linearization import pose_difference, whitened_rows
+
+
+class Problem(NamedTuple):
+    """The data: what is given of the start and the motions, and the measurements that count."""
+
+    pose: Float[Array, "3"]
+    """mean of the start"""
+    root: Float[Array, "3 3"]
+    """of its covariance"""
+    control: Float[Array, "T U"]
+    roots: Float[Array, "T W W"]
+    """of the covariances of the motions' noises"""
+    z: Float[Array, "T M Z"]
+    slot: Int[Array, "T M"]
+    used: Bool[Array, "T M"]
+
+
+class Iterate(NamedTuple):
+    """Values of all unknowns, and the path that they lead to."""
+
+    start: Float[Array, "3"]
+    """ξ"""
+    noise: Float[Array, "T W"]
+    """η"""
+    path: Float[Array, "T+1 3"]
+    """from the start on: x_0 = pose + L ξ, x_t = f(x_{t-1}, u_t, Q^{1/2} η_t)"""
+    landmarks: Float[Array, "N L"]
+
+
+def cost(sensor: Sensor, problem: Problem, at: Iterate) -> Float[Array, ""]:
+    """The cost ½ |ξ|² + ½ Σ |η_t|² + ½ Σ |R^{-1/2} (z ⊖ h(x_t, l))|² of an iterate.
+
+    Minus the log posterior density, up to a constant, as long as the noise covariances are taken
+    for given. The path is read from the iterate.
+    """
+
+    def square(z: Array, slot: Array, used: Array, pose: Array) -> Array:
+        residual = sensor.residual(z, sensor.observe(pose, at.landmarks[slot]))
+        white = linalg.solve_lower(linalg.cholesky(sensor.noise_cov(z))[0], residual)
+        return jnp.where(used, (white**2).sum(), 0.0)
+
+    over_slots = jax.vmap(square, (0, 0, 0, None))
+    each = jax.vmap(over_slots)(problem.z, problem.slot, problem.used, at.path[1:])
+    return 0.5 * ((at.start**2).sum() + (at.noise**2).sum() + each.sum())
+
+
+def linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
+    """The chain about an iterate, to first order in the models: that of the Gauss-Newton step.
+
+    It has as many rows a measurement as that of `linearization.chain_of`.
+    """
+    spare = max(0, len(sensor.landmark) - len(sensor.measurements))
+
+    def moved(pose: Array, u: Array, root: Array, noise: Array) -> tuple[Array, Array]:
+        by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, root @ noise)
+        return by_pose, by_noise @ root
+
+    by_pose, by_noise = jax.vmap(moved)(at.path[:-1], problem.control, problem.roots, at.noise)
+
+    def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
+        *rows, _ = whitened_rows(sensor, z, pose, at.landmarks[slot])
+        a, b, r = (
+            jnp.pad(jnp.where(used, row, 0.0), [(0, spare)] + [(0, 0)] * (row.ndim - 1))
+            for row in rows
+        )
+        return a, b, r
+
+    over_slots = jax.vmap(measured, (0, 0, 0, None))
+    a, b, r = jax.vmap(over_slots)(problem.z, problem.slot, problem.used, at.path[1:])
+    no_drift = jnp.zeros_like(at.path[1:])
+    steps = Step(by_pose, by_noise, no_drift, at.noise, problem.slot, a, b, r)
+    return Chain(Start(problem.root, at.start), steps)
+
+
+def roll_out(
+    motion: Motion, problem: Problem, at: Iterate, policy: Policy, share: Float[Array, ""]
+) -> Iterate:
+    """The iterate that lies a share of the step on, on the models themselves.
+
+    d_t = share k_t - J a_t - K δm with a_t = f(x_{t-1}, u_t, Q^{1/2} η̄_t) - x̄_t, of the path as it
+    comes out: where the models bend, the later noises answer to where the earlier ones led, as
+    differential dynamic programming does (Jacobson & Mayne 1970). Without that, a small turn early
+    would swing all of a long path. To first order it is share times the Gauss-Newton step. The path
+    of the iterate it starts from (x̄) need not obey the models; what comes out does.
+    """
+    shift = share * policy.landmarks
+    delta = shift.reshape(-1)
+    start = at.start + share * policy.start.constant - policy.start.by_map @ delta
+    first = problem.pose + problem.root @ start
+    first = first.at[2].set(wrap(first[2]))
+
+    def forward(pose: Array, row: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+        u, root, noise, reference, constant, by_pose, by_map = row
+        predicted = pose_difference(motion.step(pose, u, root @ noise), reference)
+        noise = noise + share * constant - by_pose @ predicted - by_map @ delta
+        pose = motion.step(pose, u, root @ noise)
+        return pose, (pose, noise)
+
+    gains = policy.steps
+    data = problem.control, problem.roots, at.noise, at.path[1:]
+    solved = gains.constant, gains.by_pose, gains.by_map
+    _, (path, noise) = jax.lax.scan(forward, first, (*data, *solved))
+    return Iterate(start, noise, jnp.concatenate([first[None], path]), at.landmarks + shift)

@@ -1,0 +1,126 @@
+"""What the robots of a team are, and where each of them is in the controls, scans and states.
+
+`filters.team_slam` runs a filter for them; `simulation.team_world` draws worlds that they drive in.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jaxslam.math.linalg import check_covariance, is_concrete
+from jaxslam.protocols import Motion
+from jaxslam.sensors.suite import Part, Suite, suite
+from jaxslam.slots import Joint
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """One robot of a team. Raises ValueError on sensors that are no suite, or a bad start."""
+
+    motion: Motion
+    sensors: Suite
+    """made by `sensors.suite`, also of a single one"""
+    start: tuple[ArrayLike, ArrayLike] | None = None
+    """pose (3,) before the first control in the frame of robot 0's, and its covariance (3, 3); None
+    where unknown, and of robot 0"""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.motion, Motion) or not isinstance(self.sensors, Suite):
+            raise ValueError(
+                f"Robot: expected a motion and a sensors.suite, got {self.motion!r} and "
+                f"{self.sensors!r}"
+            )
+        if self.start is not None:
+            if np.shape(self.start[0]) != (3,):
+                raise ValueError(
+                    f"Robot: expected a start of shape (3,), got {np.shape(self.start[0])}"
+                )
+            if is_concrete(self.start[0]) and not np.all(np.isfinite(np.asarray(self.start[0]))):
+                raise ValueError("Robot: the start is not finite")
+            check_covariance("Robot: covariance of the start", self.start[1], 3)
+
+
+def check_team(
+    name: str, robots: Sequence[Robot], tags: Sequence[int] | None, landmarks: int
+) -> tuple[int, ...]:
+    """The tags that mean robots, by default landmarks, landmarks + 1, …: after those of landmarks.
+
+    Raises ValueError, which begins with the caller's name, unless this is a team.
+    """
+    if not isinstance(robots, Sequence) or len(robots) == 0:
+        raise ValueError(f"{name}: expected at least one robot, got {robots!r}")
+    for robot in robots:
+        if not isinstance(robot, Robot):
+            raise ValueError(f"{name}: expected a team.Robot, got {robot!r}")
+    if robots[0].start is not None:
+        raise ValueError(f"{name}: robot 0 has no start of its own, the run's is its start")
+    made = tuple(range(landmarks, landmarks + len(robots))) if tags is None else tuple(tags)
+    if len(made) != len(robots) or len(set(made)) != len(made):
+        raise ValueError(f"{name}: expected {len(robots)} different tags of robots, got {made}")
+    if any(type(tag) is not int or tag < 0 for tag in made):
+        raise ValueError(f"{name}: expected tags of robots that are integers >= 0, got {made}")
+    return made
+
+
+def sizes(robots: Sequence[Robot]) -> tuple[list[int], list[int], int]:
+    """The end of each robot's part of the control (ΣU,), the end of its places in a scan, and the
+    largest Z."""
+    controls = np.cumsum([len(robot.motion.controls) for robot in robots]).tolist()
+    places = np.cumsum([sum(robot.sensors.places) for robot in robots]).tolist()
+    return controls, places, max(len(robot.sensors.measurements) for robot in robots)
+
+
+def poses(
+    joint: Joint, robots: int
+) -> tuple[Float[Array, "R 3"], Float[Array, "R 3 3"], Bool[Array, "R"]]:
+    """The pose of each robot in a state of `filters.team_slam`, its covariance, and whether it is
+    in the map.
+
+    As a probe, of a whole run: `run(filter, …, probe=partial(poses, robots=3))`. A robot that is
+    not in the map has zeros and unit covariance.
+    """
+    first = joint.alive.shape[0] - robots + 1
+    every = np.arange(robots)
+    return (
+        jnp.concatenate([joint.pose[None], joint.landmarks[first:]]),
+        pose_cross_cov(joint, robots)[every, :, every],
+        jnp.concatenate([jnp.ones(1, bool), joint.alive[first:]]),
+    )
+
+
+def pose_cross_cov(joint: Joint, robots: int) -> Float[Array, "R 3 R 3"]:
+    """The covariances of the poses of all robots with each other."""
+    first = 3 + 3 * (joint.alive.shape[0] - robots + 1)
+    at = np.concatenate([np.arange(3), first + np.arange(3 * (robots - 1))])
+    return joint.cov[at][:, at].reshape(robots, 3, robots, 3)
+
+
+def motion_of(robots: Sequence[Robot], report: int) -> Motion:
+    """The motion of the robot `report`, as a function of the controls (ΣU,) of the whole team."""
+    ends, _, _ = sizes(robots)
+    own = robots[report].motion
+    at = slice(ends[report] - len(own.controls), ends[report])
+    return Motion(
+        name="team",
+        controls=tuple(name for robot in robots for name in robot.motion.controls),
+        noises=own.noises,
+        step=lambda pose, u, w: own.step(pose, u[at], w),
+        noise_cov=lambda pose, u: own.noise_cov(pose, u[at]),
+    )
+
+
+def sensors_of(robots: Sequence[Robot], report: int) -> Suite:
+    """The sensors of the whole team as one suite, for a filter of the robot `report` alone.
+
+    The places of the other robots' sensors are marked as those that see robots, which a filter of
+    one robot leaves alone.
+    """
+    parts = []
+    for b, robot in enumerate(robots):
+        for part in robot.sensors.parts:
+            parts.append(part if b == report else Part(part.sensor, part.places, sees="robots"))
+    return suite(*parts)
