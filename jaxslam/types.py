@@ -45,7 +45,7 @@ class Status(IntEnum):
     unknown identity where identities are asked for), or a robot it concerns has no place in the map
     yet; dropped."""
     SIGHTED = 9
-    """Of no landmark yet; kept as a sighting (`filters.delayed_slam`)."""
+    """Of no landmark yet; kept as a stored measurement (`filters.delayed_slam`)."""
 
 
 class Scan(NamedTuple):

@@ -56,7 +56,7 @@ class Hypotheses:
     the 99 % quantile of chi-square with two degrees of freedom for mahalanobis, 0.5 for
     bhattacharyya"""
     decay: float = 0.5
-    """persistence lost by a measurement of its tag that does not confirm it; deleted at 0, so
+    """persistence lost by each measurement of its tag that does not confirm it; deleted at 0, so
     persistence / decay outliers in a row are survived"""
     patience: int = 200
     """scans without confirmation after which a hypothesis is deleted"""
