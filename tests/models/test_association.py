@@ -42,13 +42,13 @@ def problem(rng, m, n, near=1.0, size_z=2):
     return z[:, None] - expected[None], cross, noise
 
 
-def pairs_of(innovation, cross, noise):
+def pairs_of(innovation, cross, noise, xp=np):
     n = cross.shape[0]
-    own = cross[np.arange(n), :, np.arange(n)]
+    own = cross[xp.arange(n), :, xp.arange(n)]
     cov = own[None] + noise[:, None]
-    distance = np.einsum("mni,mnij,mnj->mn", innovation, np.linalg.inv(cov), innovation)
-    log_det = np.linalg.slogdet(cov)[1]
-    return Pairs(innovation, cov, distance, log_det, np.ones(distance.shape, bool))
+    distance = xp.einsum("mni,mnij,mnj->mn", innovation, xp.linalg.inv(cov), innovation)
+    log_det = xp.linalg.slogdet(cov)[1]
+    return Pairs(innovation, cov, distance, log_det, xp.ones(distance.shape, bool))
 
 
 def plainly(method, innovation, cross, noise, valid=None, alive=None):
@@ -56,13 +56,8 @@ def plainly(method, innovation, cross, noise, valid=None, alive=None):
     m, n = innovation.shape[:2]
     valid = jnp.ones(m, bool) if valid is None else valid
     alive = jnp.ones(n, bool) if alive is None else alive
-    own = cross[jnp.arange(n), :, jnp.arange(n)]
-    cov = own[None] + noise[:, None]
-    inverse = jnp.linalg.inv(cov)
-    distance = jnp.einsum("mni,mnij,mnj->mn", innovation, inverse, innovation)
-    log_det = jnp.linalg.slogdet(cov)[1]
-    possible = valid[:, None] & alive[None, :]
-    pairs = Pairs(innovation, cov, distance, log_det, possible)
+    pairs = pairs_of(innovation, cross, noise, jnp)
+    pairs = pairs._replace(possible=valid[:, None] & alive[None, :])
     prediction = Prediction(jnp.full(n, -1), alive, lambda scan: pairs, lambda: cross)
     scan = Scan(jnp.zeros((m, innovation.shape[2])), jnp.full(m, -1), valid)
     return Association(*method(prediction, scan))

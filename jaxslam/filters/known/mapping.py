@@ -1,4 +1,4 @@
-"""Mapping from known poses: landmarks that have nothing to do with one another."""
+"""Mapping from known poses: landmarks that are independent of one another."""
 
 import jax
 import jax.numpy as jnp

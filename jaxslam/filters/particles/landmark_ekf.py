@@ -39,7 +39,7 @@ def update_map(
     """
     particle = correct_landmarks(particle, association.slot, innovations.used, scan, settings)
     particle, evicted = evict_for_new(particle, association, innovations.used, settings.life)
-    particle, new = initialize_landmarks(particle, association.is_new, scan, settings)
+    particle, new = initialize_particle_landmarks(particle, association.is_new, scan, settings)
     status = status_of(
         scan.valid,
         matched=association.matched,
@@ -124,7 +124,7 @@ class AllocatedSlots(NamedTuple):
     """of a tag that occurs earlier in the scan"""
 
 
-def initialize_landmarks(
+def initialize_particle_landmarks(
     particle: SlamParticles, is_new: Bool[Array, "M"], scan: Scan, settings: ParticleMapSettings
 ) -> tuple[SlamParticles, AllocatedSlots]:
     """The particle with new landmarks in free slots, as many as fit."""

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.association.predicted import predicted
 from jaxslam.filters.particles.gating import gate_distance
-from jaxslam.filters.particles.scan_association import ParticleAssociation, associate_scan
+from jaxslam.filters.particles.scan_association import ParticleAssociation, particle_association
 from jaxslam.filters.particles.settings import KnownMapSensor
 from jaxslam.math.gaussians import GaussianTerms, gaussian_terms, log_density
 from jaxslam.protocols import Prediction
@@ -148,7 +148,7 @@ def associate_known(
         none = jnp.zeros(scan.tag.shape, jnp.int32)
         return ParticleAssociation(none, scan.valid, jnp.zeros_like(scan.valid), jnp.asarray(False))
     prediction = predict_known(pose, landmarks, settings)
-    return associate_scan(prediction, scan, settings.associate)
+    return particle_association(prediction, scan, settings.associate)
 
 
 def predict_known(

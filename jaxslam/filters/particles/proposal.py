@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from jaxslam import derivatives
 from jaxslam.association.predicted import predicted
 from jaxslam.filters.particles.gating import gate_distance
-from jaxslam.filters.particles.scan_association import ParticleAssociation, associate_scan
+from jaxslam.filters.particles.scan_association import ParticleAssociation, particle_association
 from jaxslam.filters.particles.settings import ParticleMapSettings
 from jaxslam.filters.particles.slam_state import SlamParticles
 from jaxslam.linearize import first_order
@@ -49,7 +49,7 @@ def associate_particle(
 ) -> ParticleAssociation:
     """The association of a scan with the map of one particle, before the scan corrects its pose."""
     prediction = predict_measurements(particle, settings.sensor)
-    return associate_scan(prediction, scan, settings.associate)
+    return particle_association(prediction, scan, settings.associate)
 
 
 class PoseProposal(NamedTuple):

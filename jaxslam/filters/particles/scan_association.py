@@ -21,7 +21,9 @@ class ParticleAssociation(NamedTuple):
     """the search ended at its budget"""
 
 
-def associate_scan(prediction: Prediction, scan: Scan, associate: Associate) -> ParticleAssociation:
+def particle_association(
+    prediction: Prediction, scan: Scan, associate: Associate
+) -> ParticleAssociation:
     """What the method finds, for the measurements that are there."""
     found = Association(*associate(prediction, scan))
     return ParticleAssociation(

@@ -3,6 +3,7 @@
 import dataclasses
 from functools import cache
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,9 +42,7 @@ def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     slam = ekf_slam(exact, scenario.sensor, capacity, update="joint", **options)
     expected = on_poses(slam, truth, log)
     trace = on_poses(mapping(scenario.sensor, capacity, **options), truth, log)
-    for name in ("pose", "points", "point_covs", "alive", "tag"):
-        actual, wanted = getattr(trace.estimate, name), getattr(expected.estimate, name)
-        np.testing.assert_allclose(actual, wanted, rtol=1e-9, atol=1e-12)
+    chex.assert_trees_all_close(trace.estimate, expected.estimate, rtol=1e-9, atol=1e-12)
     for name in ("status", "slot", "nis", "dof", "innovation_cov"):
         actual, wanted = getattr(trace.info, name), getattr(expected.info, name)
         np.testing.assert_allclose(actual, wanted, rtol=1e-8, atol=1e-10)

@@ -242,9 +242,7 @@ def test_poses_that_are_not_finite_weigh_nothing_and_are_counted(kind):
         return run(filter, log, np.zeros(3), np.zeros((3, 3)), KEY, probe=probe)
 
     some, every = go(0.0), go(-9.0)
-    for trace in (some, every):
-        for leaf in jax.tree.leaves((trace.estimate, trace.info, trace.probe[0])):
-            assert np.isfinite(np.asarray(leaf, float)).all()
+    chex.assert_tree_all_finite([(t.estimate, t.info, t.probe[0]) for t in (some, every)])
     invalid = np.asarray(some.info.extra["particles"].invalid)
     assert ((invalid > 0) & (invalid < 16)).all()
     assert not np.any(some.info.extra["particles"].underflow)
