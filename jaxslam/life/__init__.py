@@ -1,4 +1,4 @@
-"""Which landmarks stay in the map: managers that a filter asks after every scan."""
+"""Which landmarks stay in the map: rules that are asked after every scan."""
 
 from jaxslam.life.existence import existence
 from jaxslam.life.recency import recency

@@ -1,4 +1,4 @@
-"""Landmarks prove that they exist by being seen where they should be."""
+"""Landmarks are kept or removed by the log-odds that they exist."""
 
 import math
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
 from jaxslam.math.linalg import check_count
@@ -13,25 +14,23 @@ from jaxslam.protocols import Life
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Status
 
-Array = jax.Array
-
-# A landmark seen for long can still be given up, after as many misses as this takes.
-_MOST = 10.0
+_LARGEST = 10.0
+"""of the log-odds, so that also a landmark that was often measured is removed after some misses"""
 
 
 class Existence(NamedTuple):
     """What is known of each slot's landmark; zero where dead."""
 
-    log_odds: Array
-    """(N,) that it exists"""
-    confirmed: Array
-    """(N,) bool: it was once believed to; before that it is provisional"""
-    seen: Array
-    """(N,) int: scans that measured it"""
-    missed: Array
-    """(N,) int: scans that should have, and did not"""
-    since: Array
-    """(N,) int: scans since it was last measured"""
+    log_odds: Float[Array, "N"]
+    """that it exists"""
+    confirmed: Bool[Array, "N"]
+    """its probability once reached `confirm`; before that it is provisional"""
+    seen: Int[Array, "N"]
+    """scans that measured it"""
+    missed: Int[Array, "N"]
+    """scans that should have, and did not"""
+    since: Int[Array, "N"]
+    """scans since it was last measured"""
 
 
 def existence(
@@ -46,7 +45,7 @@ def existence(
     replace: bool = False,
 ) -> Life:
     """Log-odds of existence, as of a cell of an occupancy map (Thrun, Burgard, Fox, "Probabilistic
-    Robotics", 2005, sections 9.2 and 13.9, where landmarks are given up by negative evidence).
+    Robotics", 2005, sections 9.2 and 13.9, where landmarks are removed by negative evidence).
 
     A landmark begins at even odds. Each scan that measures it adds log(detected/false), each that
     should have and does not adds log((1 - detected)/(1 - false)). Where the probability comes to
@@ -63,7 +62,7 @@ def existence(
         spread: [m] a landmark with a larger standard deviation, √(tr P/2), is removed.
         replace: in a full map, new landmarks take the place of those least likely to exist among
             the provisional ones that the scan did not measure; otherwise the map refuses
-            (`Status.OVERFLOW`).
+            (`Status.OVERFLOW`). The filter has to know it: `ekf_slam(…, make_room=life)`.
     Raises:
         ValueError: on a visible that is no function; unless 0 < false < detected < 1 and
             0 < remove < 1/2 < confirm < 1; on a patience below 1 or a spread not above 0.
@@ -83,7 +82,7 @@ def existence(
     gain, loss = math.log(detected / false), math.log((1 - detected) / (1 - false))
     high, low = math.log(confirm / (1 - confirm)), math.log(remove / (1 - remove))
 
-    def init(pose: Array, landmarks: Array) -> Existence:
+    def init(pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Existence:
         capacity = landmarks.shape[0]
         none = jnp.zeros(capacity, jnp.int32)
         return Existence(
@@ -92,15 +91,15 @@ def existence(
 
     def after(
         joint: Joint, info: Info, estimate: Callable[[], Estimate]
-    ) -> tuple[Existence, Array]:
+    ) -> tuple[Existence, Bool[Array, "N"]]:
         count = len(joint.alive)
         born = slots.concerned(info.slot, info.status == Status.BORN, count)
         hit = born | slots.concerned(info.slot, info.status == Status.FUSED, count)
         known: Existence = joint.life
         old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), known)
-        should = joint.alive & ~hit & jax.vmap(visible, (None, 0))(joint.pose, joint.landmarks)
-        change = jnp.where(hit & ~born, gain, 0.0) + jnp.where(should, loss, 0.0)
-        odds = jnp.clip(old.log_odds + change.astype(old.log_odds.dtype), -_MOST, _MOST)
+        expected = joint.alive & ~hit & jax.vmap(visible, (None, 0))(joint.pose, joint.landmarks)
+        change = jnp.where(hit & ~born, gain, 0.0) + jnp.where(expected, loss, 0.0)
+        odds = jnp.clip(old.log_odds + change.astype(old.log_odds.dtype), -_LARGEST, _LARGEST)
         confirmed = joint.alive & (old.confirmed | (odds >= high))
         since = jnp.where(hit | ~joint.alive, 0, old.since + 1)
         dead = odds <= low
@@ -110,15 +109,17 @@ def existence(
             variance = jnp.trace(estimate().point_covs, axis1=1, axis2=2) / 2
             dead = dead | (variance > spread**2)
         memory = Existence(
-            odds, confirmed, old.seen + hit, old.missed + should, since.astype(jnp.int32)
+            odds, confirmed, old.seen + hit, old.missed + expected, since.astype(jnp.int32)
         )
         return memory, dead & joint.alive
 
-    def make_room(joint: Joint, needed: Array, measured: Array) -> Array:
+    def make_room(
+        joint: Joint, needed: Int[Array, ""], measured: Bool[Array, "N"]
+    ) -> Bool[Array, "N"]:
         provisional = joint.alive & ~joint.life.confirmed & ~measured
         odds = jnp.where(provisional, joint.life.log_odds, jnp.inf)
         rank = jnp.argsort(jnp.argsort(odds))
-        given_up: Array = provisional & (rank < needed)
-        return given_up
+        evicted: Array = provisional & (rank < needed)
+        return evicted
 
     return Life("existence", init, after, make_room if replace else None)

@@ -1,10 +1,10 @@
-"""When each landmark came and was last seen, for filters that look after loops."""
+"""When each landmark was initialized and last measured; those not measured for long are removed."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
 from jaxslam.math.linalg import check_count
@@ -12,39 +12,39 @@ from jaxslam.protocols import Life
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Status
 
-Array = jax.Array
-
 
 class Recency(NamedTuple):
     """Times in scans since the beginning; zero where dead."""
 
-    now: Array
-    """() int: the scans so far"""
-    born: Array
-    """(N,) int: when it entered the map"""
-    last: Array
-    """(N,) int: when it was last measured"""
-    seen: Array
-    """(N,) int: scans that measured it"""
+    now: Int[Array, ""]
+    """the scans so far"""
+    born: Int[Array, "N"]
+    """when it was initialized"""
+    last: Int[Array, "N"]
+    """when it was last measured"""
+    seen: Int[Array, "N"]
+    """scans that measured it"""
 
 
 def recency(patience: int | None = None) -> Life:
-    """When each landmark was born and last measured, and nothing that was seen long ago.
+    """The times of each landmark, as `closing` needs them; those not measured for long are removed.
 
     Args:
-        patience: a landmark not measured for so many scans, empty ones too, is removed: the map is
-            what is about the robot. None removes no landmark.
+        patience: a landmark not measured for so many scans, empty ones too, is removed, so that
+            a local map is left. None removes no landmark.
     Raises:
         ValueError: on a patience below 1.
     """
     if patience is not None:
         check_count("recency: patience", patience)
 
-    def init(pose: Array, landmarks: Array) -> Recency:
+    def init(pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Recency:
         none = jnp.zeros(landmarks.shape[0], jnp.int32)
         return Recency(jnp.zeros((), jnp.int32), none, none, none)
 
-    def after(joint: Joint, info: Info, estimate: Callable[[], Estimate]) -> tuple[Recency, Array]:
+    def after(
+        joint: Joint, info: Info, estimate: Callable[[], Estimate]
+    ) -> tuple[Recency, Bool[Array, "N"]]:
         known: Recency = joint.life
         now = known.now + 1
         count = len(joint.alive)

@@ -43,6 +43,19 @@ def removed_in(trace):
     return trace.info.extra["pruning"].removed
 
 
+def driven(filter, seen, variance=1e-4):
+    return run(filter, log_of(seen), np.zeros(3), np.eye(3) * variance, KEY)
+
+
+def seen_by_turns(second, steps=12):
+    """Landmark 0 in every scan, and another landmark in scans of its own: {scan or slice: tag}."""
+    seen = np.full((steps, 2), -1)
+    seen[:, 0] = 0
+    for at, tag in second.items():
+        seen[at, 1] = tag
+    return seen
+
+
 @cache
 def driver(**options):
     filter = managed(life.existence(always), 3, **options)
@@ -55,8 +68,7 @@ def driver(**options):
 
 
 def test_a_landmark_that_is_not_seen_again_is_removed_when_its_odds_say_so():
-    seen = np.full((12, 2), -1)
-    seen[:, 0], seen[0, 1] = 0, 1
+    seen = seen_by_turns({0: 1})
     trace = jax.device_get(driver()(log_of(seen)))
     loss = math.log(0.1 / 0.9)
     misses = math.ceil(math.log(0.05 / 0.95) / loss)  # from even odds to a probability of 0.05
@@ -75,19 +87,16 @@ def test_a_landmark_that_is_not_seen_again_is_removed_when_its_odds_say_so():
 
 
 def test_what_is_left_is_the_marginal():
-    seen = np.full((12, 2), -1)
-    seen[:, 0], seen[0, 1] = 0, 1
+    seen = seen_by_turns({0: 1})
     with_life = driver()(log_of(seen)).final
-    plain = ekf_slam(MOTION, SENSOR, 3)
-    without = run(plain, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY).final
+    without = driven(ekf_slam(MOTION, SENSOR, 3), seen).final
     marginal = jax.jit(slots.remove)(without, np.array([False, True, False]))
     np.testing.assert_allclose(with_life.cov, marginal.cov, atol=1e-14)
     np.testing.assert_allclose(with_life.landmarks, marginal.landmarks, atol=1e-14)
 
 
 def test_a_removed_landmark_can_come_back_and_begins_anew():
-    seen = np.full((12, 2), -1)
-    seen[:, 0], seen[0, 1], seen[8:, 1] = 0, 1, 1
+    seen = seen_by_turns({0: 1, slice(8, None): 1})
     trace = driver()(log_of(seen))
     assert trace.info.status[8, 1] == Status.BORN
     assert int(trace.probe.seen[-1, 1]) == 4
@@ -99,7 +108,7 @@ def test_patience_is_for_the_provisional_alone():
     seen[:3, 0], seen[0, 1] = 0, 1
     manager = life.existence(lambda pose, landmark: jnp.asarray(False), patience=5)
     filter = managed(manager, 3)
-    trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
+    trace = driven(filter, seen)
     assert list(np.argwhere(removed_in(trace))[0]) == [5, 1]
     assert list(trace.estimate.alive[-1]) == [True, False, False]
 
@@ -107,9 +116,9 @@ def test_patience_is_for_the_provisional_alone():
 def test_a_landmark_known_too_badly_is_removed():
     filter = managed(life.existence(always, spread=0.5), 3)
     seen = np.array([[0, 1]])
-    exact = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
+    exact = driven(filter, seen)
     assert not removed_in(exact).any()
-    lost = run(filter, log_of(seen), np.zeros(3), np.eye(3), KEY)
+    lost = driven(filter, seen, variance=1.0)
     np.testing.assert_array_equal(removed_in(lost)[0], [True, True, False])
     np.testing.assert_array_equal(lost.final.cov[3:, 3:], np.eye(6))
 
@@ -120,7 +129,7 @@ def test_a_full_map_refuses_or_gives_up_the_least_likely(replace):
     seen = np.array([[0, 1], [0, -1], [0, 2]])
     never = life.existence(always, remove=0.01, replace=replace)
     filter = managed(never, 2)
-    trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
+    trace = driven(filter, seen)
     if replace:
         assert trace.info.status[2, 1] == Status.BORN
         np.testing.assert_array_equal(removed_in(trace)[2], [False, True])
@@ -134,15 +143,13 @@ def test_a_full_map_refuses_or_gives_up_the_least_likely(replace):
 def test_a_full_map_of_confirmed_landmarks_refuses_in_any_case():
     seen = np.array([[0], [0], [0], [1]])
     filter = managed(life.existence(always, replace=True), 1)
-    trace = run(filter, log_of(seen), np.zeros(3), np.eye(3) * 1e-4, KEY)
+    trace = driven(filter, seen)
     assert trace.info.status[3, 0] == Status.OVERFLOW
     assert not removed_in(trace).any()
 
 
 def test_gradients_pass_through_births_and_deaths():
-    seen = np.full((8, 2), -1)
-    seen[:, 0], seen[0, 1], seen[5, 1] = 0, 1, 2
-    log = log_of(seen)
+    log = log_of(seen_by_turns({0: 1, 5: 2}, steps=8))
 
     def loss(sigma):
         sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
@@ -160,26 +167,21 @@ def test_gradients_pass_through_births_and_deaths():
 
 
 def test_batches_and_float32():
-    seen = np.full((2, 12, 2), -1)
-    seen[:, :, 0], seen[0, 0, 1], seen[1, 3:, 1] = 0, 1, 2
-    logs = jax.tree.map(lambda *x: np.stack(x), log_of(seen[0]), log_of(seen[1]))
+    each = [log_of(seen_by_turns(second)) for second in ({0: 1}, {slice(3, None): 2})]
+    logs = jax.tree.map(lambda *x: np.stack(x), *each)
     batch = jax.vmap(driver())(logs)
     for i in range(2):
-        alone = driver()(jax.tree.map(lambda x, i=i: x[i], logs))
+        alone = driver()(each[i])
         np.testing.assert_array_equal(removed_in(batch)[i], removed_in(alone))
         np.testing.assert_array_equal(batch.estimate.tag[i], alone.estimate.tag)
-    small = jax.tree.map(
-        lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, log_of(seen[0])
-    )
+    small = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, each[0])
     trace = driver()(small)
     assert trace.probe.log_odds.dtype == np.float32
     np.testing.assert_array_equal(removed_in(trace), removed_in(batch)[0])
 
 
 def test_a_root_does_not_change_because_another_run_loses_a_landmark():
-    seen = np.full((2, 12, 2), -1)
-    seen[:, :, 0], seen[0, 0, 1] = 0, 1
-    one, other = log_of(seen[0]), log_of(seen[1])
+    one, other = log_of(seen_by_turns({0: 1})), log_of(seen_by_turns({}))
     go = driver(covariance="square_root")
     beside = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), one, other))
     twice = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), other, other))
@@ -214,15 +216,7 @@ def test_a_landmark_that_the_scan_measured_stays_in_a_full_map():
     tag = np.array([[0, 1]] + [[0, 2]] * 4, np.int32)
     log = Log(np.zeros((5, 2)), Scan(z, tag, np.ones((5, 2), bool)))
     manager = life.existence(lambda pose, point: jnp.asarray(False), replace=True)
-    trace = jax.jit(
-        lambda log: run(
-            managed(manager, 2),
-            log,
-            jnp.zeros(3),
-            jnp.zeros((3, 3)),
-            jax.random.key(0),
-        )
-    )(log)
+    trace = run(managed(manager, 2), log, jnp.zeros(3), jnp.zeros((3, 3)), KEY)
     assert (np.asarray(trace.info.status[1:, 0]) == Status.FUSED).all()
     np.testing.assert_array_equal(removed_in(trace)[1], [False, True])
     np.testing.assert_array_equal(trace.estimate.tag[-1], [0, 2])

@@ -1,8 +1,8 @@
-"""Dead reckoning: the baseline that every sensor should improve on."""
+"""Dead reckoning: the pose by the motion alone, as a baseline."""
 
 import dataclasses
 
-import jax
+from jaxtyping import Array
 
 from jaxslam import validation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
@@ -28,7 +28,7 @@ def dead_reckoning(
     validation.check_parts("dead_reckoning", chart=chart, linearize=linearize)
     filter = ekf_slam(motion, sensor, 1, chart=chart, linearize=linearize)
 
-    def update(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
+    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
         return joint, nothing_of(scan)
 
     return dataclasses.replace(filter, name="dead_reckoning", update=update)

@@ -1,1 +1,1 @@
-"""What keeps a map in order: duplicates merged, loops closed, a lost robot found again."""
+"""Map management: landmarks removed, duplicates merged, loops closed, a lost robot relocalized."""

@@ -49,10 +49,11 @@ def closing(
         spread: [m]
         **options: fields of `loop_closure.LoopSettings`.
     Raises:
-        ValueError: on a square-root filter, on every below 1, a reach or spread not above 0, an
-            option that `close_loop` does not have or refuses; from `init`, on a state that is no
-            `slots.Joint` or keeps no times.
+        ValueError: on no filter or a square-root filter, on every below 1, a reach or spread not
+            above 0, an option that `close_loop` does not have or refuses; from `init`, on a state
+            that is no `slots.Joint` or keeps no times.
     """
+    validation.check_record("closing", "filter", filter, Filter)
     check_count("closing: every", every)
     loop_settings("closing", options)
     if not (reach is None or reach > 0) or not spread > 0:

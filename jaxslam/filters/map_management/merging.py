@@ -1,4 +1,4 @@
-"""Two landmarks of a map that are one: found by a joint chi-square test, merged by a constraint."""
+"""Duplicate landmarks: found by a joint chi-square test, and merged by an exact constraint."""
 
 import dataclasses
 from typing import NamedTuple
@@ -42,9 +42,11 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
             two landmarks from one where their difference is known worse than that.
         probability: of merging two that are one, by the test.
     Raises:
-        ValueError: on a reach not above 0, a probability outside 0 to 1, landmarks that may be one
-            although their parameters differ (an inverse depth); from `init`, on another state.
+        ValueError: on no filter, a reach not above 0, a probability outside 0 to 1, landmarks that
+            may be one although their parameters differ (an inverse depth); from `init`, on another
+            state.
     """
+    validation.check_record("merging", "filter", filter, Filter)
     if not reach > 0:
         raise ValueError(f"merging: expected a reach above 0, got {reach}")
     if not 0 < probability < 1:
@@ -66,21 +68,20 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
         joint, info = validation.state_and_info(f"merging: {filter.name}", joint, scan, found)
         together = co_observed(joint, info, filter.places)
         joint = joint._replace(co_observed=together)
-        form = {"square_root": filter.square_root}
-        kept, freed, distance = closest_pair(joint, filter.chart, reach, ~together, **form)
+        kept, freed, distance = closest_pair(
+            joint, filter.chart, reach, ~together, square_root=filter.square_root
+        )
         same = distance <= gate
         joint = change_where(
-            same, lambda joint: merge(joint, filter.chart, kept, freed, **form), joint
+            same,
+            lambda joint: merge(joint, filter.chart, kept, freed, square_root=filter.square_root),
+            joint,
         )
-        return joint, with_extra(info, "merging", merged_pair(same, kept, freed))
+        pair = jnp.where(same, jnp.stack([kept, freed]), -1).astype(jnp.int32)
+        return joint, with_extra(info, "merging", Merged(pair))
 
     name = f"merging {filter.name}"
     return dataclasses.replace(filter, name=name, init=init, update=update)
-
-
-def merged_pair(same: Bool[Array, ""], kept: Int[Array, ""], freed: Int[Array, ""]) -> Merged:
-    """The record of two landmarks that were merged, if they were the same."""
-    return Merged(jnp.where(same, jnp.stack([kept, freed]), -1).astype(jnp.int32))
 
 
 def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[Array, "N N"]:
@@ -107,7 +108,7 @@ def closest_pair(
     allowed: Array | None = None,
     *,
     square_root: bool = False,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
     """Slots i < j of the two landmarks that are most likely one, and their squared distance.
 
     d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), in which the correlation of the two counts:
@@ -196,8 +197,8 @@ def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool =
     )
 
 
-def _derivatives(joint: Joint, chart: Chart) -> tuple[Array, Array]:
-    """Of each landmark's coordinates by errors of the pose (N, L, 3) and its own (N, L, L)."""
+def _derivatives(joint: Joint, chart: Chart) -> tuple[Float[Array, "N L 3"], Float[Array, "N L L"]]:
+    """Of each landmark's coordinates by errors of the pose and its own."""
     capacity, size = joint.landmarks.shape
     still = jnp.broadcast_to(jnp.eye(size, dtype=joint.cov.dtype), (capacity, size, size))
     if chart.basis is None:

@@ -25,9 +25,10 @@ def pruning(filter: Filter, life: Life) -> Filter:
         filter: whose state is a `slots.Joint`.
         life: as of `jaxslam.life`.
     Raises:
-        ValueError: on a life that is none; from `init`, on another state; from `update`, on a life
-            that makes room, of which the filter does not know.
+        ValueError: on a filter or life that is none; from `init`, on another state; from `update`,
+            on a life that makes room, of which the filter does not know.
     """
+    validation.check_record("pruning", "filter", filter, Filter)
     validation.check_record("pruning", "life", life, Life)
 
     def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:

@@ -1,53 +1,139 @@
-"""How a robot that is nowhere in the map finds its place in it, from one scan.
+"""How a robot without a pose in the map is initialized from one scan.
 
-Its pose x_b is a function g(y, q) of what the map holds, y, and of what was seen, q, so it enters
-with P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a landmark):
-correlated with the whole joint state. Everything seen is a point in the frame of the robot that saw
-it, whatever the sensor.
+Its pose x_b is a function g(y, q) of what the map holds, y, and of what was measured, q, so its
+covariances are P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a
+landmark): correlated with the whole joint state. Every measurement is taken as a point in the frame
+of the robot that made it, whatever the sensor.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam import slots
+from jaxslam.filters.multi_robot.settings import SIZE, TeamSettings, measures_points
+from jaxslam.filters.multi_robot.team_state import InitialPose, pose_of, rows_of
 from jaxslam.linearize import first_order
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import symmetrize
 from jaxslam.protocols import Sensor
-
-Array = jax.Array
-
-
-class Sightings(NamedTuple):
-    """What a robot sees in full, as points in its own frame; M places."""
-
-    point: Array
-    """(M, 2) [m]"""
-    cov: Array
-    """(M, 2, 2)"""
-    tag: Array
-    """(M,) int"""
-    valid: Array
-    """(M,) bool"""
+from jaxslam.sensors.suite import Suite, split_scan
+from jaxslam.slots import Joint
+from jaxslam.types import Scan
 
 
-class Entry(NamedTuple):
-    """A place in the map that a robot may take."""
+class ObservedPoints(NamedTuple):
+    """The measurements of a robot as points in its own frame."""
 
-    pose: Array
-    """(3,)"""
-    rows: Array
-    """(3, D) G_y P_y: its covariance with all errors of the map"""
-    cov: Array
-    """(3, 3)"""
-    possible: Array
-    """() bool"""
+    point: Float[Array, "M 2"]
+    """[m]"""
+    cov: Float[Array, "M 2 2"]
+    tag: Int[Array, "M"]
+    valid: Bool[Array, "M"]
+    """there is a measurement, of a known identity, which determines the point"""
 
 
-def sightings(sensor: Sensor, z: Array, tag: Array, valid: Array) -> Sightings:
-    """Points (M, 2) in the robot's frame of measurements z (M, Z) that leave nothing free."""
+Candidate = tuple[InitialPose, list[Bool[Array, "M"]]]
+"""A pose for a robot, and which measurements of each robot of the team it is made of."""
+
+
+def best_initialization(
+    joint: Joint,
+    robot: int,
+    observed: list[ObservedPoints],
+    there: Bool[Array, "R"],
+    settings: TeamSettings,
+) -> Candidate:
+    """The pose for a robot, of all that are possible, whose heading has the least variance.
+
+    observed: by each robot. there: which robots are in the map.
+    """
+    candidates = [
+        _mutual_candidate(joint, robot, other, observed, there[other], settings)
+        for other in range(len(observed))
+        if other != robot
+    ]
+    if len(observed[robot].tag) > 1:
+        candidates.append(_landmark_candidate(joint, robot, observed, settings))
+    heading = [jnp.where(new.possible, new.cov[2, 2], jnp.inf) for new, _ in candidates]
+    best = jnp.argmin(jnp.stack(heading))
+    chosen: Candidate = jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *candidates)
+    return chosen
+
+
+def _mutual_candidate(
+    joint: Joint,
+    robot: int,
+    other: int,
+    observed: list[ObservedPoints],
+    there: Bool[Array, ""],
+    settings: TeamSettings,
+) -> Candidate:
+    """By another robot, if that is in the map and the two measure each other."""
+    mine, theirs, rows = observed[robot], observed[other], rows_of(other, settings)
+    i, sees = _first(theirs, settings.tags[robot])
+    j, sees_back = _first(mine, settings.tags[other])
+    found = by_mutual_sight(
+        pose_of(joint, other, settings),
+        joint.cov[rows],
+        joint.cov[rows, rows],
+        (theirs.point[i], theirs.cov[i]),
+        (mine.point[j], mine.cov[j]),
+    )
+    used = _none_of(observed)
+    used[other] = jnp.arange(len(used[other])) == i
+    used[robot] = jnp.arange(len(used[robot])) == j
+    return InitialPose(*found, there & sees & sees_back), used
+
+
+def _landmark_candidate(
+    joint: Joint, robot: int, observed: list[ObservedPoints], settings: TeamSettings
+) -> Candidate:
+    """By the two landmarks of the map, farthest apart, that the robot measures."""
+    mine, capacity = observed[robot], settings.capacity
+    slot, known = slots.find(joint.tag[:capacity], joint.alive[:capacity], mine.tag)
+    i, j, two = farthest_pair(mine.point, known & mine.valid)
+    pair, which = jnp.stack([i, j]), jnp.stack([slot[i], slot[j]])
+    at_pair = (3 + which[:, None] * SIZE + jnp.arange(2)[None, :]).reshape(-1)
+    rows = joint.cov[at_pair]
+    found = by_two_landmarks(
+        joint.landmarks[which, :2], rows, rows[:, at_pair], mine.point[pair], mine.cov[pair]
+    )
+    used, at = _none_of(observed), jnp.arange(len(mine.tag))
+    used[robot] = (at == i) | (at == j)
+    return InitialPose(*found, two & (which[0] != which[1])), used
+
+
+def _none_of(observed: list[ObservedPoints]) -> list[Array]:
+    return [jnp.zeros_like(each.valid) for each in observed]
+
+
+def _first(observed: ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """The first measurement with a tag, and whether there is one."""
+    match = observed.valid & (observed.tag == tag)
+    return jnp.argmax(match), match.any()
+
+
+def observed_points(sensors: Suite, scan: Scan) -> ObservedPoints:
+    """A robot's scan; not valid are measurements that do not determine a point, or without tag."""
+    found = []
+    for part, own in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
+        if measures_points(part.sensor):
+            points, covs = _points_of(part.sensor, own)
+            found.append(ObservedPoints(points, covs, own.tag, own.valid & (own.tag >= 0)))
+        else:
+            m, dtype = part.places, scan.z.dtype
+            nothing = jnp.zeros((m, 2), dtype), jnp.zeros((m, 2, 2), dtype)
+            found.append(ObservedPoints(*nothing, own.tag, jnp.zeros(m, bool)))
+    return ObservedPoints(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
+
+
+def _points_of(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[Array, "M 2 2"]]:
+    """Points in the robot's frame, with covariances, of measurements that determine them."""
+    z = scan.z[:, : len(sensor.measurements)]
     origin = jnp.zeros(3, z.dtype)
 
     def one(z: Array) -> tuple[Array, Array]:
@@ -55,22 +141,26 @@ def sightings(sensor: Sensor, z: Array, tag: Array, valid: Array) -> Sightings:
         return point, cov
 
     # What is not there is put where every model is smooth.
-    points, covs = jax.vmap(one)(jnp.where(valid[:, None], z, 1.0))
-    return Sightings(points, covs, tag, valid & (tag >= 0))
+    points: tuple[Array, Array] = jax.vmap(one)(jnp.where(scan.valid[:, None], z, 1.0))
+    return points
 
 
 def by_mutual_sight(
-    other: Array, rows: Array, cov: Array, seen: tuple[Array, Array], back: tuple[Array, Array]
-) -> tuple[Array, Array, Array]:
-    """The pose of a robot b that robot a sees and that sees a: mean, rows (3, D), covariance.
+    other: Float[Array, "3"],
+    rows: Float[Array, "3 D"],
+    cov: Float[Array, "3 3"],
+    seen: tuple[Float[Array, "2"], Float[Array, "2 2"]],
+    back: tuple[Float[Array, "2"], Float[Array, "2 2"]],
+) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
+    """The pose of a robot b that robot a measures and that measures a: mean, rows, covariance.
 
     With v where a sees b and w where b sees a, |v| and |w| are one distance measured twice, r their
     average, weighted by their variances. In the frame of a, b stands at r v/|v| and is turned by
     atan2(-v) - atan2(w); then x_b = x_a ∘ that.
 
     Args:
-        other, rows, cov: x_a (3,), its covariance with all errors (3, D) and its own (3, 3).
-        seen, back: v and w, each with its covariance (2,), (2, 2).
+        other, rows, cov: x_a, its covariance with all errors and its own.
+        seen, back: v and w, each with its covariance.
     """
     (v, cov_v), (w, cov_w) = seen, back
     share = jax.lax.stop_gradient(_distance_variance(w, cov_w))
@@ -89,16 +179,20 @@ def by_mutual_sight(
 
 
 def by_two_landmarks(
-    points: Array, rows: Array, cov: Array, seen: Array, seen_cov: Array
-) -> tuple[Array, Array, Array]:
-    """The pose of a robot that sees two landmarks of the map: mean, rows (3, D), covariance.
+    points: Float[Array, "2 2"],
+    rows: Float[Array, "4 D"],
+    cov: Float[Array, "4 4"],
+    seen: Float[Array, "2 2"],
+    seen_cov: Float[Array, "2 2 2"],
+) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
+    """The pose of a robot that measures two landmarks of the map: mean, rows, covariance.
 
-    The rigid motion that carries what is seen, q (2, 2), onto the landmarks l (2, 2) best
-    (`se2.align`): headings of l_2 - l_1 and q_2 - q_1 agree, and so do the middles.
+    The rigid motion that carries what is seen, q, onto the landmarks l best (`se2.align`): headings
+    of l_2 - l_1 and q_2 - q_1 agree, and so do the midpoints.
 
     Args:
-        points, rows, cov: l, its covariance with all errors (4, D) and its own (4, 4).
-        seen, seen_cov: q and its covariances (2, 2, 2).
+        points, rows, cov: l, its covariance with all errors and its own.
+        seen, seen_cov: q and its covariances.
     """
 
     def pose(points: Array, seen: Array) -> Array:
@@ -111,9 +205,10 @@ def by_two_landmarks(
     return _wrapped(pose(points, seen)), by_points @ rows, own
 
 
-def farthest_pair(points: Array, usable: Array) -> tuple[Array, Array, Array]:
-    """The places i < j of the usable points (M, 2) farthest from each other, and whether there are
-    two that differ."""
+def farthest_pair(
+    points: Float[Array, "M 2"], usable: Bool[Array, "M"]
+) -> tuple[Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
+    """Indices i < j of the usable points farthest from each other, and whether two differ."""
     m = points.shape[0]
     between = ((points[:, None] - points[None, :]) ** 2).sum(-1)
     both = usable[:, None] & usable[None, :] & jnp.triu(jnp.ones((m, m), bool), 1)
@@ -122,13 +217,13 @@ def farthest_pair(points: Array, usable: Array) -> tuple[Array, Array, Array]:
     return i, j, both[i, j] & (between[i, j] > 0)
 
 
-def _distance_variance(point: Array, cov: Array) -> Array:
-    """Of the distance of a point (2,) with that covariance (2, 2); positive."""
+def _distance_variance(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Float[Array, ""]:
+    """Of the distance of a point with that covariance; positive."""
     square = (point**2).sum()
     there = square > 0
     along = point @ cov @ point / jnp.where(there, square, 1.0)
     return jnp.where(along > 0, along, jnp.finfo(point.dtype).tiny)
 
 
-def _wrapped(pose: Array) -> Array:
+def _wrapped(pose: Float[Array, "3"]) -> Float[Array, "3"]:
     return jnp.concatenate([pose[:2], wrap(pose[2:])])

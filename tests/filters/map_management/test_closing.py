@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -85,8 +86,7 @@ def test_what_was_seen_by_turns_is_never_one():
     both = joint._replace(life=joint.life._replace(last=jnp.full_like(joint.life.last, 100)))
     same, report = look(both)
     assert report.merged == report.explained == 0
-    for left, right in zip(jax.tree.leaves(same), jax.tree.leaves(both), strict=True):
-        np.testing.assert_array_equal(left, right)
+    chex.assert_trees_all_equal(same, both)
 
 
 def test_a_hypothesis_the_covariance_excludes_is_refused():

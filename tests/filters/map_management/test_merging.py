@@ -3,6 +3,7 @@
 import dataclasses
 from functools import cache
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,8 +92,7 @@ def test_no_pair_within_reach():
     assert (int(i), int(j)) == (0, 0)
     assert np.isinf(distance)
     same = MERGE(joint, EUCLIDEAN, i, j)
-    for left, right in zip(jax.tree.leaves(same), jax.tree.leaves(joint), strict=True):
-        np.testing.assert_array_equal(left, right)
+    chex.assert_trees_all_equal(same, joint)
 
 
 @pytest.mark.parametrize("chart", ["euclidean", "right_invariant"])

@@ -3,6 +3,7 @@
 import itertools
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -362,8 +363,7 @@ def test_two_pairs_are_enough_and_fewer_change_nothing():
     assert np.abs(found.pose - np.array([2.0, 1.0, -1.0])).max() < 0.3
     for slot in ([0, -1], [-1, -1], [2, 0]):  # 2 is dead
         same = RELOCATED(joint, chart, np.array(slot), seen, covs)
-        for left, right in zip(jax.tree.leaves(same), jax.tree.leaves(joint), strict=True):
-            np.testing.assert_array_equal(left, right)
+        chex.assert_trees_all_equal(same, joint)
 
 
 @pytest.mark.parametrize("name", ["euclidean", "right_invariant"])

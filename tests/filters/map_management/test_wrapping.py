@@ -56,3 +56,9 @@ def test_closing_takes_times():
     ):
         with pytest.raises(ValueError, match=r"closing: expected a filter with times"):
             filter.init(np.zeros(3), np.eye(3))
+
+
+@pytest.mark.parametrize("name", MANAGERS)
+def test_a_filter_that_was_not_made_is_told(name):
+    with pytest.raises(ValueError, match=rf"^{name}: expected filter to be a Filter.*call it, ekf"):
+        MANAGERS[name](ekf_slam)

@@ -3,6 +3,7 @@
 import dataclasses
 from functools import cache
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,11 +118,7 @@ def test_a_team_of_one_is_ekf_slam():
     log = draw(alone, 0)[1]
     one = team_slam([team.Robot(alone.motion, suite((alone.sensor, 6)))], 6)
     a, b = (go(f, alone, log) for f in (ekf_slam(alone.motion, alone.sensor, 6), one))
-    pairs = zip(
-        jax.tree.leaves((a.estimate, a.info)), jax.tree.leaves((b.estimate, b.info)), strict=True
-    )
-    for left, right in pairs:
-        np.testing.assert_allclose(left, right, rtol=0, atol=1e-12)
+    chex.assert_trees_all_close((a.estimate, a.info), (b.estimate, b.info), rtol=0, atol=1e-12)
 
 
 @cache

@@ -1,0 +1,92 @@
+"""What `team_slam` is made of, and what it refuses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxslam.filters.ekf.scan import Turn
+from jaxslam.filters.ekf.settings import EkfSettings
+from jaxslam.math.linalg import check_count, check_gate
+from jaxslam.protocols import Chart, Sensor
+from jaxslam.team import Robot
+
+SIZE = 3
+"""Numbers of a slot: x, y and the heading of a robot; of a landmark the third is padding."""
+
+
+@dataclass(frozen=True, eq=False)
+class TeamSettings:
+    """Robots, the layout of state, control and scan, and how the EKF of each works."""
+
+    robots: tuple[Robot, ...]
+    capacity: int
+    """landmark slots N"""
+    tags: tuple[int, ...]
+    """(R,) that mean robots"""
+    ekf: EkfSettings
+    """what the prediction and the correction of each robot are set to"""
+    turns: tuple[list[Turn], ...]
+    """of each robot, the turn of each of its sensors in a scan"""
+
+    @property
+    def started(self) -> list[int]:
+        """Robots whose pose is known at the start."""
+        return [b for b, robot in enumerate(self.robots) if b == 0 or robot.start is not None]
+
+    @property
+    def unstarted(self) -> list[int]:
+        """Robots whose pose is to be initialized from a scan."""
+        return [b for b in range(len(self.robots)) if b not in self.started]
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Measurement slots of a scan that each robot has."""
+        return tuple(sum(robot.sensors.places) for robot in self.robots)
+
+    def slot_of(self, robot: int) -> int:
+        """The slot of a robot b > 0."""
+        return self.capacity - 1 + robot
+
+
+def check_options(
+    robots: Sequence[Robot],
+    report: int,
+    chart: Chart | None,
+    update: str,
+    gate: float | None,
+    iterations: int,
+    births: int | None,
+) -> None:
+    """Raise ValueError unless `team_slam` can do with these options."""
+    for name, value in (("iterations", iterations), ("births", births)):
+        if value is not None:
+            check_count(f"team_slam: {name}", value)
+    if type(report) is not int or not 0 <= report < len(robots):
+        raise ValueError(f"team_slam: there is no robot {report!r} to report")
+    if chart is not None and chart.name != "euclidean":
+        raise ValueError(f"team_slam: expected the chart euclidean, got {chart.name}")
+    if update not in ("sequential", "joint"):
+        raise ValueError(f'team_slam: expected update "sequential" or "joint", got {update!r}')
+    check_gate("team_slam", gate)
+
+
+def check_sensors(robots: Sequence[Robot]) -> None:
+    """Raise ValueError unless landmarks are points, and unstarted robots can be initialized."""
+    for b, robot in enumerate(robots):
+        for part in robot.sensors.parts:
+            if len(part.sensor.landmark) not in (0, 2):
+                raise ValueError(
+                    f"team_slam: the landmarks of {part.sensor.name} are not points (x, y)"
+                )
+        able = any(measures_points(part.sensor) for part in robot.sensors.parts)
+        if b > 0 and robot.start is None and not able:
+            raise ValueError(
+                f"team_slam: robot {b} has no start, and no sensor that tells both distance and "
+                "direction to find it by"
+            )
+
+
+def measures_points(sensor: Sensor) -> bool:
+    """Whether one measurement of a point (x, y) determines it, given the pose."""
+    return len(sensor.landmark) == 2 and np.shape(sensor.free.mean) == (0,)
