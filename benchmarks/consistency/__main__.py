@@ -11,7 +11,7 @@ import jax
 
 from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import report
-from jaxslam.results.report import versions, write_files
+from jaxslam.results.files import versions, write_files
 
 FOLDER = Path(__file__).parent / "results"
 

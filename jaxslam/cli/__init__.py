@@ -1,4 +1,4 @@
-"""The command `jaxslam`: the only place that parses arguments or configures JAX."""
+"""The command line `jaxslam`; only here are arguments parsed and JAX configured."""
 
 import argparse
 import platform
@@ -12,11 +12,11 @@ from threadpoolctl import threadpool_limits
 
 from jaxslam.catalog import ALL
 from jaxslam.cli import cache, devices
-from jaxslam.cli.asking import INTERRUPTED, as_folders
 from jaxslam.cli.campaign import DEFAULTS, OUT, consistency
+from jaxslam.cli.common import INTERRUPTED, as_folders
+from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
-from jaxslam.cli.spent import Spent
 from jaxslam.datasets import READERS
 from jaxslam.simulation.scenarios import SCENARIOS
 
@@ -26,7 +26,10 @@ USAGE_ERROR = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; 0 on success, 1 for a wrong model, 2 on bad input, 130 if interrupted."""
+    """Run the command; returns the exit status.
+
+    0 on success, 1 for a wrong model, 2 on bad input, 130 if interrupted.
+    """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         options = _parser().parse_args(arguments)
@@ -38,10 +41,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             devices.prepare(options)
         else:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
-        with Spent() as spent, cache.asked_for(options), threadpool_limits(1, "blas"):
+        with CompileClock() as clock, cache.from_options(options), threadpool_limits(1, "blas"):
             status = int(options.command(options, shlex.join(["jaxslam", *arguments])))
             if status != INTERRUPTED and jax.process_index() == 0:
-                print(spent)
+                print(clock)
         return status
     except (ValueError, OSError) as error:
         print(f"jaxslam: {error}", file=sys.stderr)
@@ -52,129 +55,147 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    """The parser of the command line; `options.command` is the function to call."""
     parser = argparse.ArgumentParser(prog="jaxslam", description="2-D landmark SLAM in JAX.")
     parser.add_argument("--version", action="version", version=_versions())
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_consistency(
+        commands.add_parser(
+            "consistency",
+            help="is a filter consistent? a Monte-Carlo campaign",
+            description="Run filters over the same simulated worlds and compare their errors with "
+            "the covariances they claim. Prints a table and writes JSON, CSV and figures.",
+        )
+    )
+    _add_run(
+        commands.add_parser(
+            "run",
+            help="EKF-SLAM on a data set",
+            description="Run EKF-SLAM on recorded data; writes trajectory, map, summary and a "
+            "picture.",
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+    )
+    _add_verify(
+        commands.add_parser(
+            "verify",
+            help="is a Jacobian right? of every model, or of your own file",
+            description="Compare Jacobians by forward and reverse autodiff, by hand and by "
+            "differences. Without a file: every motion model and sensor of jaxslam. Exit status 1 "
+            "if anything fails, 2 if the file cannot be used. Prints a table or report, writes "
+            "JSON.",
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+    )
+    return parser
 
-    judge = commands.add_parser(
-        "consistency",
-        help="is a filter honest? a Monte-Carlo campaign",
-        description="Run filters over the same simulated worlds and compare their errors with the "
-        "covariances they claim. Prints a table and writes JSON, CSV and figures.",
+
+def _add_consistency(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam consistency`."""
+    campaign = parser.add_argument_group(
+        "campaign", "kept in the folder of results; --resume reads them there"
     )
-    asked = judge.add_argument_group(
-        "what", "kept in the folder of results; --resume reads it there"
-    )
-    for name, about in {
+    for name, text in {
         "scenario": f"one of: {', '.join(SCENARIOS)}",
         "filters": f'"all", or some of: {",".join(ALL)}; comma-separated',
-        "runs": "simulated trajectories",
-        "steps": "steps of each; default the scenario's own",
-        "seed": "of every draw",
+        "runs": "number of simulated trajectories",
+        "steps": "number of steps of each trajectory; default: the scenario's own",
+        "seed": "seed of the random numbers",
     }.items():
         default = DEFAULTS[name]
         kind = str if isinstance(default, str) else int
-        about += "" if default is None else f" (default: {default})"
-        asked.add_argument(f"--{name}", type=kind, default=argparse.SUPPRESS, help=about)
-    asked.add_argument(
+        text += "" if default is None else f" (default: {default})"
+        campaign.add_argument(f"--{name}", type=kind, default=argparse.SUPPRESS, help=text)
+    campaign.add_argument(
         "--bound",
         action=argparse.BooleanOptionalAction,
         default=argparse.SUPPRESS,
-        help="also the Cramér-Rao bound given each true trajectory (default: no)",
+        help="also compute the Cramér-Rao bound given each true trajectory (default: no)",
     )
-    asked.add_argument(
+    campaign.add_argument(
         "--dtype",
         default=argparse.SUPPRESS,
         choices=["float32", "float64"],
         help="(default: float64)",
     )
-    judge.add_argument(
+    parser.add_argument(
         "--out", metavar="DIR", help=f"folder for results (default: {OUT}; with --resume, its own)"
     )
-    there = judge.add_mutually_exclusive_group()
-    there.add_argument(
+    earlier = parser.add_mutually_exclusive_group()
+    earlier.add_argument(
         "--resume",
         metavar="DIR",
-        help="go on with the campaign in a folder of results; with a larger --runs, extend it",
+        help="continue the campaign in a folder of results; with a larger --runs, extend it",
     )
-    there.add_argument(
-        "--overwrite", action="store_true", help="give up the campaign that is in the folder"
+    earlier.add_argument(
+        "--overwrite", action="store_true", help="replace the campaign that is in the folder"
     )
-    there.add_argument(
+    earlier.add_argument(
         "--again",
         action="store_true",
-        help="give it up where it is finished and was asked for by the same options",
+        help="replace it only if it is finished and had the same options",
     )
-    judge.add_argument(
+    parser.add_argument(
         "--block",
         type=int,
-        help="runs computed together on each device, of which a CPU has one a core; sets memory "
-        "(default: 16 on a CPU, on an accelerator by its memory)",
+        help="number of runs computed together on each device (a CPU has one device a core); "
+        "decides how much memory is used (default: 16 on a CPU, else by the memory)",
     )
-    judge.add_argument(
+    parser.add_argument(
         "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'
     )
-    cache.add_options(judge)
-    others = judge.add_argument_group(
-        "several processes", "the same command on each, but for the id"
+    cache.add_options(parser)
+    others = parser.add_argument_group(
+        "several processes", "the same command for each process, with another --process-id"
     )
     others.add_argument(
         "--coordinator",
         metavar="HOST:PORT",
-        help='where process 0 listens; "auto" for SLURM, Kubernetes, Open MPI',
+        help='address on which process 0 listens; "auto" for SLURM, Kubernetes, Open MPI',
     )
-    others.add_argument("--processes", type=int, metavar="P", help="how many there are")
-    others.add_argument("--process-id", type=int, metavar="I", help="which one this is, from 0")
+    others.add_argument("--processes", type=int, metavar="P", help="number of processes")
+    others.add_argument("--process-id", type=int, metavar="I", help="number of this one, from 0")
     others.add_argument(
         "--timeout", type=int, default=60, help="seconds to wait for the others (default: 60)"
     )
-    judge.set_defaults(command=consistency)
+    parser.set_defaults(command=consistency)
 
-    drive = commands.add_parser(
-        "run",
-        help="EKF-SLAM on a data set",
-        description="Run EKF-SLAM on recorded data; writes trajectory, map, summary and a picture.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    drive.add_argument("--dataset", required=True, help=f"one of: {', '.join(READERS)}")
-    drive.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
-    drive.add_argument("--robot", type=int, help="which robot, where a data set has several")
-    drive.add_argument(
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam run`."""
+    parser.add_argument("--dataset", required=True, help=f"one of: {', '.join(READERS)}")
+    parser.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
+    parser.add_argument("--robot", type=int, help="number of the robot, where there are several")
+    parser.add_argument(
         "--check-every",
         type=int,
         metavar="K",
-        help="is the covariance positive definite? look after every K steps, 0 never; None: at 20 "
-        "steps spread over the log",
+        help="check after every K steps that the covariance is positive definite; 0: never; None: "
+        "at 20 steps spread over the log",
     )
-    drive.set_defaults(command=run_dataset)
+    cache.add_options(parser)
+    parser.add_argument("--dtype", default="float64", choices=["float32", "float64"])
+    parser.add_argument("--out", metavar="DIR", default=str(OUT), help="folder for results")
+    parser.set_defaults(command=run_dataset)
 
-    check = commands.add_parser(
-        "verify",
-        help="is a Jacobian right? of every model, or of your own file",
-        description="Hold Jacobians by forward and reverse autodiff, by hand and by differences "
-        "against each other. Without a file: every motion model and sensor of jaxslam. Exit status "
-        "1 if anything fails, 2 if the file cannot be used. Prints a table or report, writes JSON.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    check.add_argument(
+
+def _add_verify(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam verify`."""
+    parser.add_argument(
         "target",
         metavar="FILE.py[:NAME]",
         nargs="?",
         help="a file that defines a Motion, a Sensor, or a function f and its f_jacobian",
     )
-    check.add_argument("--states", type=int, default=24, help="random states beside the hard ones")
-    check.add_argument("--seed", type=int, default=0, help="of the random states")
-    check.add_argument("--out", metavar="DIR", default=str(OUT), help="folder for results")
-    check.set_defaults(command=verify_models, dtype="float64")
-
-    for command in (drive, check):
-        cache.add_options(command)
-    drive.add_argument("--dtype", default="float64", choices=["float32", "float64"])
-    drive.add_argument("--out", metavar="DIR", default=str(OUT), help="folder for results")
-    return parser
+    parser.add_argument("--states", type=int, default=24, help="number of random states")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random states")
+    parser.add_argument("--out", metavar="DIR", default=str(OUT), help="folder for results")
+    cache.add_options(parser)
+    parser.set_defaults(command=verify_models, dtype="float64")
 
 
 def _versions() -> str:
+    """The versions of jaxslam, JAX and Python."""
     return (
         f"jaxslam {version('jaxslam')} (jax {jax.__version__}, Python {platform.python_version()})"
     )

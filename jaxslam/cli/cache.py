@@ -1,8 +1,8 @@
-"""Compiled programs on the disk: kept from one command to the next, in a folder of bounded size.
+"""Compiled programs kept on disk from one command to the next, in a folder of bounded size.
 
-JAX keeps them, each under a digest of what was compiled, for what, and by which version. Here it is
-told where, the folder is held to `BOUND` bytes, and whatever is wrong with it costs one line on the
-standard error and the time of compiling, never a result.
+JAX keeps each program under a digest of its text, the device and the version of the compiler. This
+module sets JAX's folder and bounds its size. Any failure of the cache costs a warning of one line
+and the time of compilation, never a result.
 """
 
 import argparse
@@ -19,37 +19,39 @@ from collections.abc import Iterator
 from glob import escape
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import jax
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 BOUND = 1 << 29
-"""Bytes that the folder may hold after a command; what was not used for longest goes first."""
+"""Largest size of the folder after a command [bytes]; the least recently used files are deleted."""
 
-_TROUBLE = re.compile(r"Error (reading|writing) persistent compilation cache entry for '(.*?)': ")
+_CACHE_WARNING = re.compile(
+    r"Error (reading|writing) persistent compilation cache entry for '(.*?)': "
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """`--cache` and `--no-cache`."""
+    """Add `--cache` and `--no-cache` to a command."""
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
         "--cache",
         metavar="DIR",
-        default=argparse.SUPPRESS,  # which a formatter that adds defaults does not print
-        help="keep compiled programs there for the next time "
+        default=argparse.SUPPRESS,  # a formatter that adds defaults would print None
+        help="folder in which compiled programs are kept for the next time "
         "(default: the user's cache folder, as ~/.cache/jaxslam)",
     )
     where.add_argument(
         "--no-cache",
         action="store_true",
         default=argparse.SUPPRESS,
-        help="keep no compiled programs, and use none that are kept",
+        help="neither keep compiled programs nor use those that are kept",
     )
 
 
 def user_folder() -> Path:
-    """Where this system's programs keep what they can make again, of this user.
+    """The cache folder of this user on this system, for jaxslam.
 
     Raises RuntimeError where the user has no home.
     """
@@ -64,52 +66,52 @@ def user_folder() -> Path:
     return base / "jaxslam"
 
 
-def asked_for(options: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
-    """`programs`, as the options say."""
-    return programs(getattr(options, "cache", None), getattr(options, "no_cache", False))
+def from_options(options: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
+    """The `program_cache` that the options of a command ask for."""
+    return program_cache(getattr(options, "cache", None), getattr(options, "no_cache", False))
 
 
 @contextlib.contextmanager
-def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iterator[None]:
-    """A block in which JAX keeps what it compiles in a folder, and takes it from there.
+def program_cache(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iterator[None]:
+    """A block in which JAX writes compiled programs to a folder and reads them from it.
 
-    Afterwards JAX is set as it was.
+    The configuration of JAX is restored at the end.
 
     Args:
-        asked: the folder; None for that which JAX has been told of, as by the environment's
-            JAX_COMPILATION_CACHE_DIR, and where there is none for `user_folder`.
-        none: keep nothing, and take nothing.
-        bound: bytes that the folder is held to.
+        asked: the folder; None for the one that JAX is configured with, as by the environment
+            variable JAX_COMPILATION_CACHE_DIR, or else `user_folder`.
+        none: keep and read no programs.
+        bound: largest size of the folder after the block [bytes].
     """
     if none:
-        with settings(jax_compilation_cache_dir=None):
+        with jax_settings(jax_compilation_cache_dir=None):
             yield
         return
-    if asked is None and (told := jax.config.jax_compilation_cache_dir):
-        with _troubles_told(Path(told), ours=False):
+    if asked is None and (configured := jax.config.jax_compilation_cache_dir):
+        with _one_warning(Path(configured), ours=False):
             yield
         return
     whole = asked
     try:
         whole = whole or user_folder()
-        folder = whole / kind()
+        folder = whole / processor_kind()
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (OSError, RuntimeError) as error:
         where = whole or "the user's cache folder"
         warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); going on without")
-        with settings(jax_compilation_cache_dir=None):
+        with jax_settings(jax_compilation_cache_dir=None):
             yield
         return
     try:
         with (
-            settings(
+            jax_settings(
                 jax_compilation_cache_dir=str(folder),
                 jax_persistent_cache_min_compile_time_secs=0.0,
                 jax_persistent_cache_min_entry_size_bytes=-1,
             ),
-            _troubles_told(folder, ours=True),
+            _one_warning(folder, ours=True),
         ):
             yield
     finally:
@@ -117,10 +119,10 @@ def programs(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iter
 
 
 def prune(folder: Path, bound: int) -> None:
-    """Delete files of a cache's folder, the one not used for longest first, down to the bound."""
+    """Delete the least recently used files of a cache folder until its size is within the bound."""
     found = []
     for path in folder.glob("*/*-cache"):
-        with contextlib.suppress(OSError):  # another process has deleted it
+        with contextlib.suppress(OSError):  # another process deleted it
             state = path.stat()
             found.append((max(state.st_atime, state.st_mtime), state.st_size, path))
     total = sum(size for _, size, _ in found)
@@ -132,9 +134,12 @@ def prune(folder: Path, bound: int) -> None:
             total -= size
 
 
-def kind() -> str:
-    """Which programs run here: JAX does not tell processors of one architecture apart, though code
-    for one may be illegal on another that mounts the same home."""
+def processor_kind() -> str:
+    """The name of the subfolder for programs that can run on this processor.
+
+    JAX does not distinguish processors of one architecture, though code compiled for one may be
+    illegal on another that mounts the same home.
+    """
     features = platform.processor()
     with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:
         features = next((line for line in file if line.startswith(("flags", "Features"))), "")
@@ -143,8 +148,8 @@ def kind() -> str:
 
 
 @contextlib.contextmanager
-def settings(**values: Any) -> Iterator[None]:
-    """JAX's configuration within a block. It opens its cache once, so it has to be told."""
+def jax_settings(**values: str | float | None) -> Iterator[None]:
+    """A block in which JAX has other settings. JAX opens its cache once, hence `reset_cache`."""
     before = {name: getattr(jax.config, name) for name in values}
     try:
         for name, value in values.items():
@@ -158,9 +163,11 @@ def settings(**values: Any) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _troubles_told(folder: Path, ours: bool) -> Iterator[None]:
-    """What JAX warns of its cache becomes one line; what cannot be read, or written whole, goes
-    where the folder is ours."""
+def _one_warning(folder: Path, ours: bool) -> Iterator[None]:
+    """A block in which the first of JAX's warnings about its cache is printed as one line.
+
+    ours: whether damaged programs may be deleted from the folder.
+    """
     once = threading.Lock()
 
     def show(
@@ -171,7 +178,7 @@ def _troubles_told(folder: Path, ours: bool) -> Iterator[None]:
         file: TextIO | None = None,
         line: str | None = None,
     ) -> None:
-        match = _TROUBLE.match(str(message))
+        match = _CACHE_WARNING.match(str(message))
         if match is None:
             plain(message, category, filename, lineno, file, line)
             return
@@ -184,7 +191,7 @@ def _troubles_told(folder: Path, ours: bool) -> Iterator[None]:
             warn(f"a compiled program in {folder} {what} ({reason}); going on without it")
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("always", message=_TROUBLE.pattern)
+        warnings.filterwarnings("always", message=_CACHE_WARNING.pattern)
         plain, warnings.showwarning = warnings.showwarning, show
         yield
 
@@ -194,5 +201,5 @@ def _reason(error: Exception) -> str:
 
 
 def warn(sentence: str) -> None:
-    """One line on the standard error, before going on."""
+    """Print a warning of one line on standard error."""
     print(f"jaxslam: warning: {sentence}", file=sys.stderr)

@@ -1,39 +1,44 @@
-"""`jaxslam consistency`: a campaign, its table and its files."""
+"""The command `jaxslam consistency`: a Monte-Carlo campaign, its table and its files."""
 
 import argparse
-import json
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 
 from jaxslam.catalog import ALL
 from jaxslam.cli import devices, library
-from jaxslam.cli.asking import INTERRUPTED, Progress, pick
+from jaxslam.cli.campaign_folder import (
+    BLOCKS,
+    RESULT,
+    TIMES,
+    check_same_campaign,
+    earlier_results,
+    open_store,
+)
+from jaxslam.cli.common import INTERRUPTED, Progress, pick
 from jaxslam.math.linalg import check_count
-from jaxslam.monte_carlo import Campaign, Interrupted, missing, monte_carlo
+from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.monte_carlo.candidates import rounded
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.results import report, store
+from jaxslam.results.files import check_writable, versions, write_files
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Truth
 
-BLOCKS = "blocks"
-"""The folder of a campaign's finished blocks, beside its results."""
+if TYPE_CHECKING:  # Matplotlib is slow to load
+    from jaxslam.results.plot import Figure
 
 OUT = Path("out")
-"""The folder of results, unless said otherwise."""
-
-RESULT = "consistency.json"
-"""The file of results that tells of a campaign."""
+"""Default folder of results."""
 
 FILES = (
     "report.html",
@@ -42,10 +47,7 @@ FILES = (
     *(f"{name}.png" for name in ("nees", "bound", "cost", "coverage", "whiteness", "gained")),
     *("errors.png", "map.png"),
 )
-"""What a campaign writes."""
-
-_TIMES = ("seconds", "compile_seconds", "step_seconds")
-"""Of the results, what is known only when they are made."""
+"""The files that a campaign writes."""
 
 DEFAULTS: dict[str, Any] = {
     "scenario": "circle",
@@ -56,55 +58,37 @@ DEFAULTS: dict[str, Any] = {
     "bound": False,
     "dtype": "float64",
 }
-"""What a campaign is asked for by, unless said or resumed otherwise."""
+"""Default values of the options that define a campaign."""
 
 
 def consistency(options: argparse.Namespace, command: str) -> int:
-    """Run the campaign that was asked for, print its table, write its files; exit status."""
-    asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
-    block: int | None = options.block
-    if options.resume is not None:
-        there = store.resume(options.resume / BLOCKS)
-        _check_same(options, there, asked)
-        asked = there.settings["asked"] | {"runs": there.runs} | asked
-        block = there.settings.get("block")  # other blocks would round differently
-        options.block = block if options.block is None else options.block
-    asked = DEFAULTS | asked
+    """Run a campaign, print its table and write its files; returns the exit status."""
+    asked, block = _asked(options)
     out = options.resume or options.out or OUT
-    # Worlds are drawn in float64 whatever filters compute in: both precisions see the same.
+    # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
     devices.join(options)
     scenario = _scenario(asked["scenario"], asked["steps"])
-    names = [name.strip() for name in asked["filters"].split(",")]
-    if names == ["all"]:
-        names = list(ALL)
-    if "" in names:
-        raise ValueError(
-            "--filters: expected names of filters with commas between them, or all, "
-            f"got {asked['filters']!r}"
-        )
-    if len(set(names)) < len(names):
-        raise ValueError(f"expected each filter once, got {asked['filters']!r}")
-    filters = {name: _filter(name, scenario) for name in names}
+    filters = _filters(asked["filters"], scenario)
     if not 0 <= asked["seed"] < 2**32:
         raise ValueError(f"expected a seed between 0 and 2³²-1, got {asked['seed']}")
     check_count("runs", asked["runs"])
     if options.block is not None:
         check_count("block", options.block)
-    report.check_writable(out)
+    check_writable(out)
     here = devices.chosen(options.devices)
-    keep = _keep(options, out, asked, block)
-    known = library.identity(asked, here[0].platform)
-    earlier = _earlier(out, keep)
+    keep = open_store(options, out, asked, block)
+    identity = library.identity(asked, here[0].platform)
+    earlier = earlier_results(out, keep)
     written = earlier is not None and all((out / name).exists() for name in FILES)
     if not written:
-        # What draws is imported while filters run, and needed when they have. No daemon: the end of
-        # the interpreter would pull Matplotlib's compiled code from under it.
+        # Matplotlib is loaded while filters run. Not in a daemon thread: such a thread crashes in
+        # compiled code when the interpreter exits.
         threading.Thread(target=_prepare_drawing).start()
     try:
         with (
             Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress,
-            library.of_this_command(known) as kept,
+            library.program_folder(identity) as kept,
         ):
             campaign = monte_carlo(
                 scenario,
@@ -116,17 +100,17 @@ def consistency(options: argparse.Namespace, command: str) -> int:
                 bound=asked["bound"],
                 dtype=asked["dtype"],
                 keep=keep,
-                identity=known,
+                identity=identity,
                 library=kept,
                 progress=progress,
                 glimpse=progress.glimpse,
             )
     except Interrupted as stop:
         if stop.campaign is None:
-            if not keep.spans():  # other processes may have some
+            if not keep.spans():  # other processes may have saved some
                 shutil.rmtree(keep.folder, ignore_errors=True)
             raise
-        print(report.table(stop.campaign))
+        print(report.campaign_table(stop.campaign))
         print(f"\njaxslam: interrupted, {stop}; --resume {out} goes on", file=sys.stderr)
         return INTERRUPTED
     for sentence in keep.set_aside:
@@ -135,19 +119,20 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         return 0
     took = campaign.seconds
     ran = took - campaign.compile_seconds if campaign.compile_seconds else 0.0
-    if earlier is not None and not keep.set_aside:  # else some runs were run again
-        times = {name: earlier[name] for name in _TIMES}
+    if earlier is not None and not keep.set_aside:  # else some runs were computed again
+        times = {name: earlier[name] for name in TIMES}
         campaign, command = replace(campaign, **times), earlier["command"]
-        if written:
-            print(report.table(campaign))
-            print(
-                f"\n{out} holds this campaign, finished: nothing was run and nothing written; "
-                f"--runs above {campaign.runs} extends it"
-            )
-            return 0
-    print(report.table(campaign))
+    else:
+        written = False
+    print(report.campaign_table(campaign))
+    if written:
+        print(
+            f"\n{out} holds this campaign, finished: nothing was run and nothing written; "
+            f"--runs above {campaign.runs} extends it"
+        )
+        return 0
     files = _campaign_files(campaign, scenario, asked["seed"], asked["bound"], command)
-    print("\nwrote " + ", ".join(str(path) for path in report.write_files(out, files)))
+    print("\nwrote " + ", ".join(str(path) for path in write_files(out, files)))
     print(
         f"results after {took:.1f} s"
         + f"; once every program was there, the runs took {ran:.1f} s of them" * (ran > 0)
@@ -155,106 +140,54 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _earlier(out: Path, keep: store.Store) -> dict[str, Any] | None:
-    """What the results in a folder say, where all runs are there and the results are of them."""
-    assert keep.runs is not None
-    if missing(keep.spans(), keep.runs, keep.runs):
-        return None
-    try:
-        found = json.loads((out / RESULT).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    whole = isinstance(found, dict) and found.get("runs") == keep.runs
-    return found if whole and {*_TIMES, "command"} <= found.keys() else None
+def _asked(options: argparse.Namespace) -> tuple[dict[str, Any], int | None]:
+    """The options that define the campaign, and the size of blocks that it began with.
+
+    They come from the command, the resumed campaign and the defaults, in this order. The options of
+    a resumed campaign get its size of blocks unless another is given.
+    """
+    asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
+    block: int | None = options.block
+    if options.resume is not None:
+        there = store.resume(options.resume / BLOCKS)
+        check_same_campaign(options, there, asked)
+        asked = there.settings["asked"] | {"runs": there.runs} | asked
+        block = there.settings.get("block")  # blocks of another size would round differently
+        options.block = block if options.block is None else options.block
+    return DEFAULTS | asked, block
 
 
-def _said(value: Any) -> str:
-    """An option's value, as its user would say it."""
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    return "not given" if value is None else str(value)
-
-
-def _check_same(options: argparse.Namespace, there: store.Store, asked: Mapping[str, Any]) -> None:
-    """Raise ValueError unless what was asked for fits the campaign that is to be resumed."""
-    folder = options.resume
-    if options.out is not None and options.out.resolve() != folder.resolve():
+def _filters(asked: str, scenario: Scenario) -> dict[str, Candidate]:
+    """The filters of a comma-separated list, or all, by name."""
+    names = [name.strip() for name in asked.split(",")]
+    if names == ["all"]:
+        names = list(ALL)
+    if "" in names:
         raise ValueError(
-            f"--resume {folder} writes its results there: expected no --out, got {options.out}"
+            f"--filters: expected names of filters with commas between them, or all, got {asked!r}"
         )
-    if "asked" not in there.settings:
-        raise ValueError(f"{folder} holds a campaign that no command began")
-    told = there.settings["asked"]
-    differences = [
-        f"--{name} is {_said(told[name])} there, {_said(value)} here"
-        for name, value in asked.items()
-        if name in told and told[name] != value
-    ]
-    if differences:
-        raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"expected each filter once, got {asked!r}")
+    return {name: _filter(name, scenario) for name in names}
 
 
 def _prepare_drawing() -> None:
+    """Load what draws the figures."""
     from jaxslam.results import page, plot  # noqa: F401
 
     plot.warm_up()
 
 
-def _keep(
-    options: argparse.Namespace, out: Path, asked: dict[str, Any], block: int | None
-) -> store.Store:
-    """Where this campaign's blocks are kept: a new folder, or that of the campaign resumed.
-
-    block: the size of blocks that the campaign was begun with.
-    """
-    folder, runs = out / BLOCKS, asked["runs"]
-    told = {name: value for name, value in asked.items() if name != "runs"}
-    settings = {"asked": told, "block": block}
-    if options.resume is None and jax.process_index() == 0:
-        _make_room(options, out, settings, runs)
-        store.create(folder, settings, runs)
-    devices.wait_for_all("campaign folder")
-    return store.resume(folder, settings, runs)
-
-
-def _make_room(options: argparse.Namespace, out: Path, settings: dict[str, Any], runs: int) -> None:
-    """Remove the blocks of a campaign that is to be given up; ValueError where it is not to be."""
-    folder = out / BLOCKS
-    if not (folder / store.MANIFEST).exists():
-        if folder.exists() and any(folder.iterdir()):
-            raise ValueError(f"{folder} holds files that are no campaign's; choose another --out")
-        if (out / RESULT).exists() and not options.overwrite:
-            raise ValueError(f"{out} holds the results of a campaign: --overwrite gives them up")
-        return
-    store.read_manifest(folder)  # or it is not ours to remove
-    if not options.overwrite:
-        there = store.resume(folder)
-        done, whole = there.done(), there.runs or 0
-        left = bool(missing(there.spans(), whole, max(whole, 1)))
-        if left and done:
-            raise ValueError(
-                f"{out} holds an unfinished campaign, with {done} of {whole} runs done: --resume "
-                f"{out} goes on with it, --overwrite gives it up; or choose another --out"
-            )
-        same = options.again and (there.settings, whole) == (settings, runs)
-        if done and not same:
-            raise ValueError(
-                f"{out} holds a finished campaign of {done} runs: --overwrite gives it up, "
-                f"--resume {out} prints it, or extends it to more --runs; or choose another --out"
-            )
-    shutil.rmtree(folder)
-
-
 def _campaign_files(
     campaign: Campaign, scenario: Scenario, seed: int, bound: bool, command: str
 ) -> dict[str, str | Callable[[Path], object]]:
-    """The campaign, and pictures of its first run under the first filter that makes a map."""
-    from jaxslam.results import page, plot  # matplotlib only once there is a result to draw
+    """The files of a campaign; errors and map are of run 0 of the first filter with a map."""
+    from jaxslam.results import page, plot  # matplotlib is slow to load
 
     mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
     name = next(iter(mapping or campaign.filters))
 
-    truth, estimate = campaign.first.get(name) or _first_run(campaign, scenario, name, seed)
+    truth, estimate = campaign.first.get(name) or _run_zero(campaign, scenario, name, seed)
     title = f"{scenario.name}, {name}, run 0 of seed {seed}"
     figures = {
         "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
@@ -271,7 +204,7 @@ def _campaign_files(
     }
     draw = cache(plot.png)
 
-    def saved(figure: Any) -> Callable[[Path], object]:
+    def saved(figure: "Figure") -> Callable[[Path], object]:
         return lambda path: path.write_bytes(draw(figure))
 
     return {
@@ -280,7 +213,7 @@ def _campaign_files(
             report.ROWS,
             command,
             seed,
-            report.versions(),
+            versions(),
             dict(figures.values()),
             draw,
         ),
@@ -289,10 +222,10 @@ def _campaign_files(
     } | {f"{name}.png": saved(figure) for name, (_, figure) in figures.items()}
 
 
-def _first_run(
+def _run_zero(
     campaign: Campaign, scenario: Scenario, name: str, seed: int
 ) -> tuple[Truth, Estimate]:
-    """Run 0 of a filter, which another process or an earlier command has run."""
+    """Run 0 of a filter, computed again where another process or an earlier command computed it."""
     key = jax.random.fold_in(jax.random.key(seed), 0)
     key_world, key_filter = jax.random.split(key)
     truth, log = rounded(simulate(scenario, key_world), campaign.dtype)
@@ -305,12 +238,13 @@ def _first_run(
 
 
 def _scenario(name: str, steps: int | None) -> Scenario:
+    """A scenario by name, with its own number of steps unless given."""
     make = pick("scenario", name, SCENARIOS)
     return make() if steps is None else make(steps)
 
 
 def _filter(name: str, scenario: Scenario) -> Candidate:
-    """A filter of the family for a scenario, or ValueError by name if it cannot run there."""
+    """A filter of the catalog; raises ValueError with its name if it cannot run the scenario."""
     make = pick("filter", name, ALL)
     try:
         return make(scenario, watch=True)

@@ -1,4 +1,4 @@
-"""Which devices compute, and which other processes: what must be said before JAX is first used."""
+"""The devices that compute and the other processes of a campaign, set before JAX is first used."""
 
 import argparse
 import contextlib
@@ -12,23 +12,23 @@ from jaxslam.monte_carlo.pieces import cores
 
 
 def prepare(options: argparse.Namespace) -> None:
-    """Before JAX looks at its devices: as many CPU devices as asked for, by default as cores.
+    """Set the number of CPU devices, before JAX first uses them; by default one a core.
 
-    No more than cores, or JAX would make them; `chosen` says then that there are too few.
+    Never more than there are cores, since JAX would create them; `chosen` refuses such a request.
     """
     asked = options.devices
     count = cores() if asked in ("all", "cpu") else int(asked) if asked.isdecimal() else None
     if count is not None and count < 1:
         raise ValueError(f"expected at least 1 device, got {asked}")
     if count is not None:
-        with contextlib.suppress(RuntimeError):  # JAX has been used before, as in a notebook
+        with contextlib.suppress(RuntimeError):  # JAX is already in use, as in a notebook
             jax.config.update("jax_num_cpu_devices", min(count, cores()))
 
 
 def join(options: argparse.Namespace) -> None:
-    """Join the other processes of the campaign, where there are any.
+    """Connect to the other processes of the campaign, where there are any.
 
-    Raises ValueError on numbers that do not fit, and where the coordinator cannot be reached within
+    Raises ValueError on inconsistent options, and where the coordinator cannot be reached within
     options.timeout seconds.
     """
     address, count, mine = options.coordinator, options.processes, options.process_id
@@ -36,7 +36,7 @@ def join(options: argparse.Namespace) -> None:
         if count is not None or mine is not None:
             raise ValueError("--processes and --process-id need --coordinator HOST:PORT")
         return
-    if address == "auto":  # as JAX finds them in the variables of SLURM, Kubernetes, Open MPI
+    if address == "auto":  # JAX reads the variables of SLURM, Kubernetes, Open MPI
         jax.distributed.initialize(initialization_timeout=options.timeout)
         return
     host, _, port = address.rpartition(":")
@@ -80,13 +80,13 @@ def chosen(asked: str) -> list[jax.Device]:
 
 
 def wait_for_all(what: str) -> None:
-    """Until every process of the campaign is here."""
+    """Wait until every process of the campaign has come to this point."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(what)
 
 
 def _await(host: str, port: int, timeout: int) -> None:
-    """Until a coordinator listens; the library would abort the program instead of saying so."""
+    """Wait until the coordinator listens; JAX itself would abort the program at the timeout."""
     end = time.monotonic() + timeout
     while True:
         try:

@@ -1,56 +1,61 @@
-"""A campaign's compiled programs in the cache folder, by the names that the command was given.
+"""A campaign's compiled programs in the cache folder, found by name and without a trace.
 
-JAX's own cache is asked with a program's text, for which it has to be traced and lowered first. The
-command knows what it runs without that: scenario and filters by name, of this source.
+JAX's own cache identifies a program by its text, so a program must be traced and lowered before it
+can be found. The command identifies it by the names of scenario and filter and a digest of the
+package's source.
 """
 
 import contextlib
 import hashlib
+import importlib.resources
 import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 
 from jaxslam.cli import cache
-from jaxslam.results import report
+from jaxslam.results.files import versions
+
+PACKAGE = Path(str(importlib.resources.files("jaxslam")))
+"""The folder of the package, whose source decides what a program computes."""
+
+_NOT_OF_A_PROGRAM = frozenset({"seed", "filters", "bound"})
+"""Entries of an identity that a single program does not depend on."""
 
 
-def identity(asked: Mapping[str, Any], platform: str) -> dict[str, str]:
-    """What a campaign is, by what was asked for and the source that the names in it stand for.
+def identity(asked: Mapping[str, object], platform: str) -> dict[str, str]:
+    """The identity of a campaign: its options, versions, platform and a digest of the source.
 
-    The number of runs is no part of it. platform: of the devices that compute.
+    Args:
+        asked: the options of the command; the number of runs does not count.
+        platform: that of the devices that compute.
     """
-    known = {name: str(value) for name, value in asked.items() if name != "runs"}
-    return known | report.versions() | {"platform": platform, "source": _source()}
+    options = {name: str(value) for name, value in asked.items() if name != "runs"}
+    return options | versions() | {"platform": platform, "source": _source_digest()}
 
 
-def _source() -> str:
+def _source_digest() -> str:
     """A digest of every source file of the package."""
-    total, package = hashlib.sha256(), Path(report.__file__).parent
-    for path in sorted(package.rglob("*.py")):
-        total.update(f"{path.relative_to(package).as_posix()}\n".encode())
+    total = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        total.update(f"{path.relative_to(PACKAGE).as_posix()}\n".encode())
         total.update(path.read_bytes().replace(b"\r\n", b"\n"))
     return total.hexdigest()[:16]
 
 
-_NO_PROGRAM = frozenset({"seed", "filters", "bound"})
-"""Of an identity, what is no part of a single program."""
+class ProgramFolder:
+    """A `monte_carlo.Library` in JAX's cache folder; damaged files are deleted, never used."""
 
-
-class Programs:
-    """A `monte_carlo.Library` in JAX's cache folder: what is there is whole, or is not used."""
-
-    def __init__(self, folder: Path, known: Mapping[str, str]) -> None:
+    def __init__(self, folder: Path, campaign: Mapping[str, str]) -> None:
         self._folder = folder
-        told = {name: value for name, value in known.items() if name not in _NO_PROGRAM}
-        # The folder may be one that JAX was told of, shared by unlike machines.
-        self._known = json.dumps(told | {"kind": cache.kind()}, sort_keys=True)
+        own = {name: value for name, value in campaign.items() if name not in _NOT_OF_A_PROGRAM}
+        # The user may have chosen a folder that unlike machines share.
+        self._identity = json.dumps(own | {"kind": cache.processor_kind()}, sort_keys=True)
 
     def get(self, name: str) -> bytes | None:
-        """The program of that name, or None; a damaged one is deleted, and said."""
+        """The program of that name, or None; a damaged one is deleted with a warning."""
         path = self._path(name)
         try:
             whole = path.read_bytes()
@@ -59,7 +64,7 @@ class Programs:
         digest, content = whole[:32], whole[32:]
         if hashlib.sha256(content).digest() == digest:
             with contextlib.suppress(OSError):
-                os.utime(path)  # what was not used for longest is deleted first
+                os.utime(path)  # `prune` deletes the least recently used programs
             return content
         with contextlib.suppress(OSError):
             path.unlink()
@@ -67,7 +72,7 @@ class Programs:
         return None
 
     def put(self, name: str, content: bytes) -> None:
-        """Keep it, whole or not at all."""
+        """Write a program to its file; the file appears only when it is complete."""
         path = self._path(name)
         hidden = path.with_name(f".{path.name}-{os.getpid()}")
         try:
@@ -81,17 +86,22 @@ class Programs:
                 hidden.unlink()
 
     def _path(self, name: str) -> Path:
-        digest = hashlib.sha256(f"{self._known} {name}".encode()).hexdigest()
+        digest = hashlib.sha256(f"{self._identity} {name}".encode()).hexdigest()
         return self._folder / f"jaxslam-{digest[:32]}-cache"
 
 
 @contextlib.contextmanager
-def of_this_command(known: Mapping[str, str]) -> Iterator[Programs | None]:
-    """The programs that are kept for it, instead of JAX's own cache; None where none are to be
-    kept, or several processes share the work."""
+def program_folder(campaign: Mapping[str, str]) -> Iterator[ProgramFolder | None]:
+    """A block with a campaign's `ProgramFolder` in place of JAX's own cache.
+
+    It is None where the cache is off, and where several processes share the work.
+
+    Args:
+        campaign: its `identity`.
+    """
     folder = jax.config.jax_compilation_cache_dir
     if folder is None or jax.process_count() > 1:
         yield None
         return
-    with cache.settings(jax_compilation_cache_dir=None):
-        yield Programs(Path(folder), known)
+    with cache.jax_settings(jax_compilation_cache_dir=None):
+        yield ProgramFolder(Path(folder), campaign)

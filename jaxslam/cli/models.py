@@ -1,4 +1,4 @@
-"""`jaxslam verify`: the Jacobians of every model, or of the user's own file."""
+"""The command `jaxslam verify`: the Jacobians of every model, or of the user's own file."""
 
 import argparse
 import os
@@ -6,26 +6,25 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
 
 from jaxslam import motion, sensors, verify
-from jaxslam.cli.asking import Progress
-from jaxslam.results import report
+from jaxslam.cli.common import Progress
+from jaxslam.results.files import check_writable, json_text, versions, write_files
 from jaxslam.verify import user_files
 
 FAILED = 1
 
 
 def verify_models(options: argparse.Namespace, command: str) -> int:
-    """Verify the Jacobians, print the findings, write them; exit status, 1 if any is wrong."""
+    """Verify Jacobians, print and write the findings; returns the exit status, 1 if any fails."""
     began = time.perf_counter()
-    report.check_writable(options.out)
-    ask = partial(verify.verify_jacobians, count=options.states, seed=options.seed)
+    check_writable(options.out)
+    verify_one = partial(verify.verify_jacobians, count=options.states, seed=options.seed)
     if options.target is None:
-        reports = _verify_all(ask)
+        reports = _verify_all(verify_one)
         print(verify.table(reports))
     else:
-        reports = user_files.verify_file(options.target, ask)
+        reports = user_files.verify_file(options.target, verify_one)
     details = reports if options.target else [r for r in reports if not r.passed]
     print("\n".join(["", *(str(r) for r in details)]) if details else "")
     passed = all(r.passed for r in reports)
@@ -34,30 +33,30 @@ def verify_models(options: argparse.Namespace, command: str) -> int:
         "passed": passed,
         "reports": [r.as_dict() for r in reports],
         "seconds": round(time.perf_counter() - began, 2),
-        "versions": report.versions(),
+        "versions": versions(),
     }
-    written = report.write_files(options.out, {"verify.json": report.json_text(content)})
+    written = write_files(options.out, {"verify.json": json_text(content)})
     print(f"{content['seconds']:.1f} s; wrote {written[0]}")
     return 0 if passed else FAILED
 
 
-def _verify_one(ask: Callable[..., verify.Report], factory: Callable[..., Any]) -> verify.Report:
-    return ask(verify.build(factory))
-
-
-def _verify_all(ask: Callable[..., verify.Report]) -> list[verify.Report]:
+def _verify_all(verify_one: Callable[..., verify.Report]) -> list[verify.Report]:
+    """A report on every registered model, several at a time."""
     models = motion.REGISTRY | sensors.REGISTRY
     reports = []
     with (
         Progress(f"{len(models)} models", "models") as progress,
         ThreadPoolExecutor(os.cpu_count()) as pool,  # compilation takes most of the time
     ):
-        tasks = [pool.submit(_verify_one, ask, factory) for factory in models.values()]
+        tasks = [
+            pool.submit(lambda make: verify_one(verify.build(make)), factory)
+            for factory in models.values()
+        ]
         try:
             for task in tasks:
                 reports.append(task.result())
                 progress(len(reports), len(models))
-        except BaseException:  # an interrupt: what has not begun need not
+        except BaseException:  # on an interrupt, models that wait are dropped
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return reports

@@ -1,7 +1,7 @@
-"""Readers of public data sets, one a file; each returns a `Dataset`.
+"""Readers of public data sets, one in each file; they return a `Dataset`.
 
-`READERS` is what the command line chooses from, by name: each takes (path, robot). `robot` is the
-number of a robot where a data set has several (None: the first one); elsewhere it must be None.
+`READERS` has them by name, for the command line; each takes (path, robot). `robot` is the number of
+a robot where a data set has several (None: the first one); elsewhere it must be None.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The simulated course data of the robot mapping lectures of Freiburg and Bonn."""
+"""Reader of the simulated data of the robot mapping courses of Freiburg and Bonn."""
 
 from pathlib import Path
 
@@ -23,21 +23,21 @@ def bonn(
     odometry_cov: NoiseCov = ODOMETRY_COV,
     measurement_cov: NoiseCov = MEASUREMENT_COV,
 ) -> Dataset:
-    """Read `world.dat` (landmarks: id x y) and `sensor_data.dat` of a folder.
+    """The data set in the files `world.dat` (landmarks: id x y) and `sensor_data.dat` of a folder.
 
-    The latter holds `ODOMETRY rot1 trans rot2`, each followed by the `SENSOR id range bearing` of
-    that step. Turn, go, turn is the pose increment
+    The latter has a line `ODOMETRY rot1 trans rot2` for each step, followed by lines `SENSOR id
+    range bearing` of that step. The motion is the pose increment
     (trans cos rot1, trans sin rot1, rot1 + rot2). Next to a landmark the simulated noise can make a
     range negative; such a measurement has no direction, and is dropped and counted.
 
-    The default noise is the one under which the innovations of an EKF are most likely, rounded:
-    0.1 m and 0.05 rad for the sensor, and of the odometry no more than that σ is about 0.001 a step
+    The default noise maximizes the likelihood of the innovations of an EKF, rounded: 0.1 m and
+    0.05 rad for the sensor; of the odometry the likelihood only says that σ is about 0.001 a step
     (m or rad). NIS/dof is then 0.95.
 
     Source: course data by C. Stachniss, University of Freiburg and University of Bonn.
 
     Args:
-        folder: where the two files are.
+        folder: the folder of the two files.
         odometry_cov: (3, 3) covariance of the pose increment, or a function of (pose, u).
         measurement_cov: (2, 2) covariance of (range, bearing), or a function of z.
     Raises:

@@ -1,11 +1,11 @@
-"""What a reader returns: a recorded log with the models, noise and options to run on it."""
+"""The record that readers return: a log with models, noise and options of a filter for it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float, Int
 
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
@@ -15,44 +15,43 @@ from jaxslam.types import Log, Scan, check_log
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A recorded log and how to filter it; T rows, N landmarks.
+    """A recorded log of T rows and N landmarks, with models and options to filter it.
 
         data = jaxslam.datasets.bonn(folder)
         ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
         trace = jaxslam.run(ekf, data.log, data.pose, data.pose_cov, key)
 
-    Arrays are NumPy's, in float64. Raises ValueError where they do not fit together.
+    Arrays are NumPy's, in float64. Raises ValueError where their shapes do not fit together.
     """
 
     name: str
     log: Log
-    """row t: the control that led to pose t and the scan taken there; a tag is a row of `tags`."""
-    time: NDArray[np.float64]
-    """(T,) seconds, or the number of the odometry line where the file has no clock."""
+    """row t: the control that led to pose t, and the scan at pose t; tags are indices of `tags`"""
+    time: Float[np.ndarray, "T"]
+    """[s], or the number of the odometry line where the file has no times"""
     motion: Motion
     sensor: Sensor
     tags: tuple[int, ...]
-    """the file's own name of the landmark with tag 0, 1, …, N-1."""
-    pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    """(3,) where the robot is before the first control: the map's frame starts there."""
-    pose_cov: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
-    """(3, 3) zero, since the robot's start defines the frame."""
+    """the file's own names of the landmarks with tags 0, 1, …, N-1"""
+    pose: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """the robot's pose before the first control, which is the map's frame"""
+    pose_cov: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
+    """zero, since the first pose defines the frame"""
     filter_options: dict[str, Any] = field(default_factory=dict)
-    """keyword arguments of `filters.ekf_slam` that belong to the data (update, gate)."""
-    landmarks: NDArray[np.float64] | None = None
-    """(N, 2) surveyed positions [m] in tag order, in a frame of their own; None where unknown."""
-    true_path: NDArray[np.float64] | None = None
-    """(T, 3) surveyed pose at each row [m, m, rad], in the frame of `landmarks`; None where
-    unknown."""
+    """keyword arguments of `filters.ekf_slam` for this data set (update, gate)"""
+    landmarks: Float[np.ndarray, "N 2"] | None = None
+    """surveyed positions [m] in the order of tags, in a frame of their own; None if unknown"""
+    true_path: Float[np.ndarray, "T 3"] | None = None
+    """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown"""
     dropped: dict[str, int] = field(default_factory=dict)
-    """measurements that are in the file and not in the log, counted by reason."""
+    """number of measurements of the file that are not in the log, by reason"""
     corrections: tuple[str, ...] = ()
-    """what the reader changed of what the files say, in words."""
+    """descriptions of what the reader changed"""
     source: str = ""
-    """whom to credit."""
+    """the publication of the data"""
     robots: tuple[Robot, ...] = ()
-    """of a log of several robots: for `filters.team_slam(data.robots, data.capacity)`. Tags N,
-    N+1, … are theirs; `motion` and `sensor` are of the first alone, on the same log."""
+    """the robots of a log of several, for `filters.team_slam(data.robots, data.capacity)`. They
+    have the tags N, N+1, …; `motion` and `sensor` are those of the first robot."""
 
     def __post_init__(self) -> None:
         check_log(
@@ -79,29 +78,29 @@ class Dataset:
 
     @property
     def steps(self) -> int:
-        """T."""
+        """The number of rows T."""
         return int(np.shape(self.log.control)[0])
 
     @property
     def capacity(self) -> int:
-        """N, the number of distinct landmarks."""
+        """The number of landmarks N."""
         return len(self.tags)
 
     @property
     def measurements(self) -> int:
-        """How many measurements the log holds."""
+        """The number of measurements in the log."""
         return int(np.sum(self.log.scan.valid))
 
 
 def make_log(
-    control: Sequence[Any] | NDArray[np.float64],
-    row: Sequence[int] | NDArray[np.int64],
-    tag: Sequence[int] | NDArray[np.int64],
-    z: Sequence[Any] | NDArray[np.float64],
+    control: Sequence[Sequence[float]] | Float[np.ndarray, "T U"],
+    row: Sequence[int] | Int[np.ndarray, "K"],
+    tag: Sequence[int] | Int[np.ndarray, "K"],
+    z: Sequence[Sequence[float]] | Float[np.ndarray, "K Z"],
 ) -> Log:
-    """A log of T controls (T, U) with measurement k, z[k] (Z,) of tag[k], in the scan of row[k].
+    """A log of T controls, with measurement z[k] of tag[k] in the scan of row[k].
 
-    Scans keep the order of the measurements and are padded to the fullest one: z 0, tag -1.
+    Scans keep the order of the measurements. They are padded to the largest one with z 0, tag -1.
     """
     controls, rows = np.asarray(control, np.float64), np.asarray(row, np.int64)
     values = np.asarray(z, np.float64)
@@ -109,14 +108,14 @@ def make_log(
     count = np.bincount(rows, minlength=steps)
     order = np.argsort(rows, kind="stable")
     rows = rows[order]
-    place = np.arange(rows.size) - (np.cumsum(count) - count)[rows]
-    places = int(np.max(count))
-    # Any, because the fields of a Log are declared as what they become under jit.
-    padded_z: Any = np.zeros((steps, places, values.shape[1]))
-    padded_tag: Any = np.full((steps, places), -1, np.int32)
-    valid: Any = np.zeros((steps, places), bool)
-    padded_z[rows, place] = values[order]
-    padded_tag[rows, place] = np.asarray(tag, np.int32)[order]
-    valid[rows, place] = True
+    slot = np.arange(rows.size) - (np.cumsum(count) - count)[rows]
+    slots = int(np.max(count))
+    # Any, because the fields of a Log are declared as JAX arrays.
+    padded_z: Any = np.zeros((steps, slots, values.shape[1]))
+    padded_tag: Any = np.full((steps, slots), -1, np.int32)
+    valid: Any = np.zeros((steps, slots), bool)
+    padded_z[rows, slot] = values[order]
+    padded_tag[rows, slot] = np.asarray(tag, np.int32)[order]
+    valid[rows, slot] = True
     held: Any = controls
     return Log(held, Scan(padded_z, padded_tag, valid))

@@ -1,4 +1,4 @@
-"""Text files read line by line, with errors that say where: `path:line: reason`."""
+"""Text files read line by line, with errors of the form `path:line: reason`."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -8,8 +8,8 @@ from pathlib import Path
 class TextFile:
     """The lines of a small table in a text file.
 
-    Iterating gives (line number from 1, fields split at white space); blank lines, and lines that
-    start with `comment`, are passed over. Raises ValueError where the file cannot be read.
+    Iteration yields (line number from 1, fields split at white space), without blank lines and
+    lines that start with `comment`. Raises ValueError where the file cannot be read.
     """
 
     def __init__(self, path: str | Path, comment: str | None = None) -> None:
@@ -32,21 +32,21 @@ class TextFile:
                 yield number, fields
 
     def error(self, line: int, reason: str) -> ValueError:
-        """The error to raise about a line."""
+        """A ValueError about a line, for the caller to raise."""
         return ValueError(f"{self.path}:{line}: {reason}")
 
     def end_error(self, reason: str) -> ValueError:
-        """The error to raise about what is missing when the file ends."""
+        """A ValueError about the end of the file, for the caller to raise."""
         return self.error(max(len(self.lines) - (self.lines[-1] == ""), 1), reason)
 
     def numbers(self, line: int, fields: Sequence[str], names: Sequence[str]) -> list[float]:
-        """Finite numbers, one for each name; raises ValueError on any other line."""
+        """The fields of a line as finite numbers, one a name; raises ValueError otherwise."""
         self.expect(line, fields, names)
         try:
             values = [float(field) for field in fields]
         except ValueError:
             values = []
-        # float() also takes 1_000, which no program writes into a table.
+        # float() also accepts 1_000.
         if not values or not all(map(math.isfinite, values)) or "_" in self.lines[line - 1]:
             for name, field in zip(names, fields, strict=True):
                 if not _is_finite(field):
@@ -54,19 +54,20 @@ class TextFile:
         return values
 
     def identity(self, line: int, field: str, name: str) -> int:
-        """A whole number >= 0; raises ValueError on anything else."""
+        """A field as a whole number >= 0; raises ValueError otherwise."""
         if not (field.isascii() and field.isdigit()):
             raise self.error(line, f"{name} is not a whole number >= 0: {field!r}")
         return int(field)
 
     def expect(self, line: int, fields: Sequence[str], names: Sequence[str]) -> None:
-        """Raise ValueError unless there is one field for each name."""
+        """Raise ValueError unless a line has one field for each name."""
         if len(fields) != len(names):
             wanted = f"{len(names)} fields ({' '.join(names)})"
             raise self.error(line, f"expected {wanted}, got {len(fields)}")
 
 
 def _is_finite(field: str) -> bool:
+    """Whether a field is a finite number."""
     try:
         return math.isfinite(float(field)) and "_" not in field
     except ValueError:

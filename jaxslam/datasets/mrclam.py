@@ -1,4 +1,4 @@
-"""The UTIAS multi-robot cooperative localization and mapping data (MRCLAM)."""
+"""Reader of the UTIAS multi-robot cooperative localization and mapping data (MRCLAM)."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -6,10 +6,10 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float
 
 from jaxslam.datasets.dataset import Dataset, make_log
-from jaxslam.datasets.lines import TextFile
+from jaxslam.datasets.mrclam_files import ROBOTS, read_landmarks, read_robot
 from jaxslam.motion import unicycle
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import Part, range_bearing, suite
@@ -20,16 +20,10 @@ SOURCE = (
     "K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, The UTIAS multi-robot cooperative "
     "localization and mapping dataset, International Journal of Robotics Research 30(8), 2011"
 )
-ROBOTS = range(1, 6)
-"""Subjects 1 to 5 are the robots; they carry barcodes like the landmarks, 6 to 20."""
 ODOMETRY_DENSITY = (0.01**2, 0.05**2)
-"""Variance of travel [m²/s] and heading [rad²/s] gained in a second."""
+"""Variance of travel [m²/s] and heading [rad²/s] per second."""
 MEASUREMENT_COV = np.diag([0.15, 0.01]) ** 2
 _DROPS = ("robot sightings", "unknown barcodes", "repeated in a scan")
-EXCHANGED = {11: [3.15071999, 2.38294871], 17: [0.03596156, -2.84396626]}
-"""Two subjects that stand in each other's place in the survey of data set 1, as the file has them:
-the distance of either from a landmark of the same scan differs by metres from the survey, and by
-centimetres once the two are exchanged."""
 
 
 def mrclam(
@@ -40,42 +34,42 @@ def mrclam(
     measurement_cov: NoiseCov = MEASUREMENT_COV,
     errata: bool = True,
 ) -> Dataset:
-    """Read `Robot{n}_Odometry.dat`: t v ω, and `Robot{n}_Measurement.dat`: t barcode range bearing.
+    """The data of one robot in the files of a folder.
 
-    The log has a row at every time that occurs in either file. Its control is (v, ω, Δt): the
-    velocity of the latest odometry line before the row, held since the row before; zero until the
-    first line. So Δt = 0 in the first row alone, and of odometry lines with equal times the last
-    one holds. The measurements of one time form one scan. `Barcodes.dat` says whose barcode it is;
-    sightings of robots, barcodes it does not list and repetitions within a scan are dropped and
-    counted. Tags follow the subject numbers; `Landmark_Groundtruth.dat` is the survey.
+    These are `Robot{n}_Odometry.dat` (t v ω), `Robot{n}_Measurement.dat` (t barcode range bearing),
+    `Barcodes.dat` (the subject of each barcode) and `Landmark_Groundtruth.dat` (the survey).
 
-    The default noise is chosen on robots 1 to 3 of data set 1. Bearings of one scan agree with the
-    survey to 0.005 rad, whatever the pose; 0.01 leaves room for time stamps. Ranges are off it by
-    0.16 to 0.19 m, but alike for seconds, so that innovations see 0.11 m; 0.15 is between. With
-    odometry noise of 0.01 m/√s and 0.05 rad/√s, NIS/dof is then 0.78, 1.22 and 0.92. Since the
-    errors of ranges persist, the map's covariance is too small whatever the choice. No gate: one at
-    5 σ moves the maps by millimetres.
+    The log has a row at every time that occurs in either of the first two. Its control is
+    (v, ω, Δt): the velocity of the latest odometry line at or before the row before, and the time
+    since that row; zero before the first odometry line. So Δt = 0 in the first row only, and of
+    odometry lines with equal times the last one counts. Measurements of one time form one scan.
+    Measurements of robots and of unknown barcodes, and repetitions within a scan, are dropped and
+    counted. Tags follow the subject numbers.
+
+    The default noise is chosen on robots 1 to 3 of data set 1. Bearings within a scan agree with
+    the survey to 0.005 rad; 0.01 allows for errors of the time stamps. Ranges deviate by 0.16 to
+    0.19 m, with errors that persist for seconds, so that innovations show 0.11 m; 0.15 is between.
+    With odometry noise of 0.01 m/√s and 0.05 rad/√s, NIS/dof is then 0.78, 1.22 and 0.92. Since the
+    errors of ranges persist, the map's covariance is too small for any choice. There is no gate; a
+    gate at 5 σ changes the maps by millimetres.
 
     Source: Leung, Halpern, Barfoot, Liu, International Journal of Robotics Research 30(8), 2011.
 
     Args:
         folder: where the files of one data set are.
-        robot: which robot, 1 to 5.
+        robot: number of the robot, 1 to 5.
         odometry_cov: (2, 2) covariance of (v, ω) over a row's Δt, or a function of (pose, u).
         measurement_cov: (2, 2) covariance of (range, bearing), or a function of z.
         errata: exchange the positions of subjects 11 and 17 if they are those of data set 1, see
-            `EXCHANGED`; `Dataset.corrections` then says so. False takes the survey as it is.
+            `mrclam_files.EXCHANGED`; `Dataset.corrections` then says so.
     Raises:
-        ValueError: `path:line: reason` on a malformed line, a time that goes backwards, a negative
+        ValueError: `path:line: reason` on a malformed line, a time that decreases, a negative
             range, or a subject without survey; and on a robot other than 1 to 5.
     """
     if type(robot) is not int or robot not in ROBOTS:
         raise ValueError(f"mrclam: expected a robot from 1 to 5, got {robot!r}")
-    folder = Path(folder)
-    subject_of, names = _read_barcodes(TextFile(folder / "Barcodes.dat", "#"))
-    points = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
-    corrections = _correct(points) if errata else ()
-    odometry, seen = _read_robot(folder, robot)
+    subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
+    odometry, seen = read_robot(Path(folder), robot)
     time = np.unique(np.concatenate([odometry[:, 0], seen[:, 0]]))
     row, tag, kept, dropped = _associate(seen, time, subject_of, names)
     return Dataset(
@@ -86,7 +80,7 @@ def mrclam(
         sensor=range_bearing(measurement_cov),
         tags=names,
         filter_options={"update": "sequential"},
-        landmarks=np.array([points[name] for name in names]),
+        landmarks=points,
         dropped=dropped,
         corrections=corrections,
         source=SOURCE,
@@ -102,23 +96,23 @@ def mrclam_team(
     sighting_cov: NoiseCov | None = None,
     errata: bool = True,
 ) -> Dataset:
-    """The data of several robots on one clock, with their sightings of each other.
+    """The data of several robots with common times, and their measurements of each other.
 
-    The log has a row at every time that occurs in a file of any of them, and at each row all of
-    them move, as in `mrclam`: (v, ω, Δt) for each. Places of a scan are by robot, those for
-    landmarks before those for robots; tags N, N + 1, … are the robots in the order asked for. The
-    first robot's start is the map's frame. Where the others start, the files do not say: they have
-    no start, and have to find themselves. Sightings fit much worse than landmarks do: over the
-    first half of data set 1, robots 1 to 3, they are off by 0.24 m and 0.078 rad (NIS/dof 5.7 with
-    the noise of landmarks), so a `sighting_cov` of their own is advisable. Sightings of
-    robots not asked for are dropped and counted; otherwise as `mrclam`.
+    The log has a row at every time that occurs in a file of any of the robots, with a control
+    (v, ω, Δt) for each robot as in `mrclam`. Measurement slots of a scan are ordered by robot,
+    those for landmarks before those for robots; tags N, N + 1, … are the robots in the given order.
+    The first robot's start is the map's frame. The files do not give the others' starts, which the
+    filter has to estimate. Measurements of robots are less accurate than those of landmarks: over
+    the first half of data set 1, robots 1 to 3, their errors are 0.24 m and 0.078 rad (NIS/dof 5.7
+    with the noise of landmarks), so a `sighting_cov` of their own is advisable. Measurements of
+    other robots are dropped and counted; all else is as in `mrclam`.
 
         data = mrclam_team(folder)
         filter = team_slam(data.robots, data.capacity)
 
     Args:
         folder: where the files of one data set are.
-        robots: which, each from 1 to 5, none twice.
+        robots: their numbers, each from 1 to 5, none twice.
         odometry_cov, measurement_cov, errata: as for `mrclam`.
         sighting_cov: (2, 2) covariance of (range, bearing) of another robot, or a function of z;
             default measurement_cov.
@@ -129,11 +123,8 @@ def mrclam_team(
     good = all(type(robot) is int and robot in ROBOTS for robot in asked)
     if not asked or not good or len(set(asked)) != len(asked):
         raise ValueError(f"mrclam_team: expected different robots from 1 to 5, got {robots!r}")
-    folder = Path(folder)
-    subject_of, names = _read_barcodes(TextFile(folder / "Barcodes.dat", "#"))
-    points = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
-    corrections = _correct(points) if errata else ()
-    files = [_read_robot(folder, robot) for robot in asked]
+    subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
+    files = [read_robot(Path(folder), robot) for robot in asked]
     time = np.unique(np.concatenate([table[:, 0] for pair in files for table in pair]))
     eye = range_bearing(measurement_cov)
     sight = eye if sighting_cov is None else range_bearing(sighting_cov)
@@ -164,7 +155,7 @@ def mrclam_team(
         sensor=sensors_of(team, 0),
         tags=names,
         filter_options={"update": "sequential"},
-        landmarks=np.array([points[name] for name in names]),
+        landmarks=points,
         dropped=dropped,
         corrections=corrections,
         source=SOURCE,
@@ -173,10 +164,9 @@ def mrclam_team(
 
 
 def white_noise(v: float, omega: float) -> NoiseCov:
-    """Noise of (v, ω) whose integral does not depend on how time is cut: covariance density/Δt.
+    """White noise of (v, ω) with covariance density/Δt, so that time steps can be divided.
 
-    v [m²/s], omega [rad²/s]: the variance of travel and heading gained in a second. An interval of
-    zero, over which nothing moves, gets zero.
+    v [m²/s], omega [rad²/s]: the variance of travel and heading per second. Where Δt = 0 it is 0.
     """
 
     def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
@@ -187,20 +177,10 @@ def white_noise(v: float, omega: float) -> NoiseCov:
     return noise_cov
 
 
-def _read_robot(folder: Path, robot: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Odometry (·, 3) and measurements (·, 4) of one robot, with their times."""
-    odometry = _read_in_time(
-        TextFile(folder / f"Robot{robot}_Odometry.dat", "#"), ("time", "v", "omega")
-    )
-    seen = _read_in_time(
-        TextFile(folder / f"Robot{robot}_Measurement.dat", "#"),
-        ("time", "barcode", "range", "bearing"),
-    )
-    return odometry, seen
-
-
-def _hold(odometry: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Controls (T, 3): the velocity in force at the time before, and the interval since."""
+def _hold(
+    odometry: Float[np.ndarray, "K 3"], time: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T 3"]:
+    """Controls: the velocity at the time before, and the interval since."""
     start = np.concatenate([time[:1], time[:-1]])
     latest = np.searchsorted(odometry[:, 0], start, side="right") - 1
     velocity = np.where((latest >= 0)[:, None], odometry[np.maximum(latest, 0), 1:], 0.0)
@@ -209,14 +189,14 @@ def _hold(odometry: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[n
 
 
 def _associate(
-    seen: NDArray[np.float64],
-    time: NDArray[np.float64],
+    seen: Float[np.ndarray, "J 4"],
+    time: Float[np.ndarray, "T"],
     subject_of: dict[int, int],
     names: tuple[int, ...],
 ) -> tuple[list[int], list[int], list[int], dict[str, int]]:
-    """Row, tag and index of the measurements kept, and how many were dropped why.
+    """Row, tag and index of the measurements kept, and the number of dropped ones by reason.
 
-    names: the subjects asked for, landmarks first; their tags are their places in the list.
+    names: the subjects, landmarks first; their tags are their indices in the list.
     """
     tag_of = {name: tag for tag, name in enumerate(names)}
     dropped = dict.fromkeys(_DROPS, 0)
@@ -233,63 +213,3 @@ def _associate(
         else:
             kept[int(row[k]), tag_of[subject]] = k
     return [r for r, _ in kept], [t for _, t in kept], list(kept.values()), dropped
-
-
-def _read_in_time(file: TextFile, names: tuple[str, ...]) -> NDArray[np.float64]:
-    """A table whose first column never decreases."""
-    table: list[list[float]] = []
-    for line, fields in file:
-        values = file.numbers(line, fields, names)
-        if table and values[0] < table[-1][0]:
-            raise file.error(line, f"time goes back from {table[-1][0]} to {values[0]}")
-        if names[1] == "barcode":
-            file.identity(line, fields[1], "barcode")
-            if values[2] < 0:
-                raise file.error(line, f"the range {values[2]} is negative")
-        table.append(values)
-    if not table:
-        raise file.end_error("no data in the file")
-    return np.array(table)
-
-
-def _read_barcodes(file: TextFile) -> tuple[dict[int, int], tuple[int, ...]]:
-    """The subject of each barcode, and the landmarks among the subjects in rising order."""
-    subject_of: dict[int, int] = {}
-    for line, fields in file:
-        file.expect(line, fields, ("subject", "barcode"))
-        subject = file.identity(line, fields[0], "subject")
-        barcode = file.identity(line, fields[1], "barcode")
-        if barcode in subject_of or subject in subject_of.values():
-            raise file.error(line, f"subject {subject} or barcode {barcode} occurs twice")
-        subject_of[barcode] = subject
-    names = tuple(sorted(set(subject_of.values()) - set(ROBOTS)))
-    if not names:
-        raise file.end_error("no landmark in the file")
-    return subject_of, names
-
-
-def _read_survey(file: TextFile, names: tuple[int, ...]) -> dict[int, list[float]]:
-    """The position of every landmark."""
-    points: dict[int, list[float]] = {}
-    for line, fields in file:
-        columns = ("subject", "x", "y", "sigma_x", "sigma_y")
-        _, x, y, _, _ = file.numbers(line, fields, columns)
-        subject = file.identity(line, fields[0], "subject")
-        if subject not in names:
-            raise file.error(line, f"subject {subject} is no landmark in Barcodes.dat")
-        if subject in points:
-            raise file.error(line, f"subject {subject} occurs twice")
-        points[subject] = [x, y]
-    missing = [name for name in names if name not in points]
-    if missing:
-        raise file.end_error(f"no position of subject {missing[0]} in the file")
-    return points
-
-
-def _correct(points: dict[int, list[float]]) -> tuple[str, ...]:
-    """Undo the exchange of data set 1, if this is its survey; what was done, in words."""
-    if any(points.get(subject) != position for subject, position in EXCHANGED.items()):
-        return ()
-    one, other = EXCHANGED
-    points[one], points[other] = points[other], points[one]
-    return (f"the surveyed positions of subjects {one} and {other} were exchanged",)

@@ -1,11 +1,11 @@
-"""The Plaza data sets: a lawn mower among four radio beacons that measure its distance alone."""
+"""Reader of the Plaza data sets: a lawn mower with range measurements to four radio beacons."""
 
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float
 
 from jaxslam.datasets.dataset import Dataset, make_log
 from jaxslam.motion import pose_increment
@@ -19,13 +19,13 @@ SOURCE = (
 _TABLES = {"DR": 3, "TD": 4, "TL": 3, "GT": 4}
 _COLUMNS = "DR: t, distance, turn; TD: t, sender, receiver, range; TL: id, x, y; GT: t, x, y, θ"
 RANGE_BIAS = (0.03, 0.069)
-"""Offset [m] and scale by which the ranges of both files exceed the distances: a line through all
-ranges of either file against the distances of the survey from the ground truth, least squares. It
-is taken from the ground truth, as of a radio calibrated beforehand; no estimator here finds it."""
+"""Offset [m] and scale by which the ranges of both files exceed the distances: the least-squares
+line through all ranges against the distances between survey and ground truth. It stands for a radio
+calibrated beforehand; no estimator here finds it."""
 RANGE_COV = ((0.5**2,),)
-"""What is left after that, in both files: white from one range of a beacon to the next."""
+"""Variance of the ranges after that correction [m²]; successive ranges of a beacon are white."""
 TRAVEL_DENSITY = (0.03**2, 0.03**2, 0.003**2)
-"""Variance of forward [m²/m], sideways [m²/m] and turn [rad²/m] gained in a metre of travel."""
+"""Variance of forward [m²/m], sideways [m²/m] and heading motion [rad²/m] per metre of travel."""
 
 
 def plaza(
@@ -35,18 +35,17 @@ def plaza(
     odometry_cov: NoiseCov | None = None,
     measurement_cov: NoiseCov = RANGE_COV,
 ) -> Dataset:
-    """Read `Plaza1_.mat` or `Plaza2_.mat`: odometry, ranges, surveyed beacons and ground truth.
+    """The data set in `Plaza1_.mat` or `Plaza2_.mat`: odometry, ranges, survey and ground truth.
 
     The file's tables are DR (t, distance, turn), TD (t, sender, receiver, range), TL (id, x, y of a
     beacon) and GT (t, x, y, θ). The log has a row at the time of every range: its control is the
-    pose increment (dx, dy, dθ) of the odometry since the row before, the last odometry row of it
-    cut at that time, in proportion. Ranges of one time share a row; of several of one beacon there
-    the first counts, and those before the first ground truth or after the last odometry do not;
-    the others are counted as dropped. A range z is corrected to (z - offset)/(1 + scale) by
-    `range_bias`.
+    pose increment (dx, dy, dθ) of the odometry since the row before, with a proportional part of
+    the odometry row that this time divides. Ranges of one time share a row. Dropped and counted are
+    ranges before the first ground truth or after the last odometry, and all but the first range of
+    a beacon at one time. A range z is corrected to (z - offset)/(1 + scale) by `range_bias`.
 
-    `true_path` is the ground truth at the time of each row, linear between its rows. The map's
-    frame is that of the robot's first pose, the survey's and the path's is another.
+    `true_path` is the ground truth at the time of each row, interpolated linearly. The map's frame
+    is the robot's first pose; survey and true path are in another frame.
 
     Source: Djugash, Hamner & Roth, Journal of Field Robotics 26(9), 2009, as with GTSAM:
     `gtsam.findExampleDataFile("Plaza1_.mat")`.
@@ -58,9 +57,9 @@ def plaza(
             `TRAVEL_DENSITY` times the distance.
         measurement_cov: (1, 1) covariance of a range, or a function of z.
     Raises:
-        ValueError: `path: reason` where the file cannot be read, lacks a table, has one of another
-            shape or not finite, times of odometry or ground truth do not rise, a range is not
-            positive or of a beacon without a survey.
+        ValueError: `path: reason` where the file cannot be read, lacks a table, has a table of
+            another shape or not finite, times of odometry or ground truth that do not increase, a
+            range that is not positive or of a beacon without a survey.
     """
     tables = _read(Path(path))
     odometry, ranges, survey, truth = (tables[name] for name in _TABLES)
@@ -116,12 +115,13 @@ def plaza(
     )
 
 
-def _read(path: Path) -> dict[str, NDArray[np.float64]]:
-    import scipy.io  # a tenth of a second, for this one kind of file
+def _read(path: Path) -> dict[str, Float[np.ndarray, "_ _"]]:
+    """The tables of a file; raises ValueError on any other content."""
+    import scipy.io  # slow to load, and needed for this data set alone
 
     try:
         content = scipy.io.loadmat(path, appendmat=False)
-    except Exception as problem:  # scipy's own MatReadError is of no public class
+    except Exception as problem:  # scipy's MatReadError is not public
         raise ValueError(f"{path}: cannot be read as a .mat file: {problem}") from problem
     tables = {}
     for name, columns in _TABLES.items():
@@ -140,10 +140,12 @@ def _read(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def _increments(
-    odometry: NDArray[np.float64], begin: float, times: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(T, 3) the motion since the time before, composed of the odometry's: each row of it is a
-    constant twist from the row before to its own time."""
+    odometry: Float[np.ndarray, "K 3"], begin: float, times: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T 3"]:
+    """Pose increments (T, 3) between successive times.
+
+    A row of the odometry is a constant twist from the time of the row before to its own.
+    """
     edges = np.unique(np.concatenate([[begin], odometry[:, 0], times]))
     edges = edges[(edges >= begin) & (edges <= times[-1])]
     ends = np.concatenate([[begin], odometry[:, 0]])
@@ -165,13 +167,17 @@ def _increments(
     )
 
 
-def _between(truth: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+def _between(
+    truth: Float[np.ndarray, "G 4"], times: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T 3"]:
+    """Poses at some times, linear between the rows of the ground truth."""
     heading = np.interp(times, truth[:, 0], np.unwrap(truth[:, 3]))
     x, y = (np.interp(times, truth[:, 0], truth[:, k]) for k in (1, 2))
     return np.column_stack([x, y, np.arctan2(np.sin(heading), np.cos(heading))])
 
 
 def _by_travel(pose: jax.Array, u: jax.Array) -> jax.Array:
+    """`TRAVEL_DENSITY` times the distance travelled."""
     square = u[0] ** 2 + u[1] ** 2
     moved = square > 0
     travel = jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""The Victoria Park data set, as GTSAM distributes it: a truck among trees, association given."""
+"""Reader of the Victoria Park data set as GTSAM distributes it, with known data association."""
 
 from pathlib import Path
 
@@ -29,17 +29,16 @@ def victoria_park(
     odometry_cov: NoiseCov | None = None,
     measurement_cov: NoiseCov | None = None,
 ) -> Dataset:
-    """Read `victoria_park.txt`: pose increments, and landmark positions in the frame of a pose.
+    """The data set in `victoria_park.txt`: pose increments, and landmarks in the robot's frame.
 
-    Lines `ODOMETRY i j dx dy dθ` and `LANDMARK i j x y`, each followed by the upper triangle of its
-    covariance; poses and landmarks share one numbering. Odometry must be one chain, and the noise
-    the same on every line of a kind: it becomes the noise of the models, unless overridden. Joint
-    correction: a scan holds two trees at the most. Landmarks have their tags in the order of their
-    numbers; there is no ground truth. GTSAM finds the file:
-    `gtsam.findExampleDataFile("victoria_park.txt")`.
+    The file has lines `ODOMETRY i j dx dy dθ` and `LANDMARK i j x y`, each followed by the upper
+    triangle of its covariance; poses and landmarks share one numbering. Odometry must be one chain,
+    and the covariance the same on every line of a kind: it is the noise of the models by default.
+    The correction is joint, since a scan has at most two landmarks. Tags follow the landmarks'
+    numbers; there is no ground truth. `gtsam.findExampleDataFile("victoria_park.txt")` is the file.
 
-    A scan at the very first pose gets a row of its own, with zero control; then a control of
-    exactly zero carries no noise.
+    A scan at the first pose gets a row of its own, with zero control; then a control of exactly
+    zero has no noise.
 
     Source: Guivant & Nebot, IEEE Trans. Robotics and Automation 17(3), 2001, as with GTSAM.
 
@@ -49,12 +48,12 @@ def victoria_park(
             file's.
         measurement_cov: (2, 2) covariance of (x, y), or a function of z, instead of the file's.
     Raises:
-        ValueError: `path:line: reason` on a line that is malformed or breaks one of these rules.
+        ValueError: `path:line: reason` on a line that is malformed or against these rules.
     """
     file = TextFile(path)
     controls: list[list[float]] = []
     poses: dict[int, int] = {}
-    sightings: list[tuple[int, int, int, list[float]]] = []
+    landmark_lines: list[tuple[int, int, int, list[float]]] = []
     odometry_noise = _Constant(file, 3)
     landmark_noise = _Constant(file, 2)
     last = -1
@@ -74,18 +73,18 @@ def victoria_park(
         elif keyword == "LANDMARK":
             values = file.numbers(line, fields, _LANDMARK)
             i, j = (file.identity(line, fields[k], "ij"[k]) for k in (0, 1))
-            sightings.append((line, i, j, values[2:4]))
+            landmark_lines.append((line, i, j, values[2:4]))
             landmark_noise.add(line, values[4:])
         else:
             raise file.error(line, f"unknown keyword {keyword!r}")
-    if not controls or not sightings:
+    if not controls or not landmark_lines:
         raise file.end_error(f"no {'LANDMARK' if controls else 'ODOMETRY'} line in the file")
 
-    _check_sightings(file, poses, sightings)
-    at_start = any(poses[i] == 0 for _, i, _, _ in sightings)
+    _check_landmark_lines(file, poses, landmark_lines)
+    at_start = any(poses[i] == 0 for _, i, _, _ in landmark_lines)
     if at_start:
         controls.insert(0, [0.0, 0.0, 0.0])
-    names = tuple(sorted({j for _, _, j, _ in sightings}))
+    names = tuple(sorted({j for _, _, j, _ in landmark_lines}))
     tag_of = {name: tag for tag, name in enumerate(names)}
     first = 0 if at_start else 1
     odometry_file = _unless_still(odometry_noise.cov) if at_start else odometry_noise.cov
@@ -93,9 +92,9 @@ def victoria_park(
         name="victoria_park",
         log=make_log(
             controls,
-            [poses[i] - first for _, i, _, _ in sightings],
-            [tag_of[j] for _, _, j, _ in sightings],
-            [z for _, _, _, z in sightings],
+            [poses[i] - first for _, i, _, _ in landmark_lines],
+            [tag_of[j] for _, _, j, _ in landmark_lines],
+            [z for _, _, _, z in landmark_lines],
         ),
         time=np.arange(first, first + len(controls), dtype=np.float64),
         motion=pose_increment(odometry_file if odometry_cov is None else odometry_cov),
@@ -109,7 +108,7 @@ def victoria_park(
 
 
 class _Constant:
-    """A covariance that each line repeats as its upper triangle."""
+    """A covariance that every line repeats as its upper triangle."""
 
     def __init__(self, file: TextFile, size: int) -> None:
         self.file = file
@@ -117,6 +116,7 @@ class _Constant:
         self.cov: NDArray[np.float64] = np.zeros((size, size))
 
     def add(self, line: int, triangle: list[float]) -> None:
+        """Take the covariance of a line; raises ValueError unless it equals earlier ones."""
         if self.triangle and triangle != self.triangle:
             raise self.file.error(line, "the covariance differs from that of earlier lines")
         if not self.triangle:
@@ -130,11 +130,12 @@ class _Constant:
                 raise self.file.error(line, str(problem)) from problem
 
 
-def _check_sightings(
-    file: TextFile, poses: dict[int, int], sightings: list[tuple[int, int, int, list[float]]]
+def _check_landmark_lines(
+    file: TextFile, poses: dict[int, int], landmark_lines: list[tuple[int, int, int, list[float]]]
 ) -> None:
+    """Raise ValueError on a landmark line without a pose, of a pose, or repeated."""
     seen: set[tuple[int, int]] = set()
-    for line, i, j, _ in sightings:
+    for line, i, j, _ in landmark_lines:
         if i not in poses:
             raise file.error(line, f"no odometry leads to pose {i}")
         if j in poses:
@@ -145,6 +146,8 @@ def _check_sightings(
 
 
 def _unless_still(cov: ArrayLike) -> NoiseCov:
+    """A noise covariance that is zero where the control is."""
+
     def noise(pose: jax.Array, u: jax.Array) -> jax.Array:
         return jnp.where((u == 0).all(), 0.0, jnp.asarray(cov, u.dtype))
 

@@ -1,1 +1,1 @@
-"""Results of campaigns: text, files, figures, a page, and the folder that keeps finished runs."""
+"""Results of campaigns: tables, files, figures, an HTML page, and the folder of finished runs."""

@@ -1,16 +1,7 @@
-"""Results on paper: a campaign's table, JSON and CSV, and files that appear whole or not."""
+"""Results as text: a campaign's table, JSON and CSV, and CSV of a single run."""
 
-import csv
-import io
-import json
 import math
-import os
-import platform
-import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -26,6 +17,7 @@ from jaxslam.consistency import (
 )
 from jaxslam.consistency.verdict import TESTS
 from jaxslam.monte_carlo import Campaign
+from jaxslam.results.files import csv_text, json_text, versions
 from jaxslam.types import Estimate
 
 ROWS = (
@@ -51,15 +43,15 @@ ROWS = (
     ("rotation_information", "learnt of a turn [1/rad²]", "0"),
     ("log_likelihood", "log-likelihood", ""),
 )
-"""Measure, its name in the table, and what an honest filter shows."""
+"""Rows of the table: key of the measure, label, and the value of a consistent filter."""
 
 _COLUMNS = 5
 
 
-def table(campaign: Campaign) -> str:
-    """The campaign for a human: one column a filter, one row a measure, and the verdicts.
+def campaign_table(campaign: Campaign) -> str:
+    """The campaign as a text table: a column a filter, a row a measure, and notes below.
 
-    Filters beyond the fifth start a further table.
+    Each five filters have a table of their own.
     """
     names = list(campaign.filters)
     parts = [names[i : i + _COLUMNS] for i in range(0, len(names), _COLUMNS)]
@@ -84,8 +76,10 @@ def table(campaign: Campaign) -> str:
 
 
 def qualified(campaign: Campaign) -> list[str]:
-    """A sentence on each filter that was not rejected, with what would have been noticed, and on
-    each verdict that has to be qualified, which has an asterisk in the table."""
+    """Sentences on the power of the test of each filter not rejected, and on each verdict's doubts.
+
+    Verdicts with doubts have an asterisk in the table.
+    """
     out = []
     for name, summary in campaign.filters.items():
         power = power_of(summary.noticed)
@@ -96,7 +90,7 @@ def qualified(campaign: Campaign) -> list[str]:
 
 
 def not_finite(campaign: Campaign) -> list[str]:
-    """A sentence on each filter that was not finite in some runs, with the numbers of those."""
+    """A sentence on each filter that was not finite in some runs, with their numbers."""
     out = []
     for name, summary in campaign.filters.items():
         lost = summary.not_finite_runs
@@ -110,19 +104,22 @@ def not_finite(campaign: Campaign) -> list[str]:
 
 
 def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> str:
-    """Everything but the curves, with versions, seed and command line; no NaN or infinity in it."""
+    """The campaign without its curves as JSON, with versions, seed and command; NaN is null."""
     filters = {
         name: {
             "verdict": s.verdict,
             "rejected_by": s.by,
-            "noticed": {key: _numbers(np.asarray(ends)) for key, ends in s.noticed.items()},
+            "noticed": {key: _finite_or_none(np.asarray(ends)) for key, ends in s.noticed.items()},
             "doubts": s.doubts,
-            "measures": {key: _finite(measure._asdict()) for key, measure in s.measures.items()},
+            "measures": {
+                key: dict(zip(Measure._fields, _finite_or_none(measure), strict=True))
+                for key, measure in s.measures.items()
+            },
             "nis_band": s.nis_band,
             "steps_inside_band": s.inside,
-            "coverage": {block: _numbers(share) for block, share in s.coverage.items()},
-            "autocorrelation": _numbers(s.autocorrelation),
-            "autocorrelation_band": _numbers(s.autocorrelation_band),
+            "coverage": {block: _finite_or_none(share) for block, share in s.coverage.items()},
+            "autocorrelation": _finite_or_none(s.autocorrelation),
+            "autocorrelation_band": _finite_or_none(s.autocorrelation_band),
             "not_finite_runs": s.not_finite_runs,
             "counts": s.counts,
         }
@@ -149,15 +146,10 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
     return json_text(head | {"filters": filters})
 
 
-def json_text(content: Mapping[str, Any]) -> str:
-    """Indented JSON; raises ValueError on a NaN or an infinity, which JSON does not have."""
-    return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-
-
 def as_csv(campaign: Campaign) -> str:
-    """The curves: one row a filter and step; an empty cell where there is no number."""
-    keys = list(dict.fromkeys(key for s in _of(campaign) for key in s.curves))
-    nothing = np.full(campaign.steps, np.nan)  # a filter without landmarks, say, lacks some
+    """The curves as CSV: a row for each filter and step; cells without a number are empty."""
+    keys = list(dict.fromkeys(key for s in campaign.filters.values() for key in s.curves))
+    nothing = np.full(campaign.steps, np.nan)  # some filters lack a curve, as of landmarks
     rows: list[list[str]] = []
     for name, s in campaign.filters.items():
         columns = [map(_blank, s.curves.get(key, nothing).tolist()) for key in keys]
@@ -166,21 +158,21 @@ def as_csv(campaign: Campaign) -> str:
 
 
 def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
-    """One row a step: time, pose and the upper triangle of its covariance (x, y, θ)."""
+    """A path as CSV: a row a step with time, pose and the upper triangle of the pose covariance."""
     header = ["time", "x", "y", "theta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt"]
     rows, columns = np.triu_indices(3)
     triangle = np.asarray(estimate.pose_cov)[:, rows, columns]
     values = np.concatenate(
         [np.asarray(time)[:, None], np.asarray(estimate.pose), triangle], axis=1
     )
-    # 17 digits for the time, an epoch; nine for the rest.
+    # Time may be an epoch, which needs 17 digits; nine suffice for the rest.
     return csv_text(
         header, [[f"{row[0]:.17g}", *(f"{value:.9g}" for value in row[1:])] for row in values]
     )
 
 
 def map_csv(estimate: Estimate, names: Sequence[int]) -> str:
-    """One row a landmark of a map at one time: the data set's name of it, position, covariance."""
+    """A map as CSV: a row a landmark with its name in the data set, position and covariance."""
     rows = []
     for i in np.flatnonzero(np.asarray(estimate.alive)):
         cov = np.asarray(estimate.point_covs[i])
@@ -189,61 +181,8 @@ def map_csv(estimate: Estimate, names: Sequence[int]) -> str:
     return csv_text(["landmark", "x", "y", "c_xx", "c_xy", "c_yy"], rows)
 
 
-def csv_text(header: list[str], rows: list[list[str]]) -> str:
-    """Comma-separated text with a header line."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return out.getvalue()
-
-
-def versions() -> dict[str, str]:
-    """Of Python, this package and what it computes with."""
-    return {"python": platform.python_version()} | {
-        name: version(name) for name in ("jax", "numpy")
-    }
-
-
-def check_writable(folder: Path) -> None:
-    """Raise OSError now, before hours of work, if files cannot be written to the folder.
-
-    The folder is not made here; its nearest existing parent is tried. The error names the folder as
-    it was given.
-    """
-    try:
-        there = folder.absolute()
-        while not there.exists():
-            there = there.parent
-        if not there.is_dir():
-            raise NotADirectoryError(f"{there} is not a folder")
-        with tempfile.TemporaryFile(dir=there):
-            pass
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise type(error)(f"results cannot be written to {folder}: {reason}") from error
-
-
-def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], Any]]) -> list[Path]:
-    """Write files, each text or a function that saves to a path; they appear whole or not at all.
-
-    All are written to a hidden folder beside the target first and moved in place only when the last
-    one is complete; on any error, an interrupt too, nothing of them stays behind.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as hidden:
-        for name, content in files.items():
-            target = Path(hidden) / name
-            if callable(content):
-                content(target)
-            else:
-                target.write_text(content, encoding="utf-8")
-        for name in files:
-            os.replace(Path(hidden) / name, folder / name)
-    return [folder / name for name in files]
-
-
 def _columns(campaign: Campaign, names: list[str]) -> str:
+    """The table of some filters."""
     summaries = [campaign.filters[name] for name in names]
     lines = [["", "honest", *names]]
     lines.append(["verdict", "consistent", *map(_verdict, summaries)])
@@ -255,7 +194,7 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
         if any(figure is not None for figure in note):
             figures = ["" if figure is None else f"{figure:.4g}" for figure in note]
             lines.append(["  published", "", *figures])
-    lines.append([f"NIS / dof, {LEVEL:.0%} band", "", *(_band(s.nis_band) for s in summaries)])
+    lines.append([f"NIS / dof, {LEVEL:.0%} band", "", *(_band_text(s.nis_band) for s in summaries)])
     first = [s.autocorrelation_band[0] for s in summaries]
     lags = [f"± {half:.4f}" if np.isfinite(half) else "-" for half in first]
     lines.append([f"autocorrelation, {LEVEL:.0%} band", "", *lags])
@@ -284,19 +223,16 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
     return "\n".join(text)
 
 
-def _of(campaign: Campaign) -> list[Summary]:
-    return list(campaign.filters.values())
-
-
 def _verdict(summary: Summary) -> str:
-    """The word, which tests spoke, and an asterisk where it is qualified."""
-    spoke = ", ".join(
+    """The verdict, the tests that rejected, and an asterisk if there are doubts."""
+    rejected = ", ".join(
         TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in summary.by
     )
-    return summary.verdict + f" ({spoke})" * bool(spoke) + "*" * bool(summary.doubts)
+    return summary.verdict + f" ({rejected})" * bool(rejected) + "*" * bool(summary.doubts)
 
 
 def _cell(measure: Measure | None) -> str:
+    """A measure with its interval, as text."""
     if measure is None:
         return "-"
     value, low, high = measure
@@ -307,17 +243,15 @@ def _cell(measure: Measure | None) -> str:
     return f"{value:.4g} ± {(high - low) / 2:.2g}"
 
 
-def _band(band: tuple[float, float] | None) -> str:
+def _band_text(band: tuple[float, float] | None) -> str:
     return "-" if band is None else f"[{band[0]:.4f}, {band[1]:.4f}]"
 
 
-def _numbers(values: np.ndarray) -> list[float | None]:
+def _finite_or_none(values: Iterable[float]) -> list[float | None]:
+    """The values, with None for those that are not finite."""
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-def _finite(values: dict[str, float]) -> dict[str, float | None]:
-    return {k: float(v) if np.isfinite(v) else None for k, v in values.items()}
-
-
 def _blank(value: float) -> str:
+    """A number as a cell of CSV, empty if it is not finite."""
     return f"{value:.9g}" if math.isfinite(value) else ""

@@ -1,4 +1,4 @@
-"""Is my Jacobian right? One call over a motion model, a sensor, or any function with a claim."""
+"""Verification of hand-derived Jacobians: of a motion model, a sensor, or any function."""
 
 from jaxslam.verify.record import Check, Finding, Report, table
 from jaxslam.verify.verifier import build, verify_jacobians

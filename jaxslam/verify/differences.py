@@ -1,58 +1,58 @@
-"""Difference quotients with an error estimate: the Jacobian that sees only a function's values."""
+"""Jacobians by difference quotients, with an error estimate."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
-Values = NDArray[np.float64]
-Batch = Callable[..., NDArray[np.generic]]
+Values: TypeAlias = Float[np.ndarray, "..."]
+Batch: TypeAlias = Callable[..., ArrayLike]
 """Arrays (B, n), one an argument, -> values (B, m)."""
 
 _HALVINGS = 24
 _LARGEST = 0.25
 _ORDERS = 6
 _FINE = 20
-"""the halving at which sides are compared: h = 2.4e-7"""
+"""the halving at which the one-sided quotients are compared: h = 2.4e-7"""
 _KINK = 0.05
-"""how far the two sides may differ, relative"""
+"""relative difference of the one-sided quotients above which there is no derivative"""
 
 
 class Quotient(NamedTuple):
-    """A Jacobian by differences, and how far it can be trusted."""
+    """A Jacobian by differences at S states, with its estimated error."""
 
-    value: Values
-    """(S, m, n)"""
-    error: Values
-    """(S, m, n) estimated; inf where the quotients do not converge."""
-    kink: NDArray[np.bool_]
-    """(S, m, n) whether the slopes on the two sides differ"""
+    value: Float[np.ndarray, "S m n"]
+    error: Float[np.ndarray, "S m n"]
+    """estimated; inf where the quotients do not converge"""
+    kink: Bool[np.ndarray, "S m n"]
+    """whether the one-sided derivatives differ"""
 
 
 def quotients(
     function: Batch,
     arguments: tuple[Values, ...],
     which: int,
-    periods: Values,
+    periods: Float[np.ndarray, "m"],
     halvings: int = _HALVINGS,
 ) -> Quotient:
-    """∂f/∂argument at S samples: central differences, Richardson's extrapolation, its error.
+    """∂f/∂argument at S states: central differences with Richardson's extrapolation.
 
     Steps h = ¼, ⅛, … are extrapolated to h → 0 (orders 2, 4, …, as in Ridders 1982); of all entries
-    of the tableau the one with the least estimated error is kept, where the estimate joins the
-    change from its neighbours to the rounding of f and of the argument over h.
+    of the tableau the one with the least estimated error is kept. The estimate is the change from
+    its neighbours plus the rounding error of f and of the argument over h.
 
-    Where the slopes to the left and to the right differ there is no derivative, though the central
-    quotients may converge: `kink` says so. On a circle, steps that turn by more than half of it
-    tell nothing.
+    Where the one-sided derivatives differ there is no derivative, though the central quotients may
+    converge: `kink` says so. Of an output on a circle, steps that change it by more than half a
+    period are ignored.
 
     Args:
-        function: float64 in and out, all columns, steps and samples in one call.
+        function: float64 in and out; called once with all columns, steps and states.
         arguments: (S, n_k) each.
         which: the argument to differentiate by.
         periods: (m,) period of an output on a circle, inf on a line; a jump by one is undone.
-        halvings: how many steps.
+        halvings: number of steps.
     """
     x = arguments[which]
     count, n = x.shape
@@ -67,7 +67,7 @@ def quotients(
     values = np.asarray(function(*flat), np.float64).reshape(count, 2, halvings, n, -1)
     rise = values[:, 0] - values[:, 1]
     rise = on_circle(rise, periods)
-    # The step that was taken, rounding of x ± h included.
+    # The step after rounding of x ± h.
     width = (ends[:, 0] - ends[:, 1])[:, :, np.arange(n), np.arange(n)]  # (S, H, n)
     level = np.moveaxis(rise / width[..., None], 1, 0)  # (H, S, n, m)
     fine = min(_FINE, halvings - 1)
@@ -100,8 +100,10 @@ def quotients(
     return Quotient(best.swapaxes(1, 2), least.swapaxes(1, 2), kink.swapaxes(1, 2))
 
 
-def on_circle(difference: Values, periods: Values) -> Values:
-    """Differences (…, m) less the whole periods in them."""
+def on_circle(
+    difference: Float[np.ndarray, "*batch m"], periods: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "*batch m"]:
+    """Differences modulo their periods, in [-period/2, period/2]; inf is the period of a line."""
     turns = np.where(np.isfinite(periods), periods, 1.0)
     return np.where(
         np.isfinite(periods), difference - turns * np.round(difference / turns), difference
@@ -110,10 +112,10 @@ def on_circle(difference: Values, periods: Values) -> Values:
 
 def complex_step(
     function: Batch, arguments: tuple[Values, ...], which: int, step: float = 1e-30
-) -> Values:
-    """∂f/∂argument (S, m, n) as Im f(x + ih)/h: no cancellation (Squire & Trapp 1998).
+) -> Float[np.ndarray, "S m n"]:
+    """∂f/∂argument as Im f(x + ih)/h, without cancellation (Squire & Trapp 1998).
 
-    Only for a function that is analytic and takes complex numbers; the caller makes sure.
+    Right only for a function that is analytic and takes complex numbers.
     """
     x = arguments[which]
     count, n = x.shape

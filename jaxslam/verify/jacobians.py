@@ -1,63 +1,71 @@
-"""A Jacobian four ways (forward, reverse, by hand, by differences), and who is wrong."""
+"""The Jacobians of a function computed in four ways: forward, reverse, by hand, by differences."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float
 
 from jaxslam.math.xla import quick_jit
-from jaxslam.verify.differences import Quotient, complex_step, quotients
+from jaxslam.verify.differences import Batch, Quotient, complex_step, quotients
+from jaxslam.verify.errors import describe_error
+from jaxslam.verify.functions import Function, periods
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples
-from jaxslam.verify.subject import Function, periods
-from jaxslam.verify.trouble import told
 
-Values = NDArray[np.float64]
+Values: TypeAlias = Float[np.ndarray, "_ _ _"]
+"""Jacobians (S, m, n)."""
+
+States: TypeAlias = Float[np.ndarray, "_ _"]
+"""States (S, n) of one argument."""
 
 _CHUNK = 2048
-"""rows in one call of a compiled function"""
+"""number of rows in one call of a compiled function"""
 _FEW = 8
-"""step sizes for a function that cannot be traced, which is called one state at a time"""
+"""number of step sizes for a function that cannot be traced and is called state by state"""
 
 
 class Evaluation(NamedTuple):
     """The Jacobians of one function by one argument at S states."""
 
     methods: dict[str, Values]
-    """jacfwd, jacrev, hand: (S, m, n) float64; a method that could not be had is missing"""
+    """jacfwd, jacrev and hand in float64; a method that failed is missing"""
     single: dict[str, Values]
     """the same computed in float32, held in float64"""
-    single_error: Values
-    """(S, m, n) how far autodiff in float32 is from float64 at the states rounded to float32"""
+    single_error: np.ndarray
+    """(S, m, n) error of autodiff in float32, at the states rounded to float32; () if unknown"""
     quotient: Quotient | None
     how: str
+    """the kind of quotient: differences or complex step"""
 
 
 class Evaluated(NamedTuple):
-    """All that is computed about one function."""
+    """A function with its values and Jacobians at the samples."""
 
     function: Function
     """with its outputs named"""
     samples: Samples
-    values: Values | None
-    """(S, m) in float64"""
+    values: Float[np.ndarray, "S m"] | None
+    """in float64; None if the function cannot be called"""
     by_argument: tuple[Evaluation, ...]
     checks: tuple[Check, ...]
 
 
 def evaluate(function: Function, samples: Samples) -> Evaluated:
-    """Compute every Jacobian of a function in float64 and float32. Troubles become checks."""
+    """Compute every Jacobian of a function in float64 and float32; failures become checks."""
     arguments = samples.values
     return _Evaluator(function, samples, arguments).result()
 
 
 class _Evaluator:
-    def __init__(self, function: Function, samples: Samples, arguments: tuple[Values, ...]):
+    """One evaluation of a function, which collects checks on its way."""
+
+    def __init__(self, function: Function, samples: Samples, arguments: tuple[States, ...]):
         self.function, self.samples, self.arguments = function, samples, arguments
         self.sizes = [a.shape[1] for a in arguments]
         self.over = tuple(range(len(arguments)))
@@ -67,10 +75,7 @@ class _Evaluator:
         outputs = self._outputs()
         if outputs is None:
             return Evaluated(self.function, self.samples, None, (), tuple(self.checks))
-        function = self.function
-        self.function = Function(
-            function.name, function.call, function.arguments, outputs, function.hand
-        )
+        self.function = replace(self.function, outputs=outputs)
         rounded = tuple(a.astype(np.float32) for a in self.arguments)
         double = self._autodiff(self.arguments)
         single = self._autodiff(rounded)
@@ -96,23 +101,26 @@ class _Evaluator:
 
     @cached_property
     def traceable(self) -> bool:
-        """Whether JAX can trace the function; the check that says so is made here."""
+        """Whether JAX can trace the function; also adds the check of it."""
         try:
             jax.eval_shape(self.function.call, *(a[0] for a in self.arguments))
         except (Exception, SystemExit) as error:
-            self.checks.append(Check(f"{self.function.name} is traceable", False, told(error)))
+            self.checks.append(
+                Check(f"{self.function.name} is traceable", False, describe_error(error))
+            )
             return False
         self.checks.append(Check(f"{self.function.name} is traceable", True))
         return True
 
     def _outputs(self) -> tuple[str, ...] | None:
+        """The names of the outputs; None, with a failed check, if they are no vector."""
         name, named = self.function.name, self.function.outputs
         first = [jnp.asarray(a[0]) for a in self.arguments]
         call = self.function.call
         try:
             out = jax.eval_shape(call, *first) if self.traceable else call(*first)
         except (Exception, SystemExit) as error:
-            self.checks.append(Check(f"{name} can be called", False, told(error)))
+            self.checks.append(Check(f"{name} can be called", False, describe_error(error)))
             return None
         shape = getattr(out, "shape", None)
         if np.issubdtype(getattr(out, "dtype", float), np.complexfloating):
@@ -128,15 +136,15 @@ class _Evaluator:
         return named or tuple(f"{name}[{k}]" for k in range(shape[0]))
 
     @cached_property
-    def values(self) -> Callable[..., Any]:
-        """Batches of arguments -> values (B, m)."""
+    def values(self) -> Batch:
+        """The function of batches of arguments -> values (B, m)."""
         if self.traceable:
             return _in_chunks(quick_jit(jax.vmap(self.function.call)))
         return _looped(self.function.call)
 
     @cached_property
     def both_modes(self) -> Callable[..., Any]:
-        """Batches of arguments -> Jacobians by forward and by reverse mode."""
+        """The function of batches of arguments -> Jacobians by forward and by reverse mode."""
 
         def both(*arguments: jax.Array) -> Any:
             forward = jax.jacfwd(self.function.call, argnums=self.over)(*arguments)
@@ -144,7 +152,7 @@ class _Evaluator:
 
         return quick_jit(jax.vmap(both))
 
-    def _autodiff(self, arguments: tuple[Any, ...]) -> dict[str, list[Values | None]]:
+    def _autodiff(self, arguments: tuple[States, ...]) -> dict[str, list[Values | None]]:
         if not self.traceable:
             return {}
         try:
@@ -152,7 +160,7 @@ class _Evaluator:
         except (Exception, SystemExit) as error:
             name = f"{self.function.name} can be differentiated in {arguments[0].dtype}"
             if all(check.name != name for check in self.checks):
-                self.checks.append(Check(name, False, told(error)))
+                self.checks.append(Check(name, False, describe_error(error)))
             return {}
         return {
             "jacfwd": [np.asarray(part, np.float64) for part in forward],
@@ -176,9 +184,11 @@ class _Evaluator:
                 shaped = self._split(jax.eval_shape(hand, *first))
                 batch: Callable[..., Any] = quick_jit(jax.vmap(hand))
             except (jax.errors.JAXTypeError, TypeError) as error:
-                shaped = self._split(hand(*first))  # raises again if it is not about tracing
+                shaped = self._split(hand(*first))  # raises again unless tracing was the fault
                 batch = _looped(hand)
-                self.checks.append(Check(f"{name} is called state by state", True, told(error)))
+                self.checks.append(
+                    Check(f"{name} is called state by state", True, describe_error(error))
+                )
             for into, dtype in ((double, np.float64), (single, np.float32)):
                 parts = self._split(batch(*(a.astype(dtype) for a in self.arguments)))
                 into["hand"] = [
@@ -187,10 +197,10 @@ class _Evaluator:
             claimed = sum(part is not None for part in shaped)
             self.checks.append(Check(f"{name} has its shape", True, f"{claimed} claimed"))
         except (Exception, SystemExit) as error:
-            self.checks.append(Check(f"{name} can be used", False, told(error)))
+            self.checks.append(Check(f"{name} can be used", False, describe_error(error)))
 
     def _split(self, claim: Any) -> list[Any]:
-        """One part an argument of what a hand-derived Jacobian returns; ValueError on a shape."""
+        """A claimed Jacobian split by argument; raises ValueError on a wrong shape."""
         rows = len(self.function.outputs)
         if not isinstance(claim, tuple | list):
             shape = np.shape(claim)
@@ -214,6 +224,7 @@ class _Evaluator:
         return list(claim)
 
     def _quotient(self, which: int) -> tuple[Quotient, str]:
+        """The Jacobian by differences or, where possible, by the complex step; and which it is."""
         circle = periods(self.function.outputs)
         arguments = self.arguments
         halvings = {} if self.traceable else {"halvings": _FEW}
@@ -223,7 +234,7 @@ class _Evaluator:
                 exact = complex_step(self.values, arguments, which)
             except (Exception, SystemExit):
                 return found, "differences"
-            # Only where differences confirm it: `abs` or a comparison spoils it silently.
+            # Only where differences confirm it: `abs` and comparisons make it wrong.
             off = np.abs(exact - found.value) > 10 * found.error + 1e-9 * np.abs(found.value)
             if np.isfinite(exact).all() and not off[found.error < np.inf].any():
                 rounding = 1e-14 * np.abs(exact).max(axis=2, keepdims=True, initial=0)
@@ -232,10 +243,10 @@ class _Evaluator:
         return found, "differences"
 
 
-def _in_chunks(batch: Callable[..., Any]) -> Callable[..., Any]:
-    """Any number of rows through a function of _CHUNK rows, so that it is compiled once."""
+def _in_chunks(batch: Batch) -> Batch:
+    """The function applied to any number of rows, _CHUNK at a time, so that it is compiled once."""
 
-    def call(*arguments: Values) -> Any:
+    def call(*arguments: States) -> np.ndarray:
         count = len(arguments[0])
         padded = [np.resize(a, (-(-count // _CHUNK) * _CHUNK, *a.shape[1:])) for a in arguments]
         parts = [
@@ -248,12 +259,13 @@ def _in_chunks(batch: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _of_argument(methods: dict[str, list[Values | None]], k: int) -> dict[str, Values]:
+    """The Jacobians by argument k, by each method that has one."""
     parts = {name: jacobians[k] for name, jacobians in methods.items()}
     return {name: part for name, part in parts.items() if part is not None}
 
 
 def _as_claim(claim: Any) -> Any:
-    """A claim as one array, or as a tuple of them; a list of numbers is an array."""
+    """A claimed Jacobian as one array or a tuple of arrays; a list of rows is one array."""
     if claim is None:
         raise ValueError("returns None: is a `return` missing?")
     if isinstance(claim, list):
@@ -262,16 +274,17 @@ def _as_claim(claim: Any) -> Any:
     return claim
 
 
-def _worst_gap(methods: dict[str, Values], reference: dict[str, Values]) -> Values:
+def _worst_gap(methods: dict[str, Values], reference: dict[str, Values]) -> np.ndarray:
+    """The largest difference of any method from its reference; () without methods."""
     gaps = [np.abs(methods[how] - reference[how]) for how in methods if how in reference]
-    worst: Values = np.max(gaps, axis=0) if gaps else np.zeros(())
+    worst: np.ndarray = np.max(gaps, axis=0) if gaps else np.zeros(())
     return np.where(np.isfinite(worst), worst, 0.0)
 
 
 def _looped(call: Callable[..., Any]) -> Callable[..., Any]:
-    """A batch one state at a time, for what cannot be traced; keeps None in tuples."""
+    """The function applied state by state, if it cannot be traced; keeps None in tuples."""
 
-    def batch(*arguments: Values) -> Any:
+    def batch(*arguments: States) -> Any:
         rows = [call(*(jnp.asarray(a[i]) for a in arguments)) for i in range(len(arguments[0]))]
         if isinstance(rows[0], tuple | list):
             return tuple(

@@ -1,11 +1,12 @@
-"""How far a model bends where its input may lie: second order, since that is where EKFs fail."""
+"""Linearity indices: the nonlinearity of a model relative to its linear change, within n σ."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math.linalg import check_covariance, is_concrete, root_psd
@@ -16,16 +17,20 @@ _RADII = (1.0, 0.5)
 
 
 class Linearity(NamedTuple):
-    """0 is linear; 1 bends as far as it rises; inf bends where it has no (finite) slope."""
+    """Linearity indices of a function.
 
-    hessian: jax.Array
-    """() the worst output, to second order"""
-    sampled: jax.Array
-    """() the worst output, by trying points of the region"""
-    hessian_rows: jax.Array
-    """(m,) one an output"""
-    sampled_rows: jax.Array
-    """(m,)"""
+    0: linear; 1: the nonlinear part is as large as the linear change; inf: there is no (finite)
+    linear change.
+    """
+
+    hessian: Float[Array, ""]
+    """largest of the outputs, to second order"""
+    sampled: Float[Array, ""]
+    """largest of the outputs, at points of the region"""
+    hessian_rows: Float[Array, "m"]
+    """of each output, to second order"""
+    sampled_rows: Float[Array, "m"]
+    """of each output, at points of the region"""
 
 
 def linearity_index(
@@ -37,19 +42,19 @@ def linearity_index(
     residual: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
     noise_cov: ArrayLike | None = None,
 ) -> Linearity:
-    """How far f: (n,) -> (m,) departs from its linearization within n_σ sigmas of x ~ N(x, P).
+    """Linearity indices of f: (n,) -> (m,) within n_σ standard deviations of x, with covariance P.
 
     With P = L Lᵀ, the region |ξ| <= n_σ of x + Lξ (Solà's probability concentration region, 2.3.5
-    and fig. 6), Jacobian J and Hessians H_i at x, an output's index is its largest bend over its
-    largest linear change,
+    and fig. 6), Jacobian J and Hessians H_i at x, the index of an output is its largest departure
+    from the linearization over its largest linear change,
 
         index_i = sup |f_i(x + Lξ) - f_i(x) - J_i Lξ| / (n_σ √(J_i P J_iᵀ + R_ii)),
 
     the supremum once to second order, (n_σ²/2)‖Lᵀ H_i L‖₂, and once as the maximum over points of
     the region: along ± each axis and ± each eigenvector of Lᵀ H_i L, and in 64 fixed random
     directions, at n_σ and n_σ/2. It has no unit, and changing those of x changes nothing. R, where
-    given, is the noise that is added to f: a bend below it does no harm. (Civera, Davison & Montiel
-    2008 use a related index, along the line of sight.)
+    given, is the covariance of noise added to f: a smaller departure does no harm. (Civera, Davison
+    & Montiel 2008 use a related index, along the line of sight.)
 
     Traceable: wrap it in `jax.jit`, or in `jax.vmap` over states.
 
@@ -58,10 +63,10 @@ def linearity_index(
         x: (n,) the state.
         cov: (n, n) P, may be singular.
         sigmas: n_σ.
-        residual: (y, y0) -> y ⊖ y0, where an output is on a circle.
+        residual: (y, y0) -> y ⊖ y0, for outputs on a circle.
         noise_cov: (m, m) R.
     Raises:
-        ValueError: if cov or noise_cov is no covariance of the right size, or sigmas not above 0.
+        ValueError: if cov or noise_cov is not a covariance of the right size, or sigmas <= 0.
     """
     point = _vector("linearity_index: state", x)
     if is_concrete(point) and not np.all(np.isfinite(np.asarray(point))):
@@ -78,33 +83,33 @@ def linearity_index(
         return f(point + root @ xi)
 
     zero = jnp.zeros_like(point)
-    jacobian, bend = jax.jacfwd(f)(point), jax.jacfwd(jax.jacfwd(g))(zero)
+    jacobian, hessians = jax.jacfwd(f)(point), jax.jacfwd(jax.jacfwd(g))(zero)
     slope = jacobian @ root
     rows = slope.shape[0]
     reach2 = jnp.sum(slope**2, axis=1)
     if noise_cov is not None:
         check_covariance("linearity_index: noise_cov", noise_cov, rows)
         reach2 = reach2 + jnp.diagonal(jnp.asarray(noise_cov, point.dtype))
-    smooth = jnp.isfinite(bend).all(axis=(1, 2))
-    values, vectors = jnp.linalg.eigh(jnp.where(smooth[:, None, None], bend, 0.0))  # (m, n, n)
+    smooth = jnp.isfinite(hessians).all(axis=(1, 2))
+    values, vectors = jnp.linalg.eigh(jnp.where(smooth[:, None, None], hessians, 0.0))  # (m, n, n)
     by_hessian = sigmas**2 / 2 * jnp.max(jnp.abs(values), axis=1, initial=0.0)
     by_hessian = jnp.where(smooth, by_hessian, jnp.inf)
 
-    axes = jnp.concatenate([jnp.eye(len(zero), dtype=point.dtype), _fixed(len(zero), point.dtype)])
+    axes, random = jnp.eye(len(zero), dtype=point.dtype), _random_directions(len(zero), point.dtype)
     own = jnp.swapaxes(jax.lax.stop_gradient(vectors), 1, 2).reshape(-1, len(zero))
-    directions = jnp.concatenate([axes, own])
+    directions = jnp.concatenate([axes, random, own])
     tries = jnp.concatenate([sign * r * directions for r in _RADII for sign in (1, -1)]) * sigmas
     centre, difference = g(zero), residual or jnp.subtract
     away = jax.vmap(lambda xi: difference(g(xi), centre) - slope @ xi)(tries)
-    if residual is not None:  # a change by more than half a turn is one the other way round
+    if residual is not None:  # changes by more than half a turn are wrapped
         away = jax.vmap(lambda gap: difference(gap, jnp.zeros_like(gap)))(away)
     by_sampling = jnp.max(jnp.abs(away), axis=0, initial=0.0)
-    # What rounding of f, and of the points themselves, can do is no bend.
+    # Differences within the rounding of f and of the points count as none.
     moved = jnp.abs(centre) + jnp.abs(tries @ slope.T).max(axis=0)
     rounding = 16 * jnp.finfo(point.dtype).eps * (moved + jnp.abs(jacobian) @ jnp.abs(point))
     by_sampling = jnp.where(by_sampling <= rounding, 0.0, by_sampling)
 
-    index, sampled = (_over(part, sigmas, reach2) for part in (by_hessian, by_sampling))
+    index, sampled = (_index(part, sigmas, reach2) for part in (by_hessian, by_sampling))
     return Linearity(index.max(initial=0.0), sampled.max(initial=0.0), index, sampled)
 
 
@@ -144,7 +149,7 @@ def sensor_linearity(
 ) -> Linearity:
     """`linearity_index` of `observe` by pose and landmark, covariance cov (3+L, 3+L).
 
-    with_noise: whether a bend below the sensor's own noise counts as none (R in the reach).
+    with_noise: whether departures are relative to the sensor's noise, too (R in the index).
     """
     at = _vector("sensor_linearity: pose", pose, 3)
     own = _vector("sensor_linearity: landmark", landmark, len(sensor.landmark))
@@ -160,8 +165,8 @@ def sensor_linearity(
     )
 
 
-def _vector(name: str, value: ArrayLike, size: int | None = None) -> jax.Array:
-    """As floating point, (n,); ValueError where it is not."""
+def _vector(name: str, value: ArrayLike, size: int | None = None) -> Float[Array, "n"]:
+    """A value as a floating-point vector; raises ValueError on another shape."""
     out = jnp.asarray(value)
     if out.ndim != 1 or size not in (None, out.shape[0]):
         expected = "(n,)" if size is None else f"({size},)"
@@ -169,8 +174,8 @@ def _vector(name: str, value: ArrayLike, size: int | None = None) -> jax.Array:
     return out.astype(jnp.result_type(out, float))
 
 
-def _over(bend: jax.Array, sigmas: float, reach2: jax.Array) -> jax.Array:
-    """bend / (n_σ √reach²); 0/0 = 0, and inf where there is a bend alone or f is not finite."""
+def _index(bend: Float[Array, "m"], sigmas: float, reach2: Float[Array, "m"]) -> Float[Array, "m"]:
+    """bend / (n_σ √reach²), with 0/0 = 0; inf if only reach is 0 or f is not finite."""
     defined = jnp.isfinite(bend) & jnp.isfinite(reach2)
     flat = defined & (reach2 == 0)
     bend, reach2 = jnp.where(defined, bend, 0.0), jnp.where(defined & ~flat, reach2, 1.0)
@@ -178,7 +183,7 @@ def _over(bend: jax.Array, sigmas: float, reach2: jax.Array) -> jax.Array:
     return jnp.where(defined, jnp.where(flat & (bend == 0), 0.0, ratio), jnp.inf)
 
 
-def _fixed(n: int, dtype: Any) -> jax.Array:
-    """Directions (64, n), the same every time."""
+def _random_directions(n: int, dtype: np.dtype[np.floating]) -> Float[Array, "K n"]:
+    """Fixed random unit vectors (64, n)."""
     draws = np.random.default_rng(0).normal(size=(_DIRECTIONS, n))
     return jnp.asarray(draws / np.linalg.norm(draws, axis=1, keepdims=True), dtype)

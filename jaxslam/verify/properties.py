@@ -1,43 +1,46 @@
-"""What people get wrong beside Jacobians: round trips, residuals, noise, purity, bad places."""
+"""Checks beside Jacobians: round trips, residuals, noise, purity, finite values, dtypes."""
 
 import contextlib
 import io
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxslam.math.linalg import check_covariance
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
+from jaxslam.verify.differences import on_circle
+from jaxslam.verify.errors import describe_error, line_of
+from jaxslam.verify.functions import Function, periods
 from jaxslam.verify.jacobians import Evaluated
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples
-from jaxslam.verify.subject import Function, periods
-from jaxslam.verify.trouble import line_of, told
 
-Values = NDArray[np.float64]
+Values: TypeAlias = np.ndarray
 
 _ROUNDING = 1e-9
-"""for round trips in float64, relative to the coordinates"""
+"""tolerance of round trips in float64, relative to the coordinates"""
 _GAUSS_NEWTON = 12
+"""number of iterations"""
 
 
-def of_function(evaluated: Evaluated) -> Iterator[Check]:
-    """Of any function: finite values and derivatives, purity, the same under jit and vmap."""
+def function_checks(evaluated: Evaluated) -> Iterator[Check]:
+    """Checks of any function: finite values and derivatives, purity, and jit and vmap agree."""
     if evaluated.values is None:
         return
     function = evaluated.function
-    yield _finite(evaluated)
+    yield _finite_check(evaluated)
     if any(evaluation.methods for evaluation in evaluated.by_argument):
         yield from _guarded(f"{function.name} is pure", lambda: _pure(function, evaluated))
 
 
-def of_model_function(evaluated: Evaluated) -> Iterator[Check]:
-    """Of a function of a model: float32 in, float32 out."""
+def dtype_checks(evaluated: Evaluated) -> Iterator[Check]:
+    """The check of a model's function that its result has the dtype of its arguments."""
     if any(evaluation.methods for evaluation in evaluated.by_argument):
         function = evaluated.function
         yield from _guarded(
@@ -45,35 +48,35 @@ def of_model_function(evaluated: Evaluated) -> Iterator[Check]:
         )
 
 
-def of_motion(motion: Motion, samples: Samples) -> Iterator[Check]:
-    """Of a motion model: its noise, its heading, and `perturb`."""
+def motion_checks(motion: Motion, samples: Samples) -> Iterator[Check]:
+    """Checks of a motion model: its noise, its heading, and `perturb`."""
     pose, u, w = samples.values
     yield from _guarded("noise covariance", lambda: _covariances(motion.noise_cov, (pose, u)))
 
-    def wrapped() -> str:
+    def heading_error() -> str:
         heading = np.asarray(quick_jit(jax.vmap(motion.step))(pose, u, w))[:, 2]
         worst = float(np.max(np.abs(heading)))
         return "" if worst <= np.pi else f"a heading of {worst:.6g} rad is returned"
 
-    yield from _guarded("the heading is wrapped to (-π, π]", wrapped)
+    yield from _guarded("the heading is wrapped to (-π, π]", heading_error)
     perturb = motion.perturb
     if perturb is None:
         return
 
-    def through_the_control() -> str:
+    def perturb_error() -> str:
         def gap(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
             there = motion.step(pose, perturb(u, w), jnp.zeros_like(w))
             return there - motion.step(pose, u, w)
 
-        return _on_circle(
+        return _deviation(
             quick_jit(jax.vmap(gap))(pose, u, w), np.array([np.inf, np.inf, 2 * np.pi])
         )
 
-    yield from _guarded("step(pose, u, w) = step(pose, perturb(u, w), 0)", through_the_control)
+    yield from _guarded("step(pose, u, w) = step(pose, perturb(u, w), 0)", perturb_error)
 
 
-def of_sensor(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check]:
-    """Of a sensor: noise, residual, and that `invert` and `observe` undo each other."""
+def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check]:
+    """Checks of a sensor: noise, residual, and that `invert` is the inverse of `observe`."""
     circle = periods(sensor.measurements)
     z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*seen.values), np.float64)
     yield from _guarded("noise covariance", lambda: _covariances(sensor.noise_cov, (z,)))
@@ -85,34 +88,33 @@ def of_sensor(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check
     )
     yield from _guarded(
         "the residual is antisymmetric",
-        lambda: _on_circle(residual(z, other) + residual(other, z), circle),
+        lambda: _deviation(residual(z, other) + residual(other, z), circle),
     )
     yield from _guarded(
         "the residual is a difference, wrapped on the circle",
-        lambda: _wrapped(residual, z, other, circle),
+        lambda: _residual_error(residual, z, other, circle),
     )
     if not sensor.landmark:
         return
 
-    def forth() -> str:
+    def observation_error() -> str:
         def again(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
             return sensor.residual(sensor.observe(pose, sensor.invert(pose, z, s)), z)
 
-        # At range zero there is no direction to give back, and a measurement without one is not one
-        # that the sensor could have made.
+        # At range zero the bearing is lost.
         regular = np.array(["zero" not in label and "= 0" not in label for label in inverse.labels])
         few = tuple(a[regular] for a in inverse.values)
         size = 1 + np.abs(few[0]).max()
         return _exactly(np.asarray(quick_jit(jax.vmap(again))(*few)) / size)
 
-    yield from _guarded("observe undoes invert, whatever is free", forth)
+    yield from _guarded("observe undoes invert, whatever is free", observation_error)
     yield from _guarded(
-        "invert undoes observe, within what is free", lambda: _inverted(sensor, seen)
+        "invert undoes observe, within what is free", lambda: _inversion_error(sensor, seen)
     )
 
 
-def _inverted(sensor: Sensor, seen: Samples) -> str:
-    """For a landmark seen first from a pose, some s with invert(pose, observe(pose, l), s) = l."""
+def _inversion_error(sensor: Sensor, seen: Samples) -> str:
+    """The error of invert(pose, observe(pose, l), s) = l for the best s, or ""."""
     usual = [i for i, label in enumerate(seen.labels) if label == "random"]
     pose = seen.values[0][usual]
     point = pose[:, :2] + np.roll(pose[:, :2], 1, axis=0) / 2 + 1
@@ -149,37 +151,37 @@ def _inverted(sensor: Sensor, seen: Samples) -> str:
     )
 
 
-def _wrap_named(difference: jax.Array, names: tuple[str, ...]) -> jax.Array:
+def _wrap_named(difference: Float[jax.Array, "L"], names: tuple[str, ...]) -> jax.Array:
+    """A difference of named entries, with angles wrapped."""
     circle = periods(names)
-    on_circle = np.isfinite(circle)
-    turn = np.where(on_circle, circle, 1.0)
-    return difference - jnp.where(on_circle, turn * jnp.round(difference / turn), 0.0)
+    circular = np.isfinite(circle)
+    turn = np.where(circular, circle, 1.0)
+    return difference - jnp.where(circular, turn * jnp.round(difference / turn), 0.0)
 
 
-def _wrapped(
+def _residual_error(
     residual: Callable[[Values, Values], jax.Array], z: Values, other: Values, circle: Values
 ) -> str:
+    """What is wrong with residual(z, ẑ) = z - ẑ modulo the periods, or ""."""
     plain = np.asarray(residual(z, other))
-    on_circle = np.isfinite(circle)
-    wanted = z - other
-    turn = np.where(on_circle, circle, 1.0)
-    wanted = np.where(on_circle, wanted - turn * np.round(wanted / turn), wanted)
-    off = plain - wanted
-    off = np.where(on_circle, off - turn * np.round(off / turn), off)
+    circular = np.isfinite(circle)
+    period = np.where(circular, circle, 1.0)
+    off = on_circle(plain - on_circle(z - other, circle), circle)
     if np.abs(off).max() > _ROUNDING * (1 + np.abs(z).max()):
         return f"residual(z, ẑ) differs from z - ẑ by {np.abs(off).max():.3g}"
-    if np.any(np.abs(plain)[:, on_circle] > turn[on_circle] / 2 + 1e-12):
+    if np.any(np.abs(plain)[:, circular] > period[circular] / 2 + 1e-12):
         return "an angle beyond half a turn is returned"
     for turns in (1, -3):
-        whole = np.where(on_circle, turns * turn, 0.0)
+        whole = np.where(circular, turns * period, 0.0)
         far = np.abs(np.asarray(residual(z + whole, other)) - plain)
-        far = np.where(on_circle, np.minimum(far, np.abs(far - turn)), far)
+        far = np.where(circular, np.minimum(far, np.abs(far - period)), far)
         if far.max() > 1e-8:
             return "a whole turn more changes it"
     return ""
 
 
-def _covariances(noise_cov: Callable[..., Any], arguments: tuple[Values, ...]) -> str:
+def _covariances(noise_cov: Callable[..., jax.Array], arguments: tuple[Values, ...]) -> str:
+    """What is wrong with the noise covariances at some arguments, or ""."""
     covs = np.asarray(quick_jit(jax.vmap(noise_cov))(*arguments))
     for cov in covs:
         try:
@@ -189,20 +191,20 @@ def _covariances(noise_cov: Callable[..., Any], arguments: tuple[Values, ...]) -
     return ""
 
 
-def _on_circle(difference: Any, circle: Values) -> str:
-    off = np.asarray(difference, np.float64)
-    turn = np.where(np.isfinite(circle), circle, 1.0)
-    off = np.where(np.isfinite(circle), off - turn * np.round(off / turn), off)
+def _deviation(difference: ArrayLike, circle: Float[np.ndarray, "m"]) -> str:
+    """How far a difference is from zero modulo the periods, or "" within rounding."""
+    off = on_circle(np.asarray(difference, np.float64), circle)
     worst = float(np.max(np.abs(np.where(np.isnan(off), np.inf, off)), initial=0.0))
     return "" if worst <= _ROUNDING else f"off by {worst:.3g}, relative to the coordinates"
 
 
-def _exactly(difference: Any) -> str:
-    """As `_on_circle`, of what is on none."""
-    return _on_circle(difference, np.full(np.shape(difference)[-1], np.inf))
+def _exactly(difference: ArrayLike) -> str:
+    """As `_deviation`, for entries that are not on a circle."""
+    return _deviation(difference, np.full(np.shape(difference)[-1], np.inf))
 
 
-def _finite(evaluated: Evaluated) -> Check:
+def _finite_check(evaluated: Evaluated) -> Check:
+    """The check that values and Jacobians are finite at every state."""
     function, samples = evaluated.function, evaluated.samples
     assert evaluated.values is not None
     parts = {"a value": evaluated.values}
@@ -229,13 +231,13 @@ def _finite(evaluated: Evaluated) -> Check:
 
 
 def _line_of_nan(function: Function, state: tuple[Values, ...], what: str) -> str:
-    """The user's line at which a NaN or an infinity appears, in the function or its derivative."""
-    call: Callable[..., Any] = function.call
+    """The user's line at which a NaN or an infinity first appears in the computation of `what`."""
+    call: Callable[..., object] = function.call
     if what != "a value" and "hand" not in what:
         call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
     elif "hand" in what and function.hand is not None:
         call = function.hand
-    try:  # jax says on standard output what it found
+    try:  # JAX prints what it found
         with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
             call(*(jnp.asarray(a) for a in state))
     except (Exception, SystemExit) as error:
@@ -244,7 +246,7 @@ def _line_of_nan(function: Function, state: tuple[Values, ...], what: str) -> st
 
 
 def _pure(function: Function, evaluated: Evaluated) -> str:
-    """jit = no jit, twice the same, vmap = one by one; at two states, to keep it quick."""
+    """Whether the function agrees with itself when called twice, and under jit and vmap; or ""."""
     assert evaluated.values is not None
     finite = np.flatnonzero(np.isfinite(evaluated.values).all(axis=1))
     for i in finite[[0, -1]] if len(finite) else ():
@@ -254,12 +256,13 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
             return "two calls with the same arguments differ: it keeps or draws something"
         scale = 1.0 + max(float(np.max(np.abs(np.asarray(a)), initial=0)) for a in (*state, first))
         off = first - evaluated.values[i]
-        if bad := _on_circle(off / scale, function.periods / scale):
+        if bad := _deviation(off / scale, function.periods / scale):
             return f"under jit and vmap the value is another, {bad}"
     return ""
 
 
 def _dtypes(function: Function, samples: Samples) -> str:
+    """Which dtype is not kept, or ""."""
     for dtype in (np.float32, np.float64):
         shapes = (jax.ShapeDtypeStruct(a.shape[1:], dtype) for a in samples.values)
         out = jax.eval_shape(function.call, *shapes)
@@ -269,9 +272,9 @@ def _dtypes(function: Function, samples: Samples) -> str:
 
 
 def _guarded(name: str, run: Callable[[], str]) -> Iterator[Check]:
-    """The check of that name: passed if run returns "", else what it says or raises."""
+    """A check by name, passed if run returns ""; else it reports the result or the exception."""
     try:
         trouble = run()
     except (Exception, SystemExit) as error:
-        trouble = told(error)
+        trouble = describe_error(error)
     yield Check(name, not trouble, trouble)

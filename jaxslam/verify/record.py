@@ -1,4 +1,4 @@
-"""What a verification says: findings on Jacobians, other checks, and their text."""
+"""The results of a verification: findings on Jacobians, other checks, and their text."""
 
 import math
 import textwrap
@@ -7,31 +7,31 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 _SHOWN = 3
-"""wrong entries of a Jacobian that are shown with their values; the others by name"""
+"""number of wrong entries of a Jacobian that are printed with their values; others by name only"""
 
 
 @dataclass(frozen=True)
 class WrongEntry:
-    """An entry of a Jacobian on which the methods differ, and where they do worst."""
+    """An entry of a Jacobian on which the methods differ, with the state where they differ most."""
 
     row: str
     """the output, with its unit"""
     column: str
     """the entry of the argument, with its unit"""
     states: int
-    """at how many states it is wrong"""
+    """number of states at which it is wrong"""
     precision: str
-    """float64 or float32: where it is worst"""
+    """float64 or float32, in which they differ most"""
     label: str
-    """what is special about that state"""
+    """name of the kind of state"""
     state: dict[str, list[float]]
     values: dict[str, float]
-    """the entry there, by each method"""
+    """the entry at that state, by each method"""
     dissent: tuple[str, ...]
-    """the methods that disagree with the others there"""
+    """the methods that disagree with the others at that state"""
 
     def lines(self, samples: int) -> Iterator[str]:
-        """For a human."""
+        """The entry as lines of text."""
         odd = (
             f"{' and '.join(self.dissent)} {'disagrees' if len(self.dissent) == 1 else 'disagree'}"
         )
@@ -44,48 +44,48 @@ class WrongEntry:
 
 @dataclass(frozen=True)
 class Finding:
-    """One Jacobian: how far the ways of computing it differ, and where they must not."""
+    """The comparison of one Jacobian: how far its methods differ, and its wrong entries."""
 
     function: str
     argument: str
     passed: bool
     methods: tuple[str, ...]
-    """the ways it was computed: jacfwd, jacrev, hand, differences"""
+    """the methods by which it was computed: jacfwd, jacrev, hand, differences"""
     absolute: float
-    """worst difference among jacfwd, jacrev and hand, float64"""
+    """largest difference among jacfwd, jacrev and hand, in float64"""
     relative: float
     """the same over the largest entry of the Jacobian's row at that state"""
     tolerance: float
     float32: float | None
-    """the worst relative difference in float32; None where it was not computed"""
+    """largest relative difference in float32; None where it was not computed"""
     float32_tolerance: float
     differences: float | None
-    """worst relative difference from the quotients, where they converge"""
+    """largest relative difference from the quotients, where they converge"""
     differences_tolerance: float
     quotient: str
-    """complex step, or central differences"""
+    """the kind of quotient: differences or complex step"""
     samples: int
     no_derivative: int
-    """samples at which the quotients do not converge, so that they say nothing"""
+    """number of samples at which the quotients do not converge and are ignored"""
     worst_state: dict[str, Any]
-    """label, entry and state where a difference is largest beside its tolerance"""
+    """label, entry and state with the largest difference over its tolerance"""
     wrong_entries: tuple[WrongEntry, ...]
-    """every entry outside its tolerance at some state, the one that is so at most states first"""
+    """every entry outside its tolerance at some state, in falling order of the number of states"""
 
     @property
     def name(self) -> str:
-        """As in "observe by pose"."""
+        """Function and argument, as in "observe by pose"."""
         return f"{self.function} by {self.argument}"
 
     def lines(self) -> Iterator[str]:
-        """For a human, more of it where it failed."""
-        single = "" if self.float32 is None else f", float32 {_short(self.float32)}"
+        """The finding as lines of text, longer where it failed."""
+        single = "" if self.float32 is None else f", float32 {_two_digits(self.float32)}"
         quotient = ""
         if self.differences is not None:
-            quotient = f", {self.quotient} {_short(self.differences)}"
+            quotient = f", {self.quotient} {_two_digits(self.differences)}"
         odd = f" ({self.no_derivative} without a derivative)" if self.no_derivative else ""
         verdict = "ok  " if self.passed else "FAIL"
-        worst = f"worst {_short(self.absolute)} abs, {_short(self.relative)} rel"
+        worst = f"worst {_two_digits(self.absolute)} abs, {_two_digits(self.relative)} rel"
         yield f"{verdict}  {self.name}: {worst}{single}{quotient}; {self.samples} states{odd}"
         for entry in self.wrong_entries[:_SHOWN]:
             yield from (f"      {line}" for line in entry.lines(self.samples))
@@ -96,44 +96,44 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """Something other than a Jacobian that must hold."""
+    """The result of a check other than that of a Jacobian."""
 
     name: str
     passed: bool
     detail: str = ""
 
     def lines(self) -> Iterator[str]:
-        """For a human."""
+        """The check as a line of text."""
         detail = f": {self.detail}" if self.detail else ""
         yield f"{'ok  ' if self.passed else 'FAIL'}  {self.name}{detail}"
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that was found out about one model; `print` it, or ask `passed`."""
+    """The report on one model; `print` shows it, and `passed` is the result."""
 
     model: str
     kind: str
     findings: tuple[Finding, ...] = ()
     checks: tuple[Check, ...] = ()
     linearity: float | None = None
-    """of a model: median of `linearity_index` over the random states, for standard deviations of
-    0.1 (0.05 of [rad] and [1/m])"""
+    """of a model, the median of `linearity_index` over the random states, for standard deviations
+    of 0.1 (0.05 of [rad] and [1/m])"""
     notes: tuple[str, ...] = field(default=())
 
     @property
     def passed(self) -> bool:
-        """Whether nothing failed, and anything was looked at."""
+        """Whether nothing failed and something was checked."""
         return bool(self.findings or self.checks) and self.failures == 0
 
     @property
     def failures(self) -> int:
-        """How many Jacobians and other checks failed."""
+        """Number of Jacobians and other checks that failed."""
         verdicts = [f.passed for f in self.findings] + [c.passed for c in self.checks]
         return verdicts.count(False)
 
     def __str__(self) -> str:
-        """The report for a human."""
+        """The report as text."""
         verdict = "verified" if self.passed else f"{self.failures} FAILED"
         head = f"{self.kind} {self.model}: {verdict}"
         lines = [head]
@@ -151,8 +151,8 @@ class Report:
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: names, numbers, strings; None for what is not finite."""
-        plain: dict[str, Any] = _plain(
+        """The report as a dictionary for JSON; numbers that are not finite are None."""
+        plain: dict[str, Any] = _json_value(
             {
                 "model": self.model,
                 "kind": self.kind,
@@ -167,7 +167,7 @@ class Report:
 
 
 def table(reports: Sequence[Report]) -> str:
-    """One line a model: worst relative differences of its Jacobians, and what it came to."""
+    """The table of reports: a line a model with its largest relative differences and its result."""
     head = ("", "Jacobians", "float64", "float32", "differences", "checks", "linearity", "")
     lines = [head]
     for report in reports:
@@ -195,19 +195,21 @@ def table(reports: Sequence[Report]) -> str:
 
 
 def _worst(values: Sequence[float | None]) -> str:
+    """The largest of the values that are known, as text."""
     known = [value for value in values if value is not None]
-    return _short(max(known)) if known else "-"
+    return _two_digits(max(known)) if known else "-"
 
 
-def _short(value: float) -> str:
+def _two_digits(value: float) -> str:
     return f"{value:.1e}" if value else "0"
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
+    """A value with lists for tuples, and None for numbers that are not finite."""
     if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
+        return {key: _json_value(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
+        return [_json_value(part) for part in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value

@@ -1,28 +1,29 @@
-"""Where models are tried: random states, and the ones where planar models go wrong."""
+"""The states at which models are verified: random ones, and difficult ones by unit."""
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float
 
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Sensor
-from jaxslam.verify.subject import POSE, Argument
+from jaxslam.verify.functions import POSE, Argument
 
-Values = NDArray[np.float64]
+Values: TypeAlias = Float[np.ndarray, "_ _"]
+"""States (S, n) of one argument."""
 
 FAR = 1e5
-"""Metres from the origin: survey coordinates."""
+"""Distance from the origin, as of survey coordinates [m]."""
 OUT_OF_SIGHT = 16.0
-"""Metres from robot to a far landmark, along each axis."""
+"""Distance from the robot to a far landmark, along each axis [m]."""
 NEAR = 2.0**-10
-"""Metres from robot to landmark; a power of two, so that the offset is exact in float32 too."""
+"""Distance from the robot to a close landmark [m]; a power of two is exact in float32, too."""
 _SEAM = 1e-9
 
-# One coordinate at a time takes these, whatever the others are. 0.499 and 0.501 lie on both sides
-# of where `angles.sinc` changes from its series to the closed form.
+# One coordinate at a time takes these values while the others are random. Between 0.499 and 0.501
+# `angles.sinc` changes from its series to the closed form.
 _HARD = {
     "[rad]": (0.0, _SEAM, -_SEAM, 1e-4, np.pi - _SEAM, _SEAM - np.pi, np.pi, np.pi / 2),
     "[rad/s]": (0.0, _SEAM, -_SEAM, 1e-4, 0.499, 0.501),
@@ -32,22 +33,21 @@ _HARD = {
     "[1/m]": (0.0, _SEAM, -_SEAM, -0.5),
 }
 
-
-Group = tuple[str, tuple[Values, ...]]
-"""A label, and states (S, n) an argument."""
+Group: TypeAlias = tuple[str, tuple[Values, ...]]
+"""A label, and states (S, n) for each argument."""
 
 
 class Samples(NamedTuple):
-    """S states: an array (S, n) an argument, and what is special about each."""
+    """S states: an array (S, n) for each argument, and a label for each state."""
 
     values: tuple[Values, ...]
     labels: tuple[str, ...]
 
 
-def of_arguments(arguments: tuple[Argument, ...], count: int, seed: int) -> Samples:
-    """By the units: random, each coordinate at its hard values, near, far, and zero."""
+def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> Samples:
+    """Samples of a function's arguments by their units: random, difficult, near, far and zero."""
     rng = np.random.default_rng(seed)
-    base = tuple(_draw(rng, argument, count) for argument in arguments)
+    base = tuple(_sampled_argument(rng, argument, count) for argument in arguments)
     groups: list[Group] = [("random", base)]
     for k, argument in enumerate(arguments):
         groups += list(_one_at_a_time(base, k, argument))
@@ -66,14 +66,14 @@ def of_arguments(arguments: tuple[Argument, ...], count: int, seed: int) -> Samp
             close = base[k][:2].copy()
             close[:, :2] = base[places[0]][:2, :2] + distance * np.array([[1, 0.5], [-0.25, 1]])
             groups.append((f"{arguments[k].name} close", _replaced(base, k, close, 2)))
-    return _joined(groups)
+    return _concatenated(groups)
 
 
-def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
-    """States (pose, landmark) for `observe`, and (pose, measurement, free) for `invert`.
+def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
+    """Samples (pose, landmark) for `observe`, and (pose, measurement, free) for `invert`.
 
-    Landmarks are placed by the sensor's own `embed` and `invert`, seen first from another pose than
-    the present one; every coordinate of theirs also takes its hard values.
+    Landmarks come from the sensor's own `embed` and `invert`, first seen from another pose than the
+    present one; each of their coordinates also takes its difficult values.
     """
     rng = np.random.default_rng(seed)
     embed = quick_jit(jax.vmap(sensor.embed))
@@ -82,8 +82,8 @@ def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
     def at(poses: Values, points: Values) -> Values:
         return np.asarray(embed(poses, points), np.float64)
 
-    pose = _draw(rng, Argument("pose", POSE), count)
-    elsewhere = _draw(rng, Argument("pose", POSE), count)
+    pose = _sampled_argument(rng, Argument("pose", POSE), count)
+    elsewhere = _sampled_argument(rng, Argument("pose", POSE), count)
     offset = rng.normal(size=(count, 2)) * 4
     first = pose.copy()
     first[:, :2] = np.round(first[:, :2] * 64) / 64
@@ -112,13 +112,13 @@ def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
         for label, scale in (("landmark close to the sensor", NEAR), ("landmark at the sensor", 0)):
             seen = np.where(metres, z[few] * scale, z[few])
             near = np.asarray(place(pose[few], seen, s[few] * scale), np.float64)
-            if np.isfinite(near).all():  # where it is not, that is `invert`'s fault
+            if np.isfinite(near).all():  # else `invert` fails, which another check reports
                 groups.append((label, (pose[few], near)))
     there = np.array([[FAR, -FAR], [-FAR, FAR]])
     away = pose[:2].copy()
     away[:, :2] += there
     groups.append(("large coordinates", (away, at(away, away[:, :2] + offset[:2]))))
-    observed = _joined(groups)
+    observed = _concatenated(groups)
 
     back: list[Group] = [("random", (pose, z, s))]
     back += list(_one_at_a_time((pose, z, s), 0, Argument("pose", POSE)))
@@ -127,13 +127,13 @@ def of_sensor(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
     if len(mean):
         back.append(("free coordinates zero", (pose[few], z[few], 0 * s[few])))
     back.append(("large coordinates", (away, z[:2], s[:2])))
-    return observed, _joined(back)
+    return observed, _concatenated(back)
 
 
-def _one(rng: np.random.Generator, name: str, count: int) -> Values:
-    """(count,) draws of a coordinate by its unit."""
+def _sampled_entry(rng: np.random.Generator, name: str, count: int) -> Float[np.ndarray, "S"]:
+    """Random values of a coordinate by its unit."""
     unit = name.split(" ")[-1]
-    if "steering" in name:  # a wheel does not turn to the side
+    if "steering" in name:  # a wheel does not turn by a right angle
         return rng.uniform(-0.8, 0.8, count)
     if unit == "[rad]":
         return rng.uniform(-np.pi, np.pi, count)
@@ -146,20 +146,23 @@ def _one(rng: np.random.Generator, name: str, count: int) -> Values:
     return rng.normal(size=count) * (3.0 if unit == "[m]" else 1.0)
 
 
-def _draw(rng: np.random.Generator, argument: Argument, count: int) -> Values:
-    columns = [_one(rng, name, count) for name in argument.entries]
+def _sampled_argument(rng: np.random.Generator, argument: Argument, count: int) -> Values:
+    """Random values of an argument."""
+    columns = [_sampled_entry(rng, name, count) for name in argument.entries]
     table = np.stack(columns, axis=1) if columns else np.zeros((count, 0))
     table = argument.scale * table
-    if argument.scale != 1:  # noise: half of the states are nominal
+    if argument.scale != 1:  # noise: zero in half of the states
         table[::2] = 0
     return table
 
 
 def _is_place(argument: Argument) -> bool:
+    """Whether the argument is a pose or a point."""
     return argument.entries[:2] == POSE[:2]
 
 
 def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> Iterable[Group]:
+    """States in which one entry of an argument has a difficult value."""
     for column, name in enumerate(argument.entries):
         hard = np.array(_HARD.get(name.split(" ")[-1], ()))
         if "steering" in name:
@@ -176,10 +179,12 @@ def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> 
 
 
 def _replaced(base: tuple[Values, ...], which: int, new: Values, count: int) -> tuple[Values, ...]:
+    """The first states, with another value of one argument."""
     return tuple(new[:count] if k == which else a[:count] for k, a in enumerate(base))
 
 
 def _shifted(base: tuple[Values, ...], places: list[int], shift: Values) -> Iterable[Values]:
+    """The first states, with all poses and points shifted."""
     for k, a in enumerate(base):
         rows = a[: len(shift)].copy()
         if k in places:
@@ -187,7 +192,7 @@ def _shifted(base: tuple[Values, ...], places: list[int], shift: Values) -> Iter
         yield rows
 
 
-def _joined(groups: list[Group]) -> Samples:
+def _concatenated(groups: list[Group]) -> Samples:
     labels = tuple(label for label, parts in groups for _ in range(len(parts[0])))
     parts = zip(*(parts for _, parts in groups), strict=True)
     return Samples(tuple(np.concatenate(part) for part in parts), labels)

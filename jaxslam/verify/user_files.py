@@ -1,4 +1,4 @@
-"""A user's own Python file: the models and claimed Jacobians it defines, loaded because named."""
+"""A user's own Python file: the models and hand-derived Jacobians that it defines."""
 
 import contextlib
 import dataclasses
@@ -9,18 +9,20 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+
+from numpy.typing import ArrayLike
 
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import Check, Report, build
-from jaxslam.verify.trouble import is_users, told
+from jaxslam.verify.errors import describe_error, is_user_file
+from jaxslam.verify.functions import Claim
+from jaxslam.verify.verifier import Model
 
 CLAIMS = ("_jacobian", "_jacobians")
-"""A function of the name f + one of these claims the Jacobian of f."""
-
+"""Endings of names: f_jacobian is the hand-derived Jacobian of f."""
 
 ABOUT = ("arguments", "outputs", "states")
-"""f_arguments, f_outputs, f_states: what `verify_jacobians` is told about f."""
+"""Endings of names: f_arguments and others are arguments of `verify_jacobians` for f."""
 
 
 class UnusableFile(ValueError):
@@ -29,27 +31,27 @@ class UnusableFile(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """Something of a user's file to verify: the arguments of `verify_jacobians`."""
+    """A model or function of a user's file: the arguments of `verify_jacobians`."""
 
     name: str
-    model: Motion | Sensor | Callable[..., Any]
-    jacobian: Callable[..., Any] | None = None
+    model: Model
+    jacobian: Claim | None = None
     arguments: Mapping[str, Sequence[str] | int] | None = None
     outputs: Sequence[str] | None = None
-    states: Sequence[Any] | None = None
+    states: Sequence[ArrayLike] | None = None
 
 
-class Printed(io.TextIOBase):
-    """Stands in for standard output, and remembers which line of a user's file wrote to it."""
+class PrintRecorder(io.TextIOBase):
+    """A replacement of standard output that records which lines of a user's file write to it."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
-        """"file.py:12", in order, each once"""
+        """the lines as "file.py:12", in order, each once"""
 
     def write(self, text: str) -> int:
-        """Swallow the text; note where it came from."""
+        """Record the line that calls; the text is dropped."""
         frame = sys._getframe(1)
-        while frame.f_back is not None and not is_users(frame.f_code.co_filename):
+        while frame.f_back is not None and not is_user_file(frame.f_code.co_filename):
             frame = frame.f_back
         place = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
         if place not in self.lines:
@@ -58,23 +60,23 @@ class Printed(io.TextIOBase):
 
 
 @contextlib.contextmanager
-def watched() -> Iterator[Printed]:
-    """Within the block, what is printed is noted rather than shown."""
-    printed = Printed()
+def recorded_prints() -> Iterator[PrintRecorder]:
+    """A block in which printed text is recorded instead of shown."""
+    printed = PrintRecorder()
     with contextlib.redirect_stdout(printed):
         yield printed
 
 
 def load(target: str) -> list[Target]:
-    """What `file.py` or `file.py:name` defines that can be verified, in its own order.
+    """The models and functions that `file.py` or `file.py:name` defines, in the order of the file.
 
-    Taken are objects of the kinds `Motion` and `Sensor`; factories annotated to return one, whose
-    only required parameter is a noise covariance; and functions f beside which an f_jacobian (or
-    f_jacobians) stands, whose sizes may be given as f_arguments = {"pose": ("x [m]", …), …} and
-    f_outputs = ("range [m]", …), and states to try it at as f_states = (array (S, n), …).
+    These are objects of the types `Motion` and `Sensor`; factories annotated to return one, whose
+    only required parameter is a noise covariance; and functions f with a function f_jacobian (or
+    f_jacobians), whose sizes may be given as f_arguments = {"pose": ("x [m]", …), …} and
+    f_outputs = ("range [m]", …), and their states as f_states = (array (S, n), …).
 
     Raises:
-        UnusableFile: with the line, if the file is missing, does not import, or has nothing.
+        UnusableFile: with the line, if the file is missing, does not import, or defines none.
     """
     path, name = _split(target)
     module = _import(path)
@@ -96,18 +98,20 @@ def load(target: str) -> list[Target]:
     return found
 
 
-def verify_file(target: str, ask: Callable[..., Report]) -> list[Report]:
-    """Reports on all that `load` finds in a file; `ask` is `verify_jacobians` with its options.
+def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
+    """Reports on all models and functions of a file.
 
-    Raises UnusableFile as `load` does, and if nothing of what it found can be verified.
+    verify_one: `verify_jacobians` with its options.
+
+    Raises UnusableFile as `load` does, and if none of them can be verified.
     """
-    with watched() as printed:
+    with recorded_prints() as printed:
         targets = load(target)
     notes = tuple(f"{line} prints when the file is loaded" for line in printed.lines)
     reports, unusable = [], []
     for one in targets:
         try:
-            reports.append(_verified(one, ask))
+            reports.append(_verified(one, verify_one))
         except ValueError as error:
             unusable.append(str(error))
             check = Check("can be verified", False, str(error))
@@ -117,10 +121,10 @@ def verify_file(target: str, ask: Callable[..., Report]) -> list[Report]:
     return [dataclasses.replace(reports[0], notes=notes), *reports[1:]]
 
 
-def _verified(target: Target, ask: Callable[..., Report]) -> Report:
-    """The report on a target; a model that prints as it runs is not pure, and is told so."""
-    with watched() as printed:
-        report = ask(
+def _verified(target: Target, verify_one: Callable[..., Report]) -> Report:
+    """The report on a target, with a check that it prints nothing, since it must be pure."""
+    with recorded_prints() as printed:
+        report = verify_one(
             target.model,
             target.jacobian,
             arguments=target.arguments,
@@ -134,6 +138,7 @@ def _verified(target: Target, ask: Callable[..., Report]) -> Report:
 
 
 def _split(target: str) -> tuple[Path, str]:
+    """The file and the name, or "", of FILE.py or FILE.py:NAME."""
     file, colon, name = target.rpartition(":")
     if not colon or not file.endswith(".py"):
         file, name = target, ""
@@ -146,19 +151,20 @@ def _split(target: str) -> tuple[Path, str]:
 
 
 def _import(path: Path) -> ModuleType:
+    """The module of a file; raises UnusableFile where it cannot be imported."""
     name = f"_jaxslam_user_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path.resolve())
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    sys.path.insert(0, str(path.resolve().parent))  # it may import its neighbours
+    sys.path.insert(0, str(path.resolve().parent))  # it may import modules beside it
     try:
         spec.loader.exec_module(module)
     except SyntaxError as error:
         raise UnusableFile(f"{path.name}:{error.lineno}: {error.msg}") from error
     except (Exception, SystemExit) as error:
-        raise UnusableFile(f"does not import: {told(error)}") from error
+        raise UnusableFile(f"does not import: {describe_error(error)}") from error
     finally:
         sys.path.pop(0)
         del sys.modules[name]
@@ -166,6 +172,7 @@ def _import(path: Path) -> ModuleType:
 
 
 def _target(module: ModuleType, name: str) -> Target | None:
+    """What a name of the module stands for, or None where there is nothing to verify."""
     value = getattr(module, name)
     if isinstance(value, Motion | Sensor):
         return Target(name, value)
@@ -181,12 +188,12 @@ def _target(module: ModuleType, name: str) -> Target | None:
         try:
             return Target(name, build(value))
         except Exception as error:
-            raise UnusableFile(f"the factory {name}: {told(error)}") from error
+            raise UnusableFile(f"the factory {name}: {describe_error(error)}") from error
     return None
 
 
-def _makes_a_model(factory: Callable[..., Any]) -> bool:
-    """Whether it says so, as in `def mine(noise_cov, mount=…) -> Sensor`."""
+def _makes_a_model(factory: Callable[..., object]) -> bool:
+    """Whether a function is annotated as a factory: `def mine(noise_cov, mount=…) -> Sensor`."""
     try:
         signature = inspect.signature(factory)
     except (TypeError, ValueError):

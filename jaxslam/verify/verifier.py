@@ -1,9 +1,10 @@
-"""`verify_jacobians`: what is looked at, in which order, and the report."""
+"""The function `verify_jacobians`: samples, Jacobians, other checks, and the report."""
 
+import contextlib
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.experimental
@@ -12,24 +13,33 @@ from numpy.typing import ArrayLike
 
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.verify import properties, samples, subject
+from jaxslam.verify import properties, samples
+from jaxslam.verify.comparison import compare_methods
+from jaxslam.verify.errors import describe_error
+from jaxslam.verify.functions import (
+    Claim,
+    Function,
+    motion_functions,
+    plain_function,
+    sensor_functions,
+)
 from jaxslam.verify.jacobians import Evaluated, evaluate
-from jaxslam.verify.judge import judge
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 from jaxslam.verify.record import Check, Report
 from jaxslam.verify.samples import Samples
-from jaxslam.verify.trouble import told
+
+Model: TypeAlias = Motion | Sensor | Callable[..., jax.Array]
 
 MOUNT = (0.4, -0.3, 0.9)
-"""Where `build` puts a sensor: off the robot's centre, or half of its Jacobian is not seen."""
+"""The mount of a sensor made by `build`: off the robot's centre, so that all terms contribute."""
 
 TOLERANCE = 1e-12
 FLOAT32_TOLERANCE = 1e-5
 
 
 def verify_jacobians(
-    model: Motion | Sensor | Callable[..., jax.Array],
-    jacobian: Callable[..., Any] | None = None,
+    model: Model,
+    jacobian: Claim | None = None,
     *,
     arguments: Mapping[str, Sequence[str] | int] | None = None,
     outputs: Sequence[str] | None = None,
@@ -40,38 +50,39 @@ def verify_jacobians(
     tolerance: float = TOLERANCE,
     float32_tolerance: float = FLOAT32_TOLERANCE,
 ) -> Report:
-    """Hold the Jacobians of a model, by every argument, against each other.
+    """Compare the Jacobians of a model, by every argument, computed in four ways.
 
-    At each sampled state: `jax.jacfwd`, `jax.jacrev`, the hand-derived one where there is one, and
-    difference quotients in float64 (Ridders' extrapolation with its error estimate; the complex
-    step where the function is analytic). States: random ones and the hard ones, by the units of
-    the arguments: across the ±π seam, landmark close to and at the robot and the sensor, zero rate,
-    zero inverse depth, coordinates of 1e5 m, zero control. Differences are relative to the largest
-    entry of the Jacobian's row; angles are compared on the circle. In float32, autodiff and hand
-    are compared again.
+    At each sampled state these are `jax.jacfwd`, `jax.jacrev`, the hand-derived Jacobian if there
+    is one, and difference quotients in float64 (Ridders' extrapolation with its error estimate; the
+    complex step where the function is analytic). The states are random ones and difficult ones,
+    which follow from the units of the arguments: headings next to ±π, a landmark close to and at
+    the robot and the sensor, zero rate, zero inverse depth, coordinates of 1e5 m, zero control.
+    Differences are relative to the largest entry of the Jacobian's row; angles are compared modulo
+    2π. Autodiff and the hand-derived Jacobian are compared in float32, too.
 
-    Beside Jacobians: values and derivatives finite everywhere, purity, jit and vmap, dtypes, noise
-    covariances, and of sensors the residual and the round trips of `invert`.
+    Further checks: values and derivatives are finite everywhere, the functions are pure, agree with
+    themselves under jit and vmap, and keep the dtype; noise covariances are covariances; of a
+    sensor the residual, and that `invert` and `observe` are inverse to each other.
 
-    Runs in float64 whatever JAX is set to, and leaves that as it was. Nothing in the model makes it
-    raise: a model that does not trace, raises or returns the wrong shape is reported, with the line
-    in its file, and whatever can still be checked is.
+    The computation is in float64 whatever JAX is set to, and leaves that setting as it was. No
+    fault of the model raises: a model that cannot be traced, raises or returns the wrong shape is
+    reported with the line in its file, and the remaining checks are run.
 
     Args:
         model: a `Motion`, a `Sensor`, or a pure function of vectors.
-        jacobian: for a function: its claimed Jacobian. Called with the function's arguments it
+        jacobian: of a function, its hand-derived Jacobian. Called with the function's arguments it
             returns a tuple of one (m, n_k) array an argument (None: no claim), or one array: by the
             first argument, or by all of them side by side. Models bring their own.
-        arguments: for a function: the entries of its arguments, named with units, as in
+        arguments: of a function, the names of the entries of its arguments with units, as in
             {"pose": ("x [m]", "y [m]", "theta [rad]")}, or only their number. Parameters called
             pose, frame, landmark, l or point need not be given.
-        outputs: for a function: the names of its outputs with units; [rad] is on the circle.
+        outputs: of a function, the names of its outputs with units; [rad] is modulo 2π.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
             sensor those of `observe`.
-        name: for a function: what to call it, default its own name.
-        count: random states.
-        seed: of the random states.
-        tolerance, float32_tolerance: relative, of autodiff and hand against each other.
+        name: of a function, its name in the report; default: its own.
+        count: number of random states.
+        seed: seed of the random states.
+        tolerance, float32_tolerance: largest relative difference between autodiff and hand.
     Returns:
         A `Report`: `passed`, `findings`, `checks`, `as_dict()`, and text when printed.
     Raises:
@@ -80,48 +91,6 @@ def verify_jacobians(
     """
     if not tolerance > 0 or not float32_tolerance > 0:
         raise ValueError("verify_jacobians: expected tolerances above 0")
-    examined = examine(
-        model,
-        jacobian,
-        arguments=arguments,
-        outputs=outputs,
-        states=states,
-        name=name,
-        count=count,
-        seed=seed,
-    )
-    with np.errstate(all="ignore"):
-        findings = [
-            finding
-            for evaluated in examined.evaluated
-            for finding in judge(evaluated, tolerance, float32_tolerance)
-        ]
-    with _float64():
-        bend = _typical_linearity(model, examined)
-    return Report(examined.name, examined.kind, tuple(findings), examined.checks, bend)
-
-
-class Examined(NamedTuple):
-    """What `verify_jacobians` computes before it judges."""
-
-    kind: str
-    name: str
-    evaluated: tuple[Evaluated, ...]
-    checks: tuple[Check, ...]
-
-
-def examine(
-    model: Motion | Sensor | Callable[..., jax.Array],
-    jacobian: Callable[..., Any] | None = None,
-    *,
-    arguments: Mapping[str, Sequence[str] | int] | None = None,
-    outputs: Sequence[str] | None = None,
-    states: Sequence[ArrayLike] | None = None,
-    name: str | None = None,
-    count: int = 24,
-    seed: int = 0,
-) -> Examined:
-    """All Jacobians of a model at all states, and the other checks; as `verify_jacobians`."""
     if count < 2:
         raise ValueError(f"verify_jacobians: expected count >= 2, got {count}")
     if not 0 <= seed < 2**32:
@@ -135,56 +104,101 @@ def examine(
         raise ValueError(
             f"verify_jacobians: expected jacobian to be a function, got {type(jacobian).__name__}"
         )
-    functions: tuple[subject.Function, ...]
-    if isinstance(model, Motion):
-        kind, name, functions = "motion", model.name, subject.motion_functions(model)
-    elif isinstance(model, Sensor):
-        kind, name, functions = "sensor", model.name, subject.sensor_functions(model)
+    if isinstance(model, Motion | Sensor):
+        kind, name = "motion" if isinstance(model, Motion) else "sensor", model.name
+        functions = functions_of(model)
     else:
-        function = subject.plain_function(model, jacobian, arguments, outputs, name)
-        kind, name, functions = "function", function.name, (function,)
-    given = None if states is None else _given(functions[0], states)
+        functions = (plain_function(model, jacobian, arguments, outputs, name),)
+        kind, name = "function", functions[0].name
+    given = None if states is None else _given_samples(functions[0], states)
+    examined = examine(model, functions, given, count, seed)
+    with np.errstate(all="ignore"):
+        findings = [
+            finding
+            for evaluated in examined.evaluated
+            for finding in compare_methods(evaluated, tolerance, float32_tolerance)
+        ]
+    with _float64():
+        linearity = _typical_linearity(model, examined)
+    return Report(name, kind, tuple(findings), examined.checks, linearity)
+
+
+class Examined(NamedTuple):
+    """All Jacobians of a model at all states, and the results of the other checks."""
+
+    evaluated: tuple[Evaluated, ...]
+    checks: tuple[Check, ...]
+
+
+def examine(
+    model: Model,
+    functions: tuple[Function, ...],
+    given: Samples | None = None,
+    count: int = 24,
+    seed: int = 0,
+) -> Examined:
+    """Evaluate all Jacobians of a model, and run the other checks, in float64.
+
+    Args:
+        model: a `Motion`, a `Sensor`, or a function.
+        functions: of the model, as from `functions_of`.
+        given: the states for the first function, instead of samples.
+        count, seed: of the random states.
+    """
     with _float64(), np.errstate(all="ignore"):
-        drawn = _drawn(functions, model, count, seed)
+        drawn = _samples_of(functions, model, count, seed)
         if given is not None:
             drawn = (given, *drawn[1:])
         evaluated = tuple(evaluate(f, sampled) for f, sampled in zip(functions, drawn, strict=True))
         checks: list[Check] = []
         for one in evaluated:
-            checks += [*one.checks, *properties.of_function(one)]
-            if kind != "function":
-                checks += properties.of_model_function(one)
-        checks += _of_model(model, drawn)
-    return Examined(kind, name, evaluated, tuple(checks))
+            checks += [*one.checks, *properties.function_checks(one)]
+            if isinstance(model, Motion | Sensor):
+                checks += properties.dtype_checks(one)
+        checks += _model_checks(model, drawn)
+    return Examined(evaluated, tuple(checks))
+
+
+def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
+    """The functions of a model whose Jacobians are verified."""
+    return motion_functions(model) if isinstance(model, Motion) else sensor_functions(model)
 
 
 def build(factory: Callable[..., Motion] | Callable[..., Sensor]) -> Motion | Sensor:
-    """A model of a factory like those of the registries, for verification: noise 0.01 I, and a
-    sensor mounted off the robot's centre."""
+    """A model made by a factory like those of the registries, with noise 0.01 I.
+
+    A sensor is mounted off the robot's centre.
+    """
     probe = factory(lambda *_: None)
     size = len(probe.noises if isinstance(probe, Motion) else probe.measurements)
     mounted = {"mount": MOUNT} if "mount" in inspect.signature(factory).parameters else {}
     return factory(0.01 * np.eye(size), **mounted)
 
 
-def _of_model(model: Any, drawn: tuple[Samples, ...]) -> Iterator[Check]:
+def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
+    """The checks of a motion model or a sensor as a whole."""
     try:
         if isinstance(model, Motion):
-            yield from properties.of_motion(model, drawn[0])
+            yield from properties.motion_checks(model, drawn[0])
         elif isinstance(model, Sensor):
-            yield from properties.of_sensor(model, *drawn)
+            yield from properties.sensor_checks(model, *drawn)
     except (Exception, SystemExit) as error:
-        yield Check("the rest of the checks", False, told(error))
+        yield Check("the rest of the checks", False, describe_error(error))
 
 
-def _typical_linearity(model: Any, examined: Examined) -> float | None:
-    """The median over the random states, for standard deviations by the units; None if it fails."""
+def _typical_linearity(model: Model, examined: Examined) -> float | None:
+    """The median linearity index over the random states; None for a function or if it fails.
+
+    Standard deviations follow from the units.
+    """
     if not isinstance(model, Motion | Sensor):
         return None
     first = examined.evaluated[0]
     usual = [i for i, label in enumerate(first.samples.labels) if label == "random"]
     states = tuple(a[usual] for a in first.samples.values)
-    spread = [np.array([_spread(e) for e in a.entries]) for a in first.function.arguments]
+    spread = [
+        np.array([_standard_deviation(e) for e in a.entries]) for a in first.function.arguments
+    ]
 
     def index(*state: jax.Array) -> jax.Array:
         if isinstance(model, Motion):
@@ -194,29 +208,28 @@ def _typical_linearity(model: Any, examined: Examined) -> float | None:
 
     try:
         return float(np.median(np.asarray(quick_jit(jax.vmap(index))(*states))))
-    except (Exception, SystemExit):  # what is wrong with the model is in the checks
+    except (Exception, SystemExit):  # the checks report what is wrong with the model
         return None
 
 
-def _spread(entry: str) -> float:
+def _standard_deviation(entry: str) -> float:
+    """0.05 of an angle or inverse depth, 0.1 of all else."""
     return 0.05 if entry.endswith(("[rad]", "[1/m]")) else 0.1
 
 
-def _drawn(
-    functions: tuple[subject.Function, ...], model: Any, count: int, seed: int
+def _samples_of(
+    functions: tuple[Function, ...], model: Model, count: int, seed: int
 ) -> tuple[Samples, ...]:
+    """The states at which each function is evaluated."""
     if isinstance(model, Sensor):
-        try:
-            return samples.of_sensor(model, count, seed)
-        except (
-            Exception,
-            SystemExit,
-        ):  # a sensor whose `embed` fails is tried at states drawn by units alone
-            pass
-    return tuple(samples.of_arguments(f.arguments, count, seed) for f in functions)
+        # A sensor whose `embed` fails is tried at states drawn by units alone.
+        with contextlib.suppress(Exception, SystemExit):
+            return samples.sensor_samples(model, count, seed)
+    return tuple(samples.argument_samples(f.arguments, count, seed) for f in functions)
 
 
-def _given(function: subject.Function, states: Sequence[ArrayLike]) -> Samples:
+def _given_samples(function: Function, states: Sequence[ArrayLike]) -> Samples:
+    """The caller's own states; raises ValueError on a wrong shape."""
     tables = [np.asarray(table, np.float64) for table in states]
     wanted = [len(argument.entries) for argument in function.arguments]
     shapes = [table.shape for table in tables]
@@ -230,7 +243,7 @@ def _given(function: subject.Function, states: Sequence[ArrayLike]) -> Samples:
 
 
 def _float64() -> AbstractContextManager[Any]:
-    """JAX in 64 bits, for this thread and until the block ends."""
-    home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental  # from jax 0.8, before
+    """A block in which JAX has 64-bit types, in this thread."""
+    home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental  # from jax 0.8 on, before
     context: AbstractContextManager[Any] = home.enable_x64(True)
     return context

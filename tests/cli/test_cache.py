@@ -10,7 +10,7 @@ import pytest
 
 from jaxslam import cli
 from jaxslam.cli import cache
-from jaxslam.cli.spent import Spent
+from jaxslam.cli.compile_clock import CompileClock
 
 OURS = {
     "jax_compilation_cache_dir",
@@ -28,7 +28,7 @@ def test_the_suite_writes_nothing_into_the_users_folder():
 def as_it_was(monkeypatch, tmp_path):
     """The test run may have a cache of its own; here JAX has been told of none."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "of the user"))
-    with cache.settings(jax_compilation_cache_dir=None):
+    with cache.jax_settings(jax_compilation_cache_dir=None):
         before = {name: getattr(jax.config, name) for name in OURS}
         yield
         assert {name: getattr(jax.config, name) for name in OURS} == before
@@ -40,11 +40,11 @@ def one_program(number=1.0):
     def add(x):
         return x + number
 
-    with Spent() as spent:
+    with CompileClock() as clock:
         jax.jit(add).lower(1.0).compile()
-    assert spent.programs == 1
-    assert 0.0 < spent.compiling <= spent.seconds
-    return spent.cached
+    assert clock.programs == 1
+    assert 0.0 < clock.compiling <= clock.seconds
+    return clock.cached
 
 
 def entries(folder):
@@ -53,30 +53,30 @@ def entries(folder):
 
 def test_programs_are_found_again(tmp_path):
     for cached in (0, 1):
-        with cache.programs(tmp_path / "a" / "b"):
+        with cache.program_cache(tmp_path / "a" / "b"):
             assert one_program() == cached
     assert len(entries(tmp_path / "a" / "b")) == 1
-    with cache.programs(tmp_path / "other"):
+    with cache.program_cache(tmp_path / "other"):
         assert one_program() == 0
     assert len(entries(tmp_path)) == 2
 
 
 def test_by_default_they_are_kept_in_the_users_folder_or_where_jax_was_told(tmp_path):
-    with cache.programs(None):
+    with cache.program_cache(None):
         one_program()
     assert len(entries(tmp_path / "of the user" / "jaxslam")) == 1
-    with cache.settings(
+    with cache.jax_settings(
         jax_compilation_cache_dir=str(tmp_path / "told"),
         jax_persistent_cache_min_compile_time_secs=0.0,
     ):
-        with cache.programs(None):
+        with cache.program_cache(None):
             one_program()
         assert len(entries(tmp_path / "told")) == 1
-        with cache.programs(None, none=True):
+        with cache.program_cache(None, none=True):
             assert one_program() == 0
             assert one_program(2.0) == 0
         assert len(entries(tmp_path / "told")) == 1
-        with cache.programs(tmp_path / "asked"):
+        with cache.program_cache(tmp_path / "asked"):
             one_program()
         assert len(entries(tmp_path / "asked")) == 1
     assert len(entries(tmp_path)) == 3
@@ -111,7 +111,7 @@ def warned(capsys):
 def test_a_folder_that_cannot_be_is_said_and_done_without(tmp_path, capsys, monkeypatch):
     (tmp_path / "file").write_text("")
     asked = tmp_path / "file" / "cache"
-    with cache.programs(asked):
+    with cache.program_cache(asked):
         one_program()
     (line,) = warned(capsys)
     assert f"cannot be kept in {asked} (" in line
@@ -121,7 +121,7 @@ def test_a_folder_that_cannot_be_is_said_and_done_without(tmp_path, capsys, monk
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.setattr(cache, "user_folder", homeless)
-    with cache.programs(None):
+    with cache.program_cache(None):
         one_program()
     assert "the user's cache folder (Could not determine home" in warned(capsys)[0]
 
@@ -129,7 +129,7 @@ def test_a_folder_that_cannot_be_is_said_and_done_without(tmp_path, capsys, monk
 @pytest.mark.parametrize("spoil", ["truncated", "empty", "noise", "of another version"])
 def test_a_damaged_program_is_said_and_compiled_anew(tmp_path, capsys, spoil):
     def both():
-        with cache.programs(tmp_path):
+        with cache.program_cache(tmp_path):
             return one_program() + one_program(2.0)
 
     assert both() == 0
@@ -154,8 +154,8 @@ def test_a_damaged_program_is_said_and_compiled_anew(tmp_path, capsys, spoil):
 def test_a_folder_that_jax_was_told_of_is_not_ours_to_mend(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     with (
-        cache.settings(jax_compilation_cache_dir=str(tmp_path / "file" / "below")),
-        cache.programs(None),
+        cache.jax_settings(jax_compilation_cache_dir=str(tmp_path / "file" / "below")),
+        cache.program_cache(None),
     ):
         assert one_program() + one_program(2.0) == 0
     (line,) = warned(capsys)
@@ -169,7 +169,7 @@ def test_a_full_disk_is_said_once_and_leaves_no_half_of_a_program(tmp_path, caps
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with cache.programs(tmp_path):
+    with cache.program_cache(tmp_path):
         assert one_program() + one_program(2.0) == 0
     (line,) = warned(capsys)
     assert "cannot be written (" in line
@@ -180,7 +180,7 @@ def test_a_full_disk_is_said_once_and_leaves_no_half_of_a_program(tmp_path, caps
 def test_other_warnings_are_left_alone(tmp_path):
     import warnings
 
-    with pytest.warns(UserWarning, match="something else"), cache.programs(tmp_path):
+    with pytest.warns(UserWarning, match="something else"), cache.program_cache(tmp_path):
         warnings.warn("something else", stacklevel=1)
 
 
@@ -196,7 +196,7 @@ def test_what_was_not_used_for_longest_goes_first(tmp_path):
     assert len(entries(tmp_path)) == 4
     cache.prune(tmp_path, 250)
     assert [path.name for path in entries(tmp_path)] == ["a-cache", "c-cache"]
-    with cache.programs(tmp_path, bound=0):
+    with cache.program_cache(tmp_path, bound=0):
         one_program()
     assert entries(tmp_path) == []
     assert (folder / "mine.txt").exists()
@@ -204,10 +204,10 @@ def test_what_was_not_used_for_longest_goes_first(tmp_path):
 
 def test_programs_of_another_version_or_processor_are_of_another_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "version", lambda name: "0.0.1")
-    with cache.programs(tmp_path):
+    with cache.program_cache(tmp_path):
         one_program()
     monkeypatch.undo()
-    with cache.programs(tmp_path):
+    with cache.program_cache(tmp_path):
         assert one_program() == 0
     assert len({path.parent for path in entries(tmp_path)}) == 2
 

@@ -1,11 +1,14 @@
 """The command's programs on the disk: found without a trace, whole or not at all."""
 
+from pathlib import Path
+
 import numpy as np
 import worlds
 
+import jaxslam
 from jaxslam import programs
 from jaxslam.cli import cache, library
-from jaxslam.cli.spent import Spent
+from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.monte_carlo import monte_carlo
 
 ASKED = {"scenario": "ring", "filters": "ekf", "seed": 0, "runs": 4, "bound": False}
@@ -40,7 +43,7 @@ def test_a_campaign_runs_from_what_another_has_compiled():
         traced.append(1)
         return worlds.ekf(there)
 
-    with cache.settings(jax_compilation_cache_dir=None):
+    with cache.jax_settings(jax_compilation_cache_dir=None):
         first = campaign(watched, shelf)
     names = set(shelf.content)
     assert {name.partition(",")[0] for name in names} == {
@@ -51,16 +54,16 @@ def test_a_campaign_runs_from_what_another_has_compiled():
     }
     traced.clear()
     programs.clear()  # as in another process
-    with Spent() as spent:
+    with CompileClock() as clock:
         second = campaign(watched, shelf)
     assert (traced, shelf.found) == ([], len(names))
-    assert len(names) <= spent.cached <= spent.programs  # a command counts them as loaded
+    assert len(names) <= clock.cached <= clock.programs  # a command counts them as loaded
     for name, values in first.per_run.items():
         np.testing.assert_array_equal(values, second.per_run[name])
 
 
 def test_a_program_is_kept_whole_or_not_at_all(tmp_path, capsys):
-    kept = library.Programs(tmp_path, library.identity(ASKED, "cpu"))
+    kept = library.ProgramFolder(tmp_path, library.identity(ASKED, "cpu"))
     assert kept.get("drive ekf") is None
     kept.put("drive ekf", b"a program")
     assert kept.get("drive ekf") == b"a program"
@@ -75,12 +78,12 @@ def test_a_program_is_kept_whole_or_not_at_all(tmp_path, capsys):
 def test_what_cannot_be_written_is_said_and_costs_nothing_else(tmp_path, capsys):
     nowhere = tmp_path / "a file"
     nowhere.write_text("")
-    library.Programs(nowhere, {}).put("drive ekf", b"a program")
+    library.ProgramFolder(nowhere, {}).put("drive ekf", b"a program")
     assert "cannot be kept" in capsys.readouterr().err
 
 
 def test_a_program_is_of_its_scenario_precision_source_and_processor(tmp_path, monkeypatch):
-    library.Programs(tmp_path, library.identity(ASKED, "cpu")).put("drive ekf", b"a program")
+    library.ProgramFolder(tmp_path, library.identity(ASKED, "cpu")).put("drive ekf", b"a program")
     for change, found in (
         ({"seed": 1}, True),
         ({"runs": 5}, True),
@@ -88,14 +91,15 @@ def test_a_program_is_of_its_scenario_precision_source_and_processor(tmp_path, m
         ({"scenario": "circle"}, False),
         ({"dtype": "float32"}, False),
     ):
-        other = library.Programs(tmp_path, library.identity(ASKED | change, "cpu"))
+        other = library.ProgramFolder(tmp_path, library.identity(ASKED | change, "cpu"))
         assert (other.get("drive ekf") is not None) == found
-    monkeypatch.setattr(cache, "kind", lambda: "another processor")
-    other = library.Programs(tmp_path, library.identity(ASKED, "cpu"))
+    monkeypatch.setattr(cache, "processor_kind", lambda: "another processor")
+    other = library.ProgramFolder(tmp_path, library.identity(ASKED, "cpu"))
     assert other.get("drive ekf") is None
     assert library.identity(ASKED, "cpu") != library.identity(ASKED, "gpu")
+    assert Path(jaxslam.__file__).parent == library.PACKAGE  # all of the source, not one folder
 
 
 def test_without_a_cache_there_is_no_library():
-    with cache.settings(jax_compilation_cache_dir=None), library.of_this_command({}) as kept:
+    with cache.jax_settings(jax_compilation_cache_dir=None), library.program_folder({}) as kept:
         assert kept is None

@@ -9,8 +9,8 @@ import pytest
 from jaxslam import motion, sensors
 from jaxslam.protocols import Motion
 from jaxslam.verify import build, verify_jacobians
-from jaxslam.verify.judge import judge
-from jaxslam.verify.verifier import FLOAT32_TOLERANCE, TOLERANCE, examine
+from jaxslam.verify.comparison import compare_methods
+from jaxslam.verify.verifier import FLOAT32_TOLERANCE, TOLERANCE, examine, functions_of
 
 MODELS = motion.REGISTRY | sensors.REGISTRY
 
@@ -19,8 +19,10 @@ MODELS = motion.REGISTRY | sensors.REGISTRY
 def made(request):
     """A registered model, all that was computed about it, and what that was judged to be."""
     model = build(MODELS[request.param])
-    examined = examine(model)
-    findings = [f for one in examined.evaluated for f in judge(one, TOLERANCE, FLOAT32_TOLERANCE)]
+    examined = examine(model, functions_of(model))
+    findings = [
+        f for one in examined.evaluated for f in compare_methods(one, TOLERANCE, FLOAT32_TOLERANCE)
+    ]
     return SimpleNamespace(
         model=model,
         findings=findings,
@@ -90,7 +92,7 @@ def test_every_wrong_entry_is_caught_and_named(made):
                 changed = evaluation._replace(methods=evaluation.methods | {"hand": mutant})
                 by_argument = list(evaluated.by_argument)
                 by_argument[k] = changed
-                findings = judge(
+                findings = compare_methods(
                     evaluated._replace(by_argument=tuple(by_argument)), TOLERANCE, FLOAT32_TOLERANCE
                 )
                 assert [f.passed for f in findings] == [n != k for n in range(len(findings))]

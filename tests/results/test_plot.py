@@ -71,11 +71,7 @@ def test_a_map_without_any_landmark_can_be_drawn(drive):
 def test_errors_are_drawn_within_their_claimed_bounds(drive):
     truth, trace = drive
     figure = plot.errors_figure(trace.estimate, truth)
-    assert [axes.get_ylabel() for axes in figure.axes] == [
-        "x error [m]",
-        "y error [m]",
-        "heading error [°]",
-    ]
+    assert ylabels(figure) == ["x error [m]", "y error [m]", "heading error [°]"]
     drawn = figure.axes[1].lines[0].get_ydata()
     np.testing.assert_allclose(drawn, truth.pose[:, 1] - trace.estimate.pose[:, 1])
 
@@ -100,6 +96,8 @@ def campaign():
     )
 
 
+DOF = {"pose": 3, "position": 2, "heading": 1}
+
 CAMPAIGN_FIGURES = (
     plot.nees_figure,
     plot.bound_figure,
@@ -123,21 +121,21 @@ def line(axes, label):
     return found
 
 
+def ylabels(figure):
+    return [axes.get_ylabel() for axes in figure.axes]
+
+
 def named(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_nees_is_drawn_with_its_band(campaign):
     figure = plot.nees_figure(campaign)
-    assert [axes.get_ylabel() for axes in figure.axes] == [
-        "pose NEES (dof 3)",
-        "position NEES (dof 2)",
-        "heading NEES (dof 1)",
-    ]
+    assert ylabels(figure) == [f"{block} NEES (dof {dof})" for block, dof in DOF.items()]
     verdicts = [summary.verdict for summary in campaign.filters.values()]
     assert named(figure) == ["95 % band", f"a ({verdicts[0]})", f"b ({verdicts[1]})"]
     curves, most = (campaign.filters[name].curves for name in "ba")
-    for axes, block in zip(figure.axes, ("pose", "position", "heading"), strict=True):
+    for axes, block in zip(figure.axes, DOF, strict=True):
         drawn = line(axes, f"b ({verdicts[1]})").get_ydata()
         np.testing.assert_array_equal(drawn, curves[f"nees_{block}"])
         (band,) = axes.collections
@@ -166,7 +164,7 @@ def test_an_ordinate_is_logarithmic_beyond_a_decade_and_has_numbers(low, high, s
 
 def test_errors_are_drawn_above_the_bound(campaign):
     figure = plot.bound_figure(campaign)
-    assert [axes.get_ylabel() for axes in figure.axes] == ["position RMSE [m]", "heading RMSE [°]"]
+    assert ylabels(figure) == ["position RMSE [m]", "heading RMSE [°]"]
     assert named(figure) == ["a", "b", "conditional Cramér-Rao bound"]
     for axes, key in zip(figure.axes, ("position", "heading_deg"), strict=True):
         bound = line(axes, "conditional Cramér-Rao bound")
@@ -188,12 +186,8 @@ def test_errors_are_drawn_above_the_bound(campaign):
 
 def test_coverage_is_drawn_about_the_diagonal(campaign):
     figure = plot.coverage_figure(campaign)
-    assert [axes.get_title() for axes in figure.axes] == [
-        "pose (dof 3)",
-        "position (dof 2)",
-        "heading (dof 1)",
-    ]
-    for axes, block in zip(figure.axes, ("pose", "position", "heading"), strict=True):
+    for axes, (block, dof) in zip(figure.axes, DOF.items(), strict=True):
+        assert axes.get_title() == f"{block} (dof {dof})"
         assert axes.get_box_aspect() == 1
         np.testing.assert_array_equal(*line(axes, "honest").get_data())
         np.testing.assert_array_equal(line(axes, "a").get_xdata(), LEVELS)

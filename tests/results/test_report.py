@@ -10,6 +10,7 @@ import pytest
 import worlds
 
 from jaxslam import report
+from jaxslam.results import files
 
 WORLD = worlds.ring()
 
@@ -21,7 +22,7 @@ def campaign():
 
 
 def test_the_table_shows_every_measure_and_verdict(campaign):
-    text = report.table(campaign)
+    text = report.campaign_table(campaign)
     measured = {key for summary in campaign.filters.values() for key in summary.measures}
     for key, label, _ in report.ROWS:
         assert (label in text) == (key in measured)
@@ -74,9 +75,9 @@ def test_files_appear_whole_or_not_at_all(tmp_path):
 
     out = tmp_path / "deep" / "out"
     with pytest.raises(KeyboardInterrupt):
-        report.write_files(out, {"a.txt": "text", "b.png": broken})
+        files.write_files(out, {"a.txt": "text", "b.png": broken})
     assert not list(out.glob("*")) or not out.exists()
-    written = report.write_files(out, {"a.txt": "text", "b.txt": lambda path: path.write_text("b")})
+    written = files.write_files(out, {"a.txt": "text", "b.txt": lambda path: path.write_text("b")})
     assert [path.read_text() for path in written] == ["text", "b"]
     assert sorted(path.name for path in out.iterdir()) == ["a.txt", "b.txt"]
 
@@ -84,6 +85,6 @@ def test_files_appear_whole_or_not_at_all(tmp_path):
 def test_an_unwritable_folder_is_refused_beforehand(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="not a folder"):
-        report.check_writable(tmp_path / "file" / "out")
-    report.check_writable(tmp_path / "not" / "yet" / "there")
+        files.check_writable(tmp_path / "file" / "out")
+    files.check_writable(tmp_path / "not" / "yet" / "there")
     assert not (tmp_path / "not").exists()

@@ -28,7 +28,14 @@ def verify(tmp_path, capsys):
         content = json.loads(result.read_text(encoding="utf-8")) if result.exists() else None
         return status, printed.out, printed.err, content
 
-    go.on = on
+    def says(text, status, *parts):
+        found, out, _, _ = go(text)
+        assert found == status, out
+        for part in parts:
+            assert part in out
+        return out
+
+    go.on, go.says = on, says
     return go
 
 
@@ -149,34 +156,22 @@ def test_no_file_and_no_python_file(verify, tmp_path):
 
 
 def test_printing_is_caught_with_its_line(verify):
-    status, out, _, _ = verify("print('hello')\n" + GOOD)
-    assert status == 0
-    assert "hello" not in out
-    assert "mine.py:1 prints when the file is loaded" in out
-
+    text = "print('hello')\n" + GOOD
+    assert "hello" not in verify.says(text, 0, "mine.py:1 prints when the file is loaded")
     inside = GOOD.replace("    return pose[:2]", "    print('called')\n    return pose[:2]")
-    status, out, _, _ = verify(inside)
-    assert status == 1
-    assert "called" not in out
-    assert "prints nothing: mine.py:5 prints" in out
+    assert "called" not in verify.says(inside, 1, "prints nothing: mine.py:5 prints")
 
 
 def test_what_is_wrong_beside_jacobians_is_told_with_its_line(verify):
     branch = GOOD.replace(
         "    return pose[:2]", "    if u[0] > 0:\n        u = 2 * u\n    return pose[:2]"
     )
-    status, out, _, _ = verify(branch)
-    assert status == 1
-    assert "f is traceable: mine.py:5: " in out
-    assert "hand" in out  # the claim was compared with differences all the same
-
-    status, out, _, _ = verify(GOOD.replace("pose[:2] + u[0]", "pose[:2] + jnp.sqrt(u[0])"))
-    assert status == 1
-    assert "mine.py:5: a value is not" in out
-
-    status, out, _, _ = verify(GOOD.replace('("x [m]", "y [m]")', '("x [m]",)'))
-    assert status == 1
-    assert "(2,) where an array of shape (1,) is expected" in out
+    # The claim is compared with differences all the same.
+    verify.says(branch, 1, "f is traceable: mine.py:5: ", "hand")
+    root = GOOD.replace("pose[:2] + u[0]", "pose[:2] + jnp.sqrt(u[0])")
+    verify.says(root, 1, "mine.py:5: a value is not")
+    one = GOOD.replace('("x [m]", "y [m]")', '("x [m]",)')
+    verify.says(one, 1, "(2,) where an array of shape (1,) is expected")
 
 
 def test_states_of_the_file_are_used(verify):
@@ -187,11 +182,8 @@ def test_states_of_the_file_are_used(verify):
 
 
 def test_an_exit_inside_a_model_is_no_success(verify):
-    status, out, _, _ = verify(
-        GOOD.replace("    return pose[:2]", "    import sys; sys.exit(0)\n    return pose[:2]")
-    )
-    assert status == 1
-    assert "mine.py:5: SystemExit" in out
+    leaves = GOOD.replace("    return pose[:2]", "    import sys; sys.exit(0)\n    return pose[:2]")
+    verify.says(leaves, 1, "mine.py:5: SystemExit")
 
 
 def test_neighbours_can_be_imported_and_nothing_stays_behind(verify, tmp_path):

@@ -1,6 +1,5 @@
-"""`verify_jacobians`: what it finds, in whom, and that it never raises over a model."""
+"""`verify_jacobians` of functions: the method that is wrong, and faults that are reported, not raised."""
 
-import dataclasses
 import json
 import re
 import sys
@@ -10,110 +9,9 @@ import jax.experimental
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from verified import by_name, failed
 
-from jaxslam import motion, sensors
-from jaxslam.verify import build, differences, verify_jacobians
-
-
-def by_name(report, name):
-    (check,) = [c for c in report.checks if c.name == name]
-    return check
-
-
-def failed(report):
-    names = [c.name for c in report.checks if not c.passed]
-    return sorted(names + [f.name for f in report.findings if not f.passed])
-
-
-# --- differences --------------------------------------------------------------------------------
-
-
-def smooth(x):
-    return np.stack([np.sin(x[:, 0]) * np.exp(x[:, 1]), x[:, 0] ** 3 / x[:, 1]], axis=1)
-
-
-def smooth_jacobian(x):
-    a, b = x[:, 0], x[:, 1]
-    return np.stack(
-        [
-            np.stack([np.cos(a) * np.exp(b), np.sin(a) * np.exp(b)], axis=1),
-            np.stack([3 * a**2 / b, -(a**3) / b**2], axis=1),
-        ],
-        axis=1,
-    )
-
-
-def test_quotients_and_their_error():
-    rng = np.random.default_rng(0)
-    x = np.stack([rng.normal(size=50), rng.uniform(1, 2, 50)], axis=1)
-    value, error, kink = differences.quotients(smooth, (x,), 0, np.full(2, np.inf))
-    off = np.abs(value - smooth_jacobian(x))
-    assert off.max() < 1e-10
-    assert error.max() < 1e-8
-    assert np.all(off <= 10 * error)
-    assert not kink.any()
-
-
-def test_quotients_know_where_there_is_no_derivative():
-    x = np.array([[0.0], [1e-9], [1.0]])
-
-    def root(x):
-        return np.sqrt(np.abs(x))
-
-    value, error, kink = differences.quotients(root, (x,), 0, np.full(1, np.inf))
-    assert np.all(~(error[:2, 0, 0] < 1e-3 * np.abs(value[:2, 0, 0])))
-    np.testing.assert_allclose(value[2, 0, 0], 0.5, atol=1e-10)
-
-
-def test_quotients_cross_the_seam_of_a_circle():
-    def wrapped(x):
-        return np.angle(np.exp(1j * 2 * x))
-
-    x = np.array([[np.pi / 2], [-np.pi / 2 + 1e-9], [0.3]])
-    value, _, kink = differences.quotients(wrapped, (x,), 0, np.array([2 * np.pi]))
-    np.testing.assert_allclose(value, 2, atol=1e-9)
-    assert not kink.any()
-
-
-def test_quotients_see_a_kink_where_they_converge():
-    def f(x):
-        return np.stack([np.abs(x[:, 0]), x[:, 0] * np.abs(x[:, 0])], axis=1)
-
-    value, error, kink = differences.quotients(
-        f, (np.array([[0.0], [1e-3]]),), 0, np.full(2, np.inf)
-    )
-    np.testing.assert_array_equal(kink[:, :, 0], [[True, False], [False, False]])
-
-
-def test_a_fast_turn_is_not_aliased():
-    def heading(x):
-        return np.angle(np.exp(1j * 1000 * x))
-
-    value, _, _ = differences.quotients(heading, (np.array([[0.3]]),), 0, np.array([2 * np.pi]))
-    np.testing.assert_allclose(value, 1000, rtol=1e-7)
-
-
-def test_complex_step_is_exact():
-    x = np.array([[0.7, 1.3]])
-    np.testing.assert_allclose(
-        differences.complex_step(smooth, (x,), 0), smooth_jacobian(x), rtol=1e-15
-    )
-
-
-def test_complex_step_is_used_where_the_function_allows_it():
-    def analytic(point):
-        return jnp.stack([point[0] * jnp.sin(point[1])])
-
-    def not_analytic(point):  # takes complex numbers, and loses the imaginary part
-        return jnp.stack([point[0] * jnp.sin(jnp.real(point[1])), point[0]])
-
-    assert verify_jacobians(analytic).findings[0].quotient == "complex step"
-    report = verify_jacobians(not_analytic)
-    assert report.findings[0].quotient == "differences"
-    assert report.passed
-
-
-# --- who is wrong -------------------------------------------------------------------------------
+from jaxslam.verify import verify_jacobians
 
 
 def observe(pose, landmark):
@@ -206,7 +104,7 @@ def test_own_states_are_used_and_named():
     assert verify_jacobians(f, arguments={"v": ("area [m^2]",)}).passed is False  # √ of negatives
 
 
-# --- models that misbehave ----------------------------------------------------------------------
+# --- functions that misbehave ----------------------------------------------------------------------
 
 
 def test_a_branch_on_a_tracer_is_named_and_the_claim_still_checked():
@@ -338,111 +236,6 @@ def test_hidden_state_is_found():
         return point * len(calls)
 
     assert "f is pure" in failed(verify_jacobians(f))
-
-
-def test_a_lost_dtype_is_found():
-    robot = build(motion.increment)
-    wide = dataclasses.replace(robot, step=lambda *a: robot.step(*a) + np.zeros(3))
-    assert "step keeps the dtype" in failed(verify_jacobians(wide))
-
-
-# --- models -------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def laser():
-    return build(sensors.range_bearing)
-
-
-def change(model, **fields):
-    return failed(verify_jacobians(dataclasses.replace(model, **fields)))
-
-
-def test_a_residual_that_does_not_wrap_is_found(laser):
-    names = change(laser, residual=lambda z, z_hat: z - z_hat)
-    assert "the residual is a difference, wrapped on the circle" in names
-
-
-def test_a_residual_the_wrong_way_round_is_found(laser):
-    assert change(laser, residual=lambda z, z_hat: laser.residual(z_hat, z)) == [
-        "the residual is a difference, wrapped on the circle"
-    ]
-
-
-def test_a_residual_with_an_offset_is_found(laser):
-    names = change(laser, residual=lambda z, z_hat: laser.residual(z, z_hat) + 0.1)
-    assert "the residual is zero at equality" in names
-    assert "the residual is antisymmetric" in names
-
-
-def test_an_inverse_in_the_wrong_frame_is_found(laser):
-    """The guide's slip (64): the point is taken in the robot's frame, not the sensor's."""
-    bare = sensors.range_bearing(0.01 * np.eye(2))
-    names = change(laser, invert=bare.invert, invert_jacobians=bare.invert_jacobians)
-    assert names == [
-        "invert undoes observe, within what is free",
-        "observe undoes invert, whatever is free",
-    ]
-
-
-def test_an_inverse_that_ignores_what_is_free_is_found():
-    camera = build(sensors.bearing_only)
-    stuck = dataclasses.replace(
-        camera, invert=lambda pose, z, s: camera.invert(pose, z, 3 + 0 * s), invert_jacobians=None
-    )
-    assert failed(verify_jacobians(stuck)) == ["invert undoes observe, within what is free"]
-
-
-def test_a_squared_range_is_tried_only_where_it_can_be_measured(laser):
-    """A sensor whose `invert` takes a root: no measurement is invented that it could not have made."""
-
-    def squared(z):
-        return jnp.stack([z[0] ** 2, z[1]])
-
-    def root(z):
-        there = z[0] > 0
-        return jnp.stack([jnp.where(there, jnp.sqrt(jnp.where(there, z[0], 1.0)), 0.0), z[1]])
-
-    sensor = dataclasses.replace(
-        laser,
-        measurements=("r2 [m2]", "bearing [rad]"),
-        observe=lambda pose, landmark: squared(laser.observe(pose, landmark)),
-        invert=lambda pose, z, s: laser.invert(pose, root(z), s),
-        observe_jacobians=None,
-        invert_jacobians=None,
-    )
-    report = verify_jacobians(sensor)
-    assert report.passed, str(report)
-
-
-def test_bad_noise_is_found(laser):
-    names = change(laser, noise_cov=lambda z: jnp.diag(jnp.stack([z[1], z[1] ** 2])))
-    assert names == ["noise covariance"]
-    robot = build(motion.unicycle)
-    assert change(robot, noise_cov=lambda pose, u: jnp.array([[1.0, 0.5], [0, 1]])) == [
-        "noise covariance"
-    ]
-
-
-def test_a_heading_out_of_range_and_a_wrong_perturb_are_found():
-    robot = build(motion.increment)
-    assert change(robot, perturb=lambda u, w: u - w) == [
-        "step(pose, u, w) = step(pose, perturb(u, w), 0)"
-    ]
-    names = change(
-        robot, step=lambda pose, u, w: robot.step(pose, u, w) + jnp.array([0, 0, 2 * jnp.pi])
-    )
-    assert "the heading is wrapped to (-π, π]" in names
-
-
-def test_a_sensor_whose_embed_fails_is_still_looked_at(laser):
-    def embed(pose, point):
-        raise NotImplementedError("later")
-
-    report = verify_jacobians(dataclasses.replace(laser, embed=embed))
-    assert [f for f in report.findings if f.function == "observe"]
-    assert "later" in str(report)
-    assert not report.passed
 
 
 # --- house --------------------------------------------------------------------------------------

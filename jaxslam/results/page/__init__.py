@@ -1,6 +1,6 @@
-"""A campaign as one page: a self-contained HTML5 file that opens from disk, without scripts.
+"""The report of a campaign as one self-contained HTML5 file, without scripts.
 
-Nothing in it is loaded from anywhere: figures are embedded, and the page forbids the rest.
+Figures are embedded, and the page forbids the browser to load anything else.
 """
 
 import base64
@@ -14,11 +14,11 @@ from jaxslam.results.page.style import CSS, POLICY
 from jaxslam.results.page.text import (
     breakable,
     cell,
-    counted,
     duration,
     interval_title,
     percentage,
     published_note,
+    with_noun,
 )
 from jaxslam.results.plot import Figure, describe, png
 
@@ -38,10 +38,10 @@ VERDICTS = {
 """Each verdict with its sign and its meaning."""
 
 _SHOWN = 20
-"""of the numbers of runs that were not finite."""
+"""largest number of runs listed as not finite"""
 
 _UPRIGHT = 5
-"""With more filters, the table is printed on a page of its own, across."""
+"""With more filters, the table is printed on a landscape page of its own."""
 
 _ALWAYS = ("runs", "not_finite", "divergent")
 
@@ -55,20 +55,20 @@ def page(
     figures: Mapping[str, Figure],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
-    """The whole campaign as the text of one HTML file.
+    """The HTML report of a campaign.
 
     Args:
-        campaign: what to show.
-        table: rows in order, each (key of `Summary.measures`, label, what an honest filter shows);
-            a label that starts with a space is indented. Rows that no filter has are left out.
-        command, seed: how to run it again; None where there was no seed.
-        versions: of what computed it, by name.
-        figures: by caption, in order.
-        draw: makes a PNG file of a figure; one that remembers saves who needs the files as well.
+        campaign: the campaign.
+        table: the rows, each (key of `Summary.measures`, label, value of a consistent filter); a
+            label that starts with a space is indented. Rows that no filter has are left out.
+        command, seed: those of the campaign; None where there was no seed.
+        versions: of the software, by name.
+        figures: in order, by caption.
+        draw: makes a PNG file of a figure; with a cache where the files are needed elsewhere, too.
     """
     names = list(campaign.filters)
-    heading = f"{campaign.scenario}: consistency of {counted(len(names), 'filter')}"
-    setup = f"{counted(campaign.runs, 'Monte-Carlo run')} of {counted(campaign.steps, 'step')}"
+    heading = f"{campaign.scenario}: consistency of {with_noun(len(names), 'filter')}"
+    setup = f"{with_noun(campaign.runs, 'Monte-Carlo run')} of {with_noun(campaign.steps, 'step')}"
     shown = "\n".join(
         _figure(i, caption, figure, draw(figure))
         for i, (caption, figure) in enumerate(figures.items(), 1)
@@ -118,7 +118,7 @@ def page(
 
 
 def _verdicts(campaign: Campaign) -> str:
-    """One line a filter: name, badge, what it was judged by, and what qualifies it."""
+    """The verdicts as HTML: for each filter its name, badge, measures tested, power and doubts."""
     out = []
     for name, summary in campaign.filters.items():
         there = [key for key in TESTS if key in summary.measures]
@@ -136,14 +136,14 @@ def _verdicts(campaign: Campaign) -> str:
 
 
 def _badge(verdict: str, summary: Summary | None = None) -> str:
-    """The verdict, and of a summary which tests spoke; grey and with an asterisk in doubt."""
+    """A verdict as HTML, with the tests that rejected; grey and with an asterisk if in doubt."""
     sign, meaning = VERDICTS.get(verdict, ("·", ""))
     doubts = summary.doubts if summary is not None else ()
     kind = verdict if verdict in VERDICTS else "undecided"
     if doubts and verdict == "consistent":
         sign, kind = "✓*", "undecided"
-    spoke = ", ".join(TESTS[test] for test in (summary.by if summary is not None else ()))
-    title = "; ".join([meaning, *doubts, *[f"by {spoke}"] * bool(spoke)])
+    rejected = ", ".join(TESTS[test] for test in (summary.by if summary is not None else ()))
+    title = "; ".join([meaning, *doubts, *[f"by {rejected}"] * bool(rejected)])
     return (
         f'<span class="badge {kind}" title="{escape(title)}"><span aria-hidden="true">{sign}'
         f"</span> {escape(verdict)}</span>"
@@ -151,7 +151,7 @@ def _badge(verdict: str, summary: Summary | None = None) -> str:
 
 
 def _measures(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
-    """Measures × filters; published figures under our own."""
+    """The table of measures × filters as HTML; published values below our own."""
     summaries = campaign.filters
     head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in summaries)
     verdicts = "".join(f"<td>{_badge(s.verdict, s)}</td>" for s in summaries.values())
@@ -166,7 +166,11 @@ def _measures(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
             )
             body.append(_row(label, honest, cells))
     bands = [
-        _row(f"NIS / dof, {percentage(LEVEL)} band", "", _cells(map(_band, summaries.values())))
+        _row(
+            f"NIS / dof, {percentage(LEVEL)} band",
+            "",
+            _cells(map(_nis_interval, summaries.values())),
+        )
     ]
     first = [s.autocorrelation_band[0] for s in summaries.values()]
     white = (f"± {half:.4f}" if half < float("inf") else "–" for half in first)
@@ -199,6 +203,7 @@ def _measures(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
 
 
 def _row(label: str, honest: str, cells: str) -> str:
+    """A row of the table as HTML."""
     kind = ' class="sub"' if label.startswith(" ") else ""
     honest = escape(honest.replace(">=", "≥").replace("<=", "≤"))
     return (
@@ -208,11 +213,12 @@ def _row(label: str, honest: str, cells: str) -> str:
 
 
 def _cells(texts: Iterable[str]) -> str:
+    """Cells of the table as HTML."""
     return "".join(f"<td>{text}</td>" for text in texts)
 
 
 def _lost(campaign: Campaign) -> str:
-    """A sentence on each filter that was not finite in some runs, with the numbers of those."""
+    """A sentence on each filter that was not finite in some runs, with their numbers, as HTML."""
     out = []
     for name, summary in campaign.filters.items():
         lost = summary.not_finite_runs
@@ -226,6 +232,7 @@ def _lost(campaign: Campaign) -> str:
 
 
 def _conventions(campaign: Campaign) -> str:
+    """The definitions of measures and verdicts as HTML."""
     meanings = "\n".join(
         f"<dt>{_badge(verdict)}</dt><dd>{escape(meaning)}.</dd>"
         for verdict, (_, meaning) in VERDICTS.items()
@@ -237,7 +244,7 @@ def _conventions(campaign: Campaign) -> str:
     )
     return f"""<p><strong>NEES</strong> = eᵀP⁻¹e is <em>not</em> divided by its degrees of freedom,
 which are the honest value: {DOF["pose"]} for the pose, {DOF["position"]} for the position,
-{DOF["heading"]} for the heading. Steps with a singular P have none, and are counted.
+{DOF["heading"]} for the heading. Steps with a singular P have none, and are with_noun.
 <strong>±</strong> is half the {percentage(LEVEL)} interval of the mean over independent runs; hold
 the pointer over a number for its ends, which stand in brackets where it is lopsided.
 <strong>Honest</strong> is what a filter shows whose covariances are right. A run is
@@ -256,6 +263,7 @@ reject. An asterisk marks a verdict with a reservation:</p>
 def _parameters(
     campaign: Campaign, command: str, seed: int | None, versions: Mapping[str, str]
 ) -> str:
+    """The parameters of the campaign as HTML."""
     compiling = duration(campaign.compile_seconds)
     rows = {
         "scenario": escape(campaign.scenario),
@@ -274,6 +282,7 @@ def _parameters(
 
 
 def _figure(number: int, caption: str, figure: Figure, drawn: bytes) -> str:
+    """A figure with its caption as HTML, the PNG file embedded."""
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
     data = base64.b64encode(drawn).decode("ascii")
     return (
@@ -283,6 +292,6 @@ def _figure(number: int, caption: str, figure: Figure, drawn: bytes) -> str:
     )
 
 
-def _band(summary: Summary) -> str:
+def _nis_interval(summary: Summary) -> str:
     band = summary.nis_band
     return "–" if band is None else f"{band[0]:.4f} – {band[1]:.4f}"

@@ -1,4 +1,4 @@
-"""What the page looks like, and what a browser may load for it: nothing."""
+"""The style sheet of the page, and the policy that forbids a browser to load anything."""
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 

@@ -1,4 +1,4 @@
-"""How numbers and names are written on the page."""
+"""Numbers and names as text on the page."""
 
 from html import escape
 
@@ -8,7 +8,7 @@ from jaxslam.consistency import LEVEL, Measure, lopsided
 
 
 def cell(measure: Measure | None) -> str:
-    """value ± half-width, to two digits of that, or [low, high] where the interval is lopsided."""
+    """A measure as value ± half-width to two digits, or with [low, high] if that is asymmetric."""
     if measure is None:
         return "–"
     half = (measure.high - measure.low) / 2
@@ -28,7 +28,7 @@ def cell(measure: Measure | None) -> str:
 
 
 def number(value: float, digits: int) -> str:
-    """So many significant digits; tiny and huge ones as a power of ten."""
+    """A number with some significant digits; small and large ones with a power of ten."""
     if value == 0 or 1e-3 <= abs(value) < 1e6:
         return f"{value:.{digits}g}".replace("-", "−")
     mantissa, power = f"{value:.{digits - 1}e}".split("e")
@@ -36,29 +36,29 @@ def number(value: float, digits: int) -> str:
 
 
 def interval_title(measure: Measure | None) -> str:
-    """The attribute that shows a measure's interval under the pointer."""
+    """The HTML attribute that shows a measure's interval under the pointer."""
     if measure is None or not np.isfinite(measure.high):
         return ""
     return f' title="{percentage(LEVEL)} interval {measure.low:.5g} to {measure.high:.5g}"'
 
 
 def published_note(value: float | None) -> str:
-    """The published figure, where there is one."""
+    """The published value as HTML, if there is one."""
     return "" if value is None else f'<span class="published">published {number(value, 4)}</span>'
 
 
 def percentage(share: float, digits: int = 0) -> str:
-    """As a percentage, with a space that does not break."""
+    """A share as a percentage, with a no-break space."""
     return f"{100 * share:.{digits}f}\N{NO-BREAK SPACE}%"
 
 
-def counted(number: int, noun: str) -> str:
-    """1 run, 2 runs."""
+def with_noun(number: int, noun: str) -> str:
+    """A number with its noun: 1 run, 2 runs."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def duration(seconds: float) -> str:
-    """Seconds as seconds, minutes or hours."""
+    """A duration in seconds, minutes or hours."""
     if seconds < 120:
         return f"{seconds:.1f} s"
     minutes = round(seconds / 60)
@@ -66,5 +66,5 @@ def duration(seconds: float) -> str:
 
 
 def breakable(name: str) -> str:
-    """Escaped, with places where a long name may break."""
+    """A name escaped for HTML, with places where it may break."""
     return escape(name).replace("_", "_<wbr>")

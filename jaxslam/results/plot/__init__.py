@@ -1,7 +1,7 @@
-"""Figures a paper could print: maps, errors, and what a campaign shows. Only this package draws.
+"""Figures of maps, errors and campaigns.
 
-Figures are made without pyplot, so there is no global state and no window; save one with
-`figure.savefig(path)`.
+Only this package draws. Figures are made without pyplot, so there is no global state and no window;
+`figure.savefig(path)` saves one.
 """
 
 from jaxslam.results.plot.campaign import (

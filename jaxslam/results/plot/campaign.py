@@ -1,4 +1,4 @@
-"""What a campaign shows, for all of its filters: errors, coverage, whiteness, information."""
+"""Figures of a campaign's filters: errors, cost, coverage, whiteness, information gained."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,12 +19,11 @@ from jaxslam.results.plot.style import (
 )
 
 _NOTHING = 1e-6
-"""[1/rad²] information on a heading of which one has learnt nothing: σ is 1000 rad."""
+"""Information on a heading that counts as none, σ being 1000 rad [1/rad²]."""
 
 
 def bound_figure(campaign: Campaign) -> Figure:
-    """RMSE of position and heading over the steps for every filter, above the conditional
-    Cramér-Rao bound where the campaign has one.
+    """RMSE of position and heading over the steps, with the conditional Cramér-Rao bound if known.
 
     Logarithmic where one filter's largest error is over ten times another's.
     """
@@ -58,9 +57,9 @@ def bound_figure(campaign: Campaign) -> Figure:
 
 
 def cost_figure(campaign: Campaign) -> Figure:
-    """Position error and pose NEES of every filter against what a step of it takes.
+    """Position error and pose NEES of every filter against the time of a step.
 
-    Filters that were not timed have a name and no mark.
+    Filters that were not timed appear in the legend only.
     """
     figure, panels = panels_of(7.0, 4.6, 2)
     times = [1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters]
@@ -91,9 +90,9 @@ def cost_figure(campaign: Campaign) -> Figure:
 
 
 def coverage_figure(campaign: Campaign) -> Figure:
-    """How often the truth lies in the ellipsoid of probability p, against p, for every filter.
+    """Share of steps with the truth in the ellipsoid of probability p, against p.
 
-    On the diagonal a filter is honest; below it is optimistic, above pessimistic.
+    A consistent filter is on the diagonal; an optimistic one is below, a pessimistic one above.
     """
     figure, panels = panels_of(7.0, 3.3, 1, len(DOF))
     for axes, block in zip(panels, DOF, strict=True):
@@ -112,7 +111,7 @@ def coverage_figure(campaign: Campaign) -> Figure:
 
 
 def whiteness_figure(campaign: Campaign) -> Figure:
-    """Autocorrelation of whitened innovations against the lag for every filter; 0 is honest.
+    """Autocorrelation of normalized innovations against the lag; that of a consistent filter is 0.
 
     The band is that of white innovations, the widest of the filters.
     """
@@ -135,10 +134,10 @@ def whiteness_figure(campaign: Campaign) -> Figure:
 
 
 def gained_figure(campaign: Campaign) -> Figure:
-    """Information wrongly gained along a turn of the whole frame over the steps; 0 is honest.
+    """Spurious information on the rotation of the whole frame over the steps; 0 is consistent.
 
-    Of the filters that were watched. Below 1e-6 / rad² (σ of 1000 rad, nothing) a curve runs in a
-    strip of its own under the logarithmic axis, exact zeros and rounding alike.
+    It is shown of filters with an observability monitor. Values below 1e-6 / rad² (σ of 1000 rad),
+    zeros and rounding errors alike, are drawn in a strip below the logarithmic axis.
     """
     figure, (axes,) = panels_of(7.0, 3.6, 1)
     step = np.arange(1, campaign.steps + 1)

@@ -1,4 +1,4 @@
-"""NEES of a campaign's filters over the steps, with the band of an honest one."""
+"""Figure of the NEES of a campaign's filters over the steps, with the 95 % band."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,25 +22,25 @@ from jaxslam.results.plot.style import (
 )
 
 _TOGETHER = 5
-"""curves that can be told apart in one panel"""
+"""largest number of curves in a panel"""
 
 _RANGE = (1 / 10, 100.0)
-"""times dof: what small panels show at most; beyond it a filter is wrong by any measure"""
+"""range of small panels, in multiples of dof"""
 
 
 def nees_figure(campaign: Campaign, *, blocks: Sequence[str] = tuple(DOF)) -> Figure:
     """Average NEES over the steps for every filter of a campaign, with the 95 % chi-square band.
 
-    The band is that of the filter with the most finite runs, the narrowest. Of more than five
-    filters a row of panels is drawn for each kind of filter (`catalog.KINDS`), on the same scales,
-    which end at 100 times an honest NEES: a curve beyond it runs along the upper edge.
+    The band is that of the filter with the most finite runs, the narrowest. More than five filters
+    are drawn in a row of panels for each kind of filter (`catalog.KINDS`). Their scales are the
+    same and end at 100 times dof; larger values are drawn at the upper edge.
     """
     if len(campaign.filters) > _TOGETHER:
         return _by_kind(campaign, blocks)
     figure, panels = panels_of(7.0, 1.9 * len(blocks) + 0.8, len(blocks))
     step = np.arange(1, campaign.steps + 1)
     for axes, block in zip(panels, blocks, strict=True):
-        _band(axes, campaign, block)
+        _draw_band(axes, campaign, block)
         for i, (name, summary) in enumerate(campaign.filters.items()):
             label = f"{name} ({summary.verdict})"
             curve(axes, i, step, summary.curves[f"nees_{block}"], label)
@@ -52,7 +52,7 @@ def nees_figure(campaign: Campaign, *, blocks: Sequence[str] = tuple(DOF)) -> Fi
 
 
 def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """(kind, names) of at most five filters each, in the order of `catalog.KINDS`; then others."""
+    """Groups (kind, names) of at most five filters: those of `catalog.KINDS`, then others."""
     known = {name: kind for kind, members in KINDS.items() for name in members}
     found = []
     for kind in [*KINDS, "others"]:
@@ -62,6 +62,7 @@ def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
 
 
 def _by_kind(campaign: Campaign, blocks: Sequence[str]) -> Figure:
+    """The figure with a row of panels for each kind of filter."""
     rows = kinds_of(list(campaign.filters))
     figure = Figure(figsize=(9.4, 1.35 * len(rows) + 0.9), dpi=150, layout="constrained")
     widths = [*[1.0] * len(blocks), 0.02]
@@ -76,7 +77,7 @@ def _by_kind(campaign: Campaign, blocks: Sequence[str]) -> Figure:
             axes.spines[["top", "right"]].set_visible(False)
             axes.grid(color="#dddddd", lw=0.5)
             axes.set_axisbelow(True)
-            _band(axes, campaign, block)
+            _draw_band(axes, campaign, block)
             top = _RANGE[1] * DOF[block]
             for i, name in enumerate(names):
                 summary = campaign.filters[name]
@@ -99,8 +100,8 @@ def _by_kind(campaign: Campaign, blocks: Sequence[str]) -> Figure:
     return figure
 
 
-def _band(axes: Axes, campaign: Campaign, block: str) -> None:
-    """Where the NEES of an honest filter lies, and its dof."""
+def _draw_band(axes: Axes, campaign: Campaign, block: str) -> None:
+    """Draw the 95 % band of the NEES, and its dof."""
     most = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
     step = np.arange(1, campaign.steps + 1)
     low, high = most[f"nees_{block}_low"], most[f"nees_{block}_high"]
@@ -110,7 +111,7 @@ def _band(axes: Axes, campaign: Campaign, block: str) -> None:
 
 
 def _scale(axes: Axes, campaign: Campaign, block: str) -> None:
-    """One logarithmic scale for a column, of what there is within `_RANGE`."""
+    """Set the logarithmic scale of a column of panels, within `_RANGE`."""
     dof = DOF[block]
     every = np.concatenate(
         [

@@ -1,4 +1,4 @@
-"""What one run shows: its map with ellipses, and its errors within what the filter claims."""
+"""Figures of a single run: its map with covariance ellipses, and its errors with their bounds."""
 
 import jax
 import numpy as np
@@ -13,7 +13,7 @@ from jaxslam.types import Estimate, Truth
 def ellipse(
     mean: np.ndarray, cov: np.ndarray, n_sigma: float = 3.0, points: int = 64
 ) -> np.ndarray:
-    """The contour (points + 1, 2) of Mahalanobis distance n_sigma, Solà (84), closed.
+    """The closed contour (points + 1, 2) of Mahalanobis distance n_sigma, Solà (84).
 
     mean + n L (cos α, sin α) with P = L Lᵀ. n_sigma sets the size and points the smoothness. A
     positive semi-definite P gives a segment or a point. Raises ValueError if P is not 2×2, not
@@ -43,9 +43,9 @@ def map_figure(
     n_sigma: float = 3.0,
     title: str = "",
 ) -> Figure:
-    """The estimated path and final map with n-σ ellipses, over the truth where there is one.
+    """The estimated path and final map with n-σ ellipses, and the truth if it is known.
 
-    estimate has leading T, as in `Trace.estimate`; true_points (N, 2) are drawn as they stand.
+    estimate has leading T, as in `Trace.estimate`; true_points (N, 2) are drawn without alignment.
     """
     figure, (axes,) = panels_of(6.0, 6.0, 1)
     if truth is not None:
@@ -77,7 +77,7 @@ def map_figure(
 def errors_figure(
     estimate: Estimate, truth: Truth, *, n_sigma: float = 3.0, title: str = ""
 ) -> Figure:
-    """Errors of x, y and heading over the steps, within ±n σ of the filter's own covariance."""
+    """Errors of x, y and heading over the steps, with ±n σ of the filter's own covariance."""
     error = np.asarray(truth.pose) - np.asarray(estimate.pose)
     error[:, 2] = np.asarray(jax.jit(wrap)(error[:, 2]))
     cov = np.asarray(estimate.pose_cov)
@@ -100,13 +100,13 @@ def errors_figure(
 
 
 def _extent(*clouds: np.ndarray) -> float:
-    """The larger side of the box around some points, or 1 where it has no size."""
+    """The larger side of the bounding box of some points, or 1 if it is 0."""
     every = np.concatenate([cloud[:, :2] for cloud in clouds])
     return float(np.ptp(every, axis=0).max()) or 1.0
 
 
 def _heading_mark(axes: Axes, pose: np.ndarray, extent: float) -> None:
-    """A triangle where the robot ends, pointing ahead."""
+    """Draw a triangle at a pose, in its direction."""
     size = 0.022 * extent
     shape = size * np.array([[1.2, 0.0], [-0.6, 0.6], [-0.6, -0.6], [1.2, 0.0]])
     c, s = np.cos(pose[2]), np.sin(pose[2])

@@ -1,39 +1,41 @@
-"""What every figure shares: colours, panels, curves, captions and axes."""
+"""Parts of every figure: colours, panels, curves, captions and axes."""
 
 import io
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure as Figure  # others name the type, and import only this module
+from matplotlib.figure import Figure as Figure  # re-exported: only this package imports Matplotlib
+
+from jaxslam.monte_carlo import Campaign
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
-"""A palette that colour-blind readers can tell apart (Okabe & Ito)."""
+"""A palette for colour-blind readers (Okabe & Ito)."""
 
 INK = "#333333"
 
 _HUES = 6
 _DASHES = ("-", (0, (4, 1.6)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
 _MARKS = ("o", "s", "^", "D")
-"""Filters take six of the colours in turn, then again with other dashes and markers."""
+"""Six colours are used in turn, then again with other dashes and markers."""
 
 
 def png(figure: Figure, dpi: float = 180) -> bytes:
-    """The figure as a PNG file, dpi dots an inch."""
+    """The figure as a PNG file with dpi dots an inch."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=dpi)
     return out.getvalue()
 
 
 def warm_up() -> None:
-    """Load what drawing takes fonts, text and formulas from: half a second, once a process."""
+    """Load fonts and the formula renderer, which takes half a second once a process."""
     figure, (axes, *_) = panels_of(1.0, 1.0, 1)
     axes.set_title("$x^2$")
     png(figure, dpi=10)
 
 
 def describe(figure: Figure) -> str:
-    """What the figure shows, in a sentence, for those who cannot see it."""
+    """A sentence that describes the figure, for readers who cannot see it."""
     panels = [" ".join(filter(None, (a.get_title(), a.get_ylabel()))) for a in figure.axes]
     across = next(filter(None, (a.get_xlabel() for a in figure.axes)), "")
     legends = [*figure.legends, *filter(None, (a.get_legend() for a in figure.axes))]
@@ -65,7 +67,7 @@ def curve(
     mark: float = 0.0,
     width: float = 1.2,
 ) -> None:
-    """The line of filter number i; width and marks in points, marks where a line needs them too."""
+    """Draw the curve of filter number i; width and size of marks in points, mark 0 for none."""
     dashes = _DASHES[i // _HUES % len(_DASHES)]
     marks: dict[str, Any] = {"marker": _MARKS[i // _HUES % len(_MARKS)], "ms": mark or 3.0}
     axes.plot(
@@ -81,21 +83,23 @@ def curve(
 
 
 def lone_mark(y: np.ndarray) -> dict[str, Any]:
-    """A marker for curves of a single number, which have no line."""
+    """Options that draw a marker where a curve has a single finite value, and so no line."""
     return {"marker": "o", "ms": 3.0} if np.isfinite(y).sum() == 1 else {}
 
 
 def plain(name: str) -> str:
-    """A name as it stands: no mathematics in it, and not hidden from the legend."""
+    """A name escaped for Matplotlib: without formulas, and not hidden from the legend."""
     name = name.replace("$", r"\$")
     return f" {name}" if name.startswith("_") else name
 
 
 def logarithmic(axes: Axes) -> None:
-    """A logarithmic ordinate with plain numbers, where the values span more than a decade;
-    minor ticks have numbers where decades are few. Linear where no value is above 0."""
+    """Make the ordinate logarithmic where positive values span more than a decade.
+
+    Numbers are plain; minor ticks have numbers where there are few decades.
+    """
     if not np.isfinite(axes.dataLim.minposy):
-        return  # Matplotlib would refuse to draw
+        return  # Matplotlib raises without positive values
     low, high = axes.get_ylim()
     if 0 < high < 10 * low:
         return
@@ -106,12 +110,12 @@ def logarithmic(axes: Axes) -> None:
 
 
 def few_digits(x: float, _: float) -> str:
-    """Minor ticks of a logarithmic axis: 2 and 5 of each decade."""
+    """The label of a minor tick on a logarithmic axis: 2 and 5 of each decade have one."""
     return f"{x:g}" if f"{x:.0e}"[0] in "25" else ""
 
 
 def caption(figure: Figure, title: str) -> None:
-    """Title and legend above the panels, clear of the curves; the figure grows with its rows."""
+    """Add title and legend above the panels; the figure grows with the rows of the legend."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     width = 72 * figure.get_figwidth()
     columns = 1
@@ -137,16 +141,16 @@ def caption(figure: Figure, title: str) -> None:
         line.set_linewidth(1.6)
 
 
-def head(campaign: Any) -> str:
+def head(campaign: Campaign) -> str:
     """The name of a campaign's scenario, for a title."""
     return plain(campaign.scenario)
 
 
-def runs_of(campaign: Any) -> str:
-    """How many runs a campaign has, in words."""
+def runs_of(campaign: Campaign) -> str:
+    """The number of runs of a campaign in words."""
     return f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
 
 
 def span(steps: int) -> tuple[float, float]:
-    """The first to the last step, and room for a single one."""
+    """The limits of the abscissa, with some width if there is a single step."""
     return (1, steps) if steps > 1 else (0.5, 1.5)

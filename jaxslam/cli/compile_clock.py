@@ -1,8 +1,7 @@
-"""What a command spent on compiling, and what on all else."""
+"""Wall time of a command, and the part of it that went into compilation."""
 
 import threading
 import time
-from typing import Any
 
 import jax
 
@@ -16,22 +15,23 @@ _PARTS = (
 )
 
 
-class Spent:
-    """A clock, as a context: wall seconds, and how long some program was being made meanwhile.
+class CompileClock:
+    """A context manager that measures wall time and compilation time, and counts programs.
 
-    A program is traced, lowered, and compiled or taken from the cache. Several are at once, and
-    finished ones run beside them; `compiling` is the time during which at least one was at it.
+    A program is traced, lowered, and compiled or loaded from the cache. Several threads compile at
+    once while compiled programs run; `compiling` is the time during which at least one of them
+    compiled.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._spans: list[tuple[float, float]] = []
         self.programs = 0
-        """compiled, or taken from the cache"""
+        """number of programs compiled or loaded from the cache"""
         self.cached = 0
-        """taken from the cache"""
+        """number of programs loaded from the cache"""
 
-    def __enter__(self) -> "Spent":
+    def __enter__(self) -> "CompileClock":
         self._began = time.perf_counter()
         jax.monitoring.register_event_duration_secs_listener(self._took)
         jax.monitoring.register_event_listener(self._happened)
@@ -43,12 +43,12 @@ class Spent:
 
     @property
     def seconds(self) -> float:
-        """Wall time so far."""
+        """Wall time since the block was entered [s]."""
         return time.perf_counter() - self._began
 
     @property
     def compiling(self) -> float:
-        """Wall time during which a program was being traced, lowered or compiled."""
+        """Wall time during which a program was traced, lowered or compiled [s]."""
         total, at = 0.0, self._began
         with self._lock:
             spans = sorted(self._spans)
@@ -64,15 +64,16 @@ class Spent:
             f"{self.programs - self.cached} compiled, {self.cached} loaded from the cache"
         )
 
-    def _took(self, event: str, duration_secs: float, **_: Any) -> None:
+    def _took(self, event: str, duration_secs: float, **_: str | int) -> None:
         if event in _PARTS:
             now = time.perf_counter()
             with self._lock:
                 self._spans.append((now - duration_secs, now))
-                self.programs += event in _PARTS[-2:]  # a cached one is "compiled" all the same
+                # JAX reports a cached program as compiled, too.
+                self.programs += event in _PARTS[-2:]
                 self.cached += event == RESTORED
 
-    def _happened(self, event: str, **_: Any) -> None:
+    def _happened(self, event: str, **_: str | int) -> None:
         if event == "/jax/compilation_cache/cache_hits":
             with self._lock:
                 self.cached += 1

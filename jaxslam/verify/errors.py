@@ -1,4 +1,4 @@
-"""An exception in a user's model, in one line that names theirs."""
+"""Exceptions raised by a user's model, described in one line with the place in the user's file."""
 
 import traceback
 from pathlib import Path
@@ -11,23 +11,23 @@ _JAX = str(Path(jax.__file__).parent)
 
 
 def line_of(error: BaseException) -> str:
-    """As "file.py:12", the innermost frame of a user's file, or else of a model of ours; or ""."""
+    """The place of an error in a user's file, or else in the package, as "file.py:12"; or ""."""
     frames = traceback.extract_tb(error.__traceback__)[::-1]
-    users = [f for f in frames if is_users(f.filename)]
+    users = [f for f in frames if is_user_file(f.filename)]
     ours = [f for f in frames if f.filename.startswith(_PACKAGE) and _VERIFIER not in f.filename]
     for frame in users + ours:
         return f"{Path(frame.filename).name}:{frame.lineno}"
     return ""
 
 
-def is_users(filename: str) -> bool:
-    """Whether a source file is a user's own, rather than a library's."""
+def is_user_file(filename: str) -> bool:
+    """Whether a source file is the user's own, not a library's."""
     libraries = (_JAX, _PACKAGE, "<")
     return not (filename.startswith(libraries) or "site-packages" in filename)
 
 
-def told(error: BaseException) -> str:
-    """What went wrong, on one line, with the user's file and line in front."""
+def describe_error(error: BaseException) -> str:
+    """The error in one line that begins with the user's file and line."""
     where = line_of(error)
     if isinstance(error, jax.errors.TracerBoolConversionError):
         why = "a Python `if`, `while` or `and` looks at a traced value; use jnp.where or lax.cond"

@@ -1,4 +1,4 @@
-"""What the commands share: names that must be known, and a bar of progress."""
+"""Helpers of all commands: look-up by name, folders among the options, and a progress bar."""
 
 import argparse
 import sys
@@ -16,16 +16,16 @@ INTERRUPTED = 130
 
 
 def pick(kind: str, name: str, known: Mapping[str, _T]) -> _T:
-    """What has that name, or ValueError with the names that are known."""
+    """The entry of `known` with a name; raises ValueError that lists the known names."""
     if name not in known:
         raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(known)}")
     return known[name]
 
 
 def as_folders(options: argparse.Namespace) -> None:
-    """Make paths of the options that name folders; ValueError where a name is empty.
+    """Convert the options that name folders to paths; raises ValueError on an empty name.
 
-    The path of an empty name would be the current folder.
+    `Path("")` would be the current folder.
     """
     for name in ("out", "resume", "cache"):
         text = getattr(options, name, None)
@@ -37,7 +37,7 @@ def as_folders(options: argparse.Namespace) -> None:
 
 
 class Progress:
-    """A bar on a terminal; silent where the output is not one."""
+    """A progress bar on standard error; prints nothing where that is not a terminal."""
 
     def __init__(self, what: str, unit: str = "runs") -> None:
         self._what, self._unit = what, unit
@@ -50,13 +50,13 @@ class Progress:
         return self
 
     def say(self, what: str) -> None:
-        """Show what is being done."""
+        """Show a word on the current stage of the work."""
         self._draw(f"{self._what}: {what}")
 
     def __call__(self, done: int, total: int) -> None:
-        """Show how much is done; from the second call on also how fast, and how long it will take.
+        """Show how much is done and, from the second call on, the rate and the remaining time.
 
-        The rate is that since the first call, before which programs were compiled.
+        The rate is measured from the first call, so it excludes compilation.
         """
         now = time.perf_counter()
         filled = round(30 * done / total)
@@ -70,7 +70,7 @@ class Progress:
         self._draw(line)
 
     def glimpse(self, name: str, runs: int, nees: Measure | None) -> None:
-        """A line that stays: what the first block says of a filter, while others are compiled."""
+        """Print a line with the pose NEES of a filter's first block, while others are compiled."""
         if self._shown and nees is not None:
             one = runs == 1
             shown = f"{nees.value:.3g}" + ("" if one else f" ({nees.low:.3g} to {nees.high:.3g})")
@@ -91,7 +91,7 @@ def _rate(rate: float) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """As 42 s, 3 min 5 s or 2 h 10 min."""
+    """A duration as text: 42 s, 3 min 5 s or 2 h 10 min."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

@@ -1,71 +1,73 @@
-"""A filter over a long log in pieces of one compiled program, with a look at it between them."""
+"""A filter run over a long log piece by piece, with checks of its state in between."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float, Int
 
 from jaxslam.protocols import Filter
 from jaxslam.types import Estimate, Log
 
-LOOKS = 20
-"""how often progress is shown, and the covariance looked at, where the user does not say"""
+State: TypeAlias = Any
+"""A filter's own state, a pytree."""
+
+Rows: TypeAlias = tuple[jax.Array, ...]
+"""What is kept of each step: arrays with leading T."""
+
+CHECKS = 20
+"""Default number of progress updates, and of checks of the state."""
 
 _LONGEST = 500
-"""steps between two looks at the most"""
+"""Largest number of steps in a piece."""
 
 
-class Driven(NamedTuple):
-    """What a filter made of a log, on the host."""
+class PiecewiseRun(NamedTuple):
+    """The results of a filter over a log of T steps, as NumPy arrays."""
 
     path: Estimate
-    """pose (T, 3) and pose_cov (T, 3, 3) with leading T; of the map nothing"""
-    status: NDArray[np.int32]
-    """(T, M)"""
-    nis: NDArray[np.float64]
-    """(T, M)"""
-    dof: NDArray[np.int32]
-    """(T, M)"""
-    log_likelihood: NDArray[np.float64]
-    """(T,)"""
+    """pose (T, 3) and pose_cov (T, 3, 3); the fields of the map are ()"""
+    status: Int[np.ndarray, "T M"]
+    nis: Float[np.ndarray, "T M"]
+    dof: Int[np.ndarray, "T M"]
+    log_likelihood: Float[np.ndarray, "T"]
     last: Estimate
-    """after the last step"""
-    looked: list[int]
-    """the steps, from 1, after which the state was looked at"""
-    found: list[bool]
-    """what was seen there"""
+    """the estimate after the last step"""
+    checked: list[int]
+    """the steps, from 1, after which the state was checked"""
+    passed: list[bool]
+    """the results of these checks"""
 
 
-def drive(
+def run_in_pieces(
     filter: Filter,
     log: Log,
     pose: np.ndarray,
     pose_cov: np.ndarray,
     *,
     every: int | None = None,
-    look: Callable[[Any], bool],
+    check: Callable[[State], bool],
     progress: Callable[[int, int], object],
-) -> Driven:
-    """Predict and update row by row, as `run` does for a log whose values have been checked.
+) -> PiecewiseRun:
+    """Predict and update row by row, as `run` does, for a log whose values have been checked.
 
-    The log's rows go through one program, piece by piece, of which it takes as many as there are.
+    One compiled program processes the log piece by piece; the last piece is padded.
 
     Args:
         log: T rows of arrays in the dtype of the arithmetic.
-        every: look at the state after so many steps, and after the last; 0 not at all. Default
-            `LOOKS` times.
-        look: called with the filter's own state.
-        progress: called with the steps done and all of them, every now and then.
+        every: number of steps between two checks of the state; the last step is checked, too.
+            0: no checks. Default: `CHECKS` checks.
+        check: the check, called with the filter's own state.
+        progress: called after each piece with the steps done and their total.
     """
     total = log.control.shape[0]
-    every = max(1, -(-total // LOOKS)) if every is None else every
+    every = max(1, -(-total // CHECKS)) if every is None else every
     size = min(every or _LONGEST, _LONGEST, total)
-    key = jax.random.key(0)  # the filters here draw nothing
+    key = jax.random.key(0)  # these filters are deterministic
 
-    def step(state: Any, row: Log) -> tuple[Any, tuple[Any, ...]]:
+    def step(state: State, row: Log) -> tuple[State, tuple[jax.Array, ...]]:
         state = filter.predict(state, row.control, key)
         state, info = filter.update(state, row.scan, key)
         at = filter.estimate(state)
@@ -73,8 +75,8 @@ def drive(
         return state, (at.pose, at.pose_cov, *kept)
 
     @jax.jit
-    def piece(state: Any, rows: Log, count: jax.Array) -> tuple[Any, Any, Estimate]:
-        def one(i: jax.Array, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+    def piece(state: State, rows: Log, count: jax.Array) -> tuple[State, Rows, Estimate]:
+        def one(i: jax.Array, carry: tuple[State, Rows]) -> tuple[State, Rows]:
             state, kept = carry
             state, new = step(state, jax.tree.map(lambda leaf: leaf[i], rows))
             return state, jax.tree.map(lambda all, one: all.at[i].set(one), kept, new)
@@ -87,7 +89,7 @@ def drive(
 
     kind = log.control.dtype
     state = jax.jit(filter.init)(pose.astype(kind), pose_cov.astype(kind))
-    pieces, looked, found, done = [], [], [], 0
+    pieces, checked, passed, done = [], [], [], 0
     while done < total:
         until = total if not every else min(total, (done // every + 1) * every)
         until = min(until, done + size)
@@ -97,23 +99,25 @@ def drive(
         done = until
         progress(done, total)
         if every and (done % every == 0 or done == total):
-            looked.append(done)
-            found.append(look(state))
-    whole: list[Any] = [np.concatenate(parts) for parts in zip(*pieces, strict=True)]
-    pose, cov, status, nis, dof, log_likelihood = whole
+            checked.append(done)
+            passed.append(check(state))
+    pose, cov, status, nis, dof, log_likelihood = (
+        np.concatenate(parts) for parts in zip(*pieces, strict=True)
+    )
     path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
-    return Driven(
+    return PiecewiseRun(
         path=path,
         status=status,
         nis=nis,
         dof=dof,
         log_likelihood=log_likelihood,
         last=jax.tree.map(np.asarray, last),
-        looked=looked,
-        found=found,
+        checked=checked,
+        passed=passed,
     )
 
 
 def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+    """The rows with zeros appended up to `size` of them."""
     rows = np.asarray(rows)
     return np.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])

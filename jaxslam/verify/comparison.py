@@ -1,36 +1,38 @@
-"""Which entry of which Jacobian is wrong, and which of the four ways of computing it says so."""
+"""Comparison of Jacobians computed in several ways: which entries are wrong, by which method."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
+import jax
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float, Int
 
-from jaxslam.verify.differences import Quotient
 from jaxslam.verify.jacobians import Evaluated, Evaluation
 from jaxslam.verify.record import Finding, WrongEntry
 from jaxslam.verify.samples import Samples
 
-Values = NDArray[np.float64]
+Values: TypeAlias = Float[np.ndarray, "_ _ _"]
+"""Jacobians (S, m, n)."""
 
 DIFFERENCES_TOLERANCE = 1e-6
-"""of the quotients, relative, beyond ten times their own estimate of their error"""
+"""relative tolerance of the quotients, beyond ten times their estimated error"""
 _CONVERGED = 1e-3
-"""relative error up to which a quotient counts as a derivative"""
+"""largest relative error of a quotient that counts as converged"""
 _NOTHING = 1e-9
-"""error up to which it does so in any case: a row may be zero everywhere"""
+"""absolute error at which it counts as converged in any case: a row may be zero everywhere"""
 _NOMINAL = ("random", "given")
 
 
-def judge(evaluated: Evaluated, tolerance: float, float32_tolerance: float) -> list[Finding]:
-    """Compare the methods entry by entry: one finding an argument that was evaluated.
+def compare_methods(
+    evaluated: Evaluated, tolerance: float, float32_tolerance: float
+) -> list[Finding]:
+    """One finding for each argument: the methods compared entry by entry.
 
-    A state at which the function itself has no finite value has no Jacobian; it is left to the
-    check of finite values.
+    States at which the function has no finite value are left out; another check reports them.
     """
     if evaluated.values is None:
         return []
     finite = np.all(np.isfinite(evaluated.values), axis=1)
-    evaluated = _only(evaluated, np.flatnonzero(finite))
+    evaluated = _at_states(evaluated, np.flatnonzero(finite))
     return [
         _finding(evaluated, k, tolerance, float32_tolerance)
         for k, evaluation in enumerate(evaluated.by_argument)
@@ -38,14 +40,15 @@ def judge(evaluated: Evaluated, tolerance: float, float32_tolerance: float) -> l
     ]
 
 
-def _only(evaluated: Evaluated, rows: NDArray[np.intp]) -> Evaluated:
+def _at_states(evaluated: Evaluated, rows: Int[np.ndarray, "R"]) -> Evaluated:
+    """The evaluation at some of its states."""
     samples = evaluated.samples
     by_argument = tuple(
         Evaluation(
             {how: jacobian[rows] for how, jacobian in evaluation.methods.items()},
             {how: jacobian[rows] for how, jacobian in evaluation.single.items()},
             evaluation.single_error[rows] if evaluation.single_error.ndim else np.zeros(()),
-            evaluation.quotient and _rows_of(evaluation.quotient, rows),
+            jax.tree.map(lambda part: part[rows], evaluation.quotient),
             evaluation.how,
         )
         for evaluation in evaluated.by_argument
@@ -54,28 +57,31 @@ def _only(evaluated: Evaluated, rows: NDArray[np.intp]) -> Evaluated:
     return evaluated._replace(samples=kept, by_argument=by_argument)
 
 
-def _rows_of(quotient: Quotient, rows: NDArray[np.intp]) -> Quotient:
-    return Quotient(quotient.value[rows], quotient.error[rows], quotient.kink[rows])
-
-
 class _Compared(NamedTuple):
-    """All entries against each other, (S, m, n) each but scale (S, m, 1)."""
+    """Differences between the methods at every entry of a Jacobian."""
 
     gap: Values
+    """largest difference among jacfwd, jacrev and hand in float64"""
     relative: Values
+    """the same over `scale`"""
     relative32: Values
-    away: Values
-    """from the quotients, relative, where they converge"""
-    scale: Values
+    """the same in float32"""
+    from_quotient: Values
+    """largest relative difference from the quotients, where they converge"""
+    scale: Float[np.ndarray, "S m 1"]
+    """the size of the row"""
     excess: Values
-    """the worst of the three over its tolerance; above 1 is wrong"""
-    in_float32: NDArray[np.bool_]
-    """whether float32 is what is worst"""
+    """the largest of the three over its tolerance; above 1 the entry is wrong"""
+    in_float32: Bool[np.ndarray, "S m n"]
+    """whether float32 exceeds its tolerance most"""
     no_derivative: int
+    """number of states at which the quotients do not converge"""
 
 
 def _compare(evaluation: Evaluation, tolerance: float, float32_tolerance: float) -> _Compared:
-    (gap, scale), (gap32, scale32) = _spread(evaluation.methods), _spread(evaluation.single)
+    """All differences between the methods, relative to their tolerances."""
+    gap, scale = _largest_gap(evaluation.methods)
+    gap32, scale32 = _largest_gap(evaluation.single)
     away, excess_away, lost = np.zeros_like(gap), np.zeros_like(gap), 0
     if evaluation.quotient is not None:
         value, error, kink = evaluation.quotient
@@ -83,10 +89,10 @@ def _compare(evaluation: Evaluation, tolerance: float, float32_tolerance: float)
         own = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
         trusted = ((error <= _CONVERGED * own) | (error <= _NOTHING)) & ~kink
         away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
-        excess_away = _over(away, DIFFERENCES_TOLERANCE * scale + 10 * error)
-        # At a kink any slope between those of the two sides will do. Elsewhere, if the quotients do
-        # not converge, rounding may decide what autodiff returns; where its two modes differ,
-        # nobody can be held against them.
+        excess_away = _relative(away, DIFFERENCES_TOLERANCE * scale + 10 * error)
+        # At a kink any value between the one-sided derivatives is accepted. Elsewhere, if the
+        # quotients do not converge, the result of autodiff may depend on rounding; where its two
+        # modes differ, the entries are not compared.
         odd = ~trusted.all(axis=(1, 2), keepdims=True)
         lost = int(odd.sum())
         for g, methods, size, limit in (
@@ -96,16 +102,16 @@ def _compare(evaluation: Evaluation, tolerance: float, float32_tolerance: float)
             if g.size:
                 g[kink | (odd & _modes_differ(methods, size, limit))] = 0.0
         if gap.size and lost == len(gap):
-            excess_away = np.full_like(gap, np.inf)  # no state holds anything: not a pass
-    relative, relative32 = _over(gap, scale), _over(gap32, scale32)
+            excess_away = np.full_like(gap, np.inf)  # nothing was compared, which is no pass
+    relative, relative32 = _relative(gap, scale), _relative(gap32, scale32)
     in_double = np.maximum(relative / tolerance, excess_away)
-    # By hand need not be more exact in float32 than autodiff is.
-    in_single = _over(gap32, float32_tolerance * scale32 + 2 * evaluation.single_error)
+    # The hand-derived Jacobian need not be more accurate in float32 than autodiff.
+    in_single = _relative(gap32, float32_tolerance * scale32 + 2 * evaluation.single_error)
     return _Compared(
         gap,
         relative,
         relative32,
-        _over(away, scale),
+        _relative(away, scale),
         scale,
         np.maximum(in_double, in_single),
         in_single > in_double,
@@ -138,10 +144,7 @@ def _finding(
             states=int(often[i, j]),
             precision="float32" if in_single else "float64",
             label=samples.labels[s],
-            state={
-                a.name: [float(v) for v in x[s]]
-                for a, x in zip(function.arguments, samples.values, strict=True)
-            },
+            state=_state(evaluated, s),
             values=values,
             dissent=_dissent(values, room, near),
         )
@@ -149,7 +152,7 @@ def _finding(
     nominal = np.array([label in _NOMINAL for label in samples.labels])
     entries = []
     for i, j in np.argwhere(often):
-        # Shown at its worst, of the usual states if it is wrong at one of them.
+        # Shown at the worst state, preferably a random or given one.
         usual = wrong[:, i, j] & nominal
         excess = np.where(usual if usual.any() else wrong[:, i, j], compared.excess[:, i, j], -1)
         entries.append(entry(int(np.argmax(excess)), int(i), int(j)))
@@ -165,7 +168,7 @@ def _finding(
         tolerance=tolerance,
         float32=float(compared.relative32.max(initial=0.0)) if evaluation.single else None,
         float32_tolerance=float32_tolerance,
-        differences=float(compared.away.max(initial=0.0)) if has_quotient else None,
+        differences=float(compared.from_quotient.max(initial=0.0)) if has_quotient else None,
         differences_tolerance=DIFFERENCES_TOLERANCE,
         quotient=evaluation.how,
         samples=len(samples.labels),
@@ -176,24 +179,32 @@ def _finding(
 
 
 def _worst_state(compared: _Compared, evaluated: Evaluated, which: int) -> dict[str, Any]:
-    """Where the largest excess over a tolerance occurs, wrong or not."""
+    """The state and entry with the largest excess over a tolerance, wrong or not."""
     if not compared.excess.size:
         return {}
     s, i, j = (int(k) for k in np.unravel_index(np.argmax(compared.excess), compared.excess.shape))
-    function, samples = evaluated.function, evaluated.samples
-    state: dict[str, Any] = {
-        a.name: [float(v) for v in x[s]]
-        for a, x in zip(function.arguments, samples.values, strict=True)
-    }
+    function = evaluated.function
     entry = (function.outputs[i], function.arguments[which].entries[j])
-    return {"label": samples.labels[s], "entry": entry, "state": state}
+    return {
+        "label": evaluated.samples.labels[s],
+        "entry": entry,
+        "state": _state(evaluated, s),
+    }
 
 
-def _spread(methods: dict[str, Values]) -> tuple[Values, Values]:
-    """Largest difference between two methods (S, m, n), and the size of each row (S, m, 1).
+def _state(evaluated: Evaluated, s: int) -> dict[str, list[float]]:
+    """The arguments at a state by name."""
+    pairs = zip(evaluated.function.arguments, evaluated.samples.values, strict=True)
+    return {argument.name: [float(v) for v in table[s]] for argument, table in pairs}
 
-    The size is that of the row's largest entry, so that units do not mix; a row that vanishes at
-    one state is measured by a thousandth of what it usually is.
+
+def _largest_gap(
+    methods: dict[str, Values],
+) -> tuple[Float[np.ndarray, "S m n"], Float[np.ndarray, "S m _"]]:
+    """The largest difference between two methods, and the size of each row.
+
+    The size is the row's largest entry, since rows have units of their own, but at least a
+    thousandth of its median over the states.
     """
     if not methods:
         return np.zeros((0, 0, 0)), np.zeros((0, 0, 0))
@@ -209,32 +220,38 @@ def _spread(methods: dict[str, Values]) -> tuple[Values, Values]:
     return gap, np.maximum(scale, 1e-3 * usual)
 
 
-def _modes_differ(methods: dict[str, Values], scale: Values, tolerance: float) -> Any:
-    """Whether forward and reverse mode disagree at a state, (S, 1, 1) bool."""
+def _modes_differ(
+    methods: dict[str, Values], scale: np.ndarray, tolerance: float
+) -> Bool[np.ndarray, "S 1 1"]:
+    """Whether forward and reverse mode disagree at each state."""
     both = {name: m for name, m in methods.items() if name.startswith("jac")}
     if len(both) < 2:
         return np.zeros((len(scale), 1, 1), bool)
-    return (_over(_spread(both)[0], scale) > tolerance).any(axis=(1, 2), keepdims=True)
+    return (_relative(_largest_gap(both)[0], scale) > tolerance).any(axis=(1, 2), keepdims=True)
 
 
-def _over(gap: Values, scale: Values) -> Values:
+def _relative(gap: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """gap / scale, with 0/0 = 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(gap == 0, 0.0, gap / scale)
 
 
 def _dissent(values: dict[str, float], room: float, near: float) -> tuple[str, ...]:
-    """Who is outvoted. The methods fall into camps that agree; the largest camp is right, and of
-    two equal ones that of the differences, which see the function alone."""
+    """The methods outside the largest group that agrees.
+
+    Of two equal groups the one with the differences counts, which depend on the function's values
+    alone. room, near: largest difference between two methods, and between one and the differences.
+    """
 
     def agree(a: str, b: str) -> bool:
         allowed = near if "differences" in (a, b) else room
         return abs(values[a] - values[b]) <= allowed
 
     alone = {"differences": frozenset(["differences"])} if "differences" in values else {}
-    camps = {
+    groups = {
         a: frozenset(b for b in values if a == b or agree(a, b))
         for a in values
-        if a != "differences"  # to their tolerance they would agree with a claim just off, too
+        if a != "differences"  # their tolerance is wide enough for a slightly wrong claim
     } | alone
-    best = max(camps.values(), key=lambda camp: (len(camp), "differences" in camp))
+    best = max(groups.values(), key=lambda group: (len(group), "differences" in group))
     return tuple(name for name in values if name not in best)

@@ -2,14 +2,12 @@
 
 import itertools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import charts, cli
-from jaxslam.cli.dataset import positive_definite
-from jaxslam.cli.driving import drive
+from jaxslam import charts
+from jaxslam.cli.piecewise import run_in_pieces
 from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Filter
 from jaxslam.types import Estimate, Log, Scan
@@ -59,23 +57,23 @@ def log_of(steps=STEPS):
 )
 def test_a_log_in_pieces_is_the_whole_log(every, looked):
     traced, shown, seen = [], [], []
-    driven = drive(
+    done = run_in_pieces(
         toy(traced),
         log_of(),
         np.ones(3),
         np.zeros((3, 3)),
         every=every,
-        look=lambda pose: seen.append(np.asarray(pose)) or float(pose[0]) > 20,
+        check=lambda pose: seen.append(np.asarray(pose)) or float(pose[0]) > 20,
         progress=lambda done, total: shown.append((done, total)),
     )
     wanted = 1 + np.cumsum(log_of().control, axis=0)
-    np.testing.assert_array_equal(driven.path.pose, wanted)
-    np.testing.assert_array_equal(driven.path.pose_cov[:, 0, 1], wanted[:, 0] * wanted[:, 1])
-    np.testing.assert_array_equal(driven.log_likelihood, wanted[:, 0])
-    np.testing.assert_array_equal(driven.status, np.where(log_of().scan.valid, 8, 0))
-    np.testing.assert_array_equal(driven.last.pose, wanted[-1])
-    assert driven.looked == looked
-    assert driven.found == [bool(wanted[step - 1, 0] > 20) for step in looked]
+    np.testing.assert_array_equal(done.path.pose, wanted)
+    np.testing.assert_array_equal(done.path.pose_cov[:, 0, 1], wanted[:, 0] * wanted[:, 1])
+    np.testing.assert_array_equal(done.log_likelihood, wanted[:, 0])
+    np.testing.assert_array_equal(done.status, np.where(log_of().scan.valid, 8, 0))
+    np.testing.assert_array_equal(done.last.pose, wanted[-1])
+    assert done.checked == looked
+    assert done.passed == [bool(wanted[step - 1, 0] > 20) for step in looked]
     for step, pose in zip(looked, seen, strict=True):
         np.testing.assert_array_equal(pose, wanted[step - 1])
     assert shown[-1] == (STEPS, STEPS) and all(
@@ -86,37 +84,13 @@ def test_a_log_in_pieces_is_the_whole_log(every, looked):
 
 def test_a_long_log_is_shown_every_500_steps_at_least():
     shown = []
-    drive(
+    run_in_pieces(
         toy([]),
         log_of(1200),
         np.ones(3),
         np.zeros((3, 3)),
         every=0,
-        look=lambda pose: True,
+        check=lambda pose: True,
         progress=lambda done, total: shown.append(done),
     )
     assert shown == [500, 1000, 1200]
-
-
-def test_a_covariance_is_judged_on_the_host():
-    assert positive_definite(np.diag([1.0, 1e-12]))
-    assert not positive_definite(np.diag([1.0, -1e-12]))
-    assert not positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
-
-
-def write_bonn(folder):
-    folder.mkdir()
-    (folder / "world.dat").write_text("1 2 0\n2 0 3\n")
-    steps = ["ODOMETRY 0 0.1 0.1", "SENSOR 1 1.9 -0.1", "SENSOR 2 3.0 1.5"] * 3
-    (folder / "sensor_data.dat").write_text("\n".join(steps) + "\n")
-    return str(folder)
-
-
-def test_the_command_says_in_how_many_steps_it_looked(tmp_path, capsys):
-    run = ["run", "--dataset", "bonn", write_bonn(tmp_path / "bonn"), "--out"]
-    assert cli.main([*run, str(tmp_path / "a"), "--check-every", "2"]) == 0
-    assert "at 2 of 2 steps looked at" in capsys.readouterr().out
-    assert cli.main([*run, str(tmp_path / "b"), "--check-every", "-1"]) == 2
-    assert "expected --check-every of at least 0" in capsys.readouterr().err
-    assert not (tmp_path / "b").exists()
-    assert jax.config.jax_enable_x64

@@ -1,15 +1,19 @@
-"""What is verified: functions whose arguments and outputs have names, of a model or alone."""
+"""Functions to verify, with names and units of their arguments and outputs."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxslam.protocols import Motion, Sensor
+
+Claim: TypeAlias = Callable[..., ArrayLike | Sequence[ArrayLike | None]]
+"""A hand-derived Jacobian: arguments -> one array, or one array or None for each argument."""
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
 POINT = ("x [m]", "y [m]")
@@ -20,46 +24,46 @@ GLOSSARY = {
     "l": POINT,
     "point": POINT,
 }
-"""What an argument of that name holds, unless its user says otherwise."""
+"""Default entries of an argument by its name."""
 
 _PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
 
 
 @dataclass(frozen=True)
 class Argument:
-    """One argument of a function, its entries named with units."""
+    """An argument of a function, with the names and units of its entries."""
 
     name: str
     entries: tuple[str, ...]
     scale: float = 1.0
-    """of its samples; noise is small"""
+    """factor of its random values; noise is small"""
 
 
 @dataclass(frozen=True)
 class Function:
-    """A function of vectors, and the Jacobians claimed for it."""
+    """A function of vectors with its hand-derived Jacobians."""
 
     name: str
     call: Callable[..., jax.Array]
     arguments: tuple[Argument, ...]
     outputs: tuple[str, ...]
-    hand: Callable[..., Any] | None = None
-    """arguments -> one Jacobian an argument (None where none is claimed), or, for a claim about the
-    first argument or all of them side by side, one array."""
+    hand: Claim | None = None
+    """arguments -> a tuple of a Jacobian or None for each argument, or one array: by the first
+    argument, or by all of them side by side"""
 
     @property
-    def periods(self) -> NDArray[np.float64]:
-        """(m,) of outputs on a circle, inf of those on a line."""
+    def periods(self) -> Float[np.ndarray, "m"]:
+        """The periods of the outputs, inf of those on a line."""
         return periods(self.outputs)
 
 
-def periods(names: Sequence[str]) -> NDArray[np.float64]:
-    """2π of what is in [rad], 360 of [deg], inf of all else, (m,)."""
+def periods(names: Sequence[str]) -> Float[np.ndarray, "m"]:
+    """The periods of quantities by their units: 2π of [rad], 360 of [deg], inf of all else."""
     return np.array([_PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
 
 
 def motion_functions(motion: Motion) -> tuple[Function]:
-    """`step` by pose, control and noise."""
+    """The function of a motion model: `step` by pose, control and noise."""
     arguments = (
         Argument("pose", POSE),
         Argument("control", motion.controls),
@@ -69,7 +73,7 @@ def motion_functions(motion: Motion) -> tuple[Function]:
 
 
 def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
-    """`observe` by pose and landmark; `invert` by pose, measurement and what is free."""
+    """The functions of a sensor: `observe` by (pose, landmark), `invert` by (pose, z, s)."""
     pose, landmark = Argument("pose", POSE), Argument("landmark", sensor.landmark)
     free = tuple(f"s[{k}]" for k in range(len(sensor.free.mean)))
     inverse = (pose, Argument("measurement", sensor.measurements), Argument("free", free))
@@ -87,14 +91,14 @@ def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
 
 def plain_function(
     call: Callable[..., jax.Array],
-    jacobian: Callable[..., Any] | None,
+    jacobian: Claim | None,
     arguments: Mapping[str, Sequence[str] | int] | None = None,
     outputs: Sequence[str] | None = None,
     name: str | None = None,
 ) -> Function:
-    """Any function of vectors, by the names of its parameters.
+    """A function of vectors, whose arguments are known by the names of its parameters.
 
-    Raises ValueError where the size of an argument is neither given nor known by its name.
+    Raises ValueError where the size of an argument is neither given nor follows from its name.
     """
     name = name or str(getattr(call, "__name__", type(call).__name__))
     if arguments is not None and not isinstance(arguments, Mapping):
@@ -132,7 +136,8 @@ def plain_function(
     return Function(name, call, tuple(named), tuple(outputs or ()), jacobian)
 
 
-def _has_signature(call: Callable[..., Any]) -> bool:
+def _has_signature(call: Callable[..., object]) -> bool:
+    """Whether Python knows the parameters of a callable."""
     try:
         inspect.signature(call)
     except (TypeError, ValueError):

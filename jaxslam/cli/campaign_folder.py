@@ -1,0 +1,111 @@
+"""The folder of a campaign's results: which campaign it holds, and its finished blocks of runs."""
+
+import argparse
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxslam.cli import devices
+from jaxslam.monte_carlo import missing
+from jaxslam.results import store
+
+BLOCKS = "blocks"
+"""The folder of a campaign's finished blocks, beside its results."""
+
+RESULT = "consistency.json"
+"""The file of results that a finished campaign is recognized by."""
+
+TIMES = ("seconds", "compile_seconds", "step_seconds")
+"""Entries of the results that are measured while the campaign runs."""
+
+
+def earlier_results(out: Path, keep: store.Store) -> dict[str, Any] | None:
+    """The results of a finished campaign in a folder; None without results or where runs miss."""
+    assert keep.runs is not None
+    if missing(keep.spans(), keep.runs, keep.runs):
+        return None
+    try:
+        found = json.loads((out / RESULT).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    whole = isinstance(found, dict) and found.get("runs") == keep.runs
+    return found if whole and {*TIMES, "command"} <= found.keys() else None
+
+
+def _as_option(value: object) -> str:
+    """The value of an option, as its user would write it."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return "not given" if value is None else str(value)
+
+
+def check_same_campaign(
+    options: argparse.Namespace, there: store.Store, asked: Mapping[str, object]
+) -> None:
+    """Raise ValueError unless the options agree with the campaign that is to be resumed."""
+    folder = options.resume
+    if options.out is not None and options.out.resolve() != folder.resolve():
+        raise ValueError(
+            f"--resume {folder} writes its results there: expected no --out, got {options.out}"
+        )
+    if "asked" not in there.settings:
+        raise ValueError(f"{folder} holds a campaign that no command began")
+    told = there.settings["asked"]
+    differences = [
+        f"--{name} is {_as_option(told[name])} there, {_as_option(value)} here"
+        for name, value in asked.items()
+        if name in told and told[name] != value
+    ]
+    if differences:
+        raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
+
+
+def open_store(
+    options: argparse.Namespace, out: Path, asked: dict[str, Any], block: int | None
+) -> store.Store:
+    """The store of this campaign's blocks, in a new folder or in that of the resumed campaign.
+
+    block: the size of blocks that the campaign began with.
+    """
+    folder, runs = out / BLOCKS, asked["runs"]
+    told = {name: value for name, value in asked.items() if name != "runs"}
+    settings = {"asked": told, "block": block}
+    if options.resume is None and jax.process_index() == 0:
+        _remove_old_blocks(options, out, settings, runs)
+        store.create(folder, settings, runs)
+    devices.wait_for_all("campaign folder")
+    return store.resume(folder, settings, runs)
+
+
+def _remove_old_blocks(
+    options: argparse.Namespace, out: Path, settings: dict[str, Any], runs: int
+) -> None:
+    """Delete the blocks of an earlier campaign; raises ValueError unless the options allow it."""
+    folder = out / BLOCKS
+    if not (folder / store.MANIFEST).exists():
+        if folder.exists() and any(folder.iterdir()):
+            raise ValueError(f"{folder} holds files that are no campaign's; choose another --out")
+        if (out / RESULT).exists() and not options.overwrite:
+            raise ValueError(f"{out} holds the results of a campaign: --overwrite gives them up")
+        return
+    store.read_manifest(folder)  # raises where the folder is not a campaign's
+    if not options.overwrite:
+        there = store.resume(folder)
+        done, whole = there.done(), there.runs or 0
+        left = bool(missing(there.spans(), whole, max(whole, 1)))
+        if left and done:
+            raise ValueError(
+                f"{out} holds an unfinished campaign, with {done} of {whole} runs done: --resume "
+                f"{out} goes on with it, --overwrite gives it up; or choose another --out"
+            )
+        same = options.again and (there.settings, whole) == (settings, runs)
+        if done and not same:
+            raise ValueError(
+                f"{out} holds a finished campaign of {done} runs: --overwrite gives it up, "
+                f"--resume {out} prints it, or extends it to more --runs; or choose another --out"
+            )
+    shutil.rmtree(folder)

@@ -1,0 +1,73 @@
+"""Files of results: JSON and CSV as text, and files that are written completely or not at all."""
+
+import csv
+import io
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+
+
+def json_text(content: Mapping[str, object]) -> str:
+    """Indented JSON; raises ValueError on NaN and infinity, which JSON does not have."""
+    return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def csv_text(header: list[str], rows: list[list[str]]) -> str:
+    """Comma-separated text with a header line."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def versions() -> dict[str, str]:
+    """The versions of Python, JAX and NumPy."""
+    return {"python": platform.python_version()} | {
+        name: version(name) for name in ("jax", "numpy")
+    }
+
+
+def check_writable(folder: Path) -> None:
+    """Raise OSError if files could not be written to a folder, before hours of work.
+
+    The folder is not created; its nearest existing parent is tried. The error names the folder as
+    it was given.
+    """
+    try:
+        existing = folder.absolute()
+        while not existing.exists():
+            existing = existing.parent
+        if not existing.is_dir():
+            raise NotADirectoryError(f"{existing} is not a folder")
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise type(error)(f"results cannot be written to {folder}: {reason}") from error
+
+
+def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], object]]) -> list[Path]:
+    """Write all files or, after any error or interrupt, none; returns their paths.
+
+    They are written to a hidden folder in the target and moved into place when all are complete.
+
+    Args:
+        folder: the target, which is created if needed.
+        files: by name, the text, or a function that writes the file at a path.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as hidden:
+        for name, content in files.items():
+            target = Path(hidden) / name
+            if callable(content):
+                content(target)
+            else:
+                target.write_text(content, encoding="utf-8")
+        for name in files:
+            os.replace(Path(hidden) / name, folder / name)
+    return [folder / name for name in files]

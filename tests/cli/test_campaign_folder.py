@@ -1,0 +1,171 @@
+"""`jaxslam consistency`: campaigns interrupted, resumed, extended, and not overwritten unasked."""
+
+import json
+import threading
+
+import numpy as np
+import pytest
+
+from jaxslam import cli, store
+from jaxslam.monte_carlo import Interrupted
+
+QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
+
+
+def test_an_interrupt_exits_with_130_and_writes_nothing(tmp_path, capsys, monkeypatch):
+    def interrupted(*arguments, progress, **options):
+        progress(1, 3)
+        raise Interrupted(None, 3)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
+    assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
+    assert "nothing was written" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.*"))
+
+
+def test_an_interrupted_command_leaves_no_thread_that_would_be_torn_down(tmp_path, monkeypatch):
+    """At exit Python waits for threads, but for daemons, which crash in compiled code."""
+    ended = threading.Event()
+
+    def interrupted(*arguments, **options):
+        raise Interrupted(None, 3)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
+    monkeypatch.setattr(cli.campaign, "_prepare_drawing", ended.wait)
+    before = set(threading.enumerate())
+    try:
+        assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
+        begun = set(threading.enumerate()) - before
+        assert len(begun) == 1 and not any(thread.daemon for thread in begun)
+    finally:
+        ended.set()
+
+
+def kept(out):
+    return {path.name for path in (out / "blocks").iterdir()}
+
+
+def results(out):
+    """What a campaign found, but for how long it took and what it was called."""
+    found = json.loads((out / "consistency.json").read_text())
+    return {
+        k: v
+        for k, v in found.items()
+        if k not in ("seconds", "compile_seconds", "step_seconds", "command")
+    }
+
+
+def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys, refused):
+    out = tmp_path / "out"
+    again = ["consistency", "--resume", str(out), "--devices", "1"]
+    asked = [
+        *QUICK,
+        *["--filters", "ekf,dead_reckoning", "--no-bound", "--block", "1", "--devices", "1"],
+    ]
+    assert cli.main([*asked, "--out", str(out)]) == 0
+    whole, csv = results(out), (out / "consistency.csv").read_text()
+    assert len(kept(out)) == 4
+
+    # A finished one prints its result and stays as it is, files that were lost come back; a lost
+    # block is computed again, a damaged one set aside.
+    said = capsys.readouterr().out
+    at = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    text = (out / "consistency.json").read_text()
+    assert cli.main(again) == 0
+    table, _, rest = capsys.readouterr().out.partition("\n\n" + str(out))
+    assert table and said.startswith(table)  # with the time of a step
+    assert rest.startswith(" holds this campaign, finished: nothing was run and nothing written;")
+    assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == at
+    (out / "map.png").unlink()
+    assert cli.main(again) == 0
+    assert (out / "map.png").exists()
+    assert (out / "consistency.json").read_text() == text
+    refused([*again, "--out", tmp_path / "other"], "expected no --out, got")
+    lost, damaged = sorted((out / "blocks").glob("*.npz"))[:2]
+    lost.unlink()
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    (out / "consistency.json").unlink()
+    assert cli.main(again) == 0
+    assert f"{damaged.name}" in capsys.readouterr().err
+    assert results(out) == whole
+    assert (out / "consistency.csv").read_text() == csv
+    assert f"{damaged.name}.bad" in kept(out)
+
+    difference = "--seed is 0 there, 3 here; --filters is ekf,dead_reckoning there, ekf here"
+    refused([*again, "--seed", "3", "--filters", "ekf"], difference)
+    refused(["consistency", "--resume", tmp_path], "no campaign to resume")
+
+    # More runs extend it, to what a campaign of as many gives; fewer than there are do not.
+    assert cli.main([*again, "--runs", "5", "--block", "1", "--devices", "1"]) == 0
+    extended = results(out)
+    assert extended["runs"] == 5
+    fresh = tmp_path / "fresh"
+    assert cli.main([*asked, "--runs", "5", "--out", str(fresh)]) == 0
+    assert extended == results(fresh)
+    refused([*again, "--runs", "4"], "has runs up to 5: expected at least as many, got 4")
+    assert store.resume(out / "blocks").runs == 5
+
+
+def test_an_unfinished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, refused):
+    out = tmp_path / "out"
+
+    def stopped(*arguments, keep, **options):
+        keep.save(0, {"x": np.zeros(2)}, 2)
+        raise Interrupted(None, 3)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", stopped)
+    monkeypatch.setattr(cli.campaign.shutil, "rmtree", lambda *a, **k: None)
+    assert cli.main([*QUICK, "--out", str(out)]) == 130
+    monkeypatch.undo()
+    refused([*QUICK, "--out", out], "2 of 3 runs done", "--resume", "--overwrite")
+    monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        cli.main([*QUICK, "--out", str(out), "--overwrite"])
+    assert store.resume(out / "blocks").spans() == []
+
+
+def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, refused):
+    out = tmp_path / "out"
+    begun = []
+
+    def finished(*arguments, keep, **options):
+        if keep.spans() == []:
+            keep.save(0, {"x": np.zeros(2)}, 3)
+        begun.append(keep.spans())
+        raise Interrupted(None, 3)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", finished)
+    asked = [*QUICK, "--out", str(out)]
+    assert cli.main(asked) == 130
+    mine = out / "blocks" / "mine"
+    mine.write_text("of this campaign")
+    for other in ([], ["--runs", "4", "--again"], ["--seed", "1", "--again"]):
+        holds = f"{out} holds a finished campaign of 3 runs: --overwrite gives it up"
+        refused([*asked, *other], holds, f"--resume {out}", "--out")
+    assert mine.exists() and len(begun) == 1
+    for accepted in ("--again", "--overwrite"):
+        mine.write_text("of this campaign")
+        assert cli.main([*asked, accepted]) == 130
+        assert not mine.exists()
+    # Results without their blocks are results all the same.
+    cli.campaign.shutil.rmtree(out / "blocks")
+    (out / "consistency.json").write_text("{}")
+    refused([*asked, "--again"], f"{out} holds the results of a campaign: --overwrite")
+    assert cli.main([*asked, "--overwrite"]) == 130
+    refused([*asked, "--overwrite", "--resume", out], "not allowed with")
+
+
+def test_a_campaign_begun_from_python_is_not_the_commands_to_resume(tmp_path, refused):
+    store.create(tmp_path / "blocks")
+    refused(["consistency", "--resume", tmp_path], "a campaign that no command began")
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path, refused):
+    mine = tmp_path / "blocks" / "mine.txt"
+    mine.parent.mkdir()
+    mine.write_text("precious")
+    refused([*QUICK, "--out", tmp_path], "no campaign's")
+    assert mine.read_text() == "precious"
+    (mine.parent / "manifest.json").write_text("{")
+    refused([*QUICK, "--out", tmp_path, "--overwrite"])
+    assert mine.exists()
