@@ -3,6 +3,7 @@
 import dataclasses
 from functools import cache
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -140,7 +141,7 @@ def test_gradients_and_batches():
         return run(eif, changed, scene.pose, P0, KEY).estimate.pose[-1, :2].sum()
 
     value, slope = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(0.1, log.scan.z)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+    chex.assert_tree_all_finite(slope)
     step = 1e-5
     sigma = np.array([0.1, 0.1 + step, 0.1 - step, 0.1])
     z = np.stack([log.scan.z] * 3 + [log.scan.z + 0.01])
