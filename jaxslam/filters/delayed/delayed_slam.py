@@ -12,7 +12,7 @@ from jaxslam.filters.delayed.promotion import promote
 from jaxslam.filters.delayed.state import SIZE, Delayed, Distance, Fresh, Layout, Rules, empty
 from jaxslam.filters.delayed.triangulation import Meeting, meeting_of
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.filters.ekf.scan import associated
+from jaxslam.filters.ekf.scan import associate_scan
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.reporting import info_of, seen_before, status_of
@@ -184,7 +184,7 @@ def delayed_slam(
         joint = state.joint
         landmarks = jnp.arange(layout.slots) < capacity
         shown = joint._replace(alive=joint.alive & landmarks)
-        found, matched = associated(shown, scan._replace(z=z), settings)
+        found, matched = associate_scan(shown, scan._replace(z=z), settings)
         is_new = found.is_new
         joint, done = correct_in_turn(joint, z, jnp.maximum(found.slot, 0), matched, settings)
         state = state._replace(joint=joint)

@@ -10,12 +10,12 @@ from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf import to_points
 from jaxslam.filters.ekf.coordinates import estimate_of
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import turns_of, update_by_scan, without
+from jaxslam.filters.ekf.scan import turns_of, update_by_scan, without_landmarks
 from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
     Update,
-    check_numbers,
+    check_options,
     check_settings,
 )
 from jaxslam.filters.map_management.merging import Duplicates, find_duplicate, told_apart
@@ -86,7 +86,7 @@ def ekf_slam(
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
-    check_numbers("ekf_slam", capacity, update, gate, iterations, births, covariance)
+    check_options("ekf_slam", capacity, update, gate, iterations, births, covariance)
     settings = EkfSettings(
         sensor=sensor,
         chart=chart or euclidean(),
@@ -123,7 +123,7 @@ def ekf_slam(
             info = info._replace(reduced=which)
         if life is not None:
             memory, dead = life.after(joint, info, lambda: estimate(joint))
-            joint = without(joint._replace(life=memory), dead, square_root=square_root)
+            joint = without_landmarks(joint._replace(life=memory), dead, square_root=square_root)
             info = info._replace(removed=dead | evicted)
         return joint, info
 

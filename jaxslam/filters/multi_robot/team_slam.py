@@ -12,7 +12,7 @@ from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import Turn, turn_of, update_by_scan
-from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance
+from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance_form
 from jaxslam.filters.multi_robot.joining import SIZE, best_way, entered, points_seen, sees_in_full
 from jaxslam.filters.multi_robot.pose_initialization import Entry
 from jaxslam.filters.reporting import joined
@@ -82,7 +82,7 @@ def team_slam(
         validation.check_models("team_slam", robot.motion, robot.sensors)
     validation.check_parts("team_slam", chart=chart, associate=associate)
     _check(robots, report, chart, update, gate, iterations, births)
-    check_covariance("team_slam", covariance, ("plain", "joseph"))
+    check_covariance_form("team_slam", covariance, ("plain", "joseph"))
     count = len(robots)
     control_ends, place_ends, size_z = sizes(robots)
     settings = EkfSettings(
