@@ -29,13 +29,13 @@ class Joint(NamedTuple):
     """-1 where dead"""
     lin: Any
     """the linearizer's memory"""
-    watch: Any = ()
+    watch: Any = None
     """a `Watch` of the directions that should stay unobservable, where one is kept"""
-    last: Any = ()
+    last: Any = None
     """the `Last` motion, where the chart keeps it apart"""
     life: Any = None
     """the memory of a `Life`, of a filter that is pruned"""
-    reduced: Any = ()
+    reduced: Any = None
     """(N,) bool: the slot holds a point (x, y), and padding in the rest of its L coordinates; of
     a sensor whose landmarks may become points"""
     co_observed: jax.Array | None = None
@@ -90,7 +90,7 @@ def empty(
     size = 3 + capacity * landmark_size
     if square_root:
         pose_cov = cholesky(pose_cov)[0]
-    watch: Any = ()
+    watch: Any = None
     if turn is not None:
         information = jnp.zeros((3, 3), pose.dtype)
         watch = Watch(jnp.eye(size, 3, dtype=pose.dtype), information, information[0], turn)
@@ -102,7 +102,9 @@ def empty(
         tag=jnp.full(capacity, -1, jnp.int32),
         lin=lin,
         watch=watch,
-        last=Last(pose[2], jnp.zeros((3, size), pose.dtype), 0 * pose_cov) if motion_apart else (),
+        last=Last(pose[2], jnp.zeros((3, size), pose.dtype), 0 * pose_cov)
+        if motion_apart
+        else None,
     )
 
 

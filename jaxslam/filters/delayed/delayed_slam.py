@@ -26,7 +26,7 @@ from jaxslam.filters.delayed.stored_measurements import store_measurements
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.innovation import Correction
-from jaxslam.filters.ekf.scan import associated
+from jaxslam.filters.ekf.scan import associate_scan
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.reporting import info_of, seen_before, status_of
@@ -173,7 +173,7 @@ def _associated(
     """
     joint = state.joint
     landmarks = joint.alive & (jnp.arange(settings.layout.slots) < settings.layout.landmarks)
-    return associated(joint._replace(alive=landmarks), scan, _ekf_settings(settings))
+    return associate_scan(joint._replace(alive=landmarks), scan, _ekf_settings(settings))
 
 
 def _corrected(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxslam import slots, validation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.filters.ekf.settings import check_covariance
+from jaxslam.filters.ekf.settings import check_covariance_form
 from jaxslam.math import linalg
 from jaxslam.math.linalg import check_count
 from jaxslam.math.xla import where_any
@@ -71,7 +71,9 @@ def compressed_ekf_slam(
     for name in ("associate", "watch", "make_room"):
         if options.get(name):
             raise ValueError(f"compressed_ekf_slam: does not take {name}")
-    check_covariance("compressed_ekf_slam", options.get("covariance", "plain"), ("plain", "joseph"))
+    check_covariance_form(
+        "compressed_ekf_slam", options.get("covariance", "plain"), ("plain", "joseph")
+    )
     if sensor.reduced is not None:
         raise ValueError(
             f"compressed_ekf_slam: the landmarks of {sensor.name} become points, which is not "

@@ -16,7 +16,7 @@ from jaxslam.filters.ekf.settings import (
     EkfSettings,
     Update,
     check_make_room,
-    check_numbers,
+    check_options,
     check_settings,
 )
 from jaxslam.filters.reporting import with_removed
@@ -86,7 +86,7 @@ def ekf_slam(
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
-    check_numbers("ekf_slam", capacity, update, gate, iterations, births, covariance)
+    check_options("ekf_slam", capacity, update, gate, iterations, births, covariance)
     settings = EkfSettings(
         sensor=sensor,
         chart=chart or euclidean(),

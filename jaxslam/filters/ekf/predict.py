@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam import slots
 from jaxslam.filters.ekf.settings import EkfSettings
@@ -52,19 +52,19 @@ def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfS
 class Transition(NamedTuple):
     """How errors move: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise by way of dx]."""
 
-    robot: jax.Array
-    """(3, 3) A"""
-    cross: jax.Array | None
-    """(N, L, 3) a_i; None where landmarks stand still"""
-    landmark: jax.Array | None
-    """(N, L, L) B_i; None where they are the identity"""
-    noise: jax.Array
-    """(3, 3) noise of the pose's coordinates, to dx"""
-    cross_noise: jax.Array | None
-    """(N, L, 3) the same, to dl_i"""
+    robot: Float[Array, "3 3"]
+    """A"""
+    cross: Float[Array, "N L 3"] | None
+    """a_i; None where landmarks stand still"""
+    landmark: Float[Array, "N L L"] | None
+    """B_i; None where they are the identity"""
+    noise: Float[Array, "3 3"]
+    """noise of the pose's coordinates, to dx"""
+    cross_noise: Float[Array, "N L 3"] | None
+    """the same, to dl_i"""
 
-    def times(self, matrix: jax.Array) -> jax.Array:
-        """The transition matrix times a matrix (D, k)."""
+    def times(self, matrix: Float[Array, "D k"]) -> Float[Array, "D k"]:
+        """The transition matrix times a matrix."""
         robot = linalg.matmul(self.robot, matrix[:3])
         if self.cross is None:
             return matrix.at[:3].set(robot)
@@ -72,8 +72,8 @@ class Transition(NamedTuple):
         by_robot = linalg.matmul(self.cross.reshape(turned.shape[0], 3), matrix[:3])
         return jnp.concatenate([robot, by_robot + turned])
 
-    def turn(self, matrix: jax.Array) -> jax.Array:
-        """The matrix (D, k) with B_i applied to the landmarks' rows."""
+    def turn(self, matrix: Float[Array, "D k"]) -> Float[Array, "D k"]:
+        """The matrix with B_i applied to the landmarks' rows."""
         if self.landmark is None:
             return matrix
         capacity, size = self.landmark.shape[:2]
@@ -83,15 +83,17 @@ class Transition(NamedTuple):
         )
         return jnp.concatenate([matrix[:3], turned.reshape(capacity * size, -1)])
 
-    def lift(self, size: int) -> jax.Array:
-        """(D, 3): what noise of the pose's coordinates does to all errors."""
+    def lift(self, size: int) -> Float[Array, "D 3"]:
+        """What noise of the pose's coordinates does to all errors."""
         rest = jnp.zeros((size - 3, 3), self.noise.dtype)
         if self.cross_noise is not None:
             rest = self.cross_noise.reshape(size - 3, 3)
         return jnp.concatenate([self.noise, rest])
 
 
-def in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array) -> Transition:
+def in_charts(
+    by_pose: Float[Array, "3 3"], before: Basis, after: Basis, alive: Bool[Array, "N"]
+) -> Transition:
     """E(x')⁻¹ F E(x) and E(x')⁻¹ by blocks, dead slots standing still."""
     times = jax.vmap(linalg.matmul, in_axes=(0, None))
     each = jax.vmap(linalg.matmul)
@@ -110,14 +112,14 @@ def in_charts(by_pose: jax.Array, before: Basis, after: Basis, alive: jax.Array)
 
 
 def moved_cov(
-    cov: jax.Array,
+    cov: Float[Array, "D D"],
     moved: Transition,
-    noise: jax.Array | None,
-    shared: tuple[jax.Array, jax.Array] | None = None,
-) -> jax.Array:
+    noise: Float[Array, "3 3"] | None,
+    shared: tuple[Float[Array, "k D"], Float[Array, "k D"]] | None = None,
+) -> Float[Array, "D D"]:
     """A P Aᵀ + G N Gᵀ, each entry of P written once or twice.
 
-    shared: (k, D) each, of which Sᵀ T + Tᵀ S is added; in another chart than the Euclidean.
+    shared: two matrices, of which Sᵀ T + Tᵀ S is added; in another chart than the Euclidean.
     """
     if moved.cross is None:
         robot = linalg.matmul(moved.robot, cov[:3])

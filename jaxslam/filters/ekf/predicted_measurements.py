@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from jaxslam.association.predicted import predicted
 from jaxslam.filters.ekf.settings import EkfSettings
@@ -17,8 +18,10 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
     sensor, chart, square_root = settings.sensor, settings.chart, settings.square_root
     capacity, size = joint.landmarks.shape
 
-    def jacobians() -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """ẑ (N, Z), H by errors of pose (N, Z, 3) and landmark (N, Z, L), H P Hᵀ of each alone."""
+    def jacobians() -> tuple[
+        Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z L"], Float[Array, "N Z Z"]
+    ]:
+        """ẑ, H by errors of pose and landmark, H P Hᵀ of each alone."""
         every = jnp.arange(capacity)
         robot, cross, own = settle(_blocks(joint, square_root))
         top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
@@ -39,11 +42,11 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
         alone = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in range(3 + size))
         return expected, by_pose, by_landmark, settle(alone + rest)
 
-    def measurements() -> tuple[jax.Array, jax.Array]:
+    def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
         expected, _, _, own = jacobians()
         return expected, own
 
-    def cross() -> jax.Array:
+    def cross() -> Float[Array, "N Z N Z"]:
         _, by_pose, by_landmark, _ = jacobians()
         cov = joint.cov @ joint.cov.T if square_root else joint.cov
         rows = cov[3:].reshape(capacity, size, cov.shape[1])
@@ -55,8 +58,10 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
     return predicted(sensor, joint.tag, joint.alive, measurements, cross)
 
 
-def _blocks(joint: Joint, square_root: bool) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """P of the robot (3, 3), of it with each landmark (N, 3, L), and of each landmark (N, L, L)."""
+def _blocks(
+    joint: Joint, square_root: bool
+) -> tuple[Float[Array, "3 3"], Float[Array, "N 3 L"], Float[Array, "N L L"]]:
+    """P of the robot, of it with each landmark, and of each landmark."""
     capacity, size = joint.landmarks.shape
     if square_root:
         robot, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size, -1)
@@ -70,13 +75,13 @@ def _blocks(joint: Joint, square_root: bool) -> tuple[jax.Array, jax.Array, jax.
 
 def in_chart(
     chart: Chart,
-    pose: jax.Array,
-    landmarks: jax.Array,
-    by_pose: jax.Array,
-    by_landmark: jax.Array,
-    moved: tuple[jax.Array, jax.Array] | None = None,
-) -> tuple[jax.Array, jax.Array]:
-    """Chain Jacobians (m, Z, ·) with the derivative of retract(pose, l, ·), at zero or moved."""
+    pose: Float[Array, "3"],
+    landmarks: Float[Array, "m L"],
+    by_pose: Float[Array, "m Z 3"],
+    by_landmark: Float[Array, "m Z L"],
+    moved: tuple[Float[Array, "3"], Float[Array, "m L"]] | None = None,
+) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]:
+    """Chain Jacobians with the derivative of retract(pose, l, ·), at zero or moved."""
     assert chart.basis is not None
     if moved is None:
         basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
@@ -91,9 +96,13 @@ def in_chart(
 
 
 def innovation_cov(
-    hp: jax.Array, by_pose: jax.Array, by_landmark: jax.Array, slot: jax.Array, capacity: int
-) -> jax.Array:
-    """H P Hᵀ (m, Z, m, Z) of HP (m, Z, D): only the robot's and the seen landmarks' columns."""
+    hp: Float[Array, "m Z D"],
+    by_pose: Float[Array, "m Z 3"],
+    by_landmark: Float[Array, "m Z L"],
+    slot: Int[Array, "m"],
+    capacity: int,
+) -> Float[Array, "m Z m Z"]:
+    """H P Hᵀ of H P: only the robot's and the seen landmarks' columns."""
     m, size_z, size_l = by_landmark.shape
     own = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
     if size_l == 0:

@@ -6,6 +6,7 @@ correction moves the map by what it says of e_rest, then composes it with the co
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxslam.filters.ekf.predict import Transition, in_charts, moved_cov
 from jaxslam.linearize.first_order import turned
@@ -15,32 +16,36 @@ from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
 
 
-def lever_of_motion(joint: Joint, chart: Chart) -> jax.Array:
-    """g (D, 3): what an error of the last motion, in its own frame, does to all errors."""
+def lever_of_motion(joint: Joint, chart: Chart) -> Float[Array, "D 3"]:
+    """g: what an error of the last motion, in its own frame, does to all errors."""
     assert chart.basis is not None
     still = jnp.eye(3, dtype=joint.pose.dtype)
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
     return lever_by(in_charts(still, basis, basis, joint.alive), joint.last.frame)
 
 
-def lever_by(moved: Transition, frame: jax.Array) -> jax.Array:
-    """g (D, 3), of a transition to the charts of now and the heading the last motion began from."""
+def lever_by(moved: Transition, frame: Float[Array, ""]) -> Float[Array, "D 3"]:
+    """g, of a transition to the charts of now and the heading the last motion began from."""
     assert moved.cross_noise is not None
     size = 3 + moved.cross_noise[..., 0].size
     return linalg.matmul(moved.lift(size), out_of(frame))
 
 
 def moved_anew(
-    joint: Joint, turn: jax.Array, step: jax.Array, lever: jax.Array, chart: Chart
+    joint: Joint,
+    turn: Float[Array, ""],
+    step: Float[Array, "3"],
+    lever: Float[Array, "D 3"],
+    chart: Chart,
 ) -> Joint:
-    """The map, corrected but for the last motion, composed with that motion changed by step (3,).
+    """The map, corrected but for the last motion, composed with that motion changed by a step.
 
     With T the transition of e_rest and h = g' - T g, P ← T P Tᵀ + h C Tᵀ + (h C Tᵀ)ᵀ + h Q hᵀ,
     C = cov(δ, e) and Q = cov(δ), all after the correction.
 
     Args:
-        turn: () by which the frame the motion began from has turned.
-        lever: g (D, 3) as it was before the correction.
+        turn: by which the frame the motion began from has turned.
+        lever: g as it was before the correction.
     """
     assert chart.basis is not None
     frame = joint.last.frame + turn
@@ -65,6 +70,6 @@ def moved_anew(
     )
 
 
-def out_of(frame: jax.Array) -> jax.Array:
-    """Steps in a frame of that heading as steps in the map, (3, 3)."""
+def out_of(frame: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Steps in a frame of that heading as steps in the map."""
     return se2.adjoint(jnp.stack([jnp.zeros_like(frame), jnp.zeros_like(frame), frame]))

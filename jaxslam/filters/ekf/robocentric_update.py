@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.ekf.coordinates import retracted
 from jaxslam.filters.ekf.innovation import Correction, innovate, view_of
-from jaxslam.filters.ekf.observability import informed
+from jaxslam.filters.ekf.observability import with_information
 from jaxslam.filters.ekf.predict import Transition, in_charts, moved_cov
 from jaxslam.filters.ekf.robocentric_motion import lever_by, lever_of_motion, out_of
 from jaxslam.filters.ekf.settings import EkfSettings
@@ -21,7 +21,7 @@ from jaxslam.protocols import Chart
 from jaxslam.slots import Joint, Last
 
 
-class Parted(NamedTuple):
+class MapAndMotion(NamedTuple):
     """The map as if its last motion were known, and that motion's error δ beside it.
 
     The errors of the map are e = T x + g δ, with x those of `rest`. To a map in the frame of the
@@ -30,28 +30,27 @@ class Parted(NamedTuple):
 
     rest: Joint
     """pose and landmarks without the step; cov (D + 3, ·), of x and then δ, and columns of zeros"""
-    frame: jax.Array
-    """() heading of the frame the motion began from"""
-    step: jax.Array
-    """(3,) by which the motion has been corrected"""
+    frame: Float[Array, ""]
+    """heading of the frame the motion began from"""
+    step: Float[Array, "3"]
+    """by which the motion has been corrected"""
 
 
 class Composition(NamedTuple):
     """The map with the corrected motion."""
 
-    pose: jax.Array
-    """(3,)"""
+    pose: Float[Array, "3"]
     moved: Transition
     """T"""
-    lever: jax.Array
-    """(D, 3) g"""
+    lever: Float[Array, "D 3"]
+    """g"""
 
-    def times(self, rows: jax.Array) -> jax.Array:
-        """[T g] times rows (D + 3, k)."""
+    def times(self, rows: Float[Array, "E k"]) -> Float[Array, "D k"]:
+        """[T g] times rows, E = D + 3."""
         return self.moved.times(rows[:-3]) + linalg.matmul(self.lever, rows[-3:])
 
 
-def part(joint: Joint, chart: Chart, columns: int) -> Parted:
+def separate_motion(joint: Joint, chart: Chart, columns: int) -> MapAndMotion:
     """x = e - g δ: cov(x) = P - g C - (g C)ᵀ + g Q gᵀ, C = cov(δ, e), Q = cov(δ).
 
     columns: of the P of (x, δ), D + 3 or more; what is beyond is zero.
@@ -64,15 +63,15 @@ def part(joint: Joint, chart: Chart, columns: int) -> Parted:
     beyond = [(0, 0), (0, columns - len(change) - 3)]
     top = jnp.concatenate([joint.cov - change, jnp.pad(cross.T, beyond)], axis=1)
     bottom = jnp.concatenate([cross, jnp.pad(last.own, beyond)], axis=1)
-    rest = joint._replace(cov=jnp.concatenate([top, bottom]), last=())
-    return Parted(rest, last.frame, jnp.zeros_like(joint.pose))
+    rest = joint._replace(cov=jnp.concatenate([top, bottom]), last=None)
+    return MapAndMotion(rest, last.frame, jnp.zeros_like(joint.pose))
 
 
-def compose(parted: Parted, chart: Chart) -> Composition:
+def composition_of(state: MapAndMotion, chart: Chart) -> Composition:
     """The motion with its step, put behind the rest."""
     assert chart.basis is not None
-    rest, frame = parted.rest, parted.frame
-    change = linalg.matmul(out_of(frame), parted.step[:, None])[:, 0]
+    rest, frame = state.rest, state.frame
+    change = linalg.matmul(out_of(frame), state.step[:, None])[:, 0]
     pose = rest.pose + change
     pose = settle(jnp.concatenate([pose[:2], wrap(pose[2:])]))
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
@@ -82,9 +81,9 @@ def compose(parted: Parted, chart: Chart) -> Composition:
     return Composition(pose, moved, lever_by(moved, frame))
 
 
-def whole(parted: Parted, chart: Chart) -> Joint:
+def compose_map(state: MapAndMotion, chart: Chart) -> Joint:
     """The map again: P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ, C = cov(δ, x)."""
-    found, rest = compose(parted, chart), parted.rest
+    found, rest = composition_of(state, chart), state.rest
     size = rest.cov.shape[0] - 3
     own, lever = rest.cov[size:, size : size + 3], found.lever.T
     cross = found.moved.times(rest.cov[size:, :size].T).T
@@ -94,21 +93,21 @@ def whole(parted: Parted, chart: Chart) -> Joint:
     watch = rest.watch
     if watch:
         watch = watch._replace(directions=found.moved.times(watch.directions))
-    last = Last(parted.frame, cross + shared, own)
+    last = Last(state.frame, cross + shared, own)
     return rest._replace(pose=found.pose, cov=cov, watch=watch, last=last)
 
 
-def correct_group(
-    parted: Parted,
+def correct_map_and_motion(
+    state: MapAndMotion,
     part: tuple[Float[Array, "g Z"], Int[Array, "g"], Bool[Array, "g"]],
     settings: EkfSettings,
-) -> tuple[Parted, Correction]:
+) -> tuple[MapAndMotion, Correction]:
     """Correct x and δ by g measurements in turn: z (g, Z), slot (g,), known (g,).
 
     As `update.correct_in_turn` does it: each corrects what the group sees of P, the rows P_I of
     the robot, of its landmarks and of δ, and the whole P is read and written once.
     """
-    rest, (_, slot, known) = parted.rest, part
+    rest, (_, slot, known) = state.rest, part
     size_l, size = rest.landmarks.shape[1], rest.cov.shape[0] - 3
     of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
     at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1), size + jnp.arange(3)])
@@ -126,14 +125,14 @@ def correct_group(
     )
 
     def one(
-        parted: Parted, measurement: tuple[jax.Array, Any]
-    ) -> tuple[Parted, tuple[jax.Array, jax.Array, Correction]]:
-        return _correct_one(parted, measurement, rest, settings)
+        state: MapAndMotion, measurement: tuple[jax.Array, Any]
+    ) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:
+        return _correct_one(state, measurement, rest, settings)
 
     # A gradient keeps what each begins with, and computes the rest of these few rows again.
     after, (reach, whitened, done) = jax.lax.scan(
         jax.checkpoint(one, prevent_cse=False),
-        parted._replace(rest=local),
+        state._replace(rest=local),
         (jnp.arange(len(slot)), part),
     )
     v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
@@ -151,11 +150,11 @@ def correct_group(
 
 
 def _correct_one(
-    parted: Parted,
+    state: MapAndMotion,
     measurement: tuple[jax.Array, Any],
     whole: Joint,
     settings: EkfSettings,
-) -> tuple[Parted, tuple[jax.Array, jax.Array, Correction]]:
+) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:
     """Correct a local x and δ by a measurement of its landmark i (); the whole map's slot beside.
 
     It sees e of the robot and its landmark, E = [T g] of their rows of (x, δ). With P that of
@@ -163,7 +162,7 @@ def _correct_one(
     (Z, ·), and L⁻¹ ν (Z,).
     """
     i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], measurement)
-    rest, chart = parted.rest, settings.chart
+    rest, chart = state.rest, settings.chart
     size_l, size = rest.landmarks.shape[1], rest.cov.shape[0] - 3
     at = jnp.concatenate(
         [jnp.arange(3), 3 + i[0] * size_l + jnp.arange(size_l), size + jnp.arange(3)]
@@ -178,7 +177,7 @@ def _correct_one(
         tag=rest.tag[i],
         watch=watch,
     )
-    found = compose(parted._replace(rest=local), chart)
+    found = composition_of(state._replace(rest=local), chart)
     against = found.times(local.cov)
     among = found.times(against[:, at].T).T
     if watch:
@@ -195,7 +194,7 @@ def _correct_one(
     pose = jnp.where(known[0], pose, rest.pose)  # a move by zero would round
     if watch:
         fused = said.fuse & said.correction.positive
-        watch = informed(here, chart, *said.seen, first, said.own_noise, fused)
+        watch = with_information(here, chart, *said.seen, first, said.own_noise, fused)
         watch = watch._replace(directions=rest.watch.directions)
     rest = rest._replace(
         pose=pose,
@@ -203,6 +202,6 @@ def _correct_one(
         cov=rest.cov - linalg.gram(v, said.v[:, len(among) :]),
         watch=watch,
     )
-    frame = parted.frame + (pose[2] - parted.rest.pose[2])
+    frame = state.frame + (pose[2] - state.rest.pose[2])
     done = jax.tree.map(lambda leaf: leaf[0], said.correction)
-    return Parted(rest, frame, parted.step + xi[size:]), (reach, said.whitened, done)
+    return MapAndMotion(rest, frame, state.step + xi[size:]), (reach, said.whitened, done)

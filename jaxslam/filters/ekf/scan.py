@@ -1,8 +1,8 @@
 """What a scan does to a `Joint`: each of its sensors corrects the map, then initializes landmarks.
 
-The steps are those of the textbook, one function each: `associated` predicts the measurements and
-says of which landmark each is, `update.correct` gates and corrects, `initialized` starts the new
-landmarks, and `reported` says what became of every measurement.
+The steps are those of the textbook, one function each: `associate_scan` predicts the measurements
+and says of which landmark each is, `update.correct` gates and corrects, `initialize_landmarks`
+starts the new landmarks, and `report_scan` says what became of every measurement.
 """
 
 import dataclasses
@@ -97,15 +97,15 @@ def update_by_sensor(
     """The update by the scan of one sensor; what became of it, and the slots (N,) evicted."""
     # Padding may hold anything, and is multiplied by zero further down.
     scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
-    found, matched = associated(joint, scan, settings)
+    found, matched = associate_scan(joint, scan, settings)
     at_once = settings.update == "joint" and len(scan.tag) > 0
     by_scan = correct if at_once else correct_in_turn
     joint, done = by_scan(joint, scan.z, jnp.maximum(found.slot, 0), matched, settings)
-    joint, new = initialized(joint, scan, found, matched, done, settings)
-    return joint, reported(scan, found, matched, done, new, settings), new.evicted
+    joint, new = initialize_landmarks(joint, scan, found, matched, done, settings)
+    return joint, report_scan(scan, found, matched, done, new, settings), new.evicted
 
 
-def associated(
+def associate_scan(
     joint: Joint, scan: Scan, settings: EkfSettings
 ) -> tuple[Association, Bool[Array, "M"]]:
     """Of which landmark each measurement is, by what is predicted of the map; and which correct it.
@@ -120,7 +120,7 @@ def associated(
     return found._replace(is_new=scan.valid & found.is_new), matched
 
 
-def initialized(
+def initialize_landmarks(
     joint: Joint,
     scan: Scan,
     found: Association,
@@ -169,7 +169,7 @@ def _with_room(
     needed = wanted.sum() - (~joint.alive).sum()
     measured = slots.concerned(slot, used, len(joint.alive))
     evicted = settings.make_room.make_room(joint, needed, measured)
-    return without(joint, evicted, square_root=settings.square_root), evicted
+    return without_landmarks(joint, evicted, square_root=settings.square_root), evicted
 
 
 def _started(
@@ -197,7 +197,7 @@ def _started(
     return joint, slot[mine], wanted & granted[mine]
 
 
-def reported(
+def report_scan(
     scan: Scan,
     found: Association,
     matched: Bool[Array, "M"],
@@ -230,7 +230,7 @@ def reported(
     )
 
 
-def without(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
+def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
     """The map without the landmarks of the slots `dead`; of a batch, a run without such is kept."""
 
     def removed(joint: Joint) -> Joint:

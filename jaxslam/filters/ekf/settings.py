@@ -50,7 +50,7 @@ class EkfSettings:
         return self.covariance == "square_root"
 
 
-def check_numbers(
+def check_options(
     filter: str,
     capacity: int,
     update: str,
@@ -68,10 +68,10 @@ def check_numbers(
     if update not in ("sequential", "joint"):
         raise ValueError(f'{filter}: expected update "sequential" or "joint", got {update!r}')
     check_gate(filter, gate)
-    check_covariance(filter, covariance, get_args(Covariance))
+    check_covariance_form(filter, covariance, get_args(Covariance))
 
 
-def check_covariance(filter: str, covariance: str, forms: tuple[str, ...]) -> None:
+def check_covariance_form(filter: str, covariance: str, forms: tuple[str, ...]) -> None:
     """The form of the covariance is one of those that the filter has."""
     if covariance not in forms:
         expected = " or ".join(f'"{form}"' for form in forms)

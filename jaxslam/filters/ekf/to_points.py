@@ -5,6 +5,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
 from jaxslam.math import linalg
@@ -12,32 +13,32 @@ from jaxslam.math.xla import where_any
 from jaxslam.protocols import Sensor
 from jaxslam.slots import Joint
 
-Array = jax.Array
 
-
-def seen_as(sensor: Sensor, reduced: Array | tuple[()]) -> Sensor:
-    """The sensor as it sees the landmark of a slot that is reduced () or not: l, or (x, y, …)."""
-    if sensor.reduced is None or isinstance(reduced, tuple):
+def seen_as(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
+    """The sensor as it sees a landmark, by whether it is a point (x, y, padding); None: none is."""
+    if sensor.reduced is None or reduced is None:
         return sensor
     of_points = sensor.reduced.sensor
 
-    def observe(pose: Array, landmark: Array) -> Array:
+    def observe(pose: Float[Array, "3"], landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
         as_point = of_points.observe(pose, landmark[:2])
         return jnp.where(reduced, as_point, sensor.observe(pose, landmark))
 
-    def position(landmark: Array) -> Array:
+    def position(landmark: Float[Array, "L"]) -> Float[Array, "2"]:
         return jnp.where(reduced, landmark[:2], sensor.position(landmark))
 
     return dataclasses.replace(sensor, observe=observe, position=position)
 
 
-def at_slot(sensor: Sensor, joint: Joint, slot: Array) -> Sensor:
+def at_slot(sensor: Sensor, joint: Joint, slot: Int[Array, ""]) -> Sensor:
     """The sensor as it sees the landmark of a slot () of the map."""
-    return sensor if isinstance(joint.reduced, tuple) else seen_as(sensor, joint.reduced[slot])
+    return sensor if joint.reduced is None else seen_as(sensor, joint.reduced[slot])
 
 
-def reduced_where_ready(joint: Joint, sensor: Sensor, square_root: bool) -> tuple[Joint, Array]:
-    """The map with the landmarks that may become points turned into them, and which (N,) bool."""
+def reduced_where_ready(
+    joint: Joint, sensor: Sensor, square_root: bool
+) -> tuple[Joint, Bool[Array, "N"]]:
+    """The map with the landmarks that may become points turned into them, and which."""
     which = ready(joint, sensor, square_root)
 
     def reduced(joint: Joint) -> Joint:
@@ -46,18 +47,18 @@ def reduced_where_ready(joint: Joint, sensor: Sensor, square_root: bool) -> tupl
     return where_any(which.any(), reduced, lambda joint: joint, joint), which
 
 
-def ready(joint: Joint, sensor: Sensor, square_root: bool) -> Array:
-    """Which landmarks (N,) may become points now."""
+def ready(joint: Joint, sensor: Sensor, square_root: bool) -> Bool[Array, "N"]:
+    """Which landmarks may become points now."""
     assert sensor.reduced is not None
     every = jnp.arange(joint.landmarks.shape[0])
     covs = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(every)[:, 3:, 3:]
     linear = jax.vmap(sensor.reduced.ready, (None, 0, 0))(joint.pose, joint.landmarks, covs)
-    good: Array = linear & joint.alive & ~joint.reduced
+    good: jax.Array = linear & joint.alive & ~joint.reduced
     return good
 
 
-def reduce(joint: Joint, which: Array, sensor: Sensor, square_root: bool) -> Joint:
-    """Turn the landmarks of the slots which (N,) bool into points.
+def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: bool) -> Joint:
+    """Turn the landmarks of the slots `which` into points.
 
     With J = ∂position/∂l (2, L), l ← position(l) and, of all errors, e_l ← J e_l, in rows and
     columns of P. The other L - 2 coordinates become padding. In a chart whose landmarks have errors
@@ -70,8 +71,8 @@ def reduce(joint: Joint, which: Array, sensor: Sensor, square_root: bool) -> Joi
     freed = jnp.pad(by_landmark, [(0, 0), (0, size - 2), (0, 0)])
     gain = jnp.where(which[:, None, None], freed, still)
 
-    def turned(matrix: Array) -> Array:
-        """The matrix (D, k) with J applied to the rows of landmarks."""
+    def turned(matrix: Float[Array, "D k"]) -> Float[Array, "D k"]:
+        """The matrix with J applied to the rows of landmarks."""
         rows = matrix[3:].reshape(capacity, size, -1)
         rows = linalg.total(gain[:, :, k, None] * rows[:, k, None, :] for k in range(size))
         return jnp.concatenate([matrix[:3], rows.reshape(capacity * size, -1)])

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.filters.ekf import robocentric_update
 from jaxslam.filters.ekf.coordinates import retracted
 from jaxslam.filters.ekf.innovation import Correction, Innovation, innovate, view_of
-from jaxslam.filters.ekf.observability import along, informed, split
+from jaxslam.filters.ekf.observability import split_directions, times_directions, with_information
 from jaxslam.filters.ekf.robocentric_motion import lever_of_motion, moved_anew
 from jaxslam.filters.ekf.settings import Covariance, EkfSettings
 from jaxslam.math import linalg
@@ -93,7 +93,7 @@ def _with_last_motion(
 ) -> Joint:
     """The map corrected but for the last motion, then composed with the corrected motion."""
     last, capacity = joint.last, joint.landmarks.shape[0]
-    seen_last = along(*found.jacobians, *split(last.cov.T, capacity), slot)
+    seen_last = times_directions(*found.jacobians, *split_directions(last.cov.T, capacity), slot)
     seen_last = linalg.solve_lower(found.factor, seen_last.reshape(-1, 3))
     step = linalg.gram(seen_last, found.whitened[:, None])[:, 0]
     lever = lever_of_motion(joint, chart)
@@ -158,14 +158,14 @@ def _in_turn_with_motion(
 
     def with_motion(joint: Joint) -> tuple[Joint, Correction]:
         rest, done = _in_groups(
-            lambda parted, part: robocentric_update.correct_group(parted, part, settings),
-            robocentric_update.part(joint, settings.chart, columns),
+            lambda rest, part: robocentric_update.correct_map_and_motion(rest, part, settings),
+            robocentric_update.separate_motion(joint, settings.chart, columns),
             measurements,
             group,
             joint,
         )
         # A run without a measurement must keep its map to the bit.
-        after = robocentric_update.whole(rest, settings.chart)
+        after = robocentric_update.compose_map(rest, settings.chart)
         kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)
         return kept, done
 
@@ -264,8 +264,8 @@ def _correct_local(
     return moved, (reach, found.whitened, done)
 
 
-def _nothing(joint: Joint, z: jax.Array) -> Correction:
-    """The `Correction` of m measurements z (m, Z) that nothing is done with, all zero."""
+def _nothing(joint: Joint, z: Float[Array, "m Z"]) -> Correction:
+    """The `Correction` of m measurements that nothing is done with, all zero."""
     m, size = z.shape
     dtype = jnp.result_type(z, joint.pose, joint.cov)
     each, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
@@ -279,18 +279,26 @@ def _nothing(joint: Joint, z: jax.Array) -> Correction:
     )
 
 
-def _moved(joint: Joint, found: Innovation, xi: jax.Array, slot: jax.Array, chart: Chart) -> Joint:
-    """The means moved by ξ (D,), and what the measurements tell a watch; P as it was."""
+def _moved(
+    joint: Joint,
+    found: Innovation,
+    xi: Float[Array, "D"],
+    slot: Int[Array, "m"],
+    chart: Chart,
+) -> Joint:
+    """The means moved by ξ, and what the measurements tell a watch; P as it was."""
     pose, landmarks = retracted(chart, joint, xi)
     watch = joint.watch
     if watch:
         fused = found.fuse & found.correction.positive
-        watch = informed(joint, chart, *found.seen, slot, found.own_noise, fused)
+        watch = with_information(joint, chart, *found.seen, slot, found.own_noise, fused)
     return joint._replace(pose=pose, landmarks=landmarks, watch=watch)
 
 
-def _moved_map(joint: Joint, v: jax.Array, whitened: jax.Array, chart: Chart) -> jax.Array:
-    """The landmarks (N, L) after corrections V (g·Z, D), L⁻¹ ν (g, Z), one after the other."""
+def _moved_map(
+    joint: Joint, v: Float[Array, "K D"], whitened: Float[Array, "g Z"], chart: Chart
+) -> Float[Array, "N L"]:
+    """The landmarks after corrections V (g·Z, D), L⁻¹ ν, one after the other."""
     if chart.basis is None:  # moves add up
         xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
         return retracted(chart, joint, xi)[1]
@@ -305,8 +313,13 @@ def _moved_map(joint: Joint, v: jax.Array, whitened: jax.Array, chart: Chart) ->
 
 
 def _joseph(
-    cov: jax.Array, hp: jax.Array, s: jax.Array, noise: jax.Array, factor: jax.Array, v: jax.Array
-) -> jax.Array:
+    cov: Float[Array, "D D"],
+    hp: Float[Array, "K D"],
+    s: Float[Array, "m Z m Z"],
+    noise: Float[Array, "m Z m Z"],
+    factor: Float[Array, "K K"],
+    v: Float[Array, "K D"],
+) -> Float[Array, "D D"]:
     """(I - KH) P (I - KH)ᵀ + K R Kᵀ from H P, in O(D²): the left factor first, then the right."""
     rows = hp.shape[0]
     gain = linalg.solve_lower(factor[::-1, ::-1].T, v[::-1])[::-1].T

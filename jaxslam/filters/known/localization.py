@@ -17,9 +17,9 @@ from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
     Update,
-    check_covariance,
+    check_covariance_form,
     check_iterations,
-    check_numbers,
+    check_options,
 )
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
@@ -86,8 +86,8 @@ def localization(
     capacity = points.shape[0]
     chart = _of_pose(chart or euclidean())
     linearize = linearize or at_estimate()
-    check_numbers("localization", capacity, update, gate, iterations, None)
-    check_covariance("localization", covariance, ("plain", "joseph"))
+    check_options("localization", capacity, update, gate, iterations, None)
+    check_covariance_form("localization", covariance, ("plain", "joseph"))
     if linearize.own_landmarks:
         raise ValueError(f"localization: the linearizer {linearize.name} is for maps with errors")
     check_iterations("localization", linearize, iterations)

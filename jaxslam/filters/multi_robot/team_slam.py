@@ -13,7 +13,7 @@ from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import Turn, turn_of, update_by_scan
-from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance
+from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance_form
 from jaxslam.filters.multi_robot.pose_initialization import best_initialization, observed_points
 from jaxslam.filters.multi_robot.settings import (
     SIZE,
@@ -95,7 +95,7 @@ def team_slam(
     validation.check_parts("team_slam", chart=chart, associate=associate)
     check_options(robots, report, chart, update, gate, iterations, births)
     check_sensors(robots)
-    check_covariance("team_slam", covariance, ("plain", "joseph"))
+    check_covariance_form("team_slam", covariance, ("plain", "joseph"))
     ekf = EkfSettings(
         sensor=robots[0].sensors,
         chart=_headings_wrapped(),

@@ -126,7 +126,7 @@ def test_a_reduced_map_is_filtered_as_one_of_points(options):
     log = a_log()
     start = jax.device_get(REDUCE(joint_of(), np.array([1, 1, 1, 0], bool), SENSOR, False))
     # Without a watch, and never to be reduced again.
-    start = start._replace(watch=())
+    start = start._replace(watch=None)
     keep = np.r_[0:3, np.arange(3, 19).reshape(4, 4)[:, :2].reshape(-1)]
     point = slots.Joint(
         start.pose,
