@@ -1,5 +1,5 @@
-"""The family: every variant of the one EKF-SLAM by name, set up for a scenario, and what to hold
-beside it.
+"""Every filter by name, set up for a scenario: the variants of EKF-SLAM, and what they are compared
+with.
 
 A variant is a chart, a linearizer or an option, given in one line; `monte_carlo` and the command
 line run them side by side.
@@ -34,7 +34,7 @@ from jaxslam.types import Info, Scan, Truth
 
 
 def variant(scenario: Scenario, **options: Any) -> Filter:
-    """EKF-SLAM set up as the scenario says, but for these arguments of `filters.ekf_slam`."""
+    """EKF-SLAM with the scenario's options, which these arguments of `filters.ekf_slam` replace."""
     capacity = int(np.shape(scenario.landmarks)[0])
     return ekf_slam(
         scenario.motion, scenario.sensor, capacity, **(scenario.filter_options | options)
@@ -42,12 +42,12 @@ def variant(scenario: Scenario, **options: Any) -> Filter:
 
 
 def ideal(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
-    """The EKF with Jacobians at the truth: a function of the truth that returns a filter."""
+    """The ideal EKF, with Jacobians at the truth: a function of the truth that returns a filter."""
     return lambda truth: variant(scenario, linearize=at_truth(truth), **options)
 
 
 def without_measurements(scenario: Scenario, **options: Any) -> Filter:
-    """Dead reckoning in a scenario; options of `ekf_slam` say nothing of it."""
+    """Dead reckoning in a scenario; it has none of the options of `ekf_slam`."""
     return dead_reckoning(scenario.motion, scenario.sensor)
 
 
@@ -87,23 +87,23 @@ def by_particles_in_a_known_map(scenario: Scenario, **options: Any) -> Callable[
 
 
 SLAM_PARTICLES = 50
-"""of FastSLAM in the family: few, so that a campaign of all does not wait for it."""
+"""of FastSLAM in the catalog: few, so that a campaign of all filters does not wait for it."""
 
 LOCALIZATION_PARTICLES = 300
-"""of Monte-Carlo localization in the family, in every step"""
+"""of Monte-Carlo localization in the catalog, at every step"""
 
 
 def in_canonical_form(
     scenario: Scenario, make: Callable[..., Filter], sparse: bool = True, **options: Any
 ) -> Filter:
-    """An information filter in a scenario; of the options of `ekf_slam`, the gate.
+    """An information filter in a scenario; of the options of `ekf_slam` it has the gate.
 
-    A sparse one has half the map active, 8 landmarks at least and 20 at most, all links, and
-    reports the covariance of its whole Ω: the campaign is to judge what it believes, and what
-    sparseness costs, not blankets. With all of the map active it would be `eif_slam` by definition;
-    a scan of more places than half of what is active, as in `cloister`, where all 36 columns are
-    measured in every step, is taken in pieces (`in_pieces`), since what a scan measures has to be
-    active at once.
+    A sparse one has half the map active, 8 landmarks at least and 20 at most, and all links. It
+    reports covariances from its whole Ω, not from Markov-blanket marginals, so that a campaign
+    judges the sparsification alone. With all of the map active it would be `eif_slam` by
+    definition. All landmarks that a scan measures must be active at once; so a scan of more
+    measurement slots than half of what is active (in `cloister` all 36 columns are measured in
+    every step) is divided (`in_pieces`).
     """
     count = int(np.shape(scenario.landmarks)[0])
     asked = scenario.filter_options | options
@@ -117,14 +117,14 @@ def in_canonical_form(
 
 
 LEAST_AREA, LARGEST_AREA = 8, 20
-"""active landmarks of the sparse information filters in the family"""
+"""active landmarks of the sparse information filters in the catalog"""
 
 
 def in_pieces(filter: Filter, places: int) -> Filter:
-    """The filter, to which a scan of more places comes as several of so many, one after the other.
+    """The filter, which takes a scan of more measurement slots in pieces of `places`, in turn.
 
-    Place i is in piece i mod their number. What is said of a scan as a whole is the sum of theirs,
-    or whether it is so of any.
+    Slot i is in piece i mod their number. Numbers that an `Info` has for a whole scan are summed
+    over the pieces, and flags are true where one of a piece is.
     """
 
     def update(state: Any, scan: Scan, key: jax.Array) -> tuple[Any, Info]:
@@ -179,14 +179,14 @@ BASELINES: dict[str, Callable[..., Candidate]] = {
     "dead_reckoning": without_measurements,
     "localization": in_a_known_map,
 }
-"""What no SLAM filter should be worse, or can be better, than; as FILTERS."""
+"""The worst and the best case of a SLAM filter: no measurements, and a known map; as FILTERS."""
 
 PARTICLES: dict[str, Callable[..., Candidate]] = {
     "fastslam1": lambda world, **more: by_particles(world, "motion", **more),
     "fastslam2": lambda world, **more: by_particles(world, "measurement", **more),
     "particle_localization": by_particles_in_a_known_map,
 }
-"""What draws instead of linearizing; as FILTERS."""
+"""The particle filters; as FILTERS."""
 
 CANONICAL: dict[str, Callable[..., Candidate]] = {
     "eif_slam": lambda world, **more: in_canonical_form(world, eif_slam, sparse=False, **more),
@@ -204,7 +204,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "particles": ("fastslam1", "fastslam2", "particle_localization"),
     "baselines": ("dead_reckoning", "localization"),
 }
-"""Their names by what is particular to them; figures of many filters are divided so."""
+"""The names by kind of filter; figures of many filters are divided so."""
 
 ALL = FILTERS | CANONICAL | PARTICLES | BASELINES
-"""Every one of them: what the command line knows, and runs for `--filters all`."""
+"""All filters, which the command line knows, and runs for `--filters all`."""

@@ -42,8 +42,12 @@ EVENTS = (
     *("removed", "merged", "reduced", "exhausted", "resampled", "underflow"),
     *("invalid", "injected", "capped"),
 )
-"""Fields of `Info`, or of the records in `Info.extra`, that not every filter has; each is counted
-where it is there."""
+"""What not every filter reports; each is counted where it is there. See `_event`."""
+
+_RECORD = {"removed": "pruning", "merged": "merging"} | dict.fromkeys(
+    ("resampled", "underflow", "invalid", "injected", "capped"), "particles"
+)
+"""The record in `Info.extra` that reports an event; the others are fields of `Info`."""
 
 LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
 """Probabilities of the coverage curves."""
@@ -163,13 +167,13 @@ def _counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
 
 
 def _event(info: Info, name: str) -> np.ndarray | None:
-    """How often one of `EVENTS` happened (R, T, …); None where the filter has no such event."""
-    field = "pair" if name == "merged" else name
-    for record in (info, *(info.extra or {}).values()):
-        found = jax.tree.leaves(getattr(record, name, getattr(record, field, None)))
-        if found:
-            return np.asarray(found[0][..., 0] >= 0 if name == "merged" else found[0])
-    return None
+    """How often one of `EVENTS` happened, (R, T, …); None where the filter does not report it."""
+    record = (info.extra or {}).get(_RECORD.get(name, ""), info)
+    field = "pair" if name == "merged" and record is not info else name
+    found = jax.tree.leaves(getattr(record, field, None))
+    if not found:
+        return None
+    return np.asarray(found[0][..., 0] >= 0 if name == "merged" else found[0])
 
 
 def _covered(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:

@@ -12,7 +12,7 @@ from jaxslam.consistency import Measure, Score, condense, mean_pose_nees, positi
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.monte_carlo.limit import divergence_limit, first_run
 from jaxslam.monte_carlo.plan import Plan, Promises, run_numbers
-from jaxslam.monte_carlo.programs import FilterResults
+from jaxslam.monte_carlo.programs import FilterResults, World
 from jaxslam.slots import Watch
 from jaxslam.types import Estimate, Info, Trace, Truth
 
@@ -104,7 +104,7 @@ class BlockRunner:
             out[BOUND] |= condensed_sums({name: rows[mine] for name, rows in bound.items()})
         return out
 
-    def _drive(self, name: str, which: np.ndarray, world: Any) -> FilterResults:
+    def _drive(self, name: str, which: np.ndarray, world: World) -> FilterResults:
         """What a filter makes of a block, timed."""
         drive = self.promises.drives[name].result()
         began, quiet = time.perf_counter(), self.promises.complete.done()

@@ -1,4 +1,4 @@
-"""Functions over a block of runs as compiled programs: divided over devices, kept, restored.
+"""Compiles functions over a block of runs: divided over devices, kept, restored from a library.
 
 A program takes the numbers of what it is made of (`jaxslam.programs`) and arrays that go over runs.
 It is found again by the objects it is made of, without a trace; by its structure, without a
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import serialize_executable
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
 
 from jaxslam import programs
 from jaxslam.math.xla import hot_options, quick_options
@@ -25,7 +26,14 @@ from jaxslam.monte_carlo.pieces import cores
 from jaxslam.programs import cache
 
 RESTORED = "/jaxslam/restore_program_duration"
-"""What `jax.monitoring` is told of a program that a library had, and for how long that took."""
+"""The event that `jax.monitoring` gets when a program is restored from a library, with its time."""
+
+
+Program = Callable[..., Any]
+"""(trees of arrays) -> a tree of arrays, compiled"""
+
+Axes = Any
+"""Of a tree of arrays the axis that goes over runs, or None; a prefix of the tree."""
 
 
 class Library(Protocol):
@@ -46,8 +54,8 @@ class Library(Protocol):
 class Made(NamedTuple):
     """A program that is compiled, or being compiled, and the shapes of its results."""
 
-    program: Future[Callable[..., Any]]
-    shapes: Any
+    program: Future[Program]
+    shapes: PyTree
 
 
 class _Saved(NamedTuple):
@@ -56,8 +64,8 @@ class _Saved(NamedTuple):
     executable: bytes
     inputs: int
     """how many arrays it takes beside its numbers"""
-    numbers: list[Any]
-    shapes: Any
+    numbers: list[np.ndarray]
+    shapes: PyTree
 
 
 _MADE = cache.Kept(cache.ROOM)
@@ -81,11 +89,11 @@ class Blockwise:
     def program(
         self,
         name: str,
-        objects: tuple[Any, ...],
-        function: Callable[..., Any],
-        axes: Sequence[Any],
-        out: Any,
-        *arguments: Any,
+        objects: tuple[object, ...],
+        function: Program,
+        axes: Sequence[Axes],
+        out: Axes,
+        *arguments: PyTree,
         straight: bool = False,
     ) -> Made:
         """The program of a function of arrays.
@@ -93,8 +101,7 @@ class Blockwise:
         Args:
             name: which one of these objects it is, and its name in the library.
             objects: what the function is made of.
-            axes: of each argument the axis that goes over runs, or None; or a prefix of its tree.
-            out: that of the results.
+            axes: of each argument. out: of the results.
             arguments: the arrays, or their shapes.
             straight: see `xla.quick_options`.
         """
@@ -118,10 +125,10 @@ class Blockwise:
     def _traced(
         self,
         label: str,
-        function: Callable[..., Any],
-        axes: Sequence[Any],
-        out: Any,
-        arguments: Sequence[Any],
+        function: Program,
+        axes: Sequence[Axes],
+        out: Axes,
+        arguments: Sequence[PyTree],
         straight: bool,
     ) -> Made:
         block = self._wide // len(self._devices)
@@ -150,9 +157,9 @@ class Blockwise:
         label: str,
         lowered: jax.stages.Lowered,
         numbers: list[Any],
-        shapes: Any,
+        shapes: PyTree,
         straight: bool,
-    ) -> Callable[..., Any]:
+    ) -> Program:
         options = (quick_options if straight else hot_options)(self._devices[0].platform)
         compiled: Any = cache.compiled(lowered, self._devices, options)
         keys = any(jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key) for x in numbers)
@@ -176,16 +183,16 @@ class Blockwise:
         compiled = serialize_executable.deserialize_and_load(
             saved.executable, in_tree, out_tree, execution_devices=list(self._devices)
         )
-        program: Future[Callable[..., Any]] = Future()
+        program: Future[Program] = Future()
         program.set_result(self._with(compiled, saved.numbers, jax.tree.structure(saved.shapes)))
         jax.monitoring.record_event_duration_secs(RESTORED, time.perf_counter() - began)
         return Made(program, saved.shapes)
 
-    def _with(self, compiled: Any, numbers: list[Any], out: Any) -> Callable[..., Any]:
+    def _with(self, compiled: Program, numbers: list[Any], out: PyTree) -> Program:
         """The program with its numbers, which are put on every device once."""
         there = jax.device_put(numbers, NamedSharding(self._mesh, PartitionSpec()))
 
-        def run(*arguments: Any) -> Any:
+        def run(*arguments: PyTree) -> PyTree:
             return jax.tree.unflatten(out, compiled(there, *jax.tree.leaves(arguments)))
 
         return run
@@ -197,22 +204,22 @@ def _load_lapack() -> None:
     jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.result_type(float)))
 
 
-def _by_leaf(axes: Any, tree: Any) -> list[int | None]:
-    """The axis of each leaf of a tree. axes: a prefix of the tree."""
+def _by_leaf(axes: Axes, tree: PyTree) -> list[int | None]:
+    """The axis of each leaf of a tree."""
     out: list[int | None] = []
 
-    def spread(axis: int | None, part: Any) -> None:
+    def spread(axis: int | None, part: PyTree) -> None:
         out.extend([axis] * len(jax.tree.leaves(part)))
 
     jax.tree.map(spread, axes, tree, is_leaf=lambda axis: axis is None)
     return out
 
 
-def _resized(tree: Any, runs: int, axes: Any) -> Any:
-    """The shapes of arrays by runs, with so many of them. axes: a prefix of the tree."""
+def _resized(tree: PyTree, runs: int, axes: Axes) -> PyTree:
+    """The shapes of the arrays of a tree, with so many runs."""
     leaves, structure = jax.tree.flatten(tree)
 
-    def resized(leaf: Any, axis: int | None) -> Any:
+    def resized(leaf: Any, axis: int | None) -> jax.ShapeDtypeStruct:
         shape = leaf.shape
         if axis is not None:
             shape = (*shape[:axis], runs, *shape[axis + 1 :])

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import jax
 import numpy as np
+from jax.typing import DTypeLike
 from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Summary, Tally, summarize
@@ -97,7 +98,7 @@ def monte_carlo(
     devices: Sequence[jax.Device] | None = None,
     workers: int | None = None,
     bound: bool = False,
-    dtype: Any = None,
+    dtype: DTypeLike | None = None,
     keep: Keep | None = None,
     progress: Callable[[int, int], None] | None = None,
     glimpse: Glimpse | None = None,

@@ -1,4 +1,4 @@
-"""What a campaign is given to run: whether it fits the scenario, and how many runs fit a device."""
+"""Checks of what a campaign is given to run, and how many runs fit a device."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -8,6 +8,9 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from jaxslam import programs
 from jaxslam.charts.euclidean import euclidean
@@ -17,7 +20,7 @@ from jaxslam.protocols import Candidate, Chart, Estimator, Filter, Motion, Senso
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.worlds import Scenario, simulate
-from jaxslam.types import Log, Truth
+from jaxslam.types import Log, Trace, Truth
 
 _T = TypeVar("_T")
 
@@ -35,7 +38,7 @@ def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: 
     if room is None:
         return 1024
 
-    def one(key: jax.Array) -> Any:
+    def one(key: jax.Array) -> PyTree:
         truth, log = simulate(scenario, key)
         method, _ = estimator_of(next(iter(filters.values())), truth, scenario)
         trace = method(log, key)
@@ -46,7 +49,7 @@ def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: 
     return int(np.clip(2 ** int(np.log2(max(room / 4 / each, 1.0))), 32, 4096))
 
 
-def check_dtype(dtype: Any) -> Any:
+def check_dtype(dtype: DTypeLike | None) -> np.dtype | None:
     """The dtype of a campaign's worlds, or None; ValueError unless JAX is set to have it."""
     if dtype is None:
         return None
@@ -58,7 +61,7 @@ def check_dtype(dtype: Any) -> Any:
     return wanted
 
 
-def rounded(tree: _T, dtype: Any) -> _T:
+def rounded(tree: _T, dtype: DTypeLike | None) -> _T:
     """The same arrays, those of floating-point numbers in the dtype; None leaves them."""
     if dtype is None:
         return tree
@@ -128,11 +131,11 @@ def _seen_first(sensor: Sensor, scenario: Scenario) -> jax.Array:
     return programs.call(sensor.observe, (), _number(scenario.pose), landmark)
 
 
-def _number(values: Any) -> np.ndarray:
+def _number(values: ArrayLike) -> np.ndarray:
     return np.asarray(values, jnp.result_type(float))
 
 
-def _check_stated(name: str, size: int, noise_cov: Callable[..., Any], *at: Any) -> None:
+def _check_stated(name: str, size: int, noise_cov: Callable[..., jax.Array], *at: object) -> None:
     try:
         check_covariance(name, programs.call(noise_cov, (), *at), size)
     except ValueError as error:
@@ -192,7 +195,7 @@ def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tupl
         watch = monitor_of(state)
         return None if watch is None else watch.information
 
-    def drive(log: Log, key: jax.Array) -> Any:
+    def drive(log: Log, key: jax.Array) -> Trace:
         return run(method, log, scenario.pose, scenario.pose_cov, key, probe=gained)
 
     return drive, method.chart

@@ -1,4 +1,4 @@
-"""What a campaign is, as text that two campaigns can be compared by.
+"""The fingerprint of a campaign: text by which two campaigns are compared.
 
 Two campaigns have the same fingerprint where they draw the same worlds, run the same filters over
 them and score the same measures. It is taken from what the models and filters *do*: each is traced
@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Jaxpr, Literal
+from jax.typing import DTypeLike
 
 from jaxslam import consistency
 from jaxslam.consistency import own_error_of
@@ -34,6 +35,7 @@ from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.protocols import Candidate
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.types import Log, Trace, Truth
 
 
 def fingerprint(
@@ -42,7 +44,7 @@ def fingerprint(
     key: jax.Array,
     platform: str,
     bound: bool = False,
-    dtype: Any = None,
+    dtype: DTypeLike | None = None,
 ) -> dict[str, str]:
     """All that must agree for two blocks of runs to be of one campaign: a short text by its name.
 
@@ -68,12 +70,12 @@ def fingerprint(
     if not isinstance(sensor, Suite):  # whose parts have noises of their own; "world" sees them
         found["sensor noise"] = digest(sensor.noise_cov, z)
 
-    def world(key: jax.Array) -> Any:
+    def world(key: jax.Array) -> tuple[Truth, Log, jax.Array]:
         truth, log = rounded(simulate(scenario, key), dtype)
         return truth, log, jax.vmap(sensor.position)(truth.landmarks)
 
     def results(candidate: Candidate) -> Callable[..., Any]:
-        def of(truth: Any, log: Any, key: jax.Array) -> Any:
+        def of(truth: Truth, log: Log, key: jax.Array) -> tuple[Trace, jax.Array]:
             method, chart = estimator_of(candidate, truth, scenario)
             trace = method(log, key)
             return trace, own_error_of(chart, sensor, trace, truth)

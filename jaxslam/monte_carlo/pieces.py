@@ -1,4 +1,4 @@
-"""Which runs are still to do, and with how many hands."""
+"""The runs that are still to do, in pieces of blocks; and the cores that there are."""
 
 import os
 from collections.abc import Iterable

@@ -1,6 +1,6 @@
 """What a campaign computes, and the compiled programs that its blocks wait for."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
@@ -8,12 +8,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
-from jaxslam.monte_carlo.blockwise import Library
+from jaxslam.monte_carlo.blockwise import Library, Program
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario
-
-Program = Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Plan:
     """runs a device"""
     bound: bool = False
     """whether the conditional Cramér-Rao bound of every run is taken"""
-    dtype: Any = None
+    dtype: DTypeLike | None = None
     """of the worlds; None for that of JAX"""
     library: Library | None = None
     with_first: bool = True

@@ -19,14 +19,14 @@ no device ever waits for another.
 """
 
 import contextlib
-from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam.consistency import (
     Statistics,
@@ -36,7 +36,7 @@ from jaxslam.consistency import (
     own_error_of,
     statistics,
 )
-from jaxslam.monte_carlo.blockwise import Blockwise
+from jaxslam.monte_carlo.blockwise import Axes, Blockwise, Program
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.monte_carlo.limit import divergence_limit
 from jaxslam.monte_carlo.plan import Plan, Promises, run_numbers
@@ -151,14 +151,14 @@ class _Compiling(NamedTuple):
         self,
         promise: Future[Any],
         name: str,
-        function: Callable[..., Any],
-        given: tuple[Any, ...],
-        axes: tuple[Any, ...],
+        function: Program,
+        given: tuple[PyTree, ...],
+        axes: tuple[Axes, ...],
         *,
-        out: Any = 0,
-        more: tuple[Any, ...] = (),
+        out: Axes = 0,
+        more: tuple[object, ...] = (),
         quick: bool = False,
-    ) -> Any:
+    ) -> PyTree:
         """Have `Blockwise.program` keep the promise; the shapes of the results.
 
         given: arrays or shapes. axes: those that go over the runs, of the arguments. out: of the
@@ -185,7 +185,9 @@ def _keep(promise: Future[Any], compiling: Future[Any]) -> None:
 # --- what the programs compute, of the runs which (B,) ------------------------------------------
 
 
-def draw_worlds(scenario: Scenario, dtype: Any, key: Array, which: Int[Array, "B"]) -> World:
+def draw_worlds(
+    scenario: Scenario, dtype: DTypeLike | None, key: Array, which: Int[Array, "B"]
+) -> World:
     """The truths and logs (B, …) of these runs, floating-point numbers in the dtype."""
     world: World = jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
     return rounded(world, dtype)

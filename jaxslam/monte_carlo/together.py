@@ -1,4 +1,4 @@
-"""What the processes of a campaign have to know of each other."""
+"""How the processes of a campaign divide the runs, and gather each other's tallies."""
 
 from collections.abc import Sequence
 

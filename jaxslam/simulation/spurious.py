@@ -56,7 +56,7 @@ def spoil(
     """A scan made at a pose with sensor faults put in, and the true origin of each measurement.
 
     Returns:
-        A scan of spurious.places more measurement slots, clutter last and with tag -1; and the tag
+        A scan with spurious.places further slots, clutter last and with tag -1; and the tag
         of the landmark that was truly measured in each, -1 for none.
     """
     scan = jax.tree.map(jnp.asarray, scan)

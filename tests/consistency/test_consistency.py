@@ -46,7 +46,7 @@ def synthetic(rng, runs, claimed=1.0, singular=0):
         tag=np.tile(tag, (runs, STEPS, 1)),
     )
     truth = Truth(pose + error, landmarks, np.zeros((runs, STEPS), int), np.zeros((runs, 3)))
-    return Trace(estimate, info, (), ()), truth, error
+    return Trace(estimate, info, None, None), truth, error
 
 
 @jax.jit

@@ -135,7 +135,7 @@ def correlated(rng, rho, runs=30, steps=200, slots=3):
     )
     pose = 0.1 * np.ones((runs, steps, 3))
     truth = Truth(pose, np.ones((runs, slots, 2)), np.zeros((runs, steps), int), pose[:, 0])
-    return Trace(estimate, info, (), ()), truth
+    return Trace(estimate, info, None, None), truth
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.4])

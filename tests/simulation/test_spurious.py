@@ -106,7 +106,7 @@ def test_associations_are_counted_by_what_a_slot_was_born_of():
     info = Info(0, 0, 0, 0, slot, status, 0)
     alive = np.ones((3, 2), bool)
     estimate = Estimate(np.zeros((3, 3)), 0, 0, 0, alive, np.zeros((3, 2), int))
-    trace = Trace(estimate, info, (), ())
+    trace = Trace(estimate, info, None, None)
     held = jax.jit(identities)(trace, origin)
     np.testing.assert_array_equal(held, [[4, -1]] * 3)
     found = jax.jit(associations)(trace, origin, held)
