@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +52,9 @@ def some_scan(joint, tags, seed=1, noise=0.1):
     return Scan(z, np.array(tags, np.int32), np.ones(len(tags), bool))
 
 
+assert_same = functools.partial(chex.assert_trees_all_close, rtol=0)
+
+
 @functools.cache
 def updater(**options):
     """A compiled update of `ekf_slam` with these options; "chart" by name."""
@@ -64,12 +68,6 @@ def updater(**options):
 @functools.cache
 def estimator(name):
     return jax.jit(ekf_slam(MOTION, SENSOR, CAPACITY, chart=charts.REGISTRY[name]()).estimate)
-
-
-def assert_same(a, b, atol):
-    a, b = jax.device_get((a, b))
-    for left, right in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(left, right, rtol=0, atol=atol)
 
 
 # --- dense oracle: numeric Jacobians in chart coordinates, textbook products ---------------------
@@ -311,7 +309,7 @@ def test_sequential_correction_is_joint_correction_one_landmark_at_a_time():
     for i in range(2):
         alone = scan._replace(valid=np.arange(2) == i)
         one_by_one, _ = updater(update="joint")(one_by_one, alone)
-    assert_same(at_once, one_by_one, 1e-13)
+    assert_same(at_once, one_by_one, atol=1e-13)
     together, _ = updater(update="joint")(joint, scan)
     assert np.abs(together.pose - at_once.pose).max() > 1e-5  # not on a nonlinear model
 
@@ -321,7 +319,7 @@ def test_joseph_form_is_the_plain_form():
     scan = some_scan(joint, [13, 11])
     plain, plain_info = updater(update="joint")(joint, scan)
     joseph, info = updater(update="joint", covariance="joseph")(joint, scan)
-    assert_same((joseph, info), (plain, plain_info), 1e-12)
+    assert_same((joseph, info), (plain, plain_info), atol=1e-12)
     assert np.abs(plain.cov - joint.cov).max() > 1e-3
 
 
@@ -372,7 +370,7 @@ def linear():
 
 def test_sequential_is_joint_on_a_linear_model(linear):
     (one, one_infos), (all_, all_infos) = linear(update="sequential"), linear(update="joint")
-    assert_same(one, all_, 1e-12)
+    assert_same(one, all_, atol=1e-12)
     # The likelihood of a scan is the product of those of its parts, each given the ones before.
     for a, b in zip(one_infos, all_infos, strict=True):
         np.testing.assert_allclose(a.nis, b.nis, atol=1e-11)
@@ -385,8 +383,8 @@ def test_one_pass_is_five_passes_on_a_linear_model(linear):
     (one, one_infos), (five, five_infos) = (
         linear(update="joint", **more) for more in ({}, {"iterations": 5})
     )
-    assert_same(one, five, 1e-11)
-    assert_same(one_infos, five_infos, 1e-11)
+    assert_same(one, five, atol=1e-11)
+    assert_same(one_infos, five_infos, atol=1e-11)
 
 
 def tiny(steps=12):
@@ -438,7 +436,7 @@ def single():
 def test_vmap_is_a_loop_and_one_trace_serves_all_logs(logs, single):
     mapped = jax.device_get(jax.jit(jax.vmap(runner(8)))(logs[1]))
     for i in range(3):
-        assert_same(take(mapped, i), single[0](take(logs[1], i)), 1e-11)
+        assert_same(take(mapped, i), single[0](take(logs[1], i)), atol=1e-11)
     assert single[1]() == 1
 
 
@@ -448,9 +446,9 @@ def test_capacity_8_is_a_larger_one(logs, single, capacity):
     tight = single[0](take(logs[1], 0))
     assert tight.estimate.alive[-1].sum() >= 4
     cut = [part[:, :8] for part in roomy.estimate[2:]]
-    assert_same([*roomy.estimate[:2], *cut], list(tight.estimate), 1e-12)
-    assert_same(roomy.info, tight.info, 1e-11)
-    assert_same(roomy.probe.cov[:, :19, :19], tight.probe.cov, 1e-12)
+    assert_same([*roomy.estimate[:2], *cut], list(tight.estimate), atol=1e-12)
+    assert_same(roomy.info, tight.info, atol=1e-11)
+    assert_same(roomy.probe.cov[:, :19, :19], tight.probe.cov, atol=1e-12)
     np.testing.assert_array_equal(roomy.final.cov[19:], np.eye(3 + 2 * capacity)[19:])
 
 
@@ -464,7 +462,7 @@ def test_jit_is_no_jit():
         return joint, filter.estimate(joint)
 
     u = jnp.array([0.1, 0.2])
-    assert_same(step(joint, u), jax.jit(step)(joint, u), 1e-13)
+    assert_same(step(joint, u), jax.jit(step)(joint, u), atol=1e-13)
 
 
 @pytest.mark.parametrize(

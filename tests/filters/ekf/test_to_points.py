@@ -3,6 +3,7 @@
 import dataclasses
 from functools import cache
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -116,8 +117,7 @@ def slope_of(name):
 def test_nothing_to_reduce_changes_nothing(square_root):
     joint = joint_of("euclidean", square_root)
     same = REDUCE(joint, np.zeros(4, bool), SENSOR, square_root)
-    for a, b in zip(jax.tree.leaves(joint), jax.tree.leaves(same), strict=True):
-        np.testing.assert_array_equal(a, b)
+    chex.assert_trees_all_equal(same, joint)
 
 
 @pytest.mark.parametrize("options", [{}, {"linearize": unscented()}, {"update": "joint"}])
