@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from jaxslam import programs
 from jaxslam.math import linalg
-from jaxslam.math.linalg import check_count
 from jaxslam.types import Info, Status
+from jaxslam.validation.numbers import check_count
 
 
 class Calibration(NamedTuple):

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
-from jaxslam.math.linalg import check_covariance, check_key, is_concrete, shape_told
 from jaxslam.protocols import Filter
-from jaxslam.types import Log, Status, Trace, check_log
+from jaxslam.types import Log, Status, Trace
 from jaxslam.validation import check_record, checked_estimate, same_state, state_and_info
+from jaxslam.validation.logs import check_log
+from jaxslam.validation.numbers import check_covariance, check_key, is_concrete, shape_told
 
 
 def run(

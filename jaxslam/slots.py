@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.math.linalg import cholesky, matmul, symmetrize, total, triangular_root
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 
 
 class Joint(NamedTuple):
@@ -218,7 +218,7 @@ def scatter(
         # with the map and, where rows and columns are both new, G P_RR Gᵀ; symmetric to the bit.
         half = joint.cov[:3].at[:, 3:].add(0.5 * matmul(joint.cov[:3, :3], gain.T))
         cross = total(gain[:, k, None] * half[k, None, :] for k in range(3))
-        cross = settle(jnp.pad(cross, [(3, 0), (0, 0)]))
+        cross = materialize(jnp.pad(cross, [(3, 0), (0, 0)]))
         cov = cov + (cross + cross.T)
         cov = _add_blocks(cov, own)
     watch = joint.watch

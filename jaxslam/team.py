@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.math.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Motion
 from jaxslam.sensors.suite import Part, Suite, suite
 from jaxslam.slots import Joint
+from jaxslam.validation.numbers import check_covariance, is_concrete
 
 
 @dataclass(frozen=True, eq=False)

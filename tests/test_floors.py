@@ -15,8 +15,8 @@ PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
     "math programs",
-    "types protocols slots noise derivatives",
-    "motion sensors charts linearize association resampling life validation team",
+    "types protocols slots validation noise derivatives",
+    "motion sensors charts linearize association resampling life team",
     "run filters smoothing simulation",
     "consistency monte_carlo verify catalog calibration",
     "datasets results cli __main__",

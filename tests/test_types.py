@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.types import Info, Log, Scan, Status, check_log
+from jaxslam.types import Info, Log, Scan, Status
+from jaxslam.validation import check_log
 
 
 def good_log(steps=4, places=3):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Landmark, Pose
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 from jaxslam.protocols import Basis, Chart
 
 
@@ -22,7 +22,7 @@ def robocentric() -> Chart:
     """
 
     def retract(pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark) -> tuple[Pose, Landmark]:
-        moved = settle(se2.inverse(se2.inverse(pose) + dx))
+        moved = materialize(se2.inverse(se2.inverse(pose) + dx))
         return moved, se2.from_frame(moved, se2.to_frame(pose, landmark) + dl)
 
     def local(
@@ -33,7 +33,7 @@ def robocentric() -> Chart:
         return jnp.concatenate([dx[:2], wrap(dx[2:])]), dl
 
     def basis(pose: Pose, landmark: Landmark) -> Basis:
-        c, s = settle((jnp.cos(pose[2]), jnp.sin(pose[2])))
+        c, s = materialize((jnp.cos(pose[2]), jnp.sin(pose[2])))
         one = jnp.ones_like(c)
         # With l = R(m - b), R = R(θ) and θ = -b_θ; and the same of t = -R b.
         turn = jnp.stack([c, -s, s, c]).reshape(2, 2)

@@ -23,7 +23,6 @@ from jaxslam.cli.campaign_folder import (
     open_store,
 )
 from jaxslam.cli.common import INTERRUPTED, Progress, pick
-from jaxslam.math.linalg import check_count
 from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.monte_carlo.candidates import rounded
 from jaxslam.protocols import Candidate, Filter
@@ -33,6 +32,7 @@ from jaxslam.run import run
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Truth
+from jaxslam.validation.numbers import check_count
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Figure

@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.team import Robot
-from jaxslam.types import Log, Scan, check_log
+from jaxslam.types import Log, Scan
+from jaxslam.validation.logs import check_log
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxslam.datasets.dataset import Dataset, make_log
 from jaxslam.datasets.lines import TextFile
-from jaxslam.math.linalg import check_covariance
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import relative_position
+from jaxslam.validation.numbers import check_covariance
 
 SOURCE = (
     "Victoria Park: J. Guivant and E. Nebot, Optimization of the simultaneous localization and "

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.math import linalg
-from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
+from jaxslam.validation.numbers import is_concrete
 
 Array = jax.Array
 

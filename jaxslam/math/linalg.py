@@ -1,4 +1,4 @@
-"""Small linear algebra: factors of the few-by-few matrices of a filter, and checks of covariances.
+"""Small linear algebra: factors of the few-by-few matrices of a filter.
 
 A landmark update factors a 2×2 to 6×6 matrix, millions of times, under `vmap`. The library call
 behind `jnp.linalg.cholesky` costs more there than the arithmetic, and hides a non-positive pivot
@@ -8,7 +8,6 @@ behind NaN; hence the unrolled factor below, which reports it and stays finite.
 import functools
 import operator
 from collections.abc import Callable, Iterable
-from numbers import Integral
 from typing import Any, TypeVar
 
 import jax
@@ -16,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
 
 from jaxslam.math import batched_linalg
 
@@ -365,76 +363,3 @@ def mahalanobis_squared(
 def is_positive_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
     """Whether a symmetric (n, n) matrix is positive definite: its Cholesky factor is finite, ()."""
     return jnp.all(jnp.isfinite(batched_linalg.factor(matrix)))
-
-
-def is_concrete(*values: Any) -> bool:
-    """Whether values can be looked at, i.e. no leaf is a tracer."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
-
-
-def shape_told(value: Any) -> str:
-    """For a message: the shape of what should be an array, or what it is where it has none."""
-    try:
-        shape = np.shape(value)
-    except ValueError:
-        return "rows of unlike lengths"
-    if shape == () and not hasattr(value, "shape"):
-        plain = value is None or isinstance(value, str | int | float | complex)
-        return repr(value) if plain else f"a {type(value).__name__}"
-    return str(shape)
-
-
-def check_count(name: str, value: Any) -> None:
-    """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-        raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
-
-
-def check_key(name: str, key: Any) -> None:
-    """Raise ValueError unless key is one PRNG key: of `jax.random.key`, or the raw numbers of one.
-
-    A tracer of one will do.
-    """
-    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
-    if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
-        if shape != ():
-            raise ValueError(f"{name}: expected one PRNG key, got keys of shape {shape}")
-    elif dtype != np.uint32 or shape is None or len(shape) != 1:
-        shown = repr(key) if dtype is None else f"an array of {dtype} of shape {shape}"
-        raise ValueError(f"{name}: expected a PRNG key, as of jax.random.key(0), got {shown}")
-
-
-def check_gate(name: str, gate: Any) -> None:
-    """Raise ValueError unless the gate is None, a tracer, or above 0."""
-    if gate is not None and is_concrete(gate) and not gate > 0:
-        raise ValueError(f"{name}: expected a gate above 0, got {gate}")
-
-
-def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
-    """Raise ValueError unless cov is real, finite, symmetric, positive semi-definite (size, size).
-
-    Values are looked at only where they are concrete; a tracer is checked for its shape alone.
-    """
-    got = shape_told(cov)
-    if got != str((size, size)):
-        raise ValueError(f"{name}: expected a covariance of shape ({size}, {size}), got {got}")
-    if not is_concrete(cov):
-        return
-    values = np.asarray(cov)
-    if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
-        raise ValueError(f"{name}: expected real numbers, got dtype {values.dtype}")
-    values = values.astype(np.float64)
-    if not np.all(np.isfinite(values)):
-        raise ValueError(f"{name}: the covariance has a NaN or an infinity")
-    scale = np.max(np.abs(values), initial=0.0)
-    if np.max(np.abs(values - values.T), initial=0.0) > 1e-6 * scale:
-        raise ValueError(f"{name}: the covariance is not symmetric")
-    if np.min(np.diagonal(values), initial=0.0) < 0:
-        raise ValueError(
-            f"{name}: the covariance is not positive semi-definite (negative variance)"
-        )
-    smallest = np.min(np.linalg.eigvalsh(values), initial=np.inf)
-    if smallest < -1e-6 * scale:
-        raise ValueError(
-            f"{name}: the covariance is not positive semi-definite (eigenvalue {smallest:.3g})"
-        )

@@ -12,7 +12,7 @@ _T = TypeVar("_T")
 _U = TypeVar("_U")
 
 
-def apart(function: Callable[..., _T], *arguments: Any) -> _T:
+def no_inline(function: Callable[..., _T], *arguments: Any) -> _T:
     """function(*arguments), compiled as a computation of its own.
 
     XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
@@ -73,9 +73,9 @@ def quick_jit(function: Callable[..., _T]) -> Callable[..., _T]:
     return cast(Callable[..., _T], jax.jit(function, compiler_options=options))
 
 
-def settle(values: _T) -> _T:
-    """The same arrays, computed once and kept; see `apart`, which saves a copy of large ones."""
-    return cast(_T, apart(jax.lax.optimization_barrier, values))
+def materialize(values: _T) -> _T:
+    """The same arrays, computed once and kept; `no_inline` saves a copy of large ones."""
+    return cast(_T, no_inline(jax.lax.optimization_barrier, values))
 
 
 @jax.custom_batching.custom_vmap

@@ -19,7 +19,6 @@ from jax.typing import DTypeLike
 from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Summary, Tally, summarize
-from jaxslam.math.linalg import check_count, check_key
 from jaxslam.monte_carlo.block import BOUND, BlockRunner, Glimpse
 from jaxslam.monte_carlo.blockwise import Library
 from jaxslam.monte_carlo.candidates import (
@@ -38,6 +37,7 @@ from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Estimate, Truth
 from jaxslam.validation import check_record
+from jaxslam.validation.numbers import check_count, check_key
 
 
 @dataclass(frozen=True)

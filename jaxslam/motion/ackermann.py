@@ -7,9 +7,9 @@ from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
-from jaxslam.math.linalg import is_concrete
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
+from jaxslam.validation.numbers import is_concrete
 
 
 def ackermann(

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
-from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Motion
+from jaxslam.validation.numbers import check_count
 
 _Rows = tuple[Array, Array]
 _Jacobians = tuple[Array, Array, Array]

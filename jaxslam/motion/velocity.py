@@ -8,8 +8,9 @@ from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
-from jaxslam.noise import NoiseCov, check_alpha, noise_model
+from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Motion
+from jaxslam.validation.numbers import check_alpha
 
 
 def velocity(noise_cov: NoiseCov) -> Motion:

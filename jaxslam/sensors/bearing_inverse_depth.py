@@ -17,12 +17,12 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.math.linalg import is_concrete
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Reduced, Sensor
 from jaxslam.sensors.bearing_only import bearing_only
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
 from jaxslam.sensors.prior import FreeLike, prior
+from jaxslam.validation.numbers import is_concrete
 
 _FAR = 1e-6
 """[1/m] below this inverse distance `position` places a landmark as if it had this one."""

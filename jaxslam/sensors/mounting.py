@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.arrays import Pose
-from jaxslam.math.linalg import is_concrete
+from jaxslam.validation.numbers import is_concrete
 
 NO_OFFSET = (0.0, 0.0, 0.0)
 

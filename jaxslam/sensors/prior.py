@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.math.linalg import check_covariance, is_concrete
 from jaxslam.protocols import Free
+from jaxslam.validation.numbers import check_covariance, is_concrete
 
 FreeLike = Free | tuple[ArrayLike, ArrayLike]
 

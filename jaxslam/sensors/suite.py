@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.math.arrays import Landmark, Measurement, Point, Pose, Unmeasured
-from jaxslam.math.linalg import check_count
 from jaxslam.protocols import Free, Sensor
 from jaxslam.types import Scan
+from jaxslam.validation.numbers import check_count
 
 
 @dataclass(frozen=True, eq=False)

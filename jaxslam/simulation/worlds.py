@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike
 
 from jaxslam import programs
 from jaxslam.math.angles import wrap
-from jaxslam.math.linalg import check_covariance, check_key, is_concrete, root_psd
+from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Part, Suite
 from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Log, Scan, Truth
 from jaxslam.validation import check_record
+from jaxslam.validation.numbers import check_covariance, check_key, is_concrete
 
 Visible = Callable[[jax.Array, jax.Array], jax.Array]
 """(pose, l) -> () bool: whether a sensor reports the landmark from there."""

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.math.linalg import check_count, is_concrete
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.smoothing.chain import Chain
@@ -24,6 +23,7 @@ from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
 from jaxslam.smoothing.problem import Iterate, Problem
 from jaxslam.smoothing.smooth import solution, with_singular
 from jaxslam.types import Estimate, Info, Log, Trace
+from jaxslam.validation.numbers import check_count, is_concrete
 
 
 class Solved(NamedTuple):

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam.math.linalg import check_covariance
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
+from jaxslam.validation.numbers import check_covariance
 from jaxslam.verify.differences import on_circle
 from jaxslam.verify.errors import describe_error, line_of
 from jaxslam.verify.functions import Function, periods

@@ -270,7 +270,7 @@ BAD = {
 def test_check_covariance_refuses(case):
     value, message = BAD[case]
     with pytest.raises(ValueError, match=message):
-        linalg.check_covariance("thing", value, 2)
+        validation.check_covariance("thing", value, 2)
 
 
 @pytest.mark.parametrize(
@@ -284,12 +284,12 @@ def test_check_covariance_refuses(case):
     ids=["zero", "integers", "singular", "float32"],
 )
 def test_check_covariance_accepts(value):
-    linalg.check_covariance("thing", value, 2)
+    validation.check_covariance("thing", value, 2)
 
 
 def test_check_covariance_sees_the_shape_of_a_tracer_and_no_more():
     def traced(cov, size):
-        linalg.check_covariance("thing", cov, size)
+        validation.check_covariance("thing", cov, size)
         return cov
 
     assert jax.eval_shape(lambda c: traced(c, 2), -np.eye(2)).shape == (2, 2)
@@ -299,9 +299,9 @@ def test_check_covariance_sees_the_shape_of_a_tracer_and_no_more():
 
 def test_is_concrete():
     seen = []
-    jax.eval_shape(lambda x: seen.append(linalg.is_concrete([1.0, {"x": x}])), np.zeros(2))
+    jax.eval_shape(lambda x: seen.append(validation.is_concrete([1.0, {"x": x}])), np.zeros(2))
     assert seen == [False]
-    assert linalg.is_concrete([np.zeros(2), jnp.zeros(2), 1.0])
+    assert validation.is_concrete([np.zeros(2), jnp.zeros(2), 1.0])
 
 
 def everything(a, b):
@@ -371,8 +371,8 @@ def test_a_square_and_its_slopes_are_those_of_the_product(rows):
 def test_a_key_is_one_prng_key():
     one = jax.random.key(0)
     for key in (one, jax.random.PRNGKey(0), np.asarray(jax.random.PRNGKey(0))):
-        linalg.check_key("it", key)
-    jax.eval_shape(lambda key: linalg.check_key("it", key), one)
+        validation.check_key("it", key)
+    jax.eval_shape(lambda key: validation.check_key("it", key), one)
     for key, shown in (
         (0, "got 0"),
         (None, "got None"),
@@ -380,4 +380,4 @@ def test_a_key_is_one_prng_key():
         (jax.random.split(one, 3), r"one PRNG key, got keys of shape \(3,\)"),
     ):
         with pytest.raises(ValueError, match=f"it: expected .*{shown}"):
-            linalg.check_key("it", key)
+            validation.check_key("it", key)

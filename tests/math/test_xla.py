@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.math.xla import anywhere, apart, hot_options, quick_jit, settle, where_any
+from jaxslam.math.xla import anywhere, hot_options, materialize, no_inline, quick_jit, where_any
 
 
 def test_settle_is_the_identity_under_every_transformation():
     def cubed(x):
-        once, tree = settle((x**2, {"x": x}))
+        once, tree = materialize((x**2, {"x": x}))
         return jnp.sum(once * tree["x"])
 
     x = np.array([[1.0, 2.0], [3.0, -1.0]])
@@ -24,7 +24,7 @@ def test_settle_is_the_identity_under_every_transformation():
 
 def test_apart_is_the_function_under_every_transformation():
     def f(x, y):
-        return apart(lambda a, b: (a * b, jnp.sin(a)), x, y)
+        return no_inline(lambda a, b: (a * b, jnp.sin(a)), x, y)
 
     x, y = np.array([0.3, 2.0]), np.array([1.5, -1.0])
     product, sine = jax.jit(jax.vmap(f))(x, y)
@@ -60,7 +60,7 @@ def test_nothing_is_fused_across(kept):
 
     def update(cov, gain):
         v = 3.0 * gain + 1.0
-        v = settle(v) if kept else v
+        v = materialize(v) if kept else v
         return cov - v[:, None] * v[None, :]
 
     program = jax.jit(update).lower(jnp.eye(8), jnp.ones(8)).compile().as_text()

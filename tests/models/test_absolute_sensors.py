@@ -11,7 +11,8 @@ from jaxslam import charts, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario, simulate
-from jaxslam.types import Log, Scan, Status, check_log
+from jaxslam.types import Log, Scan, Status
+from jaxslam.validation import check_log
 
 KEY = jax.random.key(0)
 STEPS, PLACES = 50, 3

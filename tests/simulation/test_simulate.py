@@ -23,7 +23,7 @@ from jaxslam.simulation.scenarios import (
     cloister_landmarks,
 )
 from jaxslam.simulation.worlds import Scenario, simulate
-from jaxslam.types import check_log
+from jaxslam.validation import check_log
 
 Q = np.array([[0.002, 0.0005], [0.0005, 0.001]])
 R = np.array([[0.04, -0.01], [-0.01, 0.01]]) * 0.25

@@ -19,7 +19,7 @@ from jaxslam.filters.delayed.state import (
     slots_where,
 )
 from jaxslam.math import linalg
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 from jaxslam.slots import Joint
 
 
@@ -108,7 +108,7 @@ def constraints_of(
     columns = hp[:, 3:].reshape(len(points), -1, SIZE)
     cov = jnp.einsum("mni,ni->mn", columns[:, points], by_point)
     cov = cov + jnp.einsum("mni,ni->mn", columns[:, stored], by_stored)
-    return settle(Constraints(value, hp, linalg.symmetrize(cov)))
+    return materialize(Constraints(value, hp, linalg.symmetrize(cov)))
 
 
 def correct_hypotheses(
@@ -135,7 +135,7 @@ def correct_hypotheses(
     k_hp = (gain[:, :, None] * constraints.hp[:, None, :]).reshape(rows, -1)
     k_s_k = gain[:, :, None, None] * constraints.cov[:, None, :, None] * gain[None, None]
     half = -k_hp.at[:, own].add(-0.5 * k_s_k.reshape(rows, rows))
-    half = settle(half)
+    half = materialize(half)
     return joint._replace(
         landmarks=joint.landmarks.at[layout.of_hypotheses].add(-gain * constraints.value[:, None]),
         cov=joint.cov.at[own].add(half).at[:, own].add(half.T),

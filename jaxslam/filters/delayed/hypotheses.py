@@ -12,7 +12,7 @@ from jaxslam.filters.delayed.state import SIZE, TableLayout, covariance_blocks
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math import uncertain_poses
 from jaxslam.math.uncertain_poses import Frame
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 from jaxslam.slots import Joint
 
 _DISTANCES = {
@@ -59,7 +59,7 @@ def point_residuals(
     variance = jnp.einsum("pqi,pij,pqj->pq", by_point, p_xx, by_point)
     variance = variance + jnp.einsum("pqi,qij,pqj->pq", by_stored, p_ss, by_stored)
     variance = variance + 2 * jnp.einsum("pqi,piqj,pqj->pq", by_point, p_xs, by_stored)
-    return settle(PointResiduals(value, variance, by_point, by_stored))
+    return materialize(PointResiduals(value, variance, by_point, by_stored))
 
 
 class UncertainPoints(NamedTuple):
@@ -111,7 +111,7 @@ def closer_than(
         return regular & (how_far < limit)
 
     out: Array = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(points, others)
-    return settle(out)
+    return materialize(out)
 
 
 def safe_root(square: Float[Array, "*n"]) -> Float[Array, "*n"]:

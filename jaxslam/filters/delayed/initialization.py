@@ -12,7 +12,7 @@ from jaxslam.filters.delayed.state import SIZE, covariance_blocks, covariance_ro
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 from jaxslam.slots import Joint
 
 # Gauss-Newton steps from a hypothesis, which is near already.
@@ -102,7 +102,7 @@ def initial_estimate(
     none = zeros[:, 0], zeros[:, :SIZE], zeros[:, :2], zeros[:, 6:], jnp.asarray(True)
     _, point, terms = jax.lax.scan(gauss_newton, (start, start, none), None, length=_STEPS + 1)[0]
     value, by_stored, by_point, inverse_root, positive = terms
-    q = settle(_triangularizing(by_point))
+    q = materialize(_triangularizing(by_point))
     r, value, transform = (q @ by_point)[:2], q @ value, q @ inverse_root
     regular = (use.sum() >= 2) & (jnp.abs(r[0, 0] * r[1, 1]) > 0)
     safe = jnp.where(regular, r, jnp.eye(2, dtype=r.dtype))
@@ -135,7 +135,7 @@ def add_landmark(
     """
     capacity = joint.landmarks.shape[0]
     rows = covariance_rows(joint)[stored]
-    hp = settle(estimate.transform @ jnp.einsum("mi,mid->md", estimate.by_stored, rows))
+    hp = materialize(estimate.transform @ jnp.einsum("mi,mid->md", estimate.by_stored, rows))
     mine = 3 + SIZE * slot + jnp.arange(2)
     own = 0.5 * estimate.minus_r_inv @ estimate.minus_r_inv.T
     half = (estimate.minus_r_inv @ hp[:2]).at[:, mine].add(own)

@@ -24,7 +24,7 @@ from jaxslam.filters.delayed.state import (
     increased,
 )
 from jaxslam.filters.delayed.triangulation import Triangulation
-from jaxslam.math.xla import settle, where_any
+from jaxslam.math.xla import materialize, where_any
 from jaxslam.slots import Joint
 
 
@@ -198,7 +198,7 @@ def intersections_of(
     pairs = jnp.concatenate([top, jnp.concatenate([p_ba, p_bb], axis=3)], axis=2)
     of_pairs = jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, 0))
     a, b = joint.landmarks[stored], joint.landmarks[first:]
-    return settle(Intersections(*of_pairs(a, b, pairs)))
+    return materialize(Intersections(*of_pairs(a, b, pairs)))
 
 
 def add_hypotheses(
@@ -238,7 +238,7 @@ def add_hypotheses(
     own_cov = jnp.pad(own_cov, [(0, 0), (0, 1), (0, 0), (0, 1)]).reshape(SIZE * count, SIZE * count)
     half = jnp.pad(jp, [(0, 0), (0, 1), (0, 0)]).reshape(SIZE * count, -1)
     own = layout.hypothesis_rows
-    half = settle(half.at[:, own].add(0.5 * own_cov))
+    half = materialize(half.at[:, own].add(0.5 * own_cov))
     # Padding's unit variance goes first, to an exact zero; the third parameter keeps it.
     unit = (formed[:, None] & (jnp.arange(SIZE) < 2)[None]).reshape(-1).astype(joint.cov.dtype)
     at = jnp.arange(own.start, own.stop)

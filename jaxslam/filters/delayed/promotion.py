@@ -33,7 +33,7 @@ from jaxslam.filters.delayed.state import (
     slots_where,
 )
 from jaxslam.math.stats import chi2_quantiles
-from jaxslam.math.xla import settle, where_any
+from jaxslam.math.xla import materialize, where_any
 
 # Stored measurements that a landmark is made of: two locate it, and the others are a matrix that
 # `linalg` factors without a library call.
@@ -142,7 +142,7 @@ def _promote(
     used, use = _outermost(settings, state, own)
     estimate, decision = _locate(settings, state, chosen, used, use)
     # Of a batch, the runs without a promotion wait, and keep all they have to the bit.
-    accepted, undecided = settle(_Decision(decision.accepted & go, decision.undecided | ~go))
+    accepted, undecided = materialize(_Decision(decision.accepted & go, decision.undecided | ~go))
 
     with_landmark = add_landmark(joint, estimate, slot, used)
     joint = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), with_landmark, joint)

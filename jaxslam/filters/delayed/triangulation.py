@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import Sensor
+from jaxslam.validation.numbers import is_concrete
 
 Stored = Float[Array, "3"]
 """a stored measurement s = (x, y, q)"""

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam import slots
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 from jaxslam.protocols import Here
 from jaxslam.slots import Joint
 
@@ -40,7 +40,7 @@ def augment(
                 by_pose, own = undo @ by_pose, undo @ own @ undo.T
         return landmark, by_pose, own
 
-    landmark, by_pose, own = settle(jax.vmap(one)(z, tag))
+    landmark, by_pose, own = materialize(jax.vmap(one)(z, tag))
     joint = slots.scatter(
         joint, slot, granted, landmark, by_pose, own, tag, square_root=square_root
     )

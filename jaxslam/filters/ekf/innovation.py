@@ -16,7 +16,7 @@ from jaxslam.filters.ekf.predicted_measurements import in_chart, innovation_cov
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.to_points import at_slot
 from jaxslam.math import linalg
-from jaxslam.math.xla import apart, settle
+from jaxslam.math.xla import materialize, no_inline
 from jaxslam.protocols import Here
 from jaxslam.slots import Joint
 
@@ -153,7 +153,7 @@ def innovate(
         s = innovation_cov(hp, by_pose, by_landmark, slot, capacity)
         s = s + same * noise[:, :, None]
         marginal = s[jnp.arange(m), :, jnp.arange(m)]
-        inverse, definite = apart(jax.vmap(linalg.whitener), marginal)
+        inverse, definite = no_inline(jax.vmap(linalg.whitener), marginal)
         first = gated is None
         if gated is None:
             gated = _gate(nu, marginal, inverse, definite, known, settings.gate)
@@ -222,7 +222,7 @@ def _linearize(
         nu = nu + jnp.einsum("mzi,i->mz", by_pose, moved[0])
         nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, moved[1])
     # One array, and so one kernel and not three.
-    rows = settle(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
+    rows = materialize(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
     return _Linearized(rows, rest, seen)
 
 
@@ -237,10 +237,10 @@ def _project(
     rows: Float[Array, "m Z C"], view: View, joint: Joint, settings: EkfSettings
 ) -> tuple[Float[Array, "m Z D"], Float[Array, "m Z D"]]:
     """H X and H P of a square-root filter; else H P twice."""
-    hp = hx = apart(_seen_rows, rows, view.robot, view.own)
+    hp = hx = no_inline(_seen_rows, rows, view.robot, view.own)
     if settings.square_root:
         m, size_z = rows.shape[:2]
-        hp = settle((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
+        hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
     return hx, hp
 
 
@@ -273,8 +273,8 @@ def _factor(
     m, size_z = s.shape[:2]
     both = fuse[:, None, None, None] & fuse[None, None, :, None]
     unit = jnp.eye(size_z, dtype=s.dtype)
-    s = settle(jnp.where(both, s, same * unit[None, :, None]))
-    factor = settle(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
+    s = materialize(jnp.where(both, s, same * unit[None, :, None]))
+    factor = materialize(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
     pivots = jnp.diagonal(factor).reshape(m, size_z)
     # Measurements that are regular one by one can still be singular together.
     regular = definite if m == 1 else (pivots > 0).all(axis=1)
@@ -294,10 +294,10 @@ def _whiten(
     """V = L⁻¹ H P and L⁻¹ ν, zero for what is not fused."""
     if len(fuse) == 1:
         inverse = jnp.where((fuse & factored.regular)[:, None, None], factored.inverse, 0.0)
-        return apart(_multiplied, inverse, hp, nu)
+        return no_inline(_multiplied, inverse, hp, nu)
     # As a vector, the factor has one layout: LAPACK wants columns, and XLA (jaxlib 0.12) may pass
     # rows to a computation that was compiled for columns.
-    return apart(_solved, factored.factor.reshape(-1), hp, nu.reshape(-1))
+    return no_inline(_solved, factored.factor.reshape(-1), hp, nu.reshape(-1))
 
 
 def _report(gated: _Gated, factored: _Factored, whitened: Float[Array, "K"]) -> Correction:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam import slots
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg, se2
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 from jaxslam.protocols import Basis, Here, Motion
 from jaxslam.slots import Joint, Last
 
@@ -28,7 +28,7 @@ def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfS
     if chart.basis is None:
         moved = Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
     else:
-        pose = settle(pose)
+        pose = materialize(pose)
         over_map = jax.vmap(chart.basis, in_axes=(None, 0))
         before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
         moved = in_charts(by_pose, before, after, joint.alive)
@@ -108,7 +108,7 @@ def in_charts(
         landmark = jnp.where(alive[:, None, None], each(own, before.landmark), still)
         cross, cross_noise = each(own, cross), each(own, cross_noise)
     cross, cross_noise = (jnp.where(alive[:, None, None], m, 0.0) for m in (cross, cross_noise))
-    return settle(Transition(robot, cross, landmark, undo, cross_noise))
+    return materialize(Transition(robot, cross, landmark, undo, cross_noise))
 
 
 def moved_cov(
@@ -126,11 +126,11 @@ def moved_cov(
         own = linalg.matmul(robot[:, :3], moved.robot.T)
         own = linalg.symmetrize(own if noise is None else own + noise)
         # Kept apart from P, which it is made of, so that P is written in place.
-        robot = settle(jnp.concatenate([own, robot[:, 3:]], axis=1))
+        robot = materialize(jnp.concatenate([own, robot[:, 3:]], axis=1))
         return cov.at[:3].set(robot).at[:, :3].set(robot.T)
     if moved.landmark is not None:
         # In memory before it is transposed: each entry would be computed twice.
-        cov = settle(moved.turn(moved.turn(cov).T))
+        cov = materialize(moved.turn(moved.turn(cov).T))
     cov = linalg.symmetrize(cov)
     # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.
     b = jnp.concatenate([moved.robot - jnp.eye(3, dtype=cov.dtype), moved.cross.reshape(-1, 3)])
@@ -138,8 +138,8 @@ def moved_cov(
     left, right = [b.T], [half]
     if shared is not None:
         left, right = [*left, shared[0]], [*right, shared[1]]
-    change = linalg.gram_both(*settle((jnp.concatenate(left), jnp.concatenate(right))))
+    change = linalg.gram_both(*materialize((jnp.concatenate(left), jnp.concatenate(right))))
     if noise is not None:
         added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
-        change = change + linalg.square(settle(added))
+        change = change + linalg.square(materialize(added))
     return cov + change

@@ -8,7 +8,7 @@ from jaxslam.association.predicted import predicted
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.to_points import at_slot
 from jaxslam.math import linalg
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 from jaxslam.protocols import Basis, Chart, Here, Prediction
 from jaxslam.slots import Joint
 
@@ -23,7 +23,7 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
     ]:
         """ẑ, H by errors of pose and landmark, H P Hᵀ of each alone."""
         every = jnp.arange(capacity)
-        robot, cross, own = settle(_blocks(joint, square_root))
+        robot, cross, own = materialize(_blocks(joint, square_root))
         top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
         bottom = jnp.concatenate([cross.transpose(0, 2, 1), own], axis=2)
         local = jnp.concatenate([top, bottom], axis=1)
@@ -36,11 +36,13 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
             by_pose, by_landmark = in_chart(
                 chart, joint.pose, joint.landmarks, by_pose, by_landmark
             )
-        expected, by_pose, by_landmark, rest = settle((expected, by_pose, by_landmark, rest))
+        expected, by_pose, by_landmark, rest = materialize((expected, by_pose, by_landmark, rest))
         h = jnp.concatenate([by_pose, by_landmark], axis=2)
-        hp = settle(linalg.total(h[:, :, k, None] * local[:, None, k] for k in range(3 + size)))
+        hp = materialize(
+            linalg.total(h[:, :, k, None] * local[:, None, k] for k in range(3 + size))
+        )
         alone = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in range(3 + size))
-        return expected, by_pose, by_landmark, settle(alone + rest)
+        return expected, by_pose, by_landmark, materialize(alone + rest)
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
         expected, _, _, own = jacobians()

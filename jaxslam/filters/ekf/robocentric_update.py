@@ -16,7 +16,7 @@ from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.linearize.first_order import turned
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.math.xla import apart, settle
+from jaxslam.math.xla import materialize, no_inline
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint, Last
 
@@ -58,7 +58,7 @@ def separate_motion(joint: Joint, chart: Chart, columns: int) -> MapAndMotion:
     last, lever = joint.last, lever_of_motion(joint, chart).T
     shared = linalg.matmul(last.own, lever)
     half = last.cov - 0.5 * shared
-    change = linalg.gram_both(*settle((lever, half)))
+    change = linalg.gram_both(*materialize((lever, half)))
     cross = last.cov - shared
     beyond = [(0, 0), (0, columns - len(change) - 3)]
     top = jnp.concatenate([joint.cov - change, jnp.pad(cross.T, beyond)], axis=1)
@@ -73,7 +73,7 @@ def composition_of(state: MapAndMotion, chart: Chart) -> Composition:
     rest, frame = state.rest, state.frame
     change = linalg.matmul(out_of(frame), state.step[:, None])[:, 0]
     pose = rest.pose + change
-    pose = settle(jnp.concatenate([pose[:2], wrap(pose[2:])]))
+    pose = materialize(jnp.concatenate([pose[:2], wrap(pose[2:])]))
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before, after = over_map(rest.pose, rest.landmarks), over_map(pose, rest.landmarks)
     by_pose = turned(jnp.eye(3, dtype=pose.dtype), change[:2])
@@ -135,7 +135,7 @@ def correct_map_and_motion(
         state._replace(rest=local),
         (jnp.arange(len(slot)), part),
     )
-    v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
+    v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
     xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
     landmarks = retracted(settings.chart, rest, xi[:size])[1]
     if watch:

@@ -19,7 +19,7 @@ from jaxslam.filters.ekf.observability import split_directions, times_directions
 from jaxslam.filters.ekf.robocentric_motion import lever_of_motion, moved_anew
 from jaxslam.filters.ekf.settings import Covariance, EkfSettings
 from jaxslam.math import linalg
-from jaxslam.math.xla import apart, settle, where_any
+from jaxslam.math.xla import materialize, no_inline, where_any
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
 
@@ -85,7 +85,7 @@ def _corrected_cov(
     root = same * jnp.where(found.fuse[:, None, None], root, unit)[:, :, None]
     root = factor + root.reshape(m * size_z, m * size_z)
     hx = found.hx.reshape(m * size_z, -1)
-    return cov - linalg.gram(v, settle(linalg.solve_lower(root, hx)))
+    return cov - linalg.gram(v, materialize(linalg.solve_lower(root, hx)))
 
 
 def _with_last_motion(
@@ -236,7 +236,7 @@ def correct_group(
         local,
         (jnp.arange(len(slot)), part),
     )
-    v = apart(linalg.matmul, reach.reshape(-1, len(at)), rows)
+    v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
     landmarks = _moved_map(joint, v[:, :size], whitened, chart)
     if watch:
         watch = local.watch._replace(directions=joint.watch.directions)

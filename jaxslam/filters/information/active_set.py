@@ -17,7 +17,7 @@ from jaxslam.filters.information.sparse_state import (
     with_landmark_blocks,
 )
 from jaxslam.filters.information.tag_association import TagAssociation
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 
 
 def active_matches(state: SparseState, association: TagAssociation) -> Bool[Array, "M A"]:
@@ -107,7 +107,7 @@ def activate(
     entered = jnp.zeros(count, bool).at[at].set(True, mode="drop")
     rows = state.neighbours.at[active].get(mode="fill", fill_value=n)
     links = state.links.at[active].get(mode="fill", fill_value=0)
-    rows, links = settle((rows, links))
+    rows, links = materialize((rows, links))
     match = (rows[:, :, None] == active[None, None, :]) & (active < n)[None, None, :]
     found = jnp.einsum("akij,akb->abij", links, match.astype(links.dtype))
     own = state.diagonal.at[jnp.where(entered, active, n)].get(mode="fill", fill_value=0)

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information.sparse_state import SparseState
 from jaxslam.filters.information.sparsification import drop_link
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 
 
 def enter_link(
@@ -35,7 +35,7 @@ def enter_link(
         return at, row[at], links[at], weight[at]
 
     # Read before anything is written: else XLA reads again later, from a copy of all N lists.
-    found = settle((weakest(i), weakest(j)))
+    found = materialize((weakest(i), weakest(j)))
     (at_i, p, link_p, least_i), (at_j, q, link_q, least_j) = found
     keep = on & (size > least_i) & (size > least_j)
     index, links = state.neighbours, state.links
@@ -45,7 +45,7 @@ def enter_link(
         diagonal, counts = drop_link(diagonal, counts, mine, other, old, full, conservative)
         row = index.at[jnp.where(full, other, n)].get(mode="fill", fill_value=n)
         back = row == mine
-        gone = settle((jnp.where(full & back.any(), other, n), jnp.argmax(back)))
+        gone = materialize((jnp.where(full & back.any(), other, n), jnp.argmax(back)))
         index = index.at[gone].set(n, mode="drop")
         links = links.at[gone].set(0.0, mode="drop")
     i, j = jnp.where(keep, i, n), jnp.where(keep, j, n)

@@ -17,7 +17,7 @@ from jaxslam.filters.information.sparse_state import (
     with_active_residual,
 )
 from jaxslam.math import linalg
-from jaxslam.math.xla import settle
+from jaxslam.math.xla import materialize
 
 
 def move_landmarks(
@@ -28,7 +28,7 @@ def move_landmarks(
     row = state.neighbours.at[slot].get(mode="fill", fill_value=n)
     links = state.links.at[slot].get(mode="fill", fill_value=0)
     # Who writes to the lists next needs the slots, so waits for this, and needs no copy of all N.
-    row, links, active = settle((row, links, state.active))
+    row, links, active = materialize((row, links, state.active))
     change = jnp.einsum("mkij,mi->mkj", links, step).reshape(-1, 2)
     return state._replace(
         active=active,

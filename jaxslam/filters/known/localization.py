@@ -23,7 +23,6 @@ from jaxslam.filters.ekf.settings import (
 )
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
-from jaxslam.math.linalg import is_concrete
 from jaxslam.protocols import (
     Associate,
     Association,
@@ -40,6 +39,7 @@ from jaxslam.protocols import (
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
+from jaxslam.validation.numbers import is_concrete
 
 Array = jax.Array
 

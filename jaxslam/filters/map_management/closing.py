@@ -17,12 +17,12 @@ from jaxslam.filters.map_management.loop_closure import (
 from jaxslam.filters.map_management.successive import merge_histories, successive_duplicate
 from jaxslam.filters.map_management.wrapping import joint_of
 from jaxslam.filters.reporting import with_extra, with_removed
-from jaxslam.math.linalg import check_count
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
 from jaxslam.protocols import Filter
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
+from jaxslam.validation.numbers import check_count
 
 
 def closing(

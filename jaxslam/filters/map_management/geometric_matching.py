@@ -18,8 +18,8 @@ from jaxslam.filters.map_management.point_pairs import (
     extend_pair,
     longest_pairs,
 )
-from jaxslam.math.linalg import check_count
 from jaxslam.math.stats import chi2_quantile
+from jaxslam.validation.numbers import check_count
 
 _BLOCK = 32  # candidates that are scored together; more cost memory
 _FINALISTS = 8  # hypotheses that are tried jointly

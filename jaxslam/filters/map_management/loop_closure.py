@@ -17,11 +17,11 @@ from jaxslam.filters.map_management.relocalization import check_points, check_po
 from jaxslam.filters.map_management.successive import merge_histories
 from jaxslam.life.recency import Recency
 from jaxslam.math import linalg
-from jaxslam.math.linalg import check_count
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
+from jaxslam.validation.numbers import check_count
 
 
 class Closing(NamedTuple):

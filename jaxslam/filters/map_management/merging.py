@@ -13,12 +13,12 @@ from jaxslam.filters.map_management.wrapping import joint_of
 from jaxslam.filters.reporting import with_extra
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import gaussian_terms
-from jaxslam.math.linalg import is_concrete
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
 from jaxslam.protocols import Chart, Filter
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan, Status
+from jaxslam.validation.numbers import is_concrete
 
 
 class Merged(NamedTuple):

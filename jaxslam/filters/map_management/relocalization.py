@@ -12,10 +12,10 @@ from jaxslam.filters.map_management.alignment import align
 from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
 from jaxslam.filters.map_management.point_pairs import PointSets
 from jaxslam.math import linalg
-from jaxslam.math.linalg import check_count, check_covariance
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
+from jaxslam.validation.numbers import check_count, check_covariance
 
 
 class Relocalization(NamedTuple):

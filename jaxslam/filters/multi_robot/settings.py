@@ -7,9 +7,9 @@ import numpy as np
 
 from jaxslam.filters.ekf.scan import Turn
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.math.linalg import check_count, check_gate
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.team import Robot
+from jaxslam.validation.numbers import check_count, check_gate
 
 SIZE = 3
 """Numbers of a slot: x, y and the heading of a robot; of a landmark the third is padding."""

@@ -31,13 +31,13 @@ from jaxslam.filters.multi_robot.team_state import (
 from jaxslam.filters.reporting import joined
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.math.linalg import check_count
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Chart, Filter
 from jaxslam.sensors.suite import Part, split_scan
 from jaxslam.slots import Joint
 from jaxslam.team import Robot, check_team, poses, sizes
 from jaxslam.types import Estimate, Info, Scan, Status
+from jaxslam.validation.numbers import check_count
 
 
 def team_slam(

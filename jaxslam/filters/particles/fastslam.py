@@ -30,7 +30,6 @@ from jaxslam.filters.particles.slam_state import (
     with_finite_poses,
 )
 from jaxslam.filters.reporting import has_distance, with_extra
-from jaxslam.math import linalg
 from jaxslam.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import normalized, resampled_where
@@ -102,7 +101,7 @@ def fastslam(
     """
     name = "fastslam"
     validation.check_models(name, motion, sensor)
-    linalg.check_count(f"{name}: particles", particles)
+    validation.check_count(f"{name}: particles", particles)
     if proposal not in ("motion", "measurement"):
         raise ValueError(f'{name}: expected proposal "motion" or "measurement", got {proposal!r}')
     check_resampling(name, resample, threshold)

@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 
 from jaxslam import validation
 from jaxslam.association.known import known as known_association
-from jaxslam.math import linalg
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Differentiable, Life, Motion, Resample, Sensor
 from jaxslam.sensors.suite import Suite
@@ -92,7 +91,7 @@ class MonteCarloSettings:
             raise ValueError(
                 f"{name}: expected a confidence between 0 and 1, got {self.confidence}"
             )
-        if linalg.is_concrete(self.slack) and not self.slack > 0:
+        if validation.is_concrete(self.slack) and not self.slack > 0:
             raise ValueError(f"{name}: expected a slack above 0, got {self.slack}")
         if rates is not None and not (np.shape(rates) == (2,) and 0 < rates[0] <= rates[1] <= 1):
             raise ValueError(
@@ -117,12 +116,12 @@ def particle_map_settings(
 ) -> ParticleMapSettings:
     """The settings, or a ValueError that begins with a filter's name."""
     validation.check_parts(name, associate=associate)
-    linalg.check_count(f"{name}: capacity", capacity)
+    validation.check_count(f"{name}: capacity", capacity)
     if births is not None:
-        linalg.check_count(f"{name}: births", births)
+        validation.check_count(f"{name}: births", births)
     if life is not None and not isinstance(life, Life):
         raise ValueError(f"{name}: expected life to be a Life, as of life.existence, got {life!r}")
-    linalg.check_gate(name, gate)
+    validation.check_gate(name, gate)
     if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
         raise ValueError(
             f"{name}: expected one sensor of landmarks that stay what they are, not a suite, an "
@@ -141,7 +140,7 @@ def known_map_sensors(
 ) -> tuple[KnownMapSensor, ...]:
     """The sensors of a suite, or the one that is none, in a map; or a ValueError."""
     validation.check_parts(name, associate=associate)
-    linalg.check_gate(name, gate)
+    validation.check_gate(name, gate)
 
     def one(sensor: Sensor, measured: int | None, ignored: bool) -> KnownMapSensor:
         method = associate or known_association()
@@ -156,17 +155,17 @@ def check_resampling(name: str, resample: Any, threshold: float) -> None:
     """A resampling method is a function, and its threshold a share."""
     if not callable(resample):
         raise ValueError(f"{name}: expected resample to be a function, got {resample!r}")
-    if linalg.is_concrete(threshold) and not 0 <= threshold <= 1:
+    if validation.is_concrete(threshold) and not 0 <= threshold <= 1:
         raise ValueError(f"{name}: expected a threshold from 0 to 1, got {threshold}")
 
 
 def checked_least(particles: int, least: int | None) -> int:
     """The least number of particles, which by default is 50, or the capacity."""
     name = "particle_localization"
-    linalg.check_count(f"{name}: particles", particles)
+    validation.check_count(f"{name}: particles", particles)
     if least is None:
         return min(_LEAST, particles)
-    linalg.check_count(f"{name}: least", least)
+    validation.check_count(f"{name}: least", least)
     if least > particles:
         raise ValueError(f"{name}: expected least <= particles = {particles}, got {least}")
     return least

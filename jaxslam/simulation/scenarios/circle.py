@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from jaxslam.math.linalg import check_count
 from jaxslam.motion.unicycle import unicycle
 from jaxslam.sensors.relative_position import relative_position
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import Scenario
+from jaxslam.validation.numbers import check_count
 
 
 def circle(steps: int = 2500) -> Scenario:

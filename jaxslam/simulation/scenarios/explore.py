@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from jaxslam.math.linalg import check_count
 from jaxslam.motion.increment import increment
 from jaxslam.sensors.range_bearing import range_bearing
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import Scenario
+from jaxslam.validation.numbers import check_count
 
 
 def explore(steps: int = 100) -> Scenario:

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.math.linalg import check_count
 from jaxslam.motion.unicycle import unicycle
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.range_bearing import range_bearing
 from jaxslam.sensors.relative_position import relative_position
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import Scenario
+from jaxslam.validation.numbers import check_count
 
 SPEED, TURN = 0.25, 0.025
 SOURCE = (

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from jaxslam.math.linalg import check_count
 from jaxslam.motion.unicycle import unicycle
 from jaxslam.sensors.range_bearing import range_bearing
 from jaxslam.simulation.worlds import Scenario
+from jaxslam.validation.numbers import check_count
 
 
 def stationary(steps: int = 300) -> Scenario:

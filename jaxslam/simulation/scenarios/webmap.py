@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.math.linalg import check_count
 from jaxslam.motion.ackermann import ackermann
 from jaxslam.motion.substeps import substeps
 from jaxslam.sensors.range_bearing import range_bearing
 from jaxslam.simulation.worlds import Scenario
+from jaxslam.validation.numbers import check_count
 
 _SPEED, _WHEELBASE = 3.0, 4.0
 _INTERVAL, _SUBSTEPS = 0.025, 8

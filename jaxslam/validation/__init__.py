@@ -1,0 +1,41 @@
+"""What is refused before anything is traced: one line each, with what was expected."""
+
+from jaxslam.validation.logs import check_log
+from jaxslam.validation.models import (
+    check_associate,
+    check_models,
+    check_motion,
+    check_parts,
+    check_record,
+    check_sensor,
+)
+from jaxslam.validation.numbers import (
+    check_alpha,
+    check_count,
+    check_covariance,
+    check_gate,
+    check_key,
+    is_concrete,
+    shape_told,
+)
+from jaxslam.validation.returned import checked_estimate, same_state, state_and_info
+
+__all__ = [
+    "check_alpha",
+    "check_associate",
+    "check_count",
+    "check_covariance",
+    "check_gate",
+    "check_key",
+    "check_log",
+    "check_models",
+    "check_motion",
+    "check_parts",
+    "check_record",
+    "check_sensor",
+    "checked_estimate",
+    "is_concrete",
+    "same_state",
+    "shape_told",
+    "state_and_info",
+]

@@ -1,0 +1,79 @@
+"""What is refused of a log: shapes, kinds, values that are not finite, tags that repeat."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.types import Log, Scan
+from jaxslam.validation.numbers import is_concrete, shape_told
+
+
+def check_log(
+    name: str,
+    log: Log,
+    *,
+    control_size: int,
+    measurement_size: int,
+    parts: tuple[int, ...] = (),
+) -> None:
+    """Raise ValueError, naming caller, field and row, unless a log is well formed.
+
+    Shapes and kinds are always checked, values (finite controls, finite valid measurements, tags
+    >= -1, of 32 bits and not repeated within a scan) only where they are concrete. parts: how many
+    places of a scan each sensor has, where there are several; a tag may then occur once with each.
+    """
+    control, scan = log.control, log.scan
+    if not isinstance(scan, Scan):
+        raise ValueError(
+            f"{name}: log.scan: expected a Scan(z, tag, valid), got {type(scan).__name__}"
+        )
+    z, tag, valid = scan
+    _expect(f"{name}: log.control", control, ("T", control_size), np.floating)
+    steps = np.shape(control)[0]
+    if np.ndim(tag) != 2:  # it says how many places there are
+        _expect(f"{name}: log.scan.tag", tag, (steps, "M"), np.integer)
+    places = np.shape(tag)[1]
+    _expect(f"{name}: log.scan.z", z, (steps, places, measurement_size), np.floating)
+    _expect(f"{name}: log.scan.tag", tag, (steps, places), np.integer)
+    _expect(f"{name}: log.scan.valid", valid, (steps, places), np.bool_)
+    if parts and places != sum(parts):
+        raise ValueError(
+            f"{name}: log.scan: expected {sum(parts)} places, {' + '.join(map(str, parts))} of the "
+            f"sensors, got {places}: log.scan.z of shape {np.shape(z)}"
+        )
+    if not is_concrete(log):
+        return
+    there, tags = np.asarray(valid), np.asarray(tag)
+    _refuse(name, ~np.isfinite(np.asarray(control)).all(axis=1), "log.control is not finite")
+    finite = np.isfinite(np.asarray(z)).all(axis=2)
+    _refuse(name, there & ~finite, "log.scan.z: a valid measurement is not finite")
+    _refuse(name, there & (tags < -1), "log.scan.tag: a tag is below -1")
+    _refuse(name, there & (tags > np.iinfo(np.int32).max), "log.scan.tag: a tag is beyond int32")
+    named = np.where(there & (tags >= 0), tags, -1 - np.arange(places))
+    for part in np.split(named, np.cumsum(parts)[:-1].astype(int), axis=1) if parts else (named,):
+        ordered = np.sort(part, axis=1)
+        repeats = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+        _refuse(name, repeats, "log.scan.tag: a tag repeats within the scan")
+
+
+def _expect(name: str, value: Any, shape: tuple[int | str, ...], kind: type) -> None:
+    """shape: a letter stands for any number."""
+    got = shape_told(value)
+    there = np.shape(value) if got.startswith("(") else ()
+    if len(there) != len(shape) or any(
+        isinstance(n, int) and n != m for n, m in zip(shape, there, strict=True)
+    ):
+        raise ValueError(f"{name}: expected shape ({', '.join(map(str, shape))}), got {got}")
+    if not hasattr(value, "dtype"):
+        raise ValueError(f"{name}: expected an array, got a {type(value).__name__}")
+    dtype = jnp.result_type(value)
+    if not jnp.issubdtype(dtype, kind):
+        raise ValueError(f"{name}: expected {kind.__name__} values, got {dtype}")
+
+
+def _refuse(name: str, bad: np.ndarray, why: str) -> None:
+    """bad: by row, or by row and place."""
+    if bad.any():
+        at = zip(("row", "place"), np.argwhere(bad)[0], strict=False)
+        raise ValueError(f"{name}: {why} ({', '.join(f'{what} {i}' for what, i in at)})")
