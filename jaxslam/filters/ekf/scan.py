@@ -7,9 +7,9 @@ starts the new landmarks, and `report_scan` says what became of every measuremen
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
@@ -20,7 +20,7 @@ from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct, correct_in_turn
 from jaxslam.filters.reporting import info_of, joined, nothing_of, seen_before, status_of
-from jaxslam.math.xla import where_any
+from jaxslam.math.xla import change_where, where_any
 from jaxslam.protocols import Association, Sensor
 from jaxslam.sensors.suite import Part, Suite, on_ground, split_scan
 from jaxslam.slots import Joint
@@ -231,12 +231,9 @@ def report_scan(
 
 
 def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
-    """The map without the landmarks of the slots `dead`; of a batch, a run without such is kept."""
+    """The map without the landmarks of the slots `dead`; of a batch, a run without such is kept.
 
-    def removed(joint: Joint) -> Joint:
-        # A root is made triangular anew; a run without a removal keeps its own to the bit.
-        less = slots.remove(joint, dead, square_root=square_root)
-        both: Joint = jax.tree.map(lambda a, b: jnp.where(dead.any(), a, b), less, joint)
-        return both
-
-    return where_any(dead.any(), removed, lambda joint: joint, joint)
+    A root is made triangular anew; a run without a removal keeps its own to the bit.
+    """
+    remove = partial(slots.remove, dead=dead, square_root=square_root)
+    return change_where(dead.any(), remove, joint)

@@ -4,10 +4,10 @@ import dataclasses
 
 from jaxtyping import Array, Float
 
-from jaxslam import slots, validation
+from jaxslam import validation
+from jaxslam.filters.ekf.scan import without_landmarks
 from jaxslam.filters.map_management.wrapping import joint_of
 from jaxslam.filters.reporting import with_removed
-from jaxslam.math.xla import change_where
 from jaxslam.protocols import Filter, Life
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
@@ -44,11 +44,8 @@ def pruning(filter: Filter, life: Life) -> Filter:
                 "pruning(ekf_slam(…, make_room=life), life)"
             )
         memory, dead = life.after(joint, info, lambda: filter.estimate(joint))
-        joint = change_where(
-            dead.any(),
-            lambda joint: slots.remove(joint, dead, square_root=filter.square_root),
-            joint._replace(life=memory),
-        )
+        joint = joint._replace(life=memory)
+        joint = without_landmarks(joint, dead, square_root=filter.square_root)
         return joint, with_removed(info, dead)
 
     name = f"pruning {filter.name}"

@@ -64,7 +64,7 @@ def check_options(
             check_count(f"team_slam: {name}", value)
     if type(report) is not int or not 0 <= report < len(robots):
         raise ValueError(f"team_slam: there is no robot {report!r} to report")
-    if chart is not None and chart.name != "euclidean":
+    if chart is not None and chart.basis is not None:
         raise ValueError(f"team_slam: expected the chart euclidean, got {chart.name}")
     if update not in ("sequential", "joint"):
         raise ValueError(f'team_slam: expected update "sequential" or "joint", got {update!r}')
