@@ -111,10 +111,8 @@ class Info(NamedTuple):
     """see `Status`."""
     log_likelihood: Float[Array, ""]
     """Σ log N(innovation; 0, S) over fused places."""
-    exhausted: Any = ()
-    """() bool: the search for the best association ended at its budget; or nothing."""
-    reduced: Any = ()
-    """(N,) bool: slots whose landmark became a point, where the sensor's may."""
+    exhausted: Bool[Array, ""] | None = None
+    """the search for the best association ended at its budget; None where there is no search"""
     extra: dict[str, Any] | None = None
     """what one family, or one wrapper of a filter, alone says: its record by its name, as
     "particles" for a `filters.particles.particle_info.ParticleInfo`."""

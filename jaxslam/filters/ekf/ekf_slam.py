@@ -19,7 +19,7 @@ from jaxslam.filters.ekf.settings import (
     check_options,
     check_settings,
 )
-from jaxslam.filters.reporting import with_removed
+from jaxslam.filters.reporting import with_extra, with_removed
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
 from jaxslam.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
@@ -122,7 +122,7 @@ def ekf_slam(
             info = with_removed(info, evicted)
         if sensor.reduced is not None:
             joint, which = to_points.reduced_where_ready(joint, sensor, square_root)
-            info = info._replace(reduced=which)
+            info = with_extra(info, "points", to_points.ToPoints(which))
         return joint, info
 
     def estimate(joint: Joint) -> Estimate:

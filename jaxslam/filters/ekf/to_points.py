@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,13 @@ from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Sensor
 from jaxslam.slots import Joint
+
+
+class ToPoints(NamedTuple):
+    """Which landmarks became points; `info.extra["points"]`."""
+
+    reduced: Bool[Array, "N"]
+    """slots whose landmark became a point in this step"""
 
 
 def seen_as(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:

@@ -170,7 +170,7 @@ def test_a_reduced_map_is_filtered_as_one_of_points(options):
 @pytest.mark.parametrize("name", CHARTS)
 def test_a_run_turns_rays_into_points_where_the_index_allows(name, square_root):
     trace = traced(name, square_root, 0.1)
-    became = trace.info.reduced
+    became = trace.info.extra["points"].reduced
     assert became.sum() >= 2
     assert became.sum(axis=0).max() == 1  # once a slot
     np.testing.assert_array_equal(became.any(axis=0), trace.probe.reduced[-1])
@@ -181,7 +181,7 @@ def test_a_run_turns_rays_into_points_where_the_index_allows(name, square_root):
     assert (off < 3 * spread).all(), (off, spread)
     # A conversion is no news: estimates go on where they would have.
     never = traced(name, square_root, 1e-9)
-    assert not never.info.reduced.any()
+    assert not never.info.extra["points"].reduced.any()
     np.testing.assert_allclose(trace.estimate.pose, never.estimate.pose, atol=0.02)
 
 
@@ -237,7 +237,7 @@ def test_gradients_and_float32():
     (_, trace), slope = jax.jit(jax.value_and_grad(last, has_aux=True))(jnp.float32(0.01))
     assert np.isfinite(slope) and slope != 0
     assert trace.final.cov.dtype == jnp.float32
-    assert trace.info.reduced.any()
+    assert trace.info.extra["points"].reduced.any()
 
 
 def test_refusals():
