@@ -1,6 +1,6 @@
 """The house rules, read from the source: who may import whom, and that public names say what they are.
 
-Imports go downward only (DESIGN.md, "Floors"); within a floor they may go sideways but not round.
+Imports go downward only (the figure in CONTRIBUTING.md); within a floor they may go sideways but not round.
 """
 
 import ast

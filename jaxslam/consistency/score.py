@@ -38,16 +38,18 @@ DROPS = (
 )
 """What can keep a measurement from the map; each is counted."""
 
-EVENTS = (
-    *("removed", "merged", "reduced", "exhausted", "resampled", "underflow"),
-    *("invalid", "injected", "capped"),
-)
-"""What not every filter reports; each is counted where it is there. See `_event`."""
-
-_RECORD = {"removed": "pruning", "merged": "merging"} | dict.fromkeys(
-    ("resampled", "underflow", "invalid", "injected", "capped"), "particles"
-)
-"""The record in `Info.extra` that reports an event; the others are fields of `Info`."""
+EVENTS: dict[str, tuple[str | None, str]] = {
+    "removed": ("pruning", "removed"),
+    "merged": ("merging", "pair"),
+    "reduced": ("points", "reduced"),
+    "exhausted": (None, "exhausted"),
+    **{
+        name: ("particles", name)
+        for name in ("resampled", "underflow", "invalid", "injected", "capped")
+    },
+}
+"""What not every filter reports, and where: the record in `Info.extra`, or None for a field of
+`Info`, and the field. Each is counted where it is there."""
 
 LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
 """Probabilities of the coverage curves."""
@@ -168,12 +170,12 @@ def _counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
 
 def _event(info: Info, name: str) -> np.ndarray | None:
     """How often one of `EVENTS` happened, (R, T, …); None where the filter does not report it."""
-    record = (info.extra or {}).get(_RECORD.get(name, ""), info)
-    field = "pair" if name == "merged" and record is not info else name
-    found = jax.tree.leaves(getattr(record, field, None))
-    if not found:
+    record, field = EVENTS[name]
+    holder = info if record is None else (info.extra or {}).get(record)
+    found = getattr(holder, field, None)
+    if found is None:
         return None
-    return np.asarray(found[0][..., 0] >= 0 if name == "merged" else found[0])
+    return np.asarray(found[..., 0] >= 0 if name == "merged" else found)
 
 
 def _covered(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:

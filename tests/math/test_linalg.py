@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxslam import validation
 from jaxslam.math import batched_linalg, linalg
 
 UNROLLED, LAPACK = [1, 2, 3, 4, 5, 6, 7, 8], [9, 20]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.filters.ekf.predicted_measurements import in_chart, innovation_cov
+from jaxslam.filters.ekf.predicted_measurements import in_chart, projected_cov
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.to_points import at_slot
 from jaxslam.math import linalg
@@ -150,7 +150,7 @@ def innovate(
         noise = own_noise + model.rest
         by_pose, by_landmark, nu = _split_rows(model.rows)
         hx, hp = _project(model.rows, view, joint, settings)
-        s = innovation_cov(hp, by_pose, by_landmark, slot, capacity)
+        s = projected_cov(hp, by_pose, by_landmark, slot, capacity)
         s = s + same * noise[:, :, None]
         marginal = s[jnp.arange(m), :, jnp.arange(m)]
         inverse, definite = no_inline(jax.vmap(linalg.whitener), marginal)

@@ -55,7 +55,7 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
         hp = linalg.total(by_pose[:, :, k, None] * cov[None, None, k] for k in range(3))
         for k in range(size):
             hp = hp + by_landmark[:, :, k, None] * rows[:, None, k]
-        return innovation_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
+        return projected_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
 
     return predicted(sensor, joint.tag, joint.alive, measurements, cross)
 
@@ -97,7 +97,7 @@ def in_chart(
     return by_chart, by_landmark if basis.landmark is None else each(by_landmark, basis.landmark)
 
 
-def innovation_cov(
+def projected_cov(
     hp: Float[Array, "m Z D"],
     by_pose: Float[Array, "m Z 3"],
     by_landmark: Float[Array, "m Z L"],

@@ -27,7 +27,7 @@ from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
 
 
-class Turn(NamedTuple):
+class SensorTurn(NamedTuple):
     """One sensor's turn in a scan."""
 
     places: int | None
@@ -47,29 +47,31 @@ class NewLandmarks(NamedTuple):
     """slots that were emptied to make room"""
 
 
-def turns_of(sensor: Sensor, settings: EkfSettings) -> list[Turn]:
+def turns_of(sensor: Sensor, settings: EkfSettings) -> list[SensorTurn]:
     """The turn of each sensor of a suite, in order; one of a sensor that is no suite.
 
     Measurements of robots are left alone.
     """
     if not isinstance(sensor, Suite):
-        return [Turn(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
+        return [SensorTurn(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
     return [
-        Turn(part.places, None)
+        SensorTurn(part.places, None)
         if part.sees == "robots"
         else turn_of(part, len(sensor.landmark), settings)
         for part in sensor.parts
     ]
 
 
-def turn_of(part: Part, size: int, settings: EkfSettings) -> Turn:
+def turn_of(part: Part, size: int, settings: EkfSettings) -> SensorTurn:
     """The turn of one sensor of a suite, among landmarks of `size` numbers."""
     sensor = on_ground(part.sensor, size)
-    return Turn(part.places, dataclasses.replace(settings, sensor=sensor, absolute=part.absolute))
+    return SensorTurn(
+        part.places, dataclasses.replace(settings, sensor=sensor, absolute=part.absolute)
+    )
 
 
 def update_by_scan(
-    joint: Joint, scan: Scan, turns: Sequence[Turn]
+    joint: Joint, scan: Scan, turns: Sequence[SensorTurn]
 ) -> tuple[Joint, Info, Bool[Array, "N"]]:
     """The update by each sensor in its turn; what became of the scan, and the slots evicted.
 

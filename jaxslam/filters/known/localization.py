@@ -12,7 +12,7 @@ from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import Turn, update_by_scan
+from jaxslam.filters.ekf.scan import SensorTurn, update_by_scan
 from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
@@ -103,10 +103,10 @@ def localization(
         births=0,
     )
     places = sensor.places if isinstance(sensor, Suite) else ()
-    turns = [Turn(None, _in_map(sensor, points, settings))]
+    turns = [SensorTurn(None, _in_map(sensor, points, settings))]
     if isinstance(sensor, Suite):
         turns = [
-            Turn(
+            SensorTurn(
                 part.places,
                 None if part.sees == "robots" else _in_map(part.sensor, points, settings),
             )

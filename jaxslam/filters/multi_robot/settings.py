@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxslam.filters.ekf.scan import Turn
+from jaxslam.filters.ekf.scan import SensorTurn
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.team import Robot
@@ -26,7 +26,7 @@ class TeamSettings:
     """(R,) that mean robots"""
     ekf: EkfSettings
     """what the prediction and the correction of each robot are set to"""
-    turns: tuple[list[Turn], ...]
+    turns: tuple[list[SensorTurn], ...]
     """of each robot, the turn of each of its sensors in a scan"""
 
     @property

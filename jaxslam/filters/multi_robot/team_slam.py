@@ -12,7 +12,7 @@ from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import Turn, turn_of, update_by_scan
+from jaxslam.filters.ekf.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance_form
 from jaxslam.filters.multi_robot.pose_initialization import best_initialization, observed_points
 from jaxslam.filters.multi_robot.settings import (
@@ -166,7 +166,7 @@ def team_slam(
     )
 
 
-def _turn_of(part: Part, ekf: EkfSettings) -> Turn:
+def _turn_of(part: Part, ekf: EkfSettings) -> SensorTurn:
     """The turn of one sensor in a scan; one that sees robots starts no landmarks."""
     births = 0 if part.sees == "robots" else ekf.births
     return turn_of(part, SIZE, dataclasses.replace(ekf, births=births))
