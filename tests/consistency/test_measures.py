@@ -12,6 +12,11 @@ from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
 from jaxslam import charts, consistency, motion, sensors
 from jaxslam.consistency.nees import block_nees
+from jaxslam.consistency.score import EVENTS
+from jaxslam.filters.ekf.to_points import ToPoints
+from jaxslam.filters.map_management.merging import Merged
+from jaxslam.filters.particles.particle_info import ParticleInfo
+from jaxslam.filters.reporting import Pruned
 from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 
@@ -294,3 +299,15 @@ def test_runs_that_are_not_finite_are_named():
     assert summary.not_finite_runs == [2, 5]
     assert np.isnan(summary.per_run["nees_pose"][[2, 5]]).all()
     assert np.isfinite(summary.per_run["nees_pose"][[0, 1, 3, 4, 6, 7]]).all()
+
+
+def test_every_event_that_is_counted_is_a_field_of_its_record():
+    records = {
+        None: Info,
+        "pruning": Pruned,
+        "merging": Merged,
+        "points": ToPoints,
+        "particles": ParticleInfo,
+    }
+    for record, field in EVENTS.values():
+        assert field in records[record]._fields
