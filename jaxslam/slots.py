@@ -246,7 +246,7 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
 
     In covariance form the marginal is what is left when rows and columns are dropped (Solà Table 1,
     state reduction); here they are overwritten with padding. Removing a dead slot changes nothing.
-    square_root: the state holds a root of P, as that of a filter with square_root=True does.
+    square_root: the state holds a root of P, as that of a filter with covariance="square_root" does.
 
     Raises ValueError unless dead is bool, one for each slot.
     """

@@ -161,7 +161,7 @@ def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool =
     The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with
     S = cov(δ) = L Lᵀ and V = L⁻¹ cov(δ, ·), x ← x ⊞ -Vᵀ L⁻¹ δ and P ← P - Vᵀ V, for points exact.
     Slot j, now the same, is removed. Nothing happens where i = j or S is singular. square_root: the
-    state holds a root of P, as that of a filter with square_root=True does.
+    state holds a root of P, as that of a filter with covariance="square_root" does.
     """
     size = joint.landmarks.shape[1]
     by_robot, by_landmark = (part[jnp.stack([i, j])] for part in _derivatives(joint, chart))
