@@ -74,7 +74,7 @@ _ON_DEMAND = {
 
 
 def __getattr__(name: str) -> Any:
-    """What reads files or draws is imported when it is first asked for."""
+    """A lazily imported module: modules that read files or plot load on first access."""
     if name in _ON_DEMAND:
         return importlib.import_module(_ON_DEMAND[name])
     raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")

@@ -20,7 +20,7 @@ class Calibration(NamedTuple):
 
     parameters: Float[np.ndarray, "P"]
     cov: Float[np.ndarray, "P P"]
-    """(JᵀJ)⁻¹, as honest as the filter's noise"""
+    """(JᵀJ)⁻¹; valid only if the filter's noise covariances are"""
     path: Float[np.ndarray, "iterations+1 P"]
     """parameters from the start on"""
     misfit: Float[np.ndarray, "iterations"]
@@ -38,7 +38,7 @@ def calibrate(
     iterations: int = 10,
     tolerance: float = 0.01,
 ) -> Calibration:
-    """The parameters at which the innovations of a run hold no more information on them.
+    """Model parameters estimated from the whitened innovations of a run, with their covariance.
 
     Gauss-Newton on Σ ‖w(p)‖², w = L⁻¹ ν with S = L Lᵀ, over all fused measurements:
 
@@ -79,13 +79,13 @@ def calibrate(
     def whitened(
         p: Float[Array, "P"],
     ) -> tuple[Float[Array, "K"], tuple[Float[Array, "K"], Int[Array, ""]]]:
-        """w, twice, since one is differentiated; and its degrees of freedom."""
+        """The whitened innovations, twice (one for `jacfwd`), and their degrees of freedom."""
         found = info(p)
         fused = found.status == Status.FUSED
         count, size = fused.size, found.innovation.shape[-1]
         there = fused.reshape(count)
         cov = jax.lax.stop_gradient(found.innovation_cov).reshape(count, size, size)
-        # Both before the factor and after: nothing of an empty place reaches a derivative.
+        # Masked before and after the factor: an empty slot then has no effect on derivatives.
         cov = jnp.where(there[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
         factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
         residual = jnp.where(there[:, None], found.innovation.reshape(count, size), 0.0)

@@ -1,4 +1,4 @@
-"""Noise covariances as factories take them: an array, or a function of what they depend on."""
+"""Noise covariances of factories, given as arrays or as functions."""
 
 from collections.abc import Callable
 

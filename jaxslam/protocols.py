@@ -1,11 +1,11 @@
-"""The records of pure functions a SLAM method is made of, and nothing else.
+"""The records of pure functions that make up a SLAM method.
 
 Every field that is a function is pure and traceable and acts on *one* pose, landmark or scan; the
 caller vmaps. Records are made by factories that close over their parameters, so calling the factory
 inside a differentiated function lets `jax.grad` reach those parameters.
 
 Shapes: pose (3,); u (U,) control; w (W,) process noise; z (Z,) measurement; l (L,) landmark
-parameters; s (K,) what a measurement leaves free (K = 0 for a full one).
+parameters; s (K,) landmark parameters that z does not determine (K = 0 if none).
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def _check_fields(
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How the robot moves. w = 0 is the nominal motion: one function for simulator and filters.
+    """A motion model, one function for simulator and filters; w = 0 is the nominal motion.
 
     This and the other records raise ValueError on a function that is none, or names that are no
     tuple of strings.
@@ -75,7 +75,7 @@ class Motion:
 
 
 class Free(NamedTuple):
-    """The Gaussian prior of what a measurement cannot see (Solà 39)."""
+    """The Gaussian prior of the unmeasured landmark parameters (Solà 39)."""
 
     mean: Float[Array, "K"]
     cov: Float[Array, "K K"]
@@ -86,7 +86,7 @@ NOTHING_FREE = Free(np.zeros(0), np.zeros((0, 0)))  # type: ignore[arg-type]
 
 
 class Reduced(NamedTuple):
-    """When a landmark's L parameters may become the point (x, y) where it stands, for good."""
+    """A permanent reduction of a landmark's L parameters to its position (x, y)."""
 
     sensor: Any
     """a Sensor with the same z, whose landmarks are points"""
@@ -96,7 +96,7 @@ class Reduced(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What the robot sees of one landmark; with L = 0, an absolute sensor, of itself in the map.
+    """A measurement model of one landmark, or with L = 0 of the robot itself (an absolute sensor).
 
     An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
     embed return (0,), position zeros that nothing reads, and K = 0. Each of its measurements
@@ -154,7 +154,7 @@ class Basis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Which error the covariance is the covariance of, on a (pose, one landmark) pair.
+    """Error coordinates of the covariance, on a pair of the pose and one landmark.
 
     The pose's retraction must not depend on a landmark, nor one landmark's on another.
     """
@@ -167,9 +167,9 @@ class Chart:
     basis: Callable[[Array, Array], Basis] | None = None
     """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
     motion_apart: bool = False
-    """whether a correction splits off what it says of the last motion, and moves the robot by that
-    in a world that stands still: the way of a map that is composed with the motion afterwards. Its
-    moves must add up: retract by one error and then by another is retract by their sum."""
+    """whether the last motion is a separate variable during corrections, with which the map is
+    composed afterwards. Retractions must be additive: by one error and then by another is by
+    their sum."""
     landmark_size: int | None = None
     """numbers L of the landmarks it acts on; None where any."""
 
@@ -178,7 +178,7 @@ class Chart:
 
 
 class Here(NamedTuple):
-    """Where a model is to be replaced: what a linearizer may look at."""
+    """The state at which a model is linearized, the input of a linearizer."""
 
     joint: Joint
     """the filter's state, `joint.lin` being the linearizer's own memory"""
@@ -195,7 +195,7 @@ class Here(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Linearizer:
-    """What affine function with added noise stands for a model, near a Gaussian.
+    """An affine approximation, with added noise, of the models near a Gaussian.
 
     First-order linearizers evaluate Jacobians somewhere; statistical ones fit to the covariance.
     Each may keep a memory of its own inside the filter's state. Derivatives are by the
@@ -229,7 +229,7 @@ class Linearizer:
 
 
 class Pairs(NamedTuple):
-    """How each of M measurements compares with each of N slots, every pair for itself."""
+    """The innovations of all pairs of M measurements and N slots."""
 
     innovation: Float[Array, "M N Z"]
     """ν_ij = z_i ⊖ ẑ_j."""
@@ -245,7 +245,7 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What association may look at: the map before the scan's corrections.
+    """The input of association: predicted measurements of the map before the scan's corrections.
 
     The functions compute what they return when they are called, within the trace.
     """
@@ -260,13 +260,12 @@ class Prediction:
 
 
 class Association(NamedTuple):
-    """Which landmark each measurement of a scan is of."""
+    """The landmark slot of each measurement of a scan."""
 
     slot: Int[Array, "M"]
     """-1 where none; no slot twice."""
     is_new: Bool[Array, "M"]
-    """start a landmark. A valid measurement that is neither is left alone, and
-    counted."""
+    """starts a landmark. A valid measurement that is neither is ignored, and counted."""
     exhausted: Array | bool = False
     """() bool: a search ended at its budget, with the best it had found."""
 
@@ -286,7 +285,7 @@ the weights before. Its sum must be left alone: its gradient may be part of the 
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """Which landmarks stay in the map: the rule that `pruning` asks after every scan."""
+    """A rule that decides after each scan which landmarks stay in the map; see `pruning`."""
 
     name: str
     init: Callable[[Array, Array], Any]
@@ -296,13 +295,13 @@ class Life:
     of it. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
     make_room: Callable[[Joint, Array, Array], Array] | None = None
     """(joint, needed () int, measured (N,) bool) -> slots (N,) bool to remove before new landmarks
-    enter a map that lacks so many places, none of those this scan measured; None where a full map
+    enter a map that lacks so many slots, none of those this scan measured; None where a full map
     refuses."""
 
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """A recursive estimator: what `run` drives and the harness judges."""
+    """A recursive estimator, as `run` and `monte_carlo` take it."""
 
     name: str
     control_size: int
@@ -317,7 +316,7 @@ class Filter:
     """(S) -> moments in map coordinates."""
     chart: Chart
     places: tuple[int, ...] = ()
-    """how many places of a scan each sensor has, in order; () where all are of one sensor."""
+    """number of measurement slots of each sensor, in order; () where all are of one sensor."""
     square_root: bool = False
     """whether its state is a `slots.Joint` with a root of the covariance."""
     landmark: tuple[str, ...] = ()
@@ -329,8 +328,8 @@ class Filter:
 
 
 Estimator = Callable[[Log, Array], Trace]
-"""(log, key) -> trace: what the harness runs; `partial(run, filter, …)`, or a batch method."""
+"""(log, key) -> trace: `partial(run, filter, …)`, or a batch method."""
 
 Candidate = Filter | Callable[[Truth], Filter | Estimator]
-"""What a campaign tries: a filter, or a function of the run's truth that returns a filter or an
+"""An entry of a campaign: a filter, or a function of the run's truth that returns a filter or an
 estimator."""

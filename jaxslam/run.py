@@ -1,4 +1,4 @@
-"""The scan driver: one function runs every filter over a whole log."""
+"""The driver of all filters: one `lax.scan` over a log."""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,7 +25,7 @@ def run(
     *,
     probe: Callable[[Any], Any] | None = None,
 ) -> Trace:
-    """Drive a filter along a log: per row predict with the control, then update with the scan.
+    """Run a filter over a log: at each row, predict with the control, then update with the scan.
 
     Traceable: wrap it in `jax.jit`, `jax.vmap` over logs and keys, or `jax.grad`. Called outside a
     trace it is compiled once for a structure: another call, with other values or a filter that its
@@ -83,7 +83,7 @@ def _drive(
     pose_cov: jax.Array,
     key: jax.Array,
 ) -> Trace:
-    """The steps of `run`."""
+    """The trace of a filter over a checked log."""
     log = jax.tree.map(jnp.asarray, log)
     dtype = jnp.result_type(log.control, log.scan.z)
     log = Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))

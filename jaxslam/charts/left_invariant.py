@@ -1,4 +1,4 @@
-"""The error of the left-invariant filter, in the robot's frame: the published counter-example."""
+"""The left-invariant error, in the robot's frame; its filter is known to be inconsistent."""
 
 import jax.numpy as jnp
 

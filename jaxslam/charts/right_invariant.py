@@ -1,4 +1,4 @@
-"""The error of the right-invariant EKF: a turn of robot and map together is one direction."""
+"""The right-invariant error, in which a rotation of robot and map is one constant direction."""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""The error of robocentric mapping: everything as the robot sees it."""
+"""The robocentric error: differences of coordinates in the robot's frame."""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""Landmarks are kept or removed by the log-odds that they exist."""
+"""Removal of landmarks by their log-odds of existence."""
 
 import math
 from collections.abc import Callable
@@ -19,7 +19,7 @@ _LARGEST = 10.0
 
 
 class Existence(NamedTuple):
-    """What is known of each slot's landmark; zero where dead."""
+    """The existence state of each slot's landmark; zero where dead."""
 
     log_odds: Float[Array, "N"]
     """that it exists"""

@@ -1,4 +1,4 @@
-"""Small linear algebra: factors of the few-by-few matrices of a filter.
+"""Small linear algebra: products, Cholesky factors and inverses of a filter's small matrices.
 
 A landmark update factors a 2×2 to 6×6 matrix, millions of times, under `vmap`. The library call
 behind `jnp.linalg.cholesky` costs more there than the arithmetic, and hides a non-positive pivot
@@ -29,19 +29,19 @@ _UNROLLED = 8
 
 
 def _tolerance(matrix: jax.Array) -> float:
-    """Of a pivot, as a share of its diagonal entry: what rounding alone leaves of zero."""
+    """The relative tolerance of a pivot: n·eps of its diagonal entry, the size of rounding."""
     return matrix.shape[-1] * float(jnp.finfo(matrix.dtype).eps)
 
 
 def total(terms: Iterable[jax.Array]) -> jax.Array:
-    """The sum of at least one array; written out, it fuses into one elementwise kernel."""
+    """The sum of at least one array, unrolled, so that it fuses into one elementwise kernel."""
     return functools.reduce(operator.add, terms)
 
 
 def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
-    """The function, of which reverse mode keeps the arguments and not each entry that it takes.
+    """The function, rematerialized in reverse mode: only its arguments are stored.
 
-    What is written out entry by entry would otherwise leave an array of the whole loop for each.
+    Unrolled code would otherwise store one array of the whole loop for each entry.
     """
     # Within a scan or a batch nothing merges the recomputation with what it repeats.
     return jax.checkpoint(function, prevent_cse=False)
@@ -131,12 +131,12 @@ def _cholesky_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _mirrored(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
-    """The symmetric matrix of a lower triangle."""
+    """The symmetric matrix with this lower triangle."""
     return jnp.tril(matrix) + jnp.tril(matrix, -1).T
 
 
 def _lower_half(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
-    """Φ: the lower triangle with half of the diagonal."""
+    """Φ(A): the lower triangle of A with half of the diagonal."""
     return jnp.tril(matrix) - 0.5 * jnp.diag(jnp.diagonal(matrix))
 
 
@@ -147,7 +147,7 @@ def _cholesky_beyond(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
 
 @jax.custom_jvp
 def _factor(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower L with L Lᵀ = A of a symmetric A, zero where a pivot is."""
+    """Lower L with L Lᵀ = A of a symmetric A; all zero if a pivot is numerically zero."""
     factor = jnp.tril(batched_linalg.factor(matrix))
     positive = jnp.all(
         jnp.diagonal(factor) ** 2 > _tolerance(matrix) * jnp.abs(jnp.diagonal(matrix))
@@ -238,7 +238,7 @@ def solve_lower(
 def _substituted(
     factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
 ) -> Float[Array, "n *rest"]:
-    """L⁻¹ B, row after row written out."""
+    """L⁻¹ B by forward substitution, unrolled."""
     rows: list[jax.Array] = []
     for i in range(len(factor)):
         rest = rhs[i] - sum((factor[i, k] * rows[k] for k in range(i)), jnp.zeros_like(rhs[i]))
@@ -249,7 +249,7 @@ def _substituted(
 
 @jax.custom_jvp
 def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """Lower W = L⁻¹ (n, n), so W A Wᵀ = I, for A = L Lᵀ of a few rows; and `cholesky`'s flag.
+    """The inverse Cholesky factor W = L⁻¹ (n, n) of a small A = L Lᵀ, and `cholesky`'s flag.
 
     A pivot that counts as zero gives a row of zeros. One division and root a pivot, where
     `cholesky` and `solve_lower` take three: for a matrix that whitens many columns, millions of

@@ -1,4 +1,4 @@
-"""Chi-square tails, quantiles and bands: what an honest filter's NEES and NIS must look like.
+"""Chi-square tails, quantiles and bands, the distributions of a consistent filter's NEES and NIS.
 
 The tail is traceable and differentiable; quantiles and bands are host numbers, from SciPy (which
 JAX itself depends on), because they become constants of a gate, a table or a plot. They are taken

@@ -18,7 +18,7 @@ Array = jax.Array
 
 
 class Frame(NamedTuple):
-    """Where a frame is in another: mean and covariance."""
+    """The pose of one frame in another: mean and covariance."""
 
     pose: Array
     """(3,)"""
@@ -46,7 +46,7 @@ def compound(a: Frame, b: Frame, cross: Array | None = None) -> Frame:
 
 
 def reverse(a: Frame) -> Frame:
-    """The frame that a is known in, in a."""
+    """The inverse of a: the reference frame of a, expressed in a."""
     (by_a,) = se2.inverse_jacobians(a.pose)
     return Frame(se2.inverse(a.pose), linalg.symmetrize(by_a @ a.cov @ by_a.T))
 

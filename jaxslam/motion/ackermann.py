@@ -1,4 +1,4 @@
-"""A car steered at its front wheels, known by the pose of the laser it carries."""
+"""The Ackermann model of a car steered at its front wheels; the pose is that of its laser."""
 
 import jax.numpy as jnp
 import numpy as np

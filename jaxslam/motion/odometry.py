@@ -1,4 +1,4 @@
-"""Turn, drive, turn again: how wheel odometry tells one pose from the next."""
+"""The odometry motion model: a rotation, a translation and a rotation."""
 
 from collections.abc import Callable
 

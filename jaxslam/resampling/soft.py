@@ -15,7 +15,7 @@ def soft(share: float, resample: Resample = systematic) -> Differentiable:
     """Soft resampling (Karkus, Hsu & Lee 2018, "Particle filter networks with application to visual
     localization", CoRL): draw from the mixture of w and the uniform distribution,
 
-        q_j = share · w_j + (1 - share)/P        the copy of j weighs (w_j/q_j)/P
+        q_j = share · w_j + (1 - share)/P        weight of a copy of j: (w_j/q_j)/P
 
     The weights of the copies are divided by their sum, as a number; gradients go through w_j/q_j.
 

@@ -1,4 +1,4 @@
-"""Any resampling, with weights whose value is 1/P and whose gradient is the score of the draw."""
+"""Stop-gradient resampling: weights of value 1/P whose gradient is the score of the draw."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxslam.resampling.weights import even, normalized
 
 def stop_gradient(resample: Resample = systematic) -> Differentiable:
     """The stop-gradient estimator (Ścibior & Wood 2021, "Differentiable particle filtering without
-    modifying the forward pass"): a copy of j weighs
+    modifying the forward pass"): a copy of j has the weight
 
         (1/P) · w_j/⊥(w_j)        ⊥ being `jax.lax.stop_gradient`
 

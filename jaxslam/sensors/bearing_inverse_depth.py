@@ -1,4 +1,4 @@
-"""Direction of a landmark that is held as a ray from its first sighting and an inverse distance."""
+"""Bearing of a landmark with inverse-depth parameters: anchor position, direction, 1/distance."""
 
 import jax
 import jax.numpy as jnp

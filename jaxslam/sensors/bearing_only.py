@@ -1,4 +1,4 @@
-"""Direction of a point landmark, without its distance: a camera, a radio direction finder."""
+"""Bearing of a point landmark, without its range: a camera, a radio direction finder."""
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike

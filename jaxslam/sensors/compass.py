@@ -1,4 +1,4 @@
-"""The robot's heading in the map: a compass, a sun sensor."""
+"""Measurement of the robot's heading in the map: a compass, a sun sensor."""
 
 from numpy.typing import ArrayLike
 

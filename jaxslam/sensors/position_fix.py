@@ -1,4 +1,4 @@
-"""The robot's position in the map: a satellite receiver, a total station."""
+"""Measurement of the robot's position in the map: a satellite receiver, a total station."""
 
 from numpy.typing import ArrayLike
 

@@ -1,4 +1,4 @@
-"""The prior of what a measurement cannot see: Solà's s ~ N(s̄, S), checked once, by the factory."""
+"""The prior of the unmeasured landmark parameters: Solà's s ~ N(s̄, S), checked by the factory."""
 
 from typing import Any, cast
 
@@ -35,7 +35,7 @@ def prior(name: str, free: FreeLike, size: int) -> Free:
 
 
 def _held(values: Any) -> jax.Array:
-    """On the host in float64, not in the width JAX has when the factory is called."""
+    """The array on the host in float64, whatever the default width of JAX."""
     if not is_concrete(values):
         return jnp.asarray(values)
     array = np.asarray(values)

@@ -1,4 +1,4 @@
-"""Distance and direction of a landmark that also shows a number: a reflectivity, a diameter."""
+"""Range, bearing and signature of a landmark; a signature is a reflectivity or a diameter."""
 
 import jax.numpy as jnp
 from jax import Array

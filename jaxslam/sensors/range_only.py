@@ -1,4 +1,4 @@
-"""Distance of a point landmark, without its direction: a radio beacon, a sonar's echo."""
+"""Range of a point landmark, without its bearing: a radio beacon, a sonar's echo."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""Several sensors on one robot, each with its own model, mount, rate and places of a scan."""
+"""Several sensors on one robot, each with its own model, mount, rate and measurement slots."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -17,11 +17,11 @@ from jaxslam.validation.numbers import check_count
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One sensor of a suite. Raises ValueError on places or every below 1, or a bad start."""
+    """One sensor of a suite. Raises ValueError on places or every below 1, or an invalid start."""
 
     sensor: Sensor
     places: int
-    """measurement places of a scan that are its own; 1 of an absolute sensor"""
+    """its measurement slots in a scan; 1 of an absolute sensor"""
     every: int = 1
     """in a simulation it measures every so many steps,"""
     start: int = 0
@@ -48,15 +48,15 @@ class Part:
 
     @property
     def absolute(self) -> bool:
-        """Whether it measures the robot itself, and no landmark."""
+        """Whether it is an absolute sensor, which measures the robot and no landmark."""
         return not self.sensor.landmark
 
 
 @dataclass(frozen=True, eq=False)
 class Suite(Sensor):
-    """Sensors side by side; made by `suite`.
+    """A set of sensors with separate measurement slots; made by `suite`.
 
-    The first places of a scan are the first part's, the next ones the second's, and so on. Rows of
+    The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of
     z are padded with zeros to the largest measurement. As a `Sensor` it says of what size logs and
     landmarks are; its parts measure.
     """
@@ -65,7 +65,7 @@ class Suite(Sensor):
 
     @property
     def places(self) -> tuple[int, ...]:
-        """How many places of a scan each part has."""
+        """The number of measurement slots of each part."""
         return tuple(part.places for part in self.parts)
 
 
@@ -74,7 +74,7 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
 
     A filter takes the parts one after the other: each corrects by what it measured of known
     landmarks, then starts its new ones, which the next part may correct already in the same scan.
-    A tag may occur once a part. Absent data are places that are not valid, whatever the reason.
+    A tag may occur once a part. Absent measurements are slots that are not valid.
 
         eyes = suite((range_bearing(R, mount=front), 8), Part(compass(S), 1, every=10))
         filter = ekf_slam(motion, eyes, capacity)
@@ -123,9 +123,9 @@ def _part(given: Any) -> Part:
 
 
 def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
-    """The scan (M,) divided into the places of each sensor, in order.
+    """The scan (M,) divided into the scans of the sensors, in order.
 
-    Raises ValueError unless the scan has as many places as the sensors together.
+    Raises ValueError unless the scan has as many slots as the sensors together.
     """
     if sum(places) != scan.tag.shape[0]:
         raise ValueError(f"expected places {tuple(places)} of a scan, got {scan.tag.shape[0]}")
@@ -137,7 +137,7 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
 
 
 def on_ground(sensor: Sensor, size: int) -> Sensor:
-    """The sensor among landmarks of `size` numbers, the first of which are its own.
+    """The sensor for landmarks of `size` numbers, of which it uses the first.
 
     Of the others a measurement says nothing: an absolute sensor ignores them all, and a new
     landmark gets them with zero mean, unit variance and no correlation, as padding has it.

@@ -1,4 +1,4 @@
-"""What is refused of a log: shapes, kinds, values that are not finite, tags that repeat."""
+"""Checks of a log: shapes, dtypes, finite values, repeated tags."""
 
 from typing import Any
 
@@ -58,7 +58,7 @@ def check_log(
 
 
 def _expect(name: str, value: Any, shape: tuple[int | str, ...], kind: type) -> None:
-    """shape: a letter stands for any number."""
+    """Raise ValueError unless an array has this shape, in which a letter stands for any number."""
     got = shape_told(value)
     there = np.shape(value) if got.startswith("(") else ()
     if len(there) != len(shape) or any(
@@ -73,7 +73,7 @@ def _expect(name: str, value: Any, shape: tuple[int | str, ...], kind: type) -> 
 
 
 def _refuse(name: str, bad: np.ndarray, why: str) -> None:
-    """bad: by row, or by row and place."""
+    """Raise ValueError if an entry of `bad` is set, by row or by row and measurement slot."""
     if bad.any():
         at = zip(("row", "place"), np.argwhere(bad)[0], strict=False)
         raise ValueError(f"{name}: {why} ({', '.join(f'{what} {i}' for what, i in at)})")
