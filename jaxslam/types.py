@@ -123,7 +123,7 @@ class Info(NamedTuple):
         return (self.status == Status.OVERFLOW).any(-1)
 
     def tally(self, status: Status) -> jax.Array:
-        """() int: number of measurements with that status in this step; over a whole trace, (T,)."""
+        """() int: number of measurements with that status in a step; over a whole trace, (T,)."""
         return (self.status == status).sum(-1)
 
 

@@ -1,4 +1,4 @@
-"""EKF-SLAM: the one Kalman-type SLAM filter, of which the published variants are arguments."""
+"""EKF-SLAM; the published variants are arguments of one filter."""
 
 import jax
 import jax.numpy as jnp
@@ -151,7 +151,7 @@ def initial_state(
     *,
     watch: bool = False,
 ) -> Joint:
-    """A robot whose covariance in coordinates is pose_cov, and no landmark."""
+    """The initial state: a robot with covariance pose_cov in map coordinates, and no landmark."""
     sensor, chart = settings.sensor, settings.chart
     size_l = len(sensor.landmark)
     ground = jnp.zeros((capacity, size_l), pose.dtype)

@@ -1,4 +1,4 @@
-"""The prediction of a Kalman-type SLAM filter on a `Joint`, whatever chart and linearizer."""
+"""The prediction of a Kalman-type SLAM filter, for any chart and linearizer."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from jaxslam.slots import Joint, Last
 
 
 def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfSettings) -> Joint:
-    """Robot motion, O(N) in a chart whose landmarks stand still: Solà (14)-(17).
+    """The state after the robot's motion, O(N) where landmark errors are constant: Solà (14)-(17).
 
     pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the error of
     the landmarks moves too, with A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block. Of
@@ -50,7 +50,7 @@ def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfS
 
 
 class Transition(NamedTuple):
-    """How errors move: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise by way of dx]."""
+    """The error model: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise through dx]."""
 
     robot: Float[Array, "3 3"]
     """A"""
@@ -84,7 +84,7 @@ class Transition(NamedTuple):
         return jnp.concatenate([matrix[:3], turned.reshape(capacity * size, -1)])
 
     def lift(self, size: int) -> Float[Array, "D 3"]:
-        """What noise of the pose's coordinates does to all errors."""
+        """The matrix from noise of the pose's coordinates to all errors."""
         rest = jnp.zeros((size - 3, 3), self.noise.dtype)
         if self.cross_noise is not None:
             rest = self.cross_noise.reshape(size - 3, 3)
@@ -94,7 +94,7 @@ class Transition(NamedTuple):
 def in_charts(
     by_pose: Float[Array, "3 3"], before: Basis, after: Basis, alive: Bool[Array, "N"]
 ) -> Transition:
-    """E(x')⁻¹ F E(x) and E(x')⁻¹ by blocks, dead slots standing still."""
+    """The blocks of E(x')⁻¹ F E(x) and E(x')⁻¹, with dead slots unchanged."""
     times = jax.vmap(linalg.matmul, in_axes=(0, None))
     each = jax.vmap(linalg.matmul)
     undo = linalg.inverse(after.pose[0])

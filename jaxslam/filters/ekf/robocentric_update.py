@@ -1,5 +1,5 @@
-"""Corrections one after the other of a map and its last motion, composed with each other at the end
-of the scan (`Chart.motion_apart`)."""
+"""Sequential corrections of a map and its last motion, which are composed at the end of the scan
+(`Chart.motion_apart`)."""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from jaxslam.slots import Joint, Last
 
 
 class MapAndMotion(NamedTuple):
-    """The map as if its last motion were known, and that motion's error δ beside it.
+    """The map given its last motion, and that motion's error δ as a separate variable.
 
     The errors of the map are e = T x + g δ, with x those of `rest`. To a map in the frame of the
     robot the motion is affine, so x and δ are corrected by adding to them, whatever the order.
@@ -68,7 +68,7 @@ def separate_motion(joint: Joint, chart: Chart, columns: int) -> MapAndMotion:
 
 
 def composition_of(state: MapAndMotion, chart: Chart) -> Composition:
-    """The motion with its step, put behind the rest."""
+    """The composition of the map with the corrected last motion."""
     assert chart.basis is not None
     rest, frame = state.rest, state.frame
     change = linalg.matmul(out_of(frame), state.step[:, None])[:, 0]
@@ -82,7 +82,7 @@ def composition_of(state: MapAndMotion, chart: Chart) -> Composition:
 
 
 def compose_map(state: MapAndMotion, chart: Chart) -> Joint:
-    """The map again: P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ, C = cov(δ, x)."""
+    """The composed map: P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ, C = cov(δ, x)."""
     found, rest = composition_of(state, chart), state.rest
     size = rest.cov.shape[0] - 3
     own, lever = rest.cov[size:, size : size + 3], found.lever.T
@@ -102,7 +102,7 @@ def correct_map_and_motion(
     part: tuple[Float[Array, "g Z"], Int[Array, "g"], Bool[Array, "g"]],
     settings: EkfSettings,
 ) -> tuple[MapAndMotion, Correction]:
-    """Correct x and δ by g measurements in turn: z (g, Z), slot (g,), known (g,).
+    """x and δ corrected by g measurements in turn: z (g, Z), slot (g,), known (g,).
 
     As `update.correct_in_turn` does it: each corrects what the group sees of P, the rows P_I of
     the robot, of its landmarks and of δ, and the whole P is read and written once.
@@ -155,7 +155,7 @@ def _correct_one(
     whole: Joint,
     settings: EkfSettings,
 ) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:
-    """Correct a local x and δ by a measurement of its landmark i (); the whole map's slot beside.
+    """A local x and δ corrected by a measurement of its landmark i (), of slot () in the map.
 
     It sees e of the robot and its landmark, E = [T g] of their rows of (x, δ). With P that of
     (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V. Returns V in the columns beside P

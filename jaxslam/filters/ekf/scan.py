@@ -1,4 +1,4 @@
-"""What a scan does to a `Joint`: each of its sensors corrects the map, then initializes landmarks.
+"""The update of a `Joint` by a scan: each sensor corrects the map, then initializes landmarks.
 
 The steps are those of the textbook, one function each: `associate_scan` predicts the measurements
 and says of which landmark each is, `update.correct` gates and corrects, `initialize_landmarks`
@@ -28,7 +28,7 @@ from jaxslam.types import Info, Scan
 
 
 class Turn(NamedTuple):
-    """One sensor's turn in a scan."""
+    """The measurement slots and settings of one sensor in a scan."""
 
     places: int | None
     """measurement slots of the scan that are its own; None where all are"""
@@ -37,7 +37,7 @@ class Turn(NamedTuple):
 
 
 class NewLandmarks(NamedTuple):
-    """What became of the measurements of a scan that are of no landmark of the map, (M,) each."""
+    """The outcome of the measurements without a landmark in the map, (M,) each."""
 
     slot: Int[Array, "M"]
     granted: Bool[Array, "M"]
@@ -48,7 +48,7 @@ class NewLandmarks(NamedTuple):
 
 
 def turns_of(sensor: Sensor, settings: EkfSettings) -> list[Turn]:
-    """The turn of each sensor of a suite, in order; one of a sensor that is no suite.
+    """The turns of the sensors of a suite, in order; a single one for a sensor that is no suite.
 
     Measurements of robots are left alone.
     """
@@ -63,7 +63,7 @@ def turns_of(sensor: Sensor, settings: EkfSettings) -> list[Turn]:
 
 
 def turn_of(part: Part, size: int, settings: EkfSettings) -> Turn:
-    """The turn of one sensor of a suite, among landmarks of `size` numbers."""
+    """The turn of one sensor of a suite, for landmarks of `size` numbers."""
     sensor = on_ground(part.sensor, size)
     return Turn(part.places, dataclasses.replace(settings, sensor=sensor, absolute=part.absolute))
 
@@ -71,7 +71,7 @@ def turn_of(part: Part, size: int, settings: EkfSettings) -> Turn:
 def update_by_scan(
     joint: Joint, scan: Scan, turns: Sequence[Turn]
 ) -> tuple[Joint, Info, Bool[Array, "N"]]:
-    """The update by each sensor in its turn; what became of the scan, and the slots evicted.
+    """The state after the update by each sensor in turn, the `Info`, and the slots evicted.
 
     Raises ValueError if the scan does not have their measurement slots.
     """
@@ -94,7 +94,7 @@ def update_by_scan(
 def update_by_sensor(
     joint: Joint, scan: Scan, settings: EkfSettings
 ) -> tuple[Joint, Info, Bool[Array, "N"]]:
-    """The update by the scan of one sensor; what became of it, and the slots (N,) evicted."""
+    """The state after the scan of one sensor, the `Info`, and the slots (N,) evicted."""
     # Padding may hold anything, and is multiplied by zero further down.
     scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
     found, matched = associate_scan(joint, scan, settings)
@@ -108,7 +108,7 @@ def update_by_sensor(
 def associate_scan(
     joint: Joint, scan: Scan, settings: EkfSettings
 ) -> tuple[Association, Bool[Array, "M"]]:
-    """Of which landmark each measurement is, by what is predicted of the map; and which correct it.
+    """The association of a scan, and which measurements correct the map.
 
     Those of an absolute sensor are of none, and all valid ones correct.
     """
@@ -128,7 +128,7 @@ def initialize_landmarks(
     done: Correction,
     settings: EkfSettings,
 ) -> tuple[Joint, NewLandmarks]:
-    """The map with the new landmarks of a scan, as many as it may start and there are slots for.
+    """The map with the new landmarks of a scan, up to `births` and the free slots.
 
     matched, done: the measurements of known landmarks, and their correction; landmarks that were
     corrected do not make room for new ones.
@@ -163,7 +163,7 @@ def _with_room(
     used: Bool[Array, "M"],
     settings: EkfSettings,
 ) -> tuple[Joint, Bool[Array, "N"]]:
-    """The map without the landmarks that `Life.make_room` gives up for new ones, and which."""
+    """The map without the landmarks that `Life.make_room` removes for new ones, and which."""
     if settings.make_room is None or settings.make_room.make_room is None:
         return joint, jnp.zeros_like(joint.alive)
     needed = wanted.sum() - (~joint.alive).sum()
@@ -179,7 +179,7 @@ def _started(
     rank: Int[Array, "M"],
     settings: EkfSettings,
 ) -> tuple[Joint, Int[Array, "M"], Bool[Array, "M"]]:
-    """Landmarks where wanted, in free slots; the slot of each measurement, and where granted.
+    """The map with landmarks started in free slots, the slot of each, and whether it was granted.
 
     rank: (M,) how many are wanted up to each measurement.
     """
@@ -205,7 +205,7 @@ def report_scan(
     new: NewLandmarks,
     settings: EkfSettings,
 ) -> Info:
-    """What became of the measurements of one sensor."""
+    """The `Info` of the measurements of one sensor."""
     status = status_of(
         scan.valid,
         matched=matched,
@@ -231,7 +231,7 @@ def report_scan(
 
 
 def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
-    """The map without the landmarks of the slots `dead`; of a batch, a run without such is kept.
+    """The map without the landmarks of the slots `dead`, exactly as before where there are none.
 
     A root is made triangular anew; a run without a removal keeps its own to the bit.
     """

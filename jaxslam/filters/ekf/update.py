@@ -1,4 +1,4 @@
-"""The correction of a Kalman-type SLAM filter on a `Joint`, by a scan at once or one by one.
+"""The correction of a Kalman-type SLAM filter by measurements at once or sequentially.
 
 With `predict`, they exploit that a motion touches the robot alone, and a measurement
 the robot and one landmark: no dense D×D product is formed. The models are records of the settings,
@@ -44,7 +44,7 @@ def correct(
     known: Bool[Array, "m"],
     settings: EkfSettings,
 ) -> tuple[Joint, Correction]:
-    """Correct by m measurements at once, z (m, Z) of the landmarks in slot (m,): Solà (26)-(30).
+    """The joint corrected by m measurements z (m, Z) of landmarks in slot (m,): Solà (26)-(30).
 
     With S = H P Hᵀ + R = L Lᵀ and V = L⁻¹ H P: x ← x ⊞ Vᵀ L⁻¹ ν and P ← P - Vᵀ V, symmetric as it
     stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot means nothing.
@@ -91,7 +91,7 @@ def _corrected_cov(
 def _with_last_motion(
     joint: Joint, found: Innovation, cov: Float[Array, "D D"], slot: Int[Array, "m"], chart: Chart
 ) -> Joint:
-    """The map corrected but for the last motion, then composed with the corrected motion."""
+    """The map corrected, then composed with the corrected last motion."""
     last, capacity = joint.last, joint.landmarks.shape[0]
     seen_last = times_directions(*found.jacobians, *split_directions(last.cov.T, capacity), slot)
     seen_last = linalg.solve_lower(found.factor, seen_last.reshape(-1, 3))
@@ -113,7 +113,7 @@ def correct_in_turn(
     known: Bool[Array, "m"],
     settings: EkfSettings,
 ) -> tuple[Joint, Correction]:
-    """Correct by m measurements one after the other, each linearized at what those before left.
+    """The joint corrected by m measurements in turn, each linearized at the estimate before it.
 
     The same numbers as `correct` on each alone, with P read and written once a group of them:
 
@@ -151,7 +151,7 @@ def correct_in_turn(
 def _in_turn_with_motion(
     joint: Joint, measurements: Measurements, group: int, settings: EkfSettings
 ) -> tuple[Joint, Correction]:
-    """`correct_in_turn` in a chart that keeps the last motion apart; P has columns for it."""
+    """`correct_in_turn` in a chart with `motion_apart`; P has columns for the last motion."""
     z, _, known = measurements
     size = joint.cov.shape[1]
     columns = size + 3 + (-(size + 3) % _LANES if size <= _CACHED else 0)
@@ -204,7 +204,7 @@ def _in_groups(
 def correct_group(
     joint: Joint, part: Measurements, settings: EkfSettings
 ) -> tuple[Joint, Correction]:
-    """Correct by a group of g measurements in turn: the local map by each, then P by them all.
+    """The joint corrected by g measurements in turn: local states by each, then P by all at once.
 
         local P (W, W) | M (W, W)    P_I of now = M P_I of before, W = 3 + g·L
         V (g·Z, D) = reach (g·Z, W) P_I of before
@@ -247,7 +247,7 @@ def correct_group(
 def _correct_local(
     local: Joint, measurement: tuple[jax.Array, Any], whole: Joint, settings: EkfSettings
 ) -> tuple[Joint, tuple[jax.Array, jax.Array, Correction]]:
-    """Correct a local map by a measurement of its landmark i (); the whole map's slot beside.
+    """A local map corrected by a measurement of its landmark i (), of slot () in the whole map.
 
     P of the local map and the matrix M beside it are corrected as one:
     [P M] ← [P M] - Vᵀ [V reach].
@@ -265,7 +265,7 @@ def _correct_local(
 
 
 def _nothing(joint: Joint, z: Float[Array, "m Z"]) -> Correction:
-    """The `Correction` of m measurements that nothing is done with, all zero."""
+    """The `Correction` of m unused measurements, all zero."""
     m, size = z.shape
     dtype = jnp.result_type(z, joint.pose, joint.cov)
     each, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
@@ -286,7 +286,7 @@ def _moved(
     slot: Int[Array, "m"],
     chart: Chart,
 ) -> Joint:
-    """The means moved by ξ, and what the measurements tell a watch; P as it was."""
+    """The means retracted by ξ, and the watch updated by the measurements; P is not changed."""
     pose, landmarks = retracted(chart, joint, xi)
     watch = joint.watch
     if watch:

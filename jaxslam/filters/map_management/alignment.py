@@ -1,4 +1,4 @@
-"""The rigid motion that aligns a cluster of points with points of a map, by least squares."""
+"""Weighted least-squares alignment of a cluster of points with points of a map."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ class Alignment(NamedTuple):
 
 
 class _Residuals(NamedTuple):
-    """r_i = T z_i - m_i about the centroids, with the covariance and the derivative."""
+    """The residuals r_i = T z_i - m_i about the centroids, their covariance and derivative."""
 
     error: Float[Array, "2*M"]
     jacobian: Float[Array, "2*M 3"]
@@ -87,7 +87,7 @@ def _residuals(
     goal: Float[Array, "M 2"],
     pose: Float[Array, "3"],
 ) -> _Residuals:
-    """Of points z and goals about their centroids; zeros and the identity for what is no pair."""
+    """The residuals of points z and goals about their centroids; 0 and identity without a pair."""
     m, there, at = slot.shape[0], slot >= 0, jnp.maximum(slot, 0)
     rotation = se2.rotation(pose[2])
     mixed = jnp.einsum("xy,iyjw->ixjw", rotation, points.cross_cov[:, :, at])
@@ -106,7 +106,7 @@ def _residuals(
 def with_unit_blocks(
     cov: Float[Array, "M 2 M 2"], there: Bool[Array, "M"]
 ) -> Float[Array, "M 2 M 2"]:
-    """The covariance, with the identity in rows and columns of what is not there."""
+    """The covariance with the identity in the rows and columns of absent points."""
     m = there.shape[0]
     both = jnp.broadcast_to(there[:, None, None, None] & there[None, None, :, None], cov.shape)
     return jnp.where(both, cov, jnp.eye(2 * m, dtype=cov.dtype).reshape(m, 2, m, 2))

@@ -1,4 +1,4 @@
-"""Hypotheses of a geometric match: a pair of cluster points is a pair of map points."""
+"""Hypotheses of a geometric match: a pair of cluster points matched with a pair of map points."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ class PointSets(NamedTuple):
 
 
 def longest_pairs(points: PointSets, count: int) -> tuple[Int[Array, "P"], Int[Array, "P"]]:
-    """Ends a, b of long pairs of cluster points, at most `count`, each point's share limited.
+    """The ends a, b of at most `count` long pairs of cluster points, with few pairs a point.
 
     A spurious point far out would be an end of all the longest pairs. So each use of a point halves
     the length of its further pairs.
@@ -50,7 +50,7 @@ def longest_pairs(points: PointSets, count: int) -> tuple[Int[Array, "P"], Int[A
 def equal_lengths(
     points: PointSets, a: Int[Array, ""], b: Int[Array, ""], gate: float
 ) -> tuple[Float[Array, "N N"], Bool[Array, "N N"]]:
-    """Test all map pairs (j, k) for the length of the cluster pair (a, b).
+    """The squared distances of the lengths of all map pairs (j, k) to that of cluster pair (a, b).
 
     With s = |z_b - z_a| and r = |m_k - m_j|: (s - r)²/var(s - r), and whether it is within the gate
     of a pair that may be and has a direction.
@@ -173,7 +173,7 @@ def moved_covs(
 
 
 def turned(points: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
-    """Turned by 90°."""
+    """Vectors rotated by 90°."""
     return jnp.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""A filter that removes landmarks from its map by a rule, after each scan."""
+"""A filter wrapper that removes landmarks by a rule after each scan."""
 
 import dataclasses
 
@@ -14,9 +14,9 @@ from jaxslam.types import Info, Scan
 
 
 def pruning(filter: Filter, life: Life) -> Filter:
-    """The filter, whose map loses the landmarks that a rule gives up after each scan.
+    """The filter with the landmarks removed that a rule selects after each scan.
 
-    The rule's memory is `Joint.life`. `info.extra["pruning"].removed` (N,) bool tells the slots.
+    The rule's memory is `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots.
 
     A rule that makes room in a full map acts between association and new landmarks, so the filter
     has to know it: `pruning(ekf_slam(…, make_room=life), life)`.

@@ -1,4 +1,4 @@
-"""How a robot without a pose in the map is initialized from one scan.
+"""Initialization of a robot's pose in the map from one scan.
 
 Its pose x_b is a function g(y, q) of what the map holds, y, and of what was measured, q, so its
 covariances are P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a
@@ -47,7 +47,7 @@ def best_initialization(
     there: Bool[Array, "R"],
     settings: TeamSettings,
 ) -> Candidate:
-    """The pose for a robot, of all that are possible, whose heading has the least variance.
+    """The candidate pose of a robot whose heading has the least variance.
 
     observed: by each robot. there: which robots are in the map.
     """
@@ -72,7 +72,7 @@ def _mutual_candidate(
     there: Bool[Array, ""],
     settings: TeamSettings,
 ) -> Candidate:
-    """By another robot, if that is in the map and the two measure each other."""
+    """The pose from another robot in the map, if the two measure each other."""
     mine, theirs, rows = observed[robot], observed[other], rows_of(other, settings)
     i, sees = _first(theirs, settings.tags[robot])
     j, sees_back = _first(mine, settings.tags[other])
@@ -92,7 +92,7 @@ def _mutual_candidate(
 def _landmark_candidate(
     joint: Joint, robot: int, observed: list[ObservedPoints], settings: TeamSettings
 ) -> Candidate:
-    """By the two landmarks of the map, farthest apart, that the robot measures."""
+    """The pose from the two measured landmarks of the map that are farthest apart."""
     mine, capacity = observed[robot], settings.capacity
     slot, known = slots.find(joint.tag[:capacity], joint.alive[:capacity], mine.tag)
     i, j, two = farthest_pair(mine.point, known & mine.valid)
@@ -118,7 +118,7 @@ def _first(observed: ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Arr
 
 
 def observed_points(sensors: Suite, scan: Scan) -> ObservedPoints:
-    """A robot's scan; not valid are measurements that do not determine a point, or without tag."""
+    """A robot's scan as points; valid if a measurement has a tag and determines a point."""
     found = []
     for part, own in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
         if measures_points(part.sensor):
@@ -218,7 +218,7 @@ def farthest_pair(
 
 
 def _distance_variance(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Float[Array, ""]:
-    """Of the distance of a point with that covariance; positive."""
+    """The variance of the distance of a point with that covariance; positive."""
     square = (point**2).sum()
     there = square > 0
     along = point @ cov @ point / jnp.where(there, square, 1.0)

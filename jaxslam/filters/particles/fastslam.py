@@ -68,12 +68,12 @@ def fastslam(
     Resampling happens in steps with ESS = 1/Σ w² below threshold·P. Where all weights underflow,
     all become 1/P and `ParticleInfo.underflow` says so; the log-likelihood, -∞, is then given as 0,
     so a sum of log-likelihoods has to look at `underflow` too. A particle that a motion or a scan
-    leaves without a finite pose keeps the one before and weighs nothing (`ParticleInfo.invalid`).
+    leaves without a finite pose keeps the one before, with weight zero (`ParticleInfo.invalid`).
 
     The measurements in an `Info` are those of the most likely particle (by its weight before
     resampling), whose slots are those of the estimate; its innovations are given its path, with the
     covariance of a pose not drawn yet in 2.0. Only nis is the mean over the particles by their
-    weights after the scan: of an honest filter that is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p =
+    weights after the scan: of a consistent filter that is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p =
     Σ_p w_p E_{N_p} d²_p, where the most likely particle's, chosen for fitting well, is less. Its
     log_likelihood is that of the scan given all before, log Σ w p(scan | particle), of the
     measurements that a particle has landmarks for. `info.extra["particles"]` is a `ParticleInfo`.
@@ -173,7 +173,7 @@ def fastslam(
 def weight_particles(
     state: SlamParticles, proposed: PoseProposal
 ) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
-    """log w_p p(scan | particle) with Σ w = 1, the log-likelihood of the measurements that have
+    """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of measurements with
     landmarks, and whether any weight was left."""
     seen = state.log_weight + proposed.log_matched
     weight, _, some = normalized(seen + proposed.log_unmatched)
@@ -181,7 +181,7 @@ def weight_particles(
 
 
 def with_drawn_poses(state: SlamParticles, key: Array) -> SlamParticles:
-    """The state after each pose was drawn from its Gaussian, all of them finite."""
+    """The state with each pose drawn from its Gaussian, all finite."""
     return state._replace(
         pose=draw_poses(state, key),
         pose_cov=jnp.zeros_like(state.pose_cov),

@@ -1,4 +1,4 @@
-"""The gate on squared Mahalanobis distances, as the weight of a particle takes it."""
+"""The gate on squared Mahalanobis distances in particle weights."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ class GatedDistance(NamedTuple):
 
 
 def gate_distance(distance: Float[Array, "*M"], gate: float | None) -> GatedDistance:
-    """Whether d² passes the gate, and what of it a weight and an `Info` take."""
+    """The gated distance: whether d² passes, and its values for weights and for `Info`."""
     finite = jnp.isfinite(distance)
     inside = finite if gate is None else finite & (distance <= gate)
     counted = distance if gate is None else jnp.where(inside, distance, gate)

@@ -1,4 +1,4 @@
-"""Monte-Carlo localization: where the robot is in a known map, by particles, from anywhere."""
+"""Monte-Carlo localization in a known map, including global localization."""
 
 import math
 from functools import partial
@@ -70,7 +70,7 @@ def particle_localization(
     Robotics", table 8.2). The state is a `PoseParticles`. Particles are resampled before a motion,
     if the last scan left ESS = 1/Σ w² below threshold · (particles in use); then so many of the
     draws are used as the KLD bound asks for the bins that these occupy after the motion (Fox 2001;
-    `resampling.kld`), at most `particles`, of which the others weigh nothing. In
+    `resampling.kld`), at most `particles`, of which the others have weight zero. In
     `info.extra["particles"]`, a `ParticleInfo`, these are `active` and `capped`.
 
     A robot that was carried away is found again by particles from the whole box (table 8.3). With
@@ -86,7 +86,7 @@ def particle_localization(
     The estimate is that of the weighted particles after a scan, before anything is drawn anew:
     `moments.weighted_pose_moments`, which is one point and one ellipse also where the particles are
     in several places. Where all weights underflow, all in use become equal (`underflow`). A motion
-    that leaves a pose which is not finite is undone, and the particle weighs nothing (`invalid`).
+    that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
     The measurements in an `Info` are those of the most likely particle, and nis is the mean over
     the particles by weight, as of `fastslam`; log_likelihood is log Σ w p(scan | x) of measurements
     matched to a landmark.
@@ -99,14 +99,14 @@ def particle_localization(
     less than it could.
 
     Args:
-        motion, sensor: any; with a `sensors.suite`, absolute sensors weigh too.
+        motion, sensor: any; with a `sensors.suite`, absolute sensors enter the weights too.
         landmarks: (N, L) the map, in the sensor's parameters.
         particles: the capacity P, at least 1.
         tags: (N,) int, different; default the row numbers.
         box: (2, 2) the lowest and the highest (x, y) [m] where the robot may be; without one,
             nothing is injected.
-        start: "gaussian", the pose and covariance that `run` is told (the latter may be zero), or
-            "uniform", the whole box and any heading, whatever it is told (global localization).
+        start: "gaussian", the pose and covariance given to `run` (the latter may be zero), or
+            "uniform", the whole box and any heading, whatever is given (global localization).
         associate: default `association.known()`, by tag. Any other decides for each particle, by
             its pose alone (maximum_likelihood with an infinite gate: the most likely landmark).
         gate: a measurement whose squared Mahalanobis distance exceeds this counts as one on the
@@ -201,8 +201,8 @@ def particle_localization(
 def weight_poses(
     state: PoseParticles, misfit: Float[Array, "P"]
 ) -> tuple[Float[Array, "P"], Bool[Array, ""]]:
-    """log w exp(-misfit) with Σ w = 1, equal for all in use where nothing is left, and whether
-    anything was."""
+    """Log-weights log w exp(-misfit) with Σ w = 1, equal where all underflow, and whether any
+    weight was left."""
     weight, _, some = normalized(state.log_weight - misfit)
     even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
     return jnp.where(some, weight, even), some
@@ -214,7 +214,7 @@ def info_of_scan(
     log_weight: Float[Array, "P"],
     log_likelihood: Float[Array, ""],
 ) -> Info:
-    """What the most likely particle makes of a scan; nis is the mean by weight."""
+    """The `Info` of the most likely particle, with the weighted mean NIS."""
     best = jnp.argmax(log_weight)
     own: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
     return info_of(
@@ -233,7 +233,7 @@ def info_of_scan(
 def predict_particles(
     state: PoseParticles, u: Float[Array, "U"], key: Array, settings: MonteCarloSettings
 ) -> PoseParticles:
-    """Resample where due, draw from the motion, and keep as many as the KLD bound asks for."""
+    """The particles resampled where due and moved, as many as the KLD bound requires."""
     key_start, key_renew, key_noise = jax.random.split(key, 3)
     state = draw_start(state, key_start, settings)
     due, particles = state.due, settings.particles
