@@ -44,17 +44,17 @@ def calibrate(
 
         p ← p - (Jᵀ J)⁻¹ Jᵀ w,    J = ∂w/∂p, S held fixed
 
-    J comes from one run in forward mode. The innovations of a filter with right models are white,
+    J comes from one run in forward mode. The innovations of a filter with correct models are white,
     and ∂ν/∂p depends on the past alone, so that E[Jᵀ w] = 0 at the true p. This is the prediction
     error method (Ljung, "System Identification", 1999, section 7.2); where all is linear with
-    Gaussian noise and S does not depend on p it is the maximum of the likelihood.
+    Gaussian noise and S does not depend on p it is the maximum-likelihood estimate.
 
-    Associations are made anew at each p and not differentiated. They need not be given: a filter
+    Associations are recomputed at each p and not differentiated. They need not be given: a filter
     with `association.nearest` and `life.recency(patience=…)` keeps a local map, in which landmarks
     seen close in time are associated whatever the drift, and no loop is closed.
 
     Each measurement of a scan is whitened by its own S; the correlation between those of one joint
-    update is left out, which costs a little precision.
+    update is ignored, which costs a little precision.
 
     Args:
         info: p (P,) -> the `Info` of a run, `lambda p: jaxslam.run(…).info`, where p may enter the

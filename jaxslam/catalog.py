@@ -1,5 +1,5 @@
-"""Every filter by name, set up for a scenario: the variants of EKF-SLAM, and what they are compared
-with.
+"""All filters by name, configured for a scenario: the variants of EKF-SLAM, and filters to compare
+them with.
 
 A variant is a chart, a linearizer or an option, given in one line; `monte_carlo` and the command
 line run them side by side.
@@ -87,7 +87,7 @@ def by_particles_in_a_known_map(scenario: Scenario, **options: Any) -> Callable[
 
 
 SLAM_PARTICLES = 50
-"""of FastSLAM in the catalog: few, so that a campaign of all filters does not wait for it."""
+"""number of particles of FastSLAM in the catalog; small, for campaigns of all filters."""
 
 LOCALIZATION_PARTICLES = 300
 """of Monte-Carlo localization in the catalog, at every step"""
@@ -100,7 +100,7 @@ def in_canonical_form(
 
     A sparse one has half the map active, 8 landmarks at least and 20 at most, and all links. It
     reports covariances from its whole Ω, not from Markov-blanket marginals, so that a campaign
-    judges the sparsification alone. With all of the map active it would be `eif_slam` by
+    evaluates the sparsification alone. With all of the map active it would be `eif_slam` by
     definition. All landmarks that a scan measures must be active at once; so a scan of more
     measurement slots than half of what is active (in `cloister` all 36 columns are measured in
     every step) is divided (`in_pieces`).

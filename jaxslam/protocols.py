@@ -66,7 +66,7 @@ class Motion:
     """(pose, u) -> (W, W)."""
     perturb: Callable[[Array, Array], Array] | None = None
     """(u, w) -> u with step(pose, u, w) = step(pose, perturb(u, w), 0), where noise is of that
-    kind; a world that disturbs the odometry instead of the robot needs it."""
+    kind; needed by worlds that add noise to the odometry instead of the robot's motion."""
     jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
     """(pose, u, w) -> by pose (3, 3), by u (3, U), by w (3, W); hand-derived, to verify against."""
 
@@ -99,7 +99,7 @@ class Sensor:
     """A measurement model of one landmark, or with L = 0 of the robot itself (an absolute sensor).
 
     An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
-    embed return (0,), position zeros that nothing reads, and K = 0. Each of its measurements
+    embed return (0,), position unused zeros, and K = 0. Each of its measurements
     corrects the robot, whatever the tag.
     """
 
@@ -117,9 +117,9 @@ class Sensor:
     landmark: tuple[str, ...] = ("x [m]", "y [m]")
     """What l holds, with units; its length is L, 0 for an absolute sensor. Default a point."""
     position: Callable[[Array], Array] = lambda landmark: landmark
-    """(l) -> (2,) where the landmark stands. Default that of a point."""
+    """(l) -> (2,) position of the landmark. Default that of a point."""
     embed: Callable[[Array, Array], Array] = lambda pose, point: point
-    """(pose, point (2,)) -> l of a landmark that stands there, seen first from pose. Default that
+    """(pose, point (2,)) -> l of a landmark at that point, measured first from pose. Default that
     of a point."""
     free: Free = NOTHING_FREE
     """the prior of s. Default that of a full measurement."""
@@ -197,8 +197,8 @@ class Here(NamedTuple):
 class Linearizer:
     """An affine approximation, with added noise, of the models near a Gaussian.
 
-    First-order linearizers evaluate Jacobians somewhere; statistical ones fit to the covariance.
-    Each may keep a memory of its own inside the filter's state. Derivatives are by the
+    First-order linearizers evaluate Jacobians at a point; statistical ones fit over the covariance.
+    Each may keep a memory inside the filter's state. Derivatives are by the
     *coordinates* of pose and landmark, whatever the chart.
     """
 
@@ -209,8 +209,8 @@ class Linearizer:
     """(motion, u, here) -> the new pose, its derivative by the old one (3, 3), the covariance that
     the noise adds to it (3, 3), memory."""
     observe: Callable[[Sensor, Here], tuple[Array, Array, Array, Array]]
-    """(sensor, here) -> the expected z, its derivatives by pose (Z, 3) and by l (Z, L), and what to
-    add to the covariance of the measurement's noise (Z, Z)."""
+    """(sensor, here) -> the predicted z, its derivatives by pose (Z, 3) and by l (Z, L), and a
+    covariance (Z, Z) to add to that of the measurement noise."""
     invert: Callable[[Sensor, Array, Array, Here], tuple[Array, Array, Array]]
     """(sensor, z, tag (), here) -> the new l, its derivative by the pose (L, 3), its covariance for
     a known pose (L, L)."""
@@ -221,8 +221,7 @@ class Linearizer:
     iterates: bool = True
     """whether a correction may linearize again at its result; a fit to a covariance may not."""
     own_landmarks: bool = False
-    """whether it linearizes at landmarks other than the estimates, and so is for maps with errors
-    alone."""
+    """whether it linearizes at landmarks other than the estimates; not for known maps then."""
 
     def __post_init__(self) -> None:
         _check_fields(self, ("init", "motion", "observe", "invert", "born"))
@@ -256,7 +255,7 @@ class Prediction:
     pairs: Callable[[Scan], Pairs]
     """(scan) -> every measurement against every slot."""
     cross: Callable[[], Array]
-    """() -> (N, Z, N, Z): H_i P H_jᵀ, what the errors of two expected measurements share."""
+    """() -> (N, Z, N, Z): H_i P H_jᵀ, the cross-covariances of predicted measurements."""
 
 
 class Association(NamedTuple):
@@ -280,7 +279,7 @@ on; the expected number of copies of j is P w_j. Not differentiated."""
 
 Differentiable = Callable[[Array, Array], tuple[Array, Array]]
 """As `Resample`, with the log-weight (P,) of each as well, Σ exp = 1, through which gradients reach
-the weights before. Its sum must be left alone: its gradient may be part of the method."""
+the weights before. Do not normalize it again: the gradient of its sum may be part of the method."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,12 +290,12 @@ class Life:
     init: Callable[[Array, Array], Any]
     """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
     after: Callable[[Joint, Info, Callable[[], Estimate]], tuple[Any, Array]]
-    """(joint, info, estimate) -> memory, slots to remove (N,) bool; after a scan, with what became
-    of it. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
+    """(joint, info, estimate) -> memory, slots to remove (N,) bool; called after a scan, with its
+    info. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
     make_room: Callable[[Joint, Array, Array], Array] | None = None
     """(joint, needed () int, measured (N,) bool) -> slots (N,) bool to remove before new landmarks
-    enter a map that lacks so many slots, none of those this scan measured; None where a full map
-    refuses."""
+    enter a map that lacks so many slots, none of those this scan measured; None if nothing is
+    removed from a full map."""
 
 
 @dataclass(frozen=True, eq=False)

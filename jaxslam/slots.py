@@ -32,7 +32,7 @@ class Joint(NamedTuple):
     watch: Any = None
     """a `Watch` of the directions that should stay unobservable, where one is kept"""
     last: Any = None
-    """the `Last` motion, where the chart keeps it apart"""
+    """the `Last` motion, in a chart with `motion_apart`"""
     life: Any = None
     """the memory of a `Life`, of a filter that is pruned"""
     reduced: Any = None
@@ -66,9 +66,9 @@ class Watch(NamedTuple):
     information: Float[Array, "3 3"]
     """Σ (H n)ᵀ R⁻¹ (H n) of all corrections"""
     scale: Float[Array, "3"]
-    """Σ of the same with absolute values, what rounding is measured by"""
+    """Σ of the same with absolute values, the scale of rounding errors"""
     turn: Float[Array, "3"]
-    """the combination of directions that turns everything about the origin by 1 rad"""
+    """the combination of directions that rotates robot and map about the origin by 1 rad"""
 
 
 def empty(
@@ -84,8 +84,8 @@ def empty(
 ) -> Joint:
     """The initial state: a robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero.
 
-    turn: (3,) how the robot moves when all turns about the origin, in the filter's chart; where
-    given, a `Watch` is kept.
+    turn: (3,) error of the pose in a rotation of robot and map about the origin, in the filter's
+    chart; where given, a `Watch` is kept.
     """
     size = 3 + capacity * landmark_size
     if square_root:
@@ -130,7 +130,7 @@ def allocate(
 
 def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
     """The last column in which each row (M, N) bool is set, 0 where none, (M,) int32; and whether
-    there is one (M,). In one pass, where an `argmax` and an `any` are two.
+    there is one (M,). One pass, instead of two by `argmax` and `any`.
     """
     # Over the leading axis XLA takes maxima of whole rows.
     at = jnp.where(match.T, jnp.arange(match.shape[1], dtype=jnp.int32)[:, None], -1)

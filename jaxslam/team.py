@@ -1,6 +1,6 @@
 """The robots of a team, and the layout of their controls, scans and states.
 
-`filters.team_slam` runs a filter for them; `simulation.team_world` draws worlds that they drive in.
+`filters.team_slam` is their filter, and `simulation.team_world` simulates their worlds.
 """
 
 from collections.abc import Sequence
@@ -117,7 +117,7 @@ def sensors_of(robots: Sequence[Robot], report: int) -> Suite:
     """The sensors of the whole team as one suite, for a filter of the robot `report` alone.
 
     The slots of the other robots' sensors are marked as those that see robots, which a filter of
-    one robot leaves alone.
+    one robot ignores.
     """
     parts = []
     for b, robot in enumerate(robots):

@@ -2,7 +2,7 @@
 
 All are NamedTuples, hence pytrees; leading axes are added by `vmap` (runs) and `scan` (time).
 T steps, M measurement slots a step, N landmark slots, Z measurement size, L landmark size.
-Masks and status codes, never NaN, say what is absent.
+Masks and status codes, never NaN, mark absent data.
 """
 
 from enum import IntEnum
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 class Status(IntEnum):
     """The outcome of a measurement; `Info.status` holds one a measurement slot.
 
-    `filters.reporting.status_of` has the table that decides.
+    `filters.reporting.status_of` has the decision table.
     """
 
     EMPTY = 0

@@ -37,14 +37,14 @@ def status_of(
     | matched | FUSED |
     | new, its tag earlier in the scan | REPEATED |
     | new, a slot granted | BORN |
-    | new, beyond the quota or postponed | DEFERRED |
+    | new, beyond `births` or postponed | DEFERRED |
     | new, stored for a later initialization | SIGHTED |
     | new, with a covariance that is not positive definite | SINGULAR |
-    | new, nothing of these: no slot is left | OVERFLOW |
+    | new, none of these: no slot is free | OVERFLOW |
     | neither matched nor new | UNMATCHED |
 
-    A singular S is SINGULAR on both sides of the gate: d² = νᵀ S⁻¹ ν needs S⁻¹, so there is no
-    gate to be outside of. A measurement without a finite value is REJECTED by `run` before a filter
+    A singular S is SINGULAR whatever the gate, since d² = νᵀ S⁻¹ ν needs S⁻¹. A measurement
+    without a finite value is REJECTED by `run` before a filter
     sees it, and one that concerns a robot without a pose in the map is UNMATCHED (`team_slam`).
 
     Args:
@@ -52,10 +52,10 @@ def status_of(
         matched: association found its landmark (or it is of an absolute sensor); wins over new.
         positive: S is positive definite, alone and with those of the scan that are fused with it,
             and so is whatever the filter needs to compute S.
-        inside: d² is finite and at most the gate. May be anything where S is not positive definite.
+        inside: d² is finite and at most the gate. Any value where S is not positive definite.
         postponed: known, but the filter cannot activate it now (`eseif`).
         new: association found it to be of no landmark.
-        repeated, granted, deferred, stored, singular: what became of a new one.
+        repeated, granted, deferred, stored, singular: outcomes of a new one.
     """
     no = jnp.zeros_like(valid)
     matched, new = no if matched is None else matched, no if new is None else new

@@ -1,9 +1,9 @@
 """Linear algebra of matrices too large to unroll: library calls, in a loop on a CPU.
 
 jaxlib's LAPACK kernels divide a batch among the threads of XLA's pool, and wait for them on a
-thread of that pool (jaxlib 0.10, `ParallelBatchMap`). Where as many of them run at once as the pool
-has threads, all wait for ever: two blocks of a campaign on two cores are enough. Under `vmap` on a
-CPU there is hence a loop of calls, each of one matrix.
+thread of that pool (jaxlib 0.10, `ParallelBatchMap`). If as many kernels run at once as the pool
+has threads, they deadlock; two blocks of a campaign on two cores are enough. So under `vmap` on a
+CPU the calls run in a loop, one matrix each.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ def _one_by_one_on_cpu(library: Callable[..., jax.Array]) -> Callable[..., jax.A
 
 
 factor = _one_by_one_on_cpu(partial(jnp.linalg.cholesky, symmetrize_input=False))
-"""Lower L (n, n) with L Lᵀ = A, NaN where A is not positive definite. Has no derivative."""
+"""Lower L (n, n) with L Lᵀ = A, NaN where A is not positive definite. No derivative."""
 
 _solve = _one_by_one_on_cpu(partial(jax.scipy.linalg.solve_triangular, lower=True))
 

@@ -43,7 +43,7 @@ def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
 
     Unrolled code would otherwise store one array of the whole loop for each entry.
     """
-    # Within a scan or a batch nothing merges the recomputation with what it repeats.
+    # Within a scan or a batch XLA does not merge the recomputation with the original.
     return jax.checkpoint(function, prevent_cse=False)
 
 
@@ -92,8 +92,8 @@ def cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
 
     A pivot not above n·eps times its diagonal entry counts as zero: its column of L is zero and the
     flag is False, so that a positive *semi*-definite A still gets a usable square root, and nothing
-    becomes NaN (beyond 8×8, L is then zero as a whole). Only the lower
-    triangle is read. Non-finite input gives False.
+    becomes NaN (beyond 8×8, the whole L is then zero). Only the lower triangle is read. Non-finite
+    input gives False.
     """
     n = matrix.shape[-1]
     if n == 0:
@@ -121,7 +121,7 @@ def _cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Ar
 
 @_cholesky.defjvp
 def _cholesky_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """dL = L Φ(L⁻¹ dA L⁻ᵀ); where a pivot is zero, its column stays zero, and 1 stands for it."""
+    """dL = L Φ(L⁻¹ dA L⁻ᵀ); the column of a zero pivot stays zero, with 1 used in its place."""
     factor, positive = _cholesky(*primals)
     good = jnp.diagonal(factor) > 0
     regular = factor + jnp.diag((~good).astype(factor.dtype))
@@ -190,8 +190,8 @@ def root_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def triangular_root(wide: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """Lower L (n, n) with L Lᵀ = A Aᵀ and a diagonal not below zero, of A (n, m), m >= n.
 
-    Householder reflections from the right, row by row; nothing is squared, so half the digits of a
-    covariance suffice. A may lack rank, and gradients are finite there.
+    Householder reflections from the right, row by row. A Aᵀ is not formed, so half the digits of a
+    covariance suffice. A may be rank deficient, and gradients are finite there.
     """
     n, m = wide.shape
 
@@ -251,9 +251,8 @@ def _substituted(
 def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """The inverse Cholesky factor W = L⁻¹ (n, n) of a small A = L Lᵀ, and `cholesky`'s flag.
 
-    A pivot that counts as zero gives a row of zeros. One division and root a pivot, where
-    `cholesky` and `solve_lower` take three: for a matrix that whitens many columns, millions of
-    times.
+    A pivot that counts as zero gives a row of zeros. It takes one division or square root a pivot,
+    where `cholesky` and `solve_lower` take three.
     """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
     zero = jnp.zeros((), matrix.dtype)
@@ -282,9 +281,9 @@ def _whitener_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """`whitener` as a loop over rows: little to compile, for what is factored once a step.
+    """The inverse Cholesky factor by a loop over rows, which compiles faster than `whitener`.
 
-    Beyond 8×8 by `cholesky`, zero as a whole where a pivot is.
+    Beyond 8×8 by `cholesky`, and all zero if a pivot is zero.
     """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
     if n == 0:
@@ -345,12 +344,12 @@ def mahalanobis_squared(
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """eᵀ P⁻¹ e and whether P (n, n) is numerically regular; 0 and False where it is not.
 
-    P is judged in units of each coordinate's own standard deviation, so that metres, radians and a
-    covariance of 1e-30 are judged alike. Regular means that each Cholesky pivot exceeds 100 n·eps,
-    i.e. no direction is known exactly, and that e is finite.
+    P is scaled by each coordinate's standard deviation, so that the test does not depend on units.
+    Regular means that each Cholesky pivot exceeds 100 n·eps, i.e. no direction is known exactly,
+    and that e is finite.
     """
     n, variance = cov.shape[-1], jnp.diagonal(cov)
-    spread = variance > 0  # the square root's slope at a zero variance is infinite, hence the 1.0
+    spread = variance > 0  # √ has an infinite derivative at zero, hence the 1.0
     unit = jnp.where(spread, 1.0 / jnp.sqrt(jnp.where(spread, variance, 1.0)), 0.0)
     factor = cholesky(cov * unit[:, None] * unit[None, :])[0]
     known = jnp.isfinite(error)

@@ -16,14 +16,14 @@ def no_inline(function: Callable[..., _T], *arguments: Any) -> _T:
     """function(*arguments), compiled as a computation of its own.
 
     XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
-    of D entries would be computed anew at each of the D² entries of the covariance it updates. It
-    fuses nothing across a call that may not be inlined. (An `optimization_barrier` is gone by the
-    time it fuses.)
+    of D entries would be computed again for each of the D² entries of the covariance it updates. It
+    does not fuse across a call that may not be inlined. (An `optimization_barrier` is removed
+    before fusion.)
     """
 
     @functools.wraps(function)
     def whole(*arguments: Any) -> _T:
-        with set_xla_metadata(inlineable="true"):  # what it calls in turn
+        with set_xla_metadata(inlineable="true"):  # functions that it calls
             return function(*arguments)
 
     with set_xla_metadata(inlineable="false"):
@@ -33,8 +33,8 @@ def no_inline(function: Callable[..., _T], *arguments: Any) -> _T:
 def quick_options(platform: str) -> dict[str, Any] | None:
     """Compiler options that shorten the compilation of loop-free programs; None if there are none.
 
-    A straight program spends its time in long passes over arrays, not in a loop of small ones, or
-    runs but once. On a CPU it is compiled without most of LLVM's optimizations.
+    For programs that run only once, or spend their time in long passes over arrays and not in loops
+    over small ones. On a CPU they are compiled without most of LLVM's optimizations.
     """
     return {"xla_backend_optimization_level": 1} if platform == "cpu" else None
 
@@ -42,8 +42,8 @@ def quick_options(platform: str) -> dict[str, Any] | None:
 def hot_options(platform: str) -> dict[str, Any] | None:
     """Compiler options that speed up long-running programs; None if there are none.
 
-    XLA vectorizes code of a CPU for 256 bits unless it is told. Where the processor has AVX-512,
-    512 made 32 runs of EKF-SLAM 1.1 times as fast in float64 and float32.
+    By default XLA vectorizes CPU code for 256 bits. Where the processor has AVX-512, 512 bits made
+    32 runs of EKF-SLAM 1.1 times as fast in float64 and float32.
     """
     return _wide_vectors() if platform == "cpu" else None
 

@@ -1,20 +1,20 @@
 """A cache of compiled programs: one program a structure, with its numbers as arguments.
 
 `call` runs a function of records of functions (a filter, a scenario) and arrays. Within a trace it
-is the plain call. Outside, three steps lead to the program, and each is left out where it can:
+is the plain call. Outside, three steps lead to the program, each skipped where possible:
 
 1. The same objects and the same shapes as before: the program is known. Nothing is traced.
 2. The function is traced to a jaxpr. What a factory closed over (noises, maps, mounts, gates,
    priors) stands in it as constants and literals; `hoisting` makes inputs of them. What is left is
    the structure.
-3. The structure is lowered. Of a text that has been compiled before, the program is taken as it is;
-   else XLA compiles it.
+3. The structure is lowered. If the same text was compiled before, that program is used; else XLA
+   compiles it.
 
 So another noise, map or gate of the same shapes costs tracing alone. An integer, and a number that
 `hoisting` leaves in the structure (0, ±1, ±π …), costs one compilation for each value.
 
-The programs least recently used are dropped beyond `ROOM`; `clear` drops all. Threads may call at
-once: whoever comes second waits for a program that is being compiled, and compiles nothing.
+The programs least recently used are dropped beyond `ROOM`; `clear` drops all. Concurrent threads
+that need the same program compile it once: the others wait.
 """
 
 import functools
@@ -37,7 +37,7 @@ from jaxslam.programs.hoisting import hoisted
 _T = TypeVar("_T")
 
 ROOM = 256
-"""Programs, and sets of objects that lead to one, that are kept."""
+"""The number of programs, and of sets of objects that lead to one, in the cache."""
 
 
 _ALL: "weakref.WeakSet[Kept]" = weakref.WeakSet()
@@ -116,7 +116,7 @@ def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any)
     Within a trace, or where JIT is disabled, the plain call.
 
     Args:
-        function: pure; not a lambda made anew at each call, which would be traced anew.
+        function: pure; not a lambda created at each call, which would be traced at each call.
         objects: what the function takes first: records of functions, options. The same objects are
             not traced again; they are kept alive.
         arguments: trees of arrays.
@@ -130,7 +130,7 @@ def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any)
     run, numbers, out = _BY_OBJECTS.get(
         key, lambda: _program(functools.partial(function, *objects), tree, shapes)
     )
-    if numbers is None:  # it closes over tracers after all
+    if numbers is None:  # it closes over tracers
         return function(*objects, *arguments)
     return cast(_T, jax.tree.unflatten(out, run(numbers, *leaves)))
 
@@ -210,7 +210,7 @@ def compiled(
 ) -> Callable[..., Any]:
     """The compiled program of a lowered text, from the cache if compiled for the same devices."""
     text = hashlib.sha256(lowered.as_text().encode()).digest()
-    # Arguments that nothing reads are not in the text.
+    # Unused arguments are not in the text.
     told = tuple(sorted(options.items())) if options else ()
     key = (text, where, lowered.in_tree, str(lowered.in_avals), told)
     return _BY_TEXT.get(key, lambda: cast(Callable[..., Any], lowered.compile(options)))

@@ -1,10 +1,10 @@
 """Constants of a traced function turned into inputs, so that one program serves all their values.
 
 A jaxpr holds the arrays that a function closed over as constants, and its scalars as literals among
-the operands. `hoisted` makes inputs of both, through calls, loops and branches. Floating-point
-literals that formulas consist of stay, since XLA simplifies with them: 0, ±1, ±π/2, ±π, ±2π,
-infinities and the limits of the dtype; so do integers, which may say how large something is. A
-primitive that is not known here keeps what it has inside.
+the operands. `hoisted` turns both into inputs, through calls, loops and branches. Literals that
+are common in formulas remain, since XLA simplifies with them: 0, ±1, ±π/2, ±π, ±2π, infinities
+and the limits of the dtype; so do integers, which may be sizes. Unknown primitives keep their
+constants.
 """
 
 import functools
@@ -104,7 +104,7 @@ def _plain_call() -> Any:
 
 
 def _call(work: _Hoisting, eqn: Any, given: _Given) -> Any:
-    """jit."""
+    """The handler of jit."""
     jaxpr, new = work.inner(eqn.params["jaxpr"], given)
     params, plain = dict(eqn.params), _plain_call().params
     params["jaxpr"] = core.ClosedJaxpr(jaxpr, [])

@@ -20,7 +20,7 @@ def kld_bound(bins: Int[Array, "*K"], error: float, confidence: float) -> Float[
         n = (k-1)/(2ε) · (1 - 2/(9(k-1)) + √(2/(9(k-1))) z)³
 
     with z the standard normal quantile of the confidence: with that probability the Kullback-
-    Leibler divergence of the sample's histogram from the distribution it is of is below ε = error.
+    Leibler divergence of the sample's histogram from its distribution is below ε = error.
     2nK is χ² with k - 1 degrees of freedom, by Wilson & Hilferty's approximation (Fox 2001,
     "KLD-sampling: Adaptive particle filters"; Fox 2003, IJRR 22(12), eq. 7).
 
@@ -50,8 +50,8 @@ def bins_of(pose: Float[Array, "P 3"], size: tuple[float, float, float]) -> Int[
 def occupied(bins: Int[Array, "P 3"]) -> Int[Array, "P"]:
     """The number of distinct rows among the first 1, 2, …, P bins, int32.
 
-    By sorting, O(P log P) in time and O(P) in memory however large the world is: of equal rows the
-    sort, which is stable, puts the first drawn first.
+    By a stable sort, O(P log P) in time and O(P) in memory for any size of the world: among equal
+    rows the first drawn comes first.
     """
     index = jnp.arange(bins.shape[0], dtype=jnp.int32)
     x, y, heading, order = jax.lax.sort(

@@ -19,10 +19,10 @@ def soft(share: float, resample: Resample = systematic) -> Differentiable:
 
     The weights of the copies are divided by their sum, as a number; gradients go through w_j/q_j.
 
-    **Biased**: expectations keep their value, but as functions of a parameter the draws from q
-    change too, and of that this gradient knows nothing. share = 1 is plain resampling, whose copies
-    all weigh 1/P and pass no gradient; the gradient of share = 0 has no such bias, and resamples
-    nothing. `stop_gradient` is without it for any method.
+    **Biased**: expectations are correct, but the draws from q depend on the parameters too, and
+    the gradient ignores this. share = 1 is plain resampling, whose copies all have weight 1/P and
+    pass no gradient; share = 0 has an unbiased gradient, and does not resample by weight.
+    `stop_gradient` is unbiased for any method.
 
     Args:
         share: of the weights in the mixture, 0 to 1.

@@ -18,8 +18,8 @@ def normalized(
 ) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
     """Normalized log-weights (Σ w = 1), log Σ exp(log_weights), and whether that sum is positive.
 
-    What is not finite weighs nothing. Where nothing is left, all weigh 1/P and the flag is False:
-    the caller counts it. The log of the sum is then 0.
+    Log-weights that are not finite give weight zero. If all are, each weight is 1/P, the flag is
+    False and the log of the sum is given as 0.
 
     Raises ValueError unless log_weights has shape (P,), P at least 1.
     """
@@ -43,8 +43,8 @@ def even(log_weights: Float[Array, "P"]) -> Float[Array, ""]:
 def survivors(
     resample: Resample | Differentiable, log_weights: Float[Array, "P"], key: Array
 ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
-    """The ancestor of each that goes on, and its log-weight: 1/P unless the method, being a
-    `Differentiable`, says something else."""
+    """The ancestors and their log-weights: log 1/P unless the method is a `Differentiable`, which
+    returns its own."""
     found = resample(log_weights, key)
     if isinstance(found, tuple):
         return found
@@ -60,7 +60,7 @@ def resampled_where(
 ) -> tuple[_T, Float[Array, "P"]]:
     """Particles, a tree of arrays (P, …), and their log-weights, resampled if `due`.
 
-    Of a batch in which nothing is due, nothing is copied.
+    In a batch without a due run nothing is copied.
     """
 
     def survive(carried: tuple[_T, Array]) -> tuple[_T, Array]:

@@ -14,7 +14,7 @@ FreeLike = Free | tuple[ArrayLike, ArrayLike]
 
 
 def prior(name: str, free: FreeLike, size: int) -> Free:
-    """free = (mean (size,), cov (size, size)), as a `Free` that any dtype can be taken from.
+    """The `Free` of free = (mean (size,), cov (size, size)), in float64 on the host unless traced.
 
     Raises ValueError unless the mean is finite and the covariance positive definite; a traced part
     is checked for its shape alone.

@@ -25,12 +25,12 @@ class Part:
     every: int = 1
     """in a simulation it measures every so many steps,"""
     start: int = 0
-    """beginning with this one; a filter goes by `Scan.valid` alone"""
+    """beginning with this one; a filter uses `Scan.valid` alone"""
     visible: Callable[[Array, Array], Array] | None = None
     """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
     sees: Literal["landmarks", "robots"] = "landmarks"
-    """what its places are for in a simulation. A filter of one robot leaves places for robots
-    alone (`Status.UNMATCHED`); that of a team goes by the tags, and starts no landmark there."""
+    """what its slots measure in a simulation. A filter of one robot ignores measurements of
+    robots (`Status.UNMATCHED`); that of a team uses the tags, and starts no landmark there."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.sensor, Sensor) or isinstance(self.sensor, Suite):
@@ -57,8 +57,8 @@ class Suite(Sensor):
     """A set of sensors with separate measurement slots; made by `suite`.
 
     The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of
-    z are padded with zeros to the largest measurement. As a `Sensor` it says of what size logs and
-    landmarks are; its parts measure.
+    z are padded with zeros to the largest measurement. As a `Sensor` it only gives the sizes of
+    measurements and landmarks; the models are those of its parts.
     """
 
     parts: tuple[Part, ...] = ()
@@ -82,8 +82,8 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
     Args:
         parts: a `Part`, or (sensor, places), each.
     Raises:
-        ValueError: without parts, on a part that is none, or if sensors of landmarks do not share
-            landmarks (x, y): only a single one may have others.
+        ValueError: without parts, on a part of another type, or if several sensors of landmarks do
+            not share landmarks (x, y): only a single one may have others.
     """
     made = tuple(part if isinstance(part, Part) else _part(part) for part in parts)
     if not made:
@@ -139,8 +139,8 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
 def on_ground(sensor: Sensor, size: int) -> Sensor:
     """The sensor for landmarks of `size` numbers, of which it uses the first.
 
-    Of the others a measurement says nothing: an absolute sensor ignores them all, and a new
-    landmark gets them with zero mean, unit variance and no correlation, as padding has it.
+    A measurement does not depend on the others: an absolute sensor ignores them all, and in a new
+    landmark they have zero mean, unit variance and no correlation, as padding.
     """
     own, spare = len(sensor.landmark), size - len(sensor.landmark)
     if spare == 0:

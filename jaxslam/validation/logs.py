@@ -21,7 +21,7 @@ def check_log(
 
     Shapes and kinds are always checked, values (finite controls, finite valid measurements, tags
     >= -1, of 32 bits and not repeated within a scan) only where they are concrete. parts: how many
-    places of a scan each sensor has, where there are several; a tag may then occur once with each.
+    measurement slots each sensor has, where there are several; a tag may then occur once with each.
     """
     control, scan = log.control, log.scan
     if not isinstance(scan, Scan):
@@ -31,7 +31,7 @@ def check_log(
     z, tag, valid = scan
     _expect(f"{name}: log.control", control, ("T", control_size), np.floating)
     steps = np.shape(control)[0]
-    if np.ndim(tag) != 2:  # it says how many places there are
+    if np.ndim(tag) != 2:  # it gives the number of measurement slots
         _expect(f"{name}: log.scan.tag", tag, (steps, "M"), np.integer)
     places = np.shape(tag)[1]
     _expect(f"{name}: log.scan.z", z, (steps, places, measurement_size), np.floating)

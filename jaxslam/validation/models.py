@@ -1,5 +1,5 @@
-"""What factories refuse before anything is traced: records of another kind, functions of the wrong
-arguments, results of the wrong size. One line each, with what was expected."""
+"""Checks of models before tracing: types of records, arguments of functions, sizes of results.
+Each error is one line that states what was expected."""
 
 import inspect
 import weakref
@@ -15,7 +15,7 @@ from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
 _Shape = tuple[int, ...]
 
 _SOUND: weakref.WeakSet[Any] = weakref.WeakSet()
-"""Models that have been evaluated and found to be of the right sizes."""
+"""Models whose sizes have been checked."""
 
 
 def check_models(name: str, motion: Any, sensor: Any) -> None:
@@ -118,7 +118,7 @@ def check_associate(name: str, associate: Any) -> None:
         raise ValueError(
             f"{name}: expected associate to be a function of (prediction, scan): {error}"
         ) from None
-    except ValueError:  # a builtin, which has no signature to look at
+    except ValueError:  # a builtin, which has no signature
         return
 
 

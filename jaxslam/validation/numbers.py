@@ -35,7 +35,7 @@ def check_count(name: str, value: Any) -> None:
 def check_key(name: str, key: Any) -> None:
     """Raise ValueError unless key is one PRNG key: of `jax.random.key`, or the raw numbers of one.
 
-    A tracer of one will do.
+    A tracer of one is accepted.
     """
     dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):

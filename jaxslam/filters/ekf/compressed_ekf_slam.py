@@ -30,11 +30,11 @@ class Compressed(NamedTuple):
     A motion does Φ ← F Φ. A correction with V = L⁻¹ H P_AA and U = L⁻¹ H Φ does P_AA ← P_AA - VᵀV,
     Φ ← Φ - VᵀU, Ψ ← Ψ + UᵀU, θ ← θ + Uᵀ L⁻¹ ν: so [P_AA Φ; Φᵀ -Ψ] behaves as the covariance of
     a robot, K landmarks and 3 + K·L further variables with mean θ, and any filter on a `Joint`
-    carries them along as landmarks that nobody sees.
+    treats them as landmarks that are never measured.
     """
 
     whole: Joint
-    """all of the map as it was when the area was opened; tags and living slots are those of now"""
+    """the whole map as it was when the area was opened, with the current tags and alive slots"""
     area: Joint
     """robot, K landmarks, and slots for Φ, Ψ and θ"""
     slot: jax.Array
@@ -46,21 +46,21 @@ def compressed_ekf_slam(
 ) -> Filter:
     """`ekf_slam` with the same results, at a cost a step that depends on the area, not on the map.
 
-    A step costs O(K²) for K = area landmarks; only when a scan asks for a landmark outside the area
-    is the map brought up to date, O(K·N²), and a new area chosen: the landmarks of the scan, room
+    A step costs O(K²) for K = area landmarks. Only when a scan measures a landmark outside the area
+    is the whole map updated, O(K·N²), and a new area chosen: the landmarks of the scan, room
     for new ones, and the landmarks nearest to the robot. J. E. Guivant, E. M. Nebot, "Optimization
     of the simultaneous localization and map-building algorithm for real-time implementation", IEEE
     T-RA 17(3), 2001. Landmarks are associated by their tags.
 
-    The state is a `Compressed`. `estimate` gives the moments of all landmarks, O(K²·N); what of
-    them is not used costs nothing under `jit`. `up_to_date` gives the whole map as a `Joint`, and
+    The state is a `Compressed`. `estimate` gives the moments of all landmarks, O(K²·N); moments
+    that are not used cost nothing under `jit`. `up_to_date` gives the whole map as a `Joint`, and
     `opened` makes a state of one.
 
     Args:
         area: number K of landmarks in the area; at least the measurement slots of a scan.
-        options: those of `ekf_slam` in the Euclidean chart, whose landmarks stand still, with a
-            linearizer that remembers nothing (at_estimate, unscented), but for associate, watch,
-            make_room and the covariance "square_root".
+        options: those of `ekf_slam` in the Euclidean chart, with a linearizer without memory
+            (at_estimate, unscented), except associate, watch, make_room and the covariance
+            "square_root".
     Raises:
         ValueError: as `ekf_slam`; on an area below 1, an option that is not for this filter; and,
             when a scan has more measurement slots than the area, from `update`.
@@ -121,7 +121,7 @@ def compressed_ekf_slam(
 
         def anew(state: Compressed) -> Compressed:
             joint = up_to_date(state)
-            # What a run has must not depend on the runs beside it.
+            # The result of a run must not depend on other runs of the batch.
             other = _opened_at(joint, _chosen(joint, own, sensor, seen, new))
             both: Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
             return both
@@ -255,7 +255,7 @@ def _chosen(joint: Joint, own: int, sensor: Sensor, seen: jax.Array, new: jax.Ar
     """The slots (own,) of a new area, ascending: those seen, free ones, the nearest to the pose."""
     points = jax.vmap(sensor.position)(joint.landmarks)
     distance = ((points - joint.pose[None, :2]) ** 2).sum(axis=1)
-    # A quarter of the area is kept for landmarks to come: each may else ask for another area.
+    # A quarter of the area is reserved for new landmarks: each would else need another area.
     spare = jnp.cumsum(~joint.alive) <= jnp.maximum(new, own // 4)
     rank = jnp.select([seen, ~joint.alive & spare, joint.alive], [0, 1, 2], 3)
     distance = jnp.where(joint.alive, distance, 0.0)

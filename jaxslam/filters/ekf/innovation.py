@@ -1,7 +1,7 @@
 """The innovations of m measurements, their covariance S, and V = L⁻¹ H P for the correction.
 
-`innovate` linearizes, forms S = H P Hᵀ + R, gates, factors S = L Lᵀ and whitens by L⁻¹: one
-function for each. What the forms of the update (`update`) take of it is an `Innovation`.
+`innovate` linearizes, forms S = H P Hᵀ + R, gates, factors S = L Lᵀ and whitens by L⁻¹, with
+one function for each step. Its result, an `Innovation`, serves all forms of the update (`update`).
 """
 
 from functools import partial
@@ -72,7 +72,7 @@ class Innovation(NamedTuple):
     seen: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
     """the same by coordinates, at the prior"""
     fuse: Bool[Array, "m"]
-    """known, inside the gate and regular alone"""
+    """known, inside the gate, and with a positive definite S_ii"""
     correction: Correction
 
 
@@ -133,11 +133,11 @@ def innovate(
         robot (3, D)     by pose (m, Z, 3)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ
         own (m, L, D)    by landmark (m, Z, L)   V = L⁻¹ H P  ξ = Vᵀ L⁻¹ ν (D,)
 
-    Each iteration linearizes at the prior moved by the last ξ; what is gated and reported is of the
-    first one.
+    Each iteration linearizes at the prior retracted by the last ξ; gate and reported numbers are
+    those of the first one.
 
-    memory: the state that the linearizer remembers by, and the landmarks' slots (m,) there. P may
-    have further columns, which count as other errors.
+    memory: the state with the linearizer's memory, and the landmarks' slots (m,) there. P may
+    have further columns, of other errors.
     """
     m, size_z = z.shape
     capacity = joint.landmarks.shape[0]
@@ -194,7 +194,7 @@ def _linearize(
 ) -> _Linearized:
     """The linearization z ≈ ẑ + H (ξ - ξ_i) at the prior retracted by ξ_i; None: at the prior.
 
-    With ν = z - ẑ + H ξ_i, what is solved for is ξ, from the prior.
+    With ν = z - ẑ + H ξ_i, the solution is ξ, relative to the prior.
     """
     whole, slot_in_whole = memory
     chart, sensor = settings.chart, settings.sensor
@@ -254,7 +254,7 @@ def _gate(
 ) -> _Gated:
     """The gate: which measurements are fused. inverse: L⁻¹ of each cov = L Lᵀ."""
     distance = (_product(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))
-    # A finite measurement so far off that its d² is not is outside any gate.
+    # A finite measurement whose d² overflows is outside any gate.
     inside = jnp.isfinite(distance) if gate is None else distance <= gate
     return _Gated(nu, cov, distance, inside, definite, known & inside & definite)
 
@@ -278,9 +278,9 @@ def _factor(
     pivots = jnp.diagonal(factor).reshape(m, size_z)
     # Measurements that are regular one by one can still be singular together.
     regular = definite if m == 1 else (pivots > 0).all(axis=1)
-    # A row without a pivot says nothing, and costs no mask of what it would say.
+    # A row without a pivot is zero and so has no effect, without a mask.
     factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
-    if m == 1:  # it has been factored already, alone
+    if m == 1:  # it has been factored already
         pivots = jnp.diagonal(inverse, axis1=1, axis2=2)
     return _Factored(s, factor, inverse, pivots, regular)
 

@@ -17,9 +17,9 @@ from jaxslam.slots import Joint, Last
 def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfSettings) -> Joint:
     """The state after the robot's motion, O(N) where landmark errors are constant: Solà (14)-(17).
 
-    pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the error of
-    the landmarks moves too, with A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block. Of
-    a square root X, P = X Xᵀ, A X is taken, and the noise's root beside it made part of it; O(N³).
+    pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the errors of
+    the landmarks change too, by A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block. A
+    square root X of P = X Xᵀ becomes the triangular root of [A X, G √N]; O(N³).
     """
     chart, square_root = settings.chart, settings.square_root
     robot = slots.robot_cov(joint, square_root)
@@ -55,7 +55,7 @@ class Transition(NamedTuple):
     robot: Float[Array, "3 3"]
     """A"""
     cross: Float[Array, "N L 3"] | None
-    """a_i; None where landmarks stand still"""
+    """a_i; None where landmark errors are constant"""
     landmark: Float[Array, "N L L"] | None
     """B_i; None where they are the identity"""
     noise: Float[Array, "3 3"]
@@ -125,11 +125,11 @@ def moved_cov(
         robot = linalg.matmul(moved.robot, cov[:3])
         own = linalg.matmul(robot[:, :3], moved.robot.T)
         own = linalg.symmetrize(own if noise is None else own + noise)
-        # Kept apart from P, which it is made of, so that P is written in place.
+        # Stored separately from P, from which it is computed, so that P is written in place.
         robot = materialize(jnp.concatenate([own, robot[:, 3:]], axis=1))
         return cov.at[:3].set(robot).at[:, :3].set(robot.T)
     if moved.landmark is not None:
-        # In memory before it is transposed: each entry would be computed twice.
+        # Stored before it is transposed: each entry would else be computed twice.
         cov = materialize(moved.turn(moved.turn(cov).T))
     cov = linalg.symmetrize(cov)
     # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.

@@ -1,7 +1,7 @@
 """The last motion as a separate variable of the state (`Chart.motion_apart`).
 
-The errors of the map are e = e_rest + g δ, with δ the error of the last motion and g its lever. A
-correction moves the map by what it says of e_rest, then composes it with the corrected motion.
+The errors of the map are e = e_rest + g δ, with δ the error of the last motion and g its Jacobian.
+A correction updates e_rest and δ, and then composes the map with the corrected motion.
 """
 
 import jax
@@ -44,7 +44,7 @@ def moved_anew(
     C = cov(δ, e) and Q = cov(δ), all after the correction.
 
     Args:
-        turn: by which the frame the motion began from has turned.
+        turn: the rotation of the frame in which the motion began.
         lever: g as it was before the correction.
     """
     assert chart.basis is not None

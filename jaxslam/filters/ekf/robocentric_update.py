@@ -24,8 +24,8 @@ from jaxslam.slots import Joint, Last
 class MapAndMotion(NamedTuple):
     """The map given its last motion, and that motion's error δ as a separate variable.
 
-    The errors of the map are e = T x + g δ, with x those of `rest`. To a map in the frame of the
-    robot the motion is affine, so x and δ are corrected by adding to them, whatever the order.
+    The errors of the map are e = T x + g δ, with x those of `rest`. In the frame of the robot the
+    motion is affine in the map, so x and δ are corrected by addition, in any order.
     """
 
     rest: Joint
@@ -33,7 +33,7 @@ class MapAndMotion(NamedTuple):
     frame: Float[Array, ""]
     """heading of the frame the motion began from"""
     step: Float[Array, "3"]
-    """by which the motion has been corrected"""
+    """the correction of the motion"""
 
 
 class Composition(NamedTuple):
@@ -104,8 +104,8 @@ def correct_map_and_motion(
 ) -> tuple[MapAndMotion, Correction]:
     """x and δ corrected by g measurements in turn: z (g, Z), slot (g,), known (g,).
 
-    As `update.correct_in_turn` does it: each corrects what the group sees of P, the rows P_I of
-    the robot, of its landmarks and of δ, and the whole P is read and written once.
+    As in `update.correct_in_turn`: each measurement corrects the rows P_I of the robot, the group's
+    landmarks and δ, and the whole P is read and written once.
     """
     rest, (_, slot, known) = state.rest, part
     size_l, size = rest.landmarks.shape[1], rest.cov.shape[0] - 3
@@ -115,7 +115,7 @@ def correct_map_and_motion(
     watch: Any = rest.watch
     if watch:
         watch = watch._replace(directions=watch.directions[at[:-3]])
-    # The local map, and beside its P the matrix that takes P_I of before to P_I of now.
+    # The local map, with the matrix from the initial P_I to the current P_I appended to its P.
     local = rest._replace(
         landmarks=rest.landmarks[slot],
         cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
@@ -129,7 +129,7 @@ def correct_map_and_motion(
     ) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:
         return _correct_one(state, measurement, rest, settings)
 
-    # A gradient keeps what each begins with, and computes the rest of these few rows again.
+    # A gradient stores the input of each step, and recomputes the rest.
     after, (reach, whitened, done) = jax.lax.scan(
         jax.checkpoint(one, prevent_cse=False),
         state._replace(rest=local),
@@ -142,7 +142,7 @@ def correct_map_and_motion(
         watch = after.rest.watch._replace(directions=rest.watch.directions)
     rest = rest._replace(
         pose=after.rest.pose,
-        landmarks=jnp.where(known.any(), landmarks, rest.landmarks),  # a move by zero would round
+        landmarks=jnp.where(known.any(), landmarks, rest.landmarks),  # adding zero would round
         cov=rest.cov - linalg.gram(v[:, : size + 3], v),
         watch=watch,
     )
@@ -157,8 +157,8 @@ def _correct_one(
 ) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:
     """A local x and δ corrected by a measurement of its landmark i (), of slot () in the map.
 
-    It sees e of the robot and its landmark, E = [T g] of their rows of (x, δ). With P that of
-    (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V. Returns V in the columns beside P
+    It measures e of the robot and its landmark, E = [T g] of their rows of (x, δ). With P that of
+    (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V. Returns V in the columns appended to P
     (Z, ·), and L⁻¹ ν (Z,).
     """
     i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], measurement)

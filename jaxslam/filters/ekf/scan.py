@@ -1,8 +1,8 @@
 """The update of a `Joint` by a scan: each sensor corrects the map, then initializes landmarks.
 
 The steps are those of the textbook, one function each: `associate_scan` predicts the measurements
-and says of which landmark each is, `update.correct` gates and corrects, `initialize_landmarks`
-starts the new landmarks, and `report_scan` says what became of every measurement.
+and associates them, `update.correct` gates and corrects, `initialize_landmarks` starts the new
+landmarks, and `report_scan` makes the `Info`.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ class Turn(NamedTuple):
     places: int | None
     """measurement slots of the scan that are its own; None where all are"""
     settings: EkfSettings | None
-    """None where its measurements are left alone: `Status.UNMATCHED`"""
+    """None where its measurements are ignored: `Status.UNMATCHED`"""
 
 
 class NewLandmarks(NamedTuple):
@@ -50,7 +50,7 @@ class NewLandmarks(NamedTuple):
 def turns_of(sensor: Sensor, settings: EkfSettings) -> list[Turn]:
     """The turns of the sensors of a suite, in order; a single one for a sensor that is no suite.
 
-    Measurements of robots are left alone.
+    Measurements of robots are ignored.
     """
     if not isinstance(sensor, Suite):
         return [Turn(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
@@ -95,7 +95,7 @@ def update_by_sensor(
     joint: Joint, scan: Scan, settings: EkfSettings
 ) -> tuple[Joint, Info, Bool[Array, "N"]]:
     """The state after the scan of one sensor, the `Info`, and the slots (N,) evicted."""
-    # Padding may hold anything, and is multiplied by zero further down.
+    # Padding may hold any number, and is multiplied by zero below.
     scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
     found, matched = associate_scan(joint, scan, settings)
     at_once = settings.update == "joint" and len(scan.tag) > 0
@@ -110,7 +110,7 @@ def associate_scan(
 ) -> tuple[Association, Bool[Array, "M"]]:
     """The association of a scan, and which measurements correct the map.
 
-    Those of an absolute sensor are of none, and all valid ones correct.
+    Measurements of an absolute sensor have no landmark, and all valid ones correct.
     """
     if settings.absolute:
         none = jnp.full_like(scan.tag, -1)
@@ -181,7 +181,7 @@ def _started(
 ) -> tuple[Joint, Int[Array, "M"], Bool[Array, "M"]]:
     """The map with landmarks started in free slots, the slot of each, and whether it was granted.
 
-    rank: (M,) how many are wanted up to each measurement.
+    rank: (M,) the number wanted up to each measurement.
     """
     births = settings.births
     taken = joint.alive if settings.reserved is None else joint.alive | settings.reserved
@@ -233,7 +233,7 @@ def report_scan(
 def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
     """The map without the landmarks of the slots `dead`, exactly as before where there are none.
 
-    A root is made triangular anew; a run without a removal keeps its own to the bit.
+    A root is made triangular again; a run without a removal keeps exactly its own.
     """
     remove = partial(slots.remove, dead=dead, square_root=square_root)
     return change_where(dead.any(), remove, joint)

@@ -16,15 +16,15 @@ from jaxslam.validation.numbers import check_count, check_gate
 Update = Literal["sequential", "joint"]
 
 Covariance = Literal["plain", "joseph", "square_root"]
-"""P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or a root X of P = X Xᵀ is held and updated"""
+"""P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or the update of a root X of P = X Xᵀ"""
 
 
 @dataclass(frozen=True, eq=False)
 class EkfSettings:
     """The models and options of a Kalman-type SLAM filter, the last argument of each step.
 
-    A factory makes it once and checks it; `dataclasses.replace` gives each sensor of a suite its
-    own. Options as `ekf_slam` has them.
+    A factory creates and validates it once; `dataclasses.replace` makes one for each sensor of a
+    suite. The options are those of `ekf_slam`.
     """
 
     sensor: Sensor

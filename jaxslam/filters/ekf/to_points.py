@@ -69,8 +69,8 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
     """The map with the landmarks of the slots `which` reduced to points.
 
     With J = ∂position/∂l (2, L), l ← position(l) and, of all errors, e_l ← J e_l, in rows and
-    columns of P. The other L - 2 coordinates become padding. In a chart whose landmarks have errors
-    of their own beside a motion of the whole (`Basis.landmark` None), J is by these.
+    columns of P. The other L - 2 coordinates become padding. In a chart with identity
+    `Basis.landmark` (None), J is the derivative by e_l at a fixed pose error.
     """
     capacity, size = joint.landmarks.shape
     points = jax.vmap(sensor.position)(joint.landmarks)
@@ -93,7 +93,7 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
         cov = linalg.triangular_root(jnp.concatenate([turned(joint.cov), unit], axis=1))
     else:
         cov = linalg.symmetrize(turned(turned(joint.cov).T)) + unit
-    # The same to the bit for a run that another run of the batch makes come here.
+    # Exactly the same for a run that gets here only because of another run of the batch.
     cov = jnp.where(which.any(), cov, joint.cov)
     watch = joint.watch
     if watch:

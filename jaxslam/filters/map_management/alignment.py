@@ -25,7 +25,7 @@ class Alignment(NamedTuple):
     jacobian: Float[Array, "2*M 3"]
     """∂r/∂T"""
     factor: Float[Array, "2*M 2*M"]
-    """Cholesky factor of Σ; the identity for what is no pair"""
+    """Cholesky factor of Σ; the identity where there is no pair"""
 
 
 class _Residuals(NamedTuple):
@@ -43,10 +43,10 @@ def align(points: PointSets, slot: Int[Array, "M"]) -> Alignment:
     """The pose that aligns cluster points with their map points, -1 for none.
 
     The closed form without weights (as `se2.align`), and from there one step of generalized least
-    squares. More steps would each be linearized where the last has left the map behind, and wander
-    along what it knows worst. For the same reason ∂r/∂θ is taken where the map puts the points,
-    (m - t)⊥ and not (R z)⊥, which differ by the residual: then a turn of the whole map turns the
-    pose with it, and no residual tells about it.
+    squares. Further steps would change the linearization point but not the map, and drift along the
+    most uncertain directions. For the same reason ∂r/∂θ is evaluated at the map points, (m - t)⊥
+    and not (R z)⊥, which differ by the residual: then a rotation of the whole map rotates the pose
+    with it, and the residuals do not depend on it.
     """
     there, target = slot >= 0, points.map[jnp.maximum(slot, 0)]
     weight = jnp.where(there, 1.0, 0.0).astype(target.dtype)

@@ -36,8 +36,8 @@ def closing(
     """The filter with a search for a closed loop after each scan (`close_loop`).
 
     `info.extra["closing"]` is the `Closing` of the step; a landmark merged into an older one counts
-    as removed (`info.extra["pruning"]`). The filter must keep times, and decide by itself what a
-    measurement is of: `pruning(ekf_slam(…, associate=association.certain(…)), life.recency())`.
+    as removed (`info.extra["pruning"]`). The filter must keep times and associate without tags, as
+    `pruning(ekf_slam(…, associate=association.certain(…)), life.recency())`.
 
     Args:
         filter: the filter.

@@ -1,7 +1,7 @@
 """Geometric matching of a cluster of points with points of a map, by pairwise distances.
 
-The cluster's own frame means nothing: a scan of a robot that does not know where it is, or a part
-of the map whose position has drifted. The full joint covariance of both is used.
+The cluster's frame is arbitrary: that of a scan of a lost robot, or of a part of the map whose
+position has drifted. The full joint covariance of both is used.
 """
 
 from typing import NamedTuple

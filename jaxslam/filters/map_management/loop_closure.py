@@ -38,7 +38,7 @@ class Closing(NamedTuple):
     exhausted: Bool[Array, ""]
     """more pairs agreed than were tried"""
     refused: Bool[Array, ""]
-    """enough is explained, but not clearly more than by another hypothesis, or it is unlikely"""
+    """enough landmarks match, but another hypothesis has nearly as many, or D² is too large"""
     duplicates: Int[Array, ""]
     """landmarks merged one by one, 0 or 1, by `closing(…, reach=…)`"""
 
@@ -48,23 +48,23 @@ class LoopSettings:
     """The settings of `close_loop`."""
 
     window: int = 50
-    """scans: a landmark is recent if one of the last so many measured it"""
+    """number of scans: a landmark is recent if one of the last `window` scans measured it"""
     cluster: int = 12
     """recent landmarks that are compared, those measured last"""
     sightings: int = 1
-    """by how many scans they must have been measured"""
+    """least number of scans that measured them"""
     least: int = 5
     """pairs that must agree, at least 3"""
     margin: int = 2
-    """by how many more than under any other hypothesis"""
+    """least number of matches more than under any other hypothesis"""
     probability: float = 0.99
     """of each chi-square test of the geometry"""
     drift: float = 0.9999
     """probability that the true pairs lie within the filter's covariance"""
     pairs: int = 8
-    """of recent landmarks whose distances are looked for; long ones"""
+    """number of pairs of recent landmarks whose distances are searched for; long ones"""
     candidates: int = 64
-    """agreeing pairs of old landmarks that are tried with each, the best"""
+    """number of best agreeing pairs of old landmarks that are tried with each"""
 
 
 def loop_settings(caller: str, options: Mapping[str, Any]) -> LoopSettings:
@@ -101,15 +101,15 @@ def close_loop(joint: Joint, chart: Chart, **options: Any) -> tuple[Joint, Closi
     A landmark is recent if it was measured within the last `window` scans, and it may be an old one
     only if it was initialized after that was last measured: landmarks observed over overlapping
     periods cannot be duplicates. The pair must agree with the joint covariance of both,
-    δ = l_i - l_k, δᵀ cov(δ)⁻¹ δ <= χ²(2, drift). Of these pairs `geometric_matching.match` finds the
-    largest set of consistent geometry, whatever the drift. They are merged (`merging.merge`) if there
-    are enough of them, clearly more than any other hypothesis has, and D² of all δ together is at
-    most χ²(2n, drift).
+    δ = l_i - l_k, δᵀ cov(δ)⁻¹ δ <= χ²(2, drift). Of these pairs `geometric_matching.match` finds
+    the largest set of consistent geometry, whatever the drift. They are merged (`merging.merge`)
+    if there are enough of them, clearly more than any other hypothesis has, and D² of all δ
+    together is at most χ²(2n, drift).
     The old slot keeps the landmark.
 
     The joint compatibility of Neira & Tardós 2001, on relative geometry first, so that a large
-    error of the heading bends nothing; the map is joined as by Castellanos, Neira, Tardós, "Limits
-    to the consistency of EKF-based SLAM", IAV 2004, one cluster at a time.
+    heading error does not matter; clusters are joined as in Castellanos, Neira, Tardós, "Limits
+    to the consistency of EKF-based SLAM", IAV 2004, one at a time.
 
     Args:
         joint: whose `life` is that of `life.recency()`.

@@ -39,12 +39,11 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
     Args:
         filter: whose state is a `slots.Joint`.
         reach: [m] no two true landmarks are as near to one another. The test alone cannot separate
-            two landmarks from one where their difference is known worse than that.
-        probability: of merging two that are one, by the test.
+            two landmarks from one where their difference is less certain than that.
+        probability: of the test, that two estimates of one landmark are merged.
     Raises:
-        ValueError: on no filter, a reach not above 0, a probability outside 0 to 1, landmarks that
-            may be one although their parameters differ (an inverse depth); from `init`, on another
-            state.
+        ValueError: on no filter, a reach not above 0, a probability outside 0 to 1, landmarks whose
+            parameters are not unique (an inverse depth); from `init`, on another state.
     """
     validation.check_record("merging", "filter", filter, Filter)
     if not reach > 0:
@@ -111,10 +110,9 @@ def closest_pair(
 ) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
     """Slots i < j of the pair most likely to be duplicates, and their squared distance.
 
-    d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), in which the correlation of the two counts:
-    of landmarks that are each known badly, but well against one another, d² is large. i = j = 0 and
-    d² infinite where no pair is within reach [m] of another and allowed (N, N). square_root: as in
-    `merge`.
+    d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), including the correlation of the two: for
+    landmarks with large covariances but a certain difference d² is large. i = j = 0 and d² infinite
+    where no pair is within reach [m] of another and allowed (N, N). square_root: as in `merge`.
 
     Raises ValueError on a reach not above 0, or allowed of another shape.
     """
@@ -183,7 +181,7 @@ def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool =
     if square_root:
         cov = linalg.root_psd(cov)
     together = joint.co_observed
-    if together is not None:  # of the landmark kept: what was measured together with either
+    if together is not None:  # the landmark kept takes over the co-observations of both
         with_one = together[i] | (ok & (together[i] | together[j]))
         together = together.at[i].set(with_one).at[:, i].set(with_one)
     merged = joint._replace(

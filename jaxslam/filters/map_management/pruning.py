@@ -18,15 +18,15 @@ def pruning(filter: Filter, life: Life) -> Filter:
 
     The rule's memory is `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots.
 
-    A rule that makes room in a full map acts between association and new landmarks, so the filter
-    has to know it: `pruning(ekf_slam(…, make_room=life), life)`.
+    A rule that makes room in a full map acts between association and new landmarks, so it must also
+    be an argument of the filter: `pruning(ekf_slam(…, make_room=life), life)`.
 
     Args:
         filter: whose state is a `slots.Joint`.
         life: as of `jaxslam.life`.
     Raises:
-        ValueError: on a filter or life that is none; from `init`, on another state; from `update`,
-            on a life that makes room, of which the filter does not know.
+        ValueError: on a filter or life of another type; from `init`, on another state; from
+            `update`, on a life that makes room, if the filter does not have it.
     """
     validation.check_record("pruning", "filter", filter, Filter)
     validation.check_record("pruning", "life", life, Life)

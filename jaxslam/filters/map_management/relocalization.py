@@ -77,8 +77,8 @@ def relocalize(
 
     `geometric_matching.match` has the search. Another hypothesis is one that shares fewer than two
     of the best one's pairs, for two pairs fix a pose; the scan is ambiguous where such a one
-    explains almost as much, as in a symmetric map. Errors of the map that are common to all of it
-    (where its origin is) do not count: its cross-covariances see to that.
+    explains almost as much, as in a symmetric map. Errors common to the whole map (of its origin)
+    do not matter, because the cross-covariances are used.
 
     Args:
         points: (N, 2) the map [m].
@@ -90,7 +90,7 @@ def relocalize(
         probability: of each chi-square test.
         least: measurements that must be explained, at least 3.
         margin: least number of matches more than at any other pose.
-        pairs: of measurements whose distances are looked for; long ones.
+        pairs: number of pairs of measurements whose distances are searched for; long ones.
         candidates: agreeing pairs of landmarks that are tried with each, the best; where there are
             more, `exhausted` is set.
     Raises:
@@ -188,7 +188,7 @@ def relocated(
     With r = T z - m over the pairs, J = ∂r/∂T, Σ = cov(r) = R Z Rᵀ + P_mm, N = (Jᵀ Σ⁻¹ J)⁻¹ and
     A = Σ⁻¹ - Σ⁻¹ J N Jᵀ Σ⁻¹, T the generalized least squares: P_TT = N, P_TM = N Jᵀ Σ⁻¹ P_mM,
     M ← M + P_Mm A r and P_MM ← P_MM - P_Mm A P_mM. So it is the limit of an update from an infinite
-    covariance of the pose, linearized at the answer. The scan is used up: do not update with it.
+    covariance of the pose, linearized at the result. Do not use the scan in an update again.
     Nothing happens with fewer than two pairs, or where the pose is not determined.
 
     Args:

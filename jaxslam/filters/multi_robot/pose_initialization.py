@@ -1,6 +1,6 @@
 """Initialization of a robot's pose in the map from one scan.
 
-Its pose x_b is a function g(y, q) of what the map holds, y, and of what was measured, q, so its
+Its pose x_b is a function g(y, q) of variables y of the map and of measurements q, so its
 covariances are P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a
 landmark): correlated with the whole joint state. Every measurement is taken as a point in the frame
 of the robot that made it, whatever the sensor.
@@ -140,7 +140,7 @@ def _points_of(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[A
         point, _, cov = first_order.invert_at(sensor, origin, z, origin, z)
         return point, cov
 
-    # What is not there is put where every model is smooth.
+    # Absent measurements are replaced by a value at which every model is smooth.
     points: tuple[Array, Array] = jax.vmap(one)(jnp.where(scan.valid[:, None], z, 1.0))
     return points
 
@@ -154,9 +154,9 @@ def by_mutual_sight(
 ) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
     """The pose of a robot b that robot a measures and that measures a: mean, rows, covariance.
 
-    With v where a sees b and w where b sees a, |v| and |w| are one distance measured twice, r their
-    average, weighted by their variances. In the frame of a, b stands at r v/|v| and is turned by
-    atan2(-v) - atan2(w); then x_b = x_a ∘ that.
+    With v the position of b measured by a, and w that of a measured by b, r is the mean of |v| and
+    |w| weighted by their inverse variances. In the frame of a, b is at r v/|v| with heading
+    atan2(-v) - atan2(w); then x_b = x_a ∘ that pose.
 
     Args:
         other, rows, cov: x_a, its covariance with all errors and its own.
@@ -187,8 +187,8 @@ def by_two_landmarks(
 ) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
     """The pose of a robot that measures two landmarks of the map: mean, rows, covariance.
 
-    The rigid motion that carries what is seen, q, onto the landmarks l best (`se2.align`): headings
-    of l_2 - l_1 and q_2 - q_1 agree, and so do the midpoints.
+    The rigid motion that aligns the measured points q with the landmarks l (`se2.align`): the
+    directions of l_2 - l_1 and q_2 - q_1 agree, and so do the midpoints.
 
     Args:
         points, rows, cov: l, its covariance with all errors and its own.

@@ -25,9 +25,9 @@ class TeamSettings:
     tags: tuple[int, ...]
     """(R,) that mean robots"""
     ekf: EkfSettings
-    """what the prediction and the correction of each robot are set to"""
+    """settings of the prediction and the correction of each robot"""
     turns: tuple[list[Turn], ...]
-    """of each robot, the turn of each of its sensors in a scan"""
+    """turns of the sensors of each robot in a scan"""
 
     @property
     def started(self) -> list[int]:

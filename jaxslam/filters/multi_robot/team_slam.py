@@ -64,8 +64,8 @@ def team_slam(
     The control of a step is (u_0, …, u_{R-1}); the measurement slots of a scan are those of robot
     0's sensors in order, then robot 1's, and so on. All robots move; then each in turn (those
     without start last) corrects the map sensor by sensor, and initializes its new landmarks. Info
-    of a robot that was measured has that robot's slot. Whom a measurement is of, its tag says; in
-    slots of a `Part` that sees "robots" no landmark is initialized (`Status.DEFERRED`).
+    of a robot that was measured has that robot's slot. The tag of a measurement identifies the
+    robot; in slots of a `Part` that sees "robots" no landmark is initialized (`Status.DEFERRED`).
 
     A robot without start has no pose in the map, and its control and measurements change nothing
     (those of it and by it are `Status.UNMATCHED`), until in some step, after the corrections of
@@ -73,7 +73,7 @@ def team_slam(
     (`by_mutual_sight` of `pose_initialization`), or it measures two landmarks of the map
     (`by_two_landmarks`, of the two farthest apart). Of several poses it takes the one whose heading
     has the least variance. The two measurements used are `Status.BORN` with its slot, and the rest
-    of its scan corrects. That takes tags, and sensors whose measurement determines a point.
+    of its scan corrects. This requires tags, and sensors whose measurement determines a point.
 
     Args:
         robots: `team.Robot`s; robot 0 starts where the run does, the others relative to it.
@@ -82,7 +82,7 @@ def team_slam(
         report: which robot `estimate` is of; `team.poses` has all.
         chart: `charts.euclidean()` or None; no other.
         associate, update, gate, iterations, covariance, births: as for `ekf_slam`, but for the
-            covariance "square_root"; births are a sensor.
+            covariance "square_root"; births is a limit for each sensor.
     Raises:
         ValueError: without robots, on tags that clash, another chart, no such robot to report,
             landmarks that are not (x, y), a robot without start whose sensors cannot tell where

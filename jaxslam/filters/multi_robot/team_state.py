@@ -79,7 +79,7 @@ def _exchanged(joint: Joint, robot: int, settings: TeamSettings) -> Joint:
     """The joint with robot 0 and another exchanged; its own inverse except for `alive`."""
     slot, first, other = settings.slot_of(robot), slice(0, 3), rows_of(robot, settings)
     cov = joint.cov
-    # Whole rows and columns are copied; a gather by index takes every entry singly.
+    # Whole rows and columns are copied; a gather by index would copy single entries.
     cov = cov.at[first].set(cov[other]).at[other].set(cov[first])
     cov = cov.at[:, first].set(cov[:, other]).at[:, other].set(cov[:, first])
     return joint._replace(

@@ -13,7 +13,7 @@ class GatedDistance(NamedTuple):
     inside: Bool[Array, "..."]
     """within the gate; without one, d² is finite"""
     counted: Float[Array, "..."]
-    """d² as the weight counts it: that of the gate where it lies beyond"""
+    """d² in the weight, clipped at the gate"""
     reported: Float[Array, "..."]
     """d², a large number where it is not finite"""
 

@@ -1,6 +1,6 @@
 """The landmark EKFs of one particle, given its drawn pose.
 
-Everything here acts on one particle; `fastslam` vmaps it, `mapping` has but one.
+All functions act on one particle; `fastslam` vmaps them, `mapping` has only one.
 """
 
 from typing import NamedTuple
@@ -119,7 +119,7 @@ class AllocatedSlots(NamedTuple):
     """a free landmark slot, where granted"""
     granted: Bool[Array, "M"]
     deferred: Bool[Array, "M"]
-    """beyond the quota of a scan"""
+    """beyond `births`, the limit of a scan"""
     repeated: Bool[Array, "M"]
     """of a tag that occurs earlier in the scan"""
 

@@ -1,7 +1,7 @@
 """The likelihood of a scan given a pose in a known map.
 
-Everything here acts on one pose; `particle_localization` vmaps it. The pose has no error of its own
-and the map none at all, so the covariance of an innovation is the sensor's noise.
+All functions act on one pose; `particle_localization` vmaps them. Pose and map have no error here,
+so the covariance of an innovation is the sensor's noise.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class ScanLikelihood(NamedTuple):
     """The likelihood of a scan at one pose, for each measurement."""
 
     measured: Bool[Array, "*P M"]
-    """a measurement that counts"""
+    """a measurement that enters the likelihood"""
     slot: Int[Array, "*P M"]
     """of the landmark measured; -1 of an absolute sensor"""
     matched: Bool[Array, "*P M"]
@@ -41,8 +41,8 @@ class ScanLikelihood(NamedTuple):
     dof: Int[Array, "*P M"]
     """Z of the sensor"""
     counted: Float[Array, "*P M"]
-    """d² as the weight has it: the gate's where it is beyond, `unmatched_distance` where of no
-    landmark, 0 where there is no measurement"""
+    """d² in the weight: clipped at the gate, `unmatched_distance` without a landmark, 0 where
+    there is no measurement"""
     log_density: Float[Array, "*P M"]
     """-(counted + log |2πR|)/2 of measurements matched to a landmark, else 0"""
     exhausted: Bool[Array, "*P"]
@@ -76,9 +76,9 @@ def sensor_likelihood(
 ) -> ScanLikelihood:
     """The likelihood of one sensor's measurements.
 
-    One outside the gate counts as one on the gate, and one that is of no landmark as one at d² =
-    `unmatched_distance`: a particle gains nothing by explaining less. So with a gate no weight
-    underflows for a single outlier.
+    A measurement outside the gate gets the d² of the gate, and one without a landmark
+    `unmatched_distance`, so that a particle with fewer associations is not preferred. With a gate
+    no weight underflows because of a single outlier.
     """
     sensor = settings.sensor
     size_z, size_l = len(sensor.measurements), len(sensor.landmark)

@@ -31,17 +31,17 @@ def weighted_pose_moments(
 
         cov = (1 + Σw²)/(1 - Σw²) Σ w_p d_p d_pᵀ
 
-    A sample is all that is known: 1 - Σw² because distances are from the sample's own mean, 1 + Σw²
-    because that mean is itself one of 1/Σw² draws; of independent draws cov is the expected square
+    1 - Σw² accounts for differences from the sample mean instead of the true one, and 1 + Σw² for
+    the variance of the sample mean of 1/Σw² draws; for independent draws cov is the expected square
     of (truth - mean). Two errors remain. Its inverse is biased: the NEES of n consistent
     independent draws has mean 3 (n - 1)/(n - 5), 5.4 of 10 particles and 3.1 of 100. And copies
-    made by resampling are not independent: when all descend from few, the spread is theirs, and too
-    small (Bailey, Nieto & Nebot 2006). Of one particle cov is zero, which says that nothing is
-    known of the error, not that there is none.
+    made by resampling are not independent: with few distinct ancestors the spread is too small
+    (Bailey, Nieto & Nebot 2006). For one particle cov is zero, which means that the error is
+    unknown, not that it is zero.
     """
     w = jnp.exp(log_weight)
     xy = (w[:, None] * pose[:, :2]).sum(axis=0)
-    # Headings that cancel have no mean; there the one of the most likely particle.
+    # Headings that cancel have no mean; then the heading of the most likely particle is used.
     sine, cosine = (w * jnp.sin(pose[:, 2])).sum(), (w * jnp.cos(pose[:, 2])).sum()
     cancel = sine**2 + cosine**2 < jnp.finfo(w.dtype).eps ** 2
     own = pose[best, 2]
@@ -72,8 +72,8 @@ def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
 
     The map has the slots of the most likely particle. The point of a slot is the mean over the
     particles that hold the same tag there, by weight, and its covariance the mixture's, Σ w C + Σ w
-    d dᵀ. Where tags are unknown, nothing says that two particles hold the same landmark, and the
-    point is the most likely particle's own, its covariance given that particle's path.
+    d dᵀ. Where tags are unknown, landmarks of different particles cannot be matched, and the point
+    is the most likely particle's own, with its covariance given that particle's path.
     """
     pose, pose_cov = slam_pose_moments(state)
     best = state.best
@@ -81,7 +81,7 @@ def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
     named = (state.tag == state.tag[best][None]) & (state.tag[best] >= 0)[None]
     own = (jnp.arange(state.pose.shape[0]) == best)[:, None]
     same = state.alive & state.alive[best][None] & (named | own)
-    # A most likely particle without weight would leave nothing to divide by.
+    # A most likely particle of weight zero would cause a division by zero.
     w = jnp.where(same, jnp.exp(state.log_weight)[:, None], 0.0)
     w = jnp.where((w.sum(axis=0) > 0)[None], w, own.astype(w.dtype))
     w = w / w.sum(axis=0)[None]
@@ -95,7 +95,7 @@ def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
     points, covs = jax.vmap(jax.vmap(point))(state.landmarks, state.covs)
     alive = state.alive[best]
 
-    # Coordinate by coordinate: XLA goes through (P, N) much faster than through (P, N, 2, 2).
+    # Coordinate by coordinate: XLA processes (P, N) much faster than (P, N, 2, 2).
     def average(values: Float[Array, "P N"]) -> Float[Array, "N"]:
         return jnp.where(w > 0, w * values, 0.0).sum(axis=0)
 

@@ -73,7 +73,7 @@ def particle_localization(
     `resampling.kld`), at most `particles`, of which the others have weight zero. In
     `info.extra["particles"]`, a `ParticleInfo`, these are `active` and `capped`.
 
-    A robot that was carried away is found again by particles from the whole box (table 8.3). With
+    A kidnapped robot is found again by particles from the whole box (table 8.3). With
     c the average over the particles, by weight, of exp(-Σ d²/2m) over the m measurements of a scan,
 
         slow ← slow + α_slow (c - slow)     fast ← fast + α_fast (c - fast)
@@ -84,19 +84,18 @@ def particle_localization(
     without a measurement change nothing. slack above 1 injects less (Gutmann & Fox 2002).
 
     The estimate is that of the weighted particles after a scan, before anything is drawn anew:
-    `moments.weighted_pose_moments`, which is one point and one ellipse also where the particles are
-    in several places. Where all weights underflow, all in use become equal (`underflow`). A motion
+    `moments.weighted_pose_moments`, a single mean and covariance even if the particles form several
+    modes. Where all weights underflow, all in use become equal (`underflow`). A motion
     that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
     The measurements in an `Info` are those of the most likely particle, and nis is the mean over
     the particles by weight, as of `fastslam`; log_likelihood is log Σ w p(scan | x) of measurements
     matched to a landmark.
 
-    Shapes are fixed, so that a step costs what its capacity does, however few particles are in use.
+    Shapes are fixed, so the cost of a step depends on the capacity, not on the particles in use.
 
-    Particles stand for a density that the scan makes sharper than they are dense: with a precise
-    sensor none may lie within its noise, and all may agree on a wrong place. Then take more
-    particles, or give the sensor more noise than it has, as is customary; the estimate then claims
-    less than it could.
+    With a precise sensor no particle may lie within its noise (particle deprivation), and all may
+    converge to a wrong position. Then take more particles, or inflate the sensor noise, as is
+    customary; the estimate is then conservative.
 
     Args:
         motion, sensor: any; with a `sensors.suite`, absolute sensors enter the weights too.
@@ -114,7 +113,7 @@ def particle_localization(
         resample: one of `jaxslam.resampling`; also `soft` or `stop_gradient` of one.
         threshold: of ESS, as a share; 1 resamples (and chooses the number) in every step with
             unequal weights, 0 only to inject. Where odometry is precise beside the scans, copies
-            stay together, and a lower one is more honest.
+            stay together, and a lower threshold gives a more consistent covariance.
         bins: sizes in x [m], y [m], θ [rad].
         error, confidence: of the bound: with this probability the Kullback-Leibler divergence is
             below the error.
@@ -126,7 +125,7 @@ def particle_localization(
         ValueError: on counts below 1 or least above particles, a map or tags as `localization`
             refuses them, a box that is not finite or has no inside, start "uniform" without a box,
             a threshold outside [0, 1], a gate, bins, error or slack not above 0, a confidence not
-            within (0, 1), or rates that do not fit.
+            within (0, 1), or invalid rates.
     """
     validation.check_models("particle_localization", motion, sensor)
     points, names = checked_map("particle_localization", sensor, landmarks, tags)
@@ -156,7 +155,7 @@ def particle_localization(
         state, scan = draw_start(state, key, settings), zero_padding(scan)
         likelihood = jax.vmap(partial(scan_likelihood, scan=scan, sensors=sensors))(state.pose)
         log_likelihood = normalized(state.log_weight + likelihood.log_density.sum(axis=1))[1]
-        # Beside d², a weight has log |2πR|, which is the same for all.
+        # Besides d², a weight has the term log |2πR|, which is the same for all.
         misfit = 0.5 * likelihood.counted.sum(axis=1)
         weight, some = weight_poses(state, misfit)
         ess = effective_size(weight)

@@ -21,7 +21,7 @@ class ParticleEvents(NamedTuple):
     injected: Int[Array, ""]
     """drawn from the box"""
     invalid: Int[Array, ""]
-    """left without a finite pose by the motion"""
+    """with a non-finite pose after the motion"""
     capped: Bool[Array, ""]
     """more particles were wanted than there may be"""
 
@@ -41,13 +41,13 @@ class PoseParticles(NamedTuple):
     start_cov: Float[Array, "3 3"]
     """of the start while it is not drawn yet, then zero"""
     fast: Float[Array, ""]
-    """short-term average of how well scans fit"""
+    """short-term average of the scans' likelihood, in units of its peak"""
     slow: Float[Array, ""]
     """long-term average of the same; both 0 before the first scan"""
     due: Bool[Array, ""]
     """to be resampled before the next motion"""
     injection: Float[Array, ""]
-    """the probability of a particle to be drawn from the whole box then"""
+    """the probability of each particle to be drawn from the whole box then"""
     events: ParticleEvents
 
 

@@ -60,7 +60,7 @@ class PoseProposal(NamedTuple):
     log_matched: Float[Array, "*P"]
     """log-likelihood of the measurements matched to a landmark"""
     log_unmatched: Float[Array, "*P"]
-    """what the others count with"""
+    """the terms of the other measurements"""
 
 
 class ParticleInnovations(NamedTuple):
@@ -85,18 +85,18 @@ def propose_pose(
 ) -> tuple[PoseProposal, ParticleInnovations]:
     """The Gaussian of the pose given the scan, and the scan's likelihood marginal over the pose.
 
-    Measurement by measurement, each linearized where those before left the pose (Montemerlo et al.
-    2003, FastSLAM 2.0): with H_x, H_l at the pose's mean and the landmark's, C the landmark's
+    Measurement by measurement, each linearized at the pose corrected by those before (Montemerlo
+    et al. 2003, FastSLAM 2.0): with H_x, H_l at the means of pose and landmark, C the landmark's
     covariance,
 
         S = H_x P H_xᵀ + H_l C H_lᵀ + R    x ← x + P H_xᵀ S⁻¹ ν    P ← P - P H_xᵀ S⁻¹ H_x P
         log w += log N(ν; 0, S)
 
     the product of which is the density of the scan given the path. P = 0 (a pose that is drawn
-    already) moves nothing, and leaves the weights of FastSLAM 1.0. P is not inverted, so it may be
-    singular. A measurement outside the gate counts as one on the gate, and one that is of no
-    landmark as one at d² = `unmatched_distance` of a landmark known exactly, log N = -(d² +
-    log |2πR|)/2: a particle gains nothing by explaining less.
+    already) is not changed, and gives the weights of FastSLAM 1.0. P is not inverted, so it may be
+    singular. A measurement outside the gate gets the d² of the gate, and one without a landmark
+    d² = `unmatched_distance` of a landmark known exactly, log N = -(d² + log |2πR|)/2, so that a
+    particle with fewer associations is not preferred.
     """
     sensor, gate = settings.sensor, settings.gate
     size_z = len(sensor.measurements)

@@ -12,10 +12,10 @@ from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Differentiable, Life, Motion, Resample, Sensor
 from jaxslam.sensors.suite import Suite
 
-# The probability that a measurement of a landmark lies within d², where no gate says more.
+# The probability that a measurement of a landmark lies within d², where there is no gate.
 _NEAR = 0.99
 
-# Particles that are kept at least, where the caller does not say.
+# The default least number of particles.
 _LEAST = 50
 
 
@@ -55,14 +55,14 @@ class KnownMapSensor(AssociationSettings):
     measured: int | None
     """measurement slots M of a scan that are its own; None for all"""
     ignored: bool
-    """it measures other robots, and is left alone"""
+    """it measures other robots, and is ignored"""
 
 
 @dataclass(frozen=True, eq=False)
 class MonteCarloSettings:
     """The settings of the particles of `particle_localization`: origin and number.
 
-    Raises ValueError on numbers that mean nothing.
+    Raises ValueError on invalid numbers.
     """
 
     motion: Motion

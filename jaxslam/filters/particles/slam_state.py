@@ -20,8 +20,8 @@ class SlamParticles(NamedTuple):
 
     pose: Float[Array, "*P 3"]
     pose_cov: Float[Array, "*P 3 3"]
-    """of the pose, of what was not drawn yet: of the start, or of a motion whose scan is still to
-    come; zero after an update"""
+    """covariance of the pose not drawn yet: of the start, or of a motion before its scan; zero
+    after an update"""
     log_weight: Float[Array, "*P"]
     """Σ exp = 1"""
     landmarks: Float[Array, "*P N L"]
@@ -34,10 +34,10 @@ class SlamParticles(NamedTuple):
     best: Int[Array, ""] | None
     """the most likely particle, by its weight before the last resampling; None of one particle"""
     lost: Int[Array, "*P"]
-    """new landmarks that found a particle's map full since the start, along its own ancestry"""
+    """new landmarks dropped from full maps since the start, along the particle's ancestry"""
     invalid: Bool[Array, "*P"]
-    """the last motion left a pose that was not finite; it was left out, and the particle has no
-    weight"""
+    """the last motion gave a pose that was not finite; it was discarded, and the particle has
+    weight zero"""
     life: Any = None
     """the memory (P, …) of the filter's `Life`, where it has one"""
 
