@@ -1,8 +1,8 @@
 """jaxslam: pure-functional, differentiable 2-D landmark SLAM.
 
-A SLAM method is a record of pure functions (`protocols`); one driver runs it over a log (`run`) and
-one harness over thousands of simulated worlds (`monte_carlo`). Importing the package configures
-nothing; for float64 set `jax_enable_x64` yourself, as the command line does.
+A SLAM method is a record of pure functions (`protocols`). `run` applies it to a log, and
+`monte_carlo` to thousands of simulated worlds. Importing the package does not change the
+configuration of JAX; for float64 set `jax_enable_x64` yourself, as the command line does.
 """
 
 import importlib
@@ -74,7 +74,7 @@ _ON_DEMAND = {
 
 
 def __getattr__(name: str) -> Any:
-    """What reads files or draws is imported when it is first asked for."""
+    """A lazily imported module: modules that read files or plot load on first access."""
     if name in _ON_DEMAND:
         return importlib.import_module(_ON_DEMAND[name])
     raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")

@@ -20,7 +20,7 @@ class Calibration(NamedTuple):
 
     parameters: Float[np.ndarray, "P"]
     cov: Float[np.ndarray, "P P"]
-    """(JᵀJ)⁻¹, as honest as the filter's noise"""
+    """(JᵀJ)⁻¹; valid only if the filter's noise covariances are"""
     path: Float[np.ndarray, "iterations+1 P"]
     """parameters from the start on"""
     misfit: Float[np.ndarray, "iterations"]
@@ -38,23 +38,23 @@ def calibrate(
     iterations: int = 10,
     tolerance: float = 0.01,
 ) -> Calibration:
-    """The parameters at which the innovations of a run hold no more information on them.
+    """Model parameters estimated from the whitened innovations of a run, with their covariance.
 
     Gauss-Newton on Σ ‖w(p)‖², w = L⁻¹ ν with S = L Lᵀ, over all fused measurements:
 
         p ← p - (Jᵀ J)⁻¹ Jᵀ w,    J = ∂w/∂p, S held fixed
 
-    J comes from one run in forward mode. The innovations of a filter with right models are white,
+    J comes from one run in forward mode. The innovations of a filter with correct models are white,
     and ∂ν/∂p depends on the past alone, so that E[Jᵀ w] = 0 at the true p. This is the prediction
     error method (Ljung, "System Identification", 1999, section 7.2); where all is linear with
-    Gaussian noise and S does not depend on p it is the maximum of the likelihood.
+    Gaussian noise and S does not depend on p it is the maximum-likelihood estimate.
 
-    Associations are made anew at each p and not differentiated. They need not be given: a filter
+    Associations are recomputed at each p and not differentiated. They need not be given: a filter
     with `association.nearest` and `life.recency(patience=…)` keeps a local map, in which landmarks
     seen close in time are associated whatever the drift, and no loop is closed.
 
     Each measurement of a scan is whitened by its own S; the correlation between those of one joint
-    update is left out, which costs a little precision.
+    update is ignored, which costs a little precision.
 
     Args:
         info: p (P,) -> the `Info` of a run, `lambda p: jaxslam.run(…).info`, where p may enter the
@@ -79,13 +79,13 @@ def calibrate(
     def whitened(
         p: Float[Array, "P"],
     ) -> tuple[Float[Array, "K"], tuple[Float[Array, "K"], Int[Array, ""]]]:
-        """w, twice, since one is differentiated; and its degrees of freedom."""
+        """The whitened innovations, twice (one for `jacfwd`), and their degrees of freedom."""
         found = info(p)
         fused = found.status == Status.FUSED
         count, size = fused.size, found.innovation.shape[-1]
         there = fused.reshape(count)
         cov = jax.lax.stop_gradient(found.innovation_cov).reshape(count, size, size)
-        # Both before the factor and after: nothing of an empty place reaches a derivative.
+        # Masked before and after the factor: an empty slot then has no effect on derivatives.
         cov = jnp.where(there[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
         factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
         residual = jnp.where(there[:, None], found.innovation.reshape(count, size), 0.0)

@@ -1,5 +1,5 @@
-"""Every filter by name, set up for a scenario: the variants of EKF-SLAM, and what they are compared
-with.
+"""All filters by name, configured for a scenario: the variants of EKF-SLAM, and filters to compare
+them with.
 
 A variant is a chart, a linearizer or an option, given in one line; `monte_carlo` and the command
 line run them side by side.
@@ -52,7 +52,7 @@ def without_measurements(scenario: Scenario, **options: Any) -> Filter:
 
 
 def in_a_known_map(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
-    """Localization in the true map; of the options of `ekf_slam`, those that concern it."""
+    """Localization in the true map, with those options of `ekf_slam` that it has."""
     asked = scenario.filter_options | options
     mine = {name: asked[name] for name in ("update", "gate", "iterations") if name in asked}
     return lambda truth: localization(scenario.motion, scenario.sensor, truth.landmarks, **mine)
@@ -61,7 +61,7 @@ def in_a_known_map(scenario: Scenario, **options: Any) -> Callable[[Truth], Filt
 def by_particles(
     scenario: Scenario, proposal: Literal["motion", "measurement"], **options: Any
 ) -> Filter:
-    """FastSLAM of 50 particles; of the options of `ekf_slam`, those that it has too."""
+    """FastSLAM of 50 particles, with those options of `ekf_slam` that it has."""
     asked = scenario.filter_options | options
     mine = {name: asked[name] for name in ("gate", "associate", "births") if name in asked}
     capacity = int(np.shape(scenario.landmarks)[0])
@@ -87,7 +87,7 @@ def by_particles_in_a_known_map(scenario: Scenario, **options: Any) -> Callable[
 
 
 SLAM_PARTICLES = 50
-"""of FastSLAM in the catalog: few, so that a campaign of all filters does not wait for it."""
+"""number of particles of FastSLAM in the catalog; small, for campaigns of all filters."""
 
 LOCALIZATION_PARTICLES = 300
 """of Monte-Carlo localization in the catalog, at every step"""
@@ -96,11 +96,11 @@ LOCALIZATION_PARTICLES = 300
 def in_canonical_form(
     scenario: Scenario, make: Callable[..., Filter], sparse: bool = True, **options: Any
 ) -> Filter:
-    """An information filter in a scenario; of the options of `ekf_slam` it has the gate.
+    """An information filter in a scenario; of the options of `ekf_slam` it takes the gate.
 
     A sparse one has half the map active, 8 landmarks at least and 20 at most, and all links. It
     reports covariances from its whole Ω, not from Markov-blanket marginals, so that a campaign
-    judges the sparsification alone. With all of the map active it would be `eif_slam` by
+    evaluates the sparsification alone. With all of the map active it would be `eif_slam` by
     definition. All landmarks that a scan measures must be active at once; so a scan of more
     measurement slots than half of what is active (in `cloister` all 36 columns are measured in
     every step) is divided (`in_pieces`).
@@ -121,7 +121,7 @@ LEAST_AREA, LARGEST_AREA = 8, 20
 
 
 def in_pieces(filter: Filter, places: int) -> Filter:
-    """The filter, which takes a scan of more measurement slots in pieces of `places`, in turn.
+    """The filter applied in turn to pieces of a scan, each of `places` measurement slots.
 
     Slot i is in piece i mod their number. Numbers that an `Info` has for a whole scan are summed
     over the pieces, and flags are true where one of a piece is.
@@ -144,7 +144,7 @@ def in_pieces(filter: Filter, places: int) -> Filter:
         state, infos = jax.lax.scan(one, state, each)
 
         def whole(leaf: jax.Array) -> jax.Array:
-            if leaf.ndim == 1:  # of a scan, not of its places
+            if leaf.ndim == 1:  # of a scan, not of its measurement slots
                 return leaf.any() if leaf.dtype == bool else leaf.sum()
             return leaf.swapaxes(0, 1).reshape(places * pieces, *leaf.shape[2:])[:m]
 

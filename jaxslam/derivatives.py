@@ -1,7 +1,7 @@
 """The Jacobians filters use: forward-mode automatic differentiation of the models.
 
-The hand-derived Jacobians that models carry are for verification; a filter never reads them, so
-that a user's own model needs none.
+The hand-derived Jacobians of models are for verification; filters do not use them, so a
+user's own model needs none.
 """
 
 import jax

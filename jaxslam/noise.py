@@ -1,4 +1,4 @@
-"""Noise covariances as factories take them: an array, or a function of what they depend on."""
+"""Noise covariances of factories, given as arrays or as functions."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ def noise_model(name: str, noise_cov: NoiseCov, size: int) -> Callable[..., jax.
     """A function (…) -> (size, size) in the dtype of its first argument.
 
     An array is checked once (shape, finite, symmetric, positive semi-definite; ValueError) and held
-    constant; a function is taken as it is and its result is checked for shape when traced.
+    constant; the shape of a function's result is checked when it is traced.
     """
     if callable(noise_cov):
 

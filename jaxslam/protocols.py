@@ -1,11 +1,11 @@
-"""The records of pure functions a SLAM method is made of, and nothing else.
+"""The records of pure functions that make up a SLAM method.
 
 Every field that is a function is pure and traceable and acts on *one* pose, landmark or scan; the
 caller vmaps. Records are made by factories that close over their parameters, so calling the factory
 inside a differentiated function lets `jax.grad` reach those parameters.
 
 Shapes: pose (3,); u (U,) control; w (W,) process noise; z (Z,) measurement; l (L,) landmark
-parameters; s (K,) what a measurement leaves free (K = 0 for a full one).
+parameters; s (K,) landmark parameters that z does not determine (K = 0 if none).
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def _check_fields(
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How the robot moves. w = 0 is the nominal motion: one function for simulator and filters.
+    """A motion model, one function for simulator and filters; w = 0 is the nominal motion.
 
     This and the other records raise ValueError on a function that is none, or names that are no
     tuple of strings.
@@ -66,7 +66,7 @@ class Motion:
     """(pose, u) -> (W, W)."""
     perturb: Callable[[Array, Array], Array] | None = None
     """(u, w) -> u with step(pose, u, w) = step(pose, perturb(u, w), 0), where noise is of that
-    kind; a world that disturbs the odometry instead of the robot needs it."""
+    kind; needed by worlds that add noise to the odometry instead of the robot's motion."""
     jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
     """(pose, u, w) -> by pose (3, 3), by u (3, U), by w (3, W); hand-derived, to verify against."""
 
@@ -75,7 +75,7 @@ class Motion:
 
 
 class Free(NamedTuple):
-    """The Gaussian prior of what a measurement cannot see (Solà 39)."""
+    """The Gaussian prior of the unmeasured landmark parameters (Solà 39)."""
 
     mean: Float[Array, "K"]
     cov: Float[Array, "K K"]
@@ -86,7 +86,7 @@ NOTHING_FREE = Free(np.zeros(0), np.zeros((0, 0)))  # type: ignore[arg-type]
 
 
 class Reduced(NamedTuple):
-    """When a landmark's L parameters may become the point (x, y) where it stands, for good."""
+    """A permanent reduction of a landmark's L parameters to its position (x, y)."""
 
     sensor: Any
     """a Sensor with the same z, whose landmarks are points"""
@@ -96,10 +96,10 @@ class Reduced(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What the robot sees of one landmark; with L = 0, an absolute sensor, of itself in the map.
+    """A measurement model of one landmark, or with L = 0 of the robot itself (an absolute sensor).
 
     An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
-    embed return (0,), position zeros that nothing reads, and K = 0. Each of its measurements
+    embed return (0,), position unused zeros, and K = 0. Each of its measurements
     corrects the robot, whatever the tag.
     """
 
@@ -117,9 +117,9 @@ class Sensor:
     landmark: tuple[str, ...] = ("x [m]", "y [m]")
     """What l holds, with units; its length is L, 0 for an absolute sensor. Default a point."""
     position: Callable[[Array], Array] = lambda landmark: landmark
-    """(l) -> (2,) where the landmark stands. Default that of a point."""
+    """(l) -> (2,) position of the landmark. Default that of a point."""
     embed: Callable[[Array, Array], Array] = lambda pose, point: point
-    """(pose, point (2,)) -> l of a landmark that stands there, seen first from pose. Default that
+    """(pose, point (2,)) -> l of a landmark at that point, measured first from pose. Default that
     of a point."""
     free: Free = NOTHING_FREE
     """the prior of s. Default that of a full measurement."""
@@ -154,7 +154,7 @@ class Basis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Which error the covariance is the covariance of, on a (pose, one landmark) pair.
+    """Error coordinates of the covariance, on a pair of the pose and one landmark.
 
     The pose's retraction must not depend on a landmark, nor one landmark's on another.
     """
@@ -167,9 +167,9 @@ class Chart:
     basis: Callable[[Array, Array], Basis] | None = None
     """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
     motion_apart: bool = False
-    """whether a correction splits off what it says of the last motion, and moves the robot by that
-    in a world that stands still: the way of a map that is composed with the motion afterwards. Its
-    moves must add up: retract by one error and then by another is retract by their sum."""
+    """whether the last motion is a separate variable during corrections, with which the map is
+    composed afterwards. Retractions must be additive: by one error and then by another is by
+    their sum."""
     landmark_size: int | None = None
     """numbers L of the landmarks it acts on; None where any."""
 
@@ -178,7 +178,7 @@ class Chart:
 
 
 class Here(NamedTuple):
-    """Where a model is to be replaced: what a linearizer may look at."""
+    """The state at which a model is linearized, the input of a linearizer."""
 
     joint: Joint
     """the filter's state, `joint.lin` being the linearizer's own memory"""
@@ -195,10 +195,10 @@ class Here(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Linearizer:
-    """What affine function with added noise stands for a model, near a Gaussian.
+    """An affine approximation, with added noise, of the models near a Gaussian.
 
-    First-order linearizers evaluate Jacobians somewhere; statistical ones fit to the covariance.
-    Each may keep a memory of its own inside the filter's state. Derivatives are by the
+    First-order linearizers evaluate Jacobians at a point; statistical ones fit over the covariance.
+    Each may keep a memory inside the filter's state. Derivatives are by the
     *coordinates* of pose and landmark, whatever the chart.
     """
 
@@ -209,8 +209,8 @@ class Linearizer:
     """(motion, u, here) -> the new pose, its derivative by the old one (3, 3), the covariance that
     the noise adds to it (3, 3), memory."""
     observe: Callable[[Sensor, Here], tuple[Array, Array, Array, Array]]
-    """(sensor, here) -> the expected z, its derivatives by pose (Z, 3) and by l (Z, L), and what to
-    add to the covariance of the measurement's noise (Z, Z)."""
+    """(sensor, here) -> the predicted z, its derivatives by pose (Z, 3) and by l (Z, L), and a
+    covariance (Z, Z) to add to that of the measurement noise."""
     invert: Callable[[Sensor, Array, Array, Here], tuple[Array, Array, Array]]
     """(sensor, z, tag (), here) -> the new l, its derivative by the pose (L, 3), its covariance for
     a known pose (L, L)."""
@@ -221,15 +221,14 @@ class Linearizer:
     iterates: bool = True
     """whether a correction may linearize again at its result; a fit to a covariance may not."""
     own_landmarks: bool = False
-    """whether it linearizes at landmarks other than the estimates, and so is for maps with errors
-    alone."""
+    """whether it linearizes at landmarks other than the estimates; not for known maps then."""
 
     def __post_init__(self) -> None:
         _check_fields(self, ("init", "motion", "observe", "invert", "born"))
 
 
 class Pairs(NamedTuple):
-    """How each of M measurements compares with each of N slots, every pair for itself."""
+    """The innovations of all pairs of M measurements and N slots."""
 
     innovation: Float[Array, "M N Z"]
     """ν_ij = z_i ⊖ ẑ_j."""
@@ -245,7 +244,7 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What association may look at: the map before the scan's corrections.
+    """The input of association: predicted measurements of the map before the scan's corrections.
 
     The functions compute what they return when they are called, within the trace.
     """
@@ -256,17 +255,16 @@ class Prediction:
     pairs: Callable[[Scan], Pairs]
     """(scan) -> every measurement against every slot."""
     cross: Callable[[], Array]
-    """() -> (N, Z, N, Z): H_i P H_jᵀ, what the errors of two expected measurements share."""
+    """() -> (N, Z, N, Z): H_i P H_jᵀ, the cross-covariances of predicted measurements."""
 
 
 class Association(NamedTuple):
-    """Which landmark each measurement of a scan is of."""
+    """The landmark slot of each measurement of a scan."""
 
     slot: Int[Array, "M"]
     """-1 where none; no slot twice."""
     is_new: Bool[Array, "M"]
-    """start a landmark. A valid measurement that is neither is left alone, and
-    counted."""
+    """starts a landmark. A valid measurement that is neither is ignored, and counted."""
     exhausted: Array | bool = False
     """() bool: a search ended at its budget, with the best it had found."""
 
@@ -281,28 +279,28 @@ on; the expected number of copies of j is P w_j. Not differentiated."""
 
 Differentiable = Callable[[Array, Array], tuple[Array, Array]]
 """As `Resample`, with the log-weight (P,) of each as well, Σ exp = 1, through which gradients reach
-the weights before. Its sum must be left alone: its gradient may be part of the method."""
+the weights before. Do not normalize it again: the gradient of its sum may be part of the method."""
 
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """Which landmarks stay in the map: the rule that `pruning` asks after every scan."""
+    """A rule that decides after each scan which landmarks stay in the map; see `pruning`."""
 
     name: str
     init: Callable[[Array, Array], Any]
     """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
     after: Callable[[Joint, Info, Callable[[], Estimate]], tuple[Any, Array]]
-    """(joint, info, estimate) -> memory, slots to remove (N,) bool; after a scan, with what became
-    of it. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
+    """(joint, info, estimate) -> memory, slots to remove (N,) bool; called after a scan, with its
+    info. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
     make_room: Callable[[Joint, Array, Array], Array] | None = None
     """(joint, needed () int, measured (N,) bool) -> slots (N,) bool to remove before new landmarks
-    enter a map that lacks so many places, none of those this scan measured; None where a full map
-    refuses."""
+    enter a map that lacks so many slots, none of those this scan measured; None if nothing is
+    removed from a full map."""
 
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """A recursive estimator: what `run` drives and the harness judges."""
+    """A recursive estimator, as `run` and `monte_carlo` take it."""
 
     name: str
     control_size: int
@@ -317,7 +315,7 @@ class Filter:
     """(S) -> moments in map coordinates."""
     chart: Chart
     places: tuple[int, ...] = ()
-    """how many places of a scan each sensor has, in order; () where all are of one sensor."""
+    """number of measurement slots of each sensor, in order; () where all are of one sensor."""
     square_root: bool = False
     """whether its state is a `slots.Joint` with a root of the covariance."""
     landmark: tuple[str, ...] = ()
@@ -329,8 +327,8 @@ class Filter:
 
 
 Estimator = Callable[[Log, Array], Trace]
-"""(log, key) -> trace: what the harness runs; `partial(run, filter, …)`, or a batch method."""
+"""(log, key) -> trace: `partial(run, filter, …)`, or a batch method."""
 
 Candidate = Filter | Callable[[Truth], Filter | Estimator]
-"""What a campaign tries: a filter, or a function of the run's truth that returns a filter or an
+"""An entry of a campaign: a filter, or a function of the run's truth that returns a filter or an
 estimator."""

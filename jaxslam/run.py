@@ -1,4 +1,4 @@
-"""The scan driver: one function runs every filter over a whole log."""
+"""The driver of all filters: one `lax.scan` over a log."""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,27 +25,27 @@ def run(
     *,
     probe: Callable[[Any], Any] | None = None,
 ) -> Trace:
-    """Drive a filter along a log: per row predict with the control, then update with the scan.
+    """Run a filter over a log: at each row, predict with the control, then update with the scan.
 
     Traceable: wrap it in `jax.jit`, `jax.vmap` over logs and keys, or `jax.grad`. Called outside a
-    trace it is compiled once for a structure: another call, with other values or a filter that its
-    factory made anew with other noises, runs the same program (`programs`). The arithmetic runs in
+    trace it is compiled once for a structure: another call, with other values or a filter with
+    other noises, runs the same program (`programs`). The arithmetic runs in
     the wider dtype of the log's controls and measurements. A valid measurement that is not finite
     is refused where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse
-    mode keeps one state a step, and computes each step again on the way back.
+    mode stores one state a step, and recomputes each step in the backward pass.
 
     Args:
         filter: made by a factory of `jaxslam.filters`.
-        log: T rows; control (T, U), scans of M places.
+        log: T rows; control (T, U), scans of M measurement slots.
         pose: (3,) where the robot is before the first control.
-        pose_cov: (3, 3) how well that is known; zero is allowed.
+        pose_cov: (3, 3) its covariance; zero is allowed.
         key: a PRNG key, split into two a step; a filter without randomness ignores them.
         probe: called with the filter's own state after each update; what it returns is stacked.
     Returns:
         Trace with estimates and infos of leading axis T, and the final state.
     Raises:
         ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN in controls
-            or valid measurements, tags repeated within a scan, or a bad pose_cov.
+            or valid measurements, tags repeated within a scan, or an invalid pose_cov.
     """
     check_record("run", "filter", filter, Filter)
     check_record("run", "log", log, Log)
@@ -83,7 +83,7 @@ def _drive(
     pose_cov: jax.Array,
     key: jax.Array,
 ) -> Trace:
-    """The steps of `run`."""
+    """The trace of a filter over a checked log."""
     log = jax.tree.map(jnp.asarray, log)
     dtype = jnp.result_type(log.control, log.scan.z)
     log = Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))
@@ -104,7 +104,7 @@ def _drive(
         estimate = checked_estimate(name, filter.estimate(state))
         return state, (estimate, info, None if probe is None else probe(state))
 
-    # What a scan runs cannot be merged with its own recomputation, so no barrier is needed.
+    # XLA cannot merge the body of a scan with its recomputation, so no barrier is needed.
     body = jax.checkpoint(step, prevent_cse=False)
     final, (estimate, info, probed) = jax.lax.scan(body, start, (log, keys))
     return Trace(estimate, info, final, probed)

@@ -1,8 +1,8 @@
-"""The fixed-capacity landmark table: a joint Gaussian over the robot and N landmark slots.
+"""The fixed-capacity map: a joint Gaussian over the robot and N landmark slots.
 
 The padding invariant: a dead slot has zero mean, zero cross-covariance, unit variance and tag -1.
-So the covariance is positive definite whenever its living part is, and every product with a dead
-slot's rows is zero: padding is inert without a mask in the filter's equations.
+So the covariance is positive definite if its alive part is, and every product with a dead slot's
+rows is zero: padding has no effect, and the filter's equations need no mask.
 """
 
 from typing import Any, NamedTuple
@@ -32,7 +32,7 @@ class Joint(NamedTuple):
     watch: Any = None
     """a `Watch` of the directions that should stay unobservable, where one is kept"""
     last: Any = None
-    """the `Last` motion, where the chart keeps it apart"""
+    """the `Last` motion, in a chart with `motion_apart`"""
     life: Any = None
     """the memory of a `Life`, of a filter that is pruned"""
     reduced: Any = None
@@ -54,11 +54,11 @@ class Last(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """What the filter's own linearized system does to the three degrees of freedom of its frame.
+    """The three directions that should stay unobservable, propagated by the linearized system.
 
-    A direction begins at the robot, goes where the transition matrices take it, and enters a new
-    landmark as its first measurement says; so it is unobservable as long as no later measurement
-    sees it, and the directions that none sees are the unobservable subspace.
+    A direction n starts at the robot and is propagated by the transition matrices and by the
+    Jacobians of new landmarks. It is unobservable as long as H n = 0 for all later measurements;
+    these directions span the unobservable subspace.
     """
 
     directions: Float[Array, "D 3"]
@@ -66,9 +66,9 @@ class Watch(NamedTuple):
     information: Float[Array, "3 3"]
     """Σ (H n)ᵀ R⁻¹ (H n) of all corrections"""
     scale: Float[Array, "3"]
-    """Σ of the same with absolute values, what rounding is measured by"""
+    """Σ of the same with absolute values, the scale of rounding errors"""
     turn: Float[Array, "3"]
-    """the combination of directions that turns everything about the origin by 1 rad"""
+    """the combination of directions that rotates robot and map about the origin by 1 rad"""
 
 
 def empty(
@@ -82,10 +82,10 @@ def empty(
     turn: jax.Array | None = None,
     motion_apart: bool = False,
 ) -> Joint:
-    """A robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero.
+    """The initial state: a robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero.
 
-    turn: (3,) how the robot moves when all turns about the origin, in the filter's chart; where
-    given, a `Watch` is kept.
+    turn: (3,) error of the pose in a rotation of robot and map about the origin, in the filter's
+    chart; where given, a `Watch` is kept.
     """
     size = 3 + capacity * landmark_size
     if square_root:
@@ -118,7 +118,7 @@ def find(
 def allocate(
     alive: Bool[Array, "N"], wanted: Bool[Array, "M"]
 ) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
-    """A free slot for each place that wants one: the first wish gets the lowest, and so on.
+    """A free slot for each measurement that needs one: the first gets the lowest, and so on.
 
     alive (N,) and wanted (M,) bool -> slot (M,) int32, 0 where none, and granted (M,) bool.
     """
@@ -130,7 +130,7 @@ def allocate(
 
 def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
     """The last column in which each row (M, N) bool is set, 0 where none, (M,) int32; and whether
-    there is one (M,). In one pass, where an `argmax` and an `any` are two.
+    there is one (M,). One pass, instead of two by `argmax` and `any`.
     """
     # Over the leading axis XLA takes maxima of whole rows.
     at = jnp.where(match.T, jnp.arange(match.shape[1], dtype=jnp.int32)[:, None], -1)
@@ -139,7 +139,7 @@ def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "
 
 
 def concerned(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:
-    """Which of count slots the places slot (M,) name, where on (M,); (count,) bool."""
+    """Mask (count,) of the slots that occur in slot (M,) where on (M,)."""
     return jnp.zeros(count, bool).at[jnp.where(on, slot, count)].set(True, mode="drop")
 
 
@@ -185,7 +185,7 @@ def scatter(
 
     With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM, P_LL = G P_RR Gᵀ + diag(own_cov).
     So the landmarks of one scan are correlated with each other through the robot. Written as
-    additions to the zeros of padding, in one pass over P; places not granted add none.
+    additions to the zeros of padding, in one pass over P; those not granted add none.
     Of a square root X, X_L = G X_R beside a root of own_cov in the columns of the slot.
 
     Args:
@@ -197,7 +197,7 @@ def scatter(
     capacity = joint.landmarks.shape[0]
     if m == 0:
         return joint
-    # By slot: the place it is filled from. Whole passes over P are cheaper than scattered writes.
+    # By slot: the index it is filled from. Whole passes over P are cheaper than scattered writes.
     place, born = where_set(granted[None, :] & (slot[None, :] == jnp.arange(capacity)[:, None]))
 
     def of_slots(values: jax.Array) -> jax.Array:
@@ -242,11 +242,11 @@ def _add_blocks(cov: Float[Array, "D D"], blocks: Float[Array, "N L L"]) -> Floa
 
 
 def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
-    """Forget the landmarks of the slots dead (N,) bool: marginalize them out and free their slots.
+    """Marginalize out the landmarks of the slots dead (N,) bool, and free the slots.
 
     In covariance form the marginal is what is left when rows and columns are dropped (Solà Table 1,
     state reduction); here they are overwritten with padding. Removing a dead slot changes nothing.
-    square_root: the state holds a root of P, as that of a filter with covariance="square_root" does.
+    square_root: the state holds a root of P, as of a filter with covariance="square_root".
 
     Raises ValueError unless dead is bool, one for each slot.
     """

@@ -1,6 +1,6 @@
-"""What the robots of a team are, and where each of them is in the controls, scans and states.
+"""The robots of a team, and the layout of their controls, scans and states.
 
-`filters.team_slam` runs a filter for them; `simulation.team_world` draws worlds that they drive in.
+`filters.team_slam` is their filter, and `simulation.team_world` simulates their worlds.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from jaxslam.validation.numbers import check_covariance, is_concrete
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """One robot of a team. Raises ValueError on sensors that are no suite, or a bad start."""
+    """One robot of a team. Raises ValueError on sensors that are no suite, or an invalid start."""
 
     motion: Motion
     sensors: Suite
@@ -47,7 +47,7 @@ class Robot:
 def check_team(
     name: str, robots: Sequence[Robot], tags: Sequence[int] | None, landmarks: int
 ) -> tuple[int, ...]:
-    """The tags that mean robots, by default landmarks, landmarks + 1, …: after those of landmarks.
+    """The tags of the robots, by default landmarks, landmarks + 1, …, after those of landmarks.
 
     Raises ValueError, which begins with the caller's name, unless this is a team.
     """
@@ -67,7 +67,7 @@ def check_team(
 
 
 def sizes(robots: Sequence[Robot]) -> tuple[list[int], list[int], int]:
-    """The end of each robot's part of the control (ΣU,), the end of its places in a scan, and the
+    """The end of each robot's part of the control (ΣU,), the end of its slots in a scan, and the
     largest Z."""
     controls = np.cumsum([len(robot.motion.controls) for robot in robots]).tolist()
     places = np.cumsum([sum(robot.sensors.places) for robot in robots]).tolist()
@@ -116,8 +116,8 @@ def motion_of(robots: Sequence[Robot], report: int) -> Motion:
 def sensors_of(robots: Sequence[Robot], report: int) -> Suite:
     """The sensors of the whole team as one suite, for a filter of the robot `report` alone.
 
-    The places of the other robots' sensors are marked as those that see robots, which a filter of
-    one robot leaves alone.
+    The slots of the other robots' sensors are marked as those that see robots, which a filter of
+    one robot ignores.
     """
     parts = []
     for b, robot in enumerate(robots):

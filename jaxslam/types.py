@@ -1,8 +1,8 @@
-"""The glossary of shapes: what flows between worlds, filters and the harness.
+"""The records exchanged by simulators, filters and campaigns, with their shapes.
 
 All are NamedTuples, hence pytrees; leading axes are added by `vmap` (runs) and `scan` (time).
-T steps, M measurement places a step, N landmark slots, Z measurement size, L landmark size.
-Masks and status codes, never NaN, say what is absent.
+T steps, M measurement slots a step, N landmark slots, Z measurement size, L landmark size.
+Masks and status codes, never NaN, mark absent data.
 """
 
 from enum import IntEnum
@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int
 
 
 class Status(IntEnum):
-    """What became of a measurement place; `Info.status` holds one a place.
+    """The outcome of a measurement; `Info.status` holds one a measurement slot.
 
-    `filters.reporting.status_of` has the table that decides.
+    `filters.reporting.status_of` has the decision table.
     """
 
     EMPTY = 0
@@ -30,22 +30,22 @@ class Status(IntEnum):
     OVERFLOW = 4
     """A new landmark, but the map is full; dropped."""
     DEFERRED = 5
-    """A new landmark beyond the scan's quota of births, or any landmark that `eseif` has no
-    place for until it can relocate; dropped for now."""
+    """A new landmark beyond `births`, the limit of new landmarks a scan, or a landmark that `eseif`
+    cannot activate until it relocates the robot; dropped in this scan."""
     REPEATED = 6
     """Its new tag occurs earlier in the same scan; dropped."""
     SINGULAR = 7
-    """Its innovation covariance is not positive definite, so that no gate can be asked; dropped."""
+    """Its innovation covariance is not positive definite, so that it cannot be gated; dropped."""
     UNMATCHED = 8
     """Association found it neither of a landmark nor new (between two gates, ambiguous, or of
-    unknown identity where identities are asked for), or a robot it concerns has no place in the map
-    yet; dropped."""
+    unknown identity where a tag is required), or a robot it concerns has no pose in the map yet;
+    dropped."""
     SIGHTED = 9
     """Of no landmark yet; kept as a stored measurement (`filters.delayed_slam`)."""
 
 
 class Scan(NamedTuple):
-    """The measurements of one step, padded to M places."""
+    """The measurements of one step, padded to M slots."""
 
     z: Float[Array, "M Z"]
     """measurements; any finite number where not valid."""
@@ -55,7 +55,7 @@ class Scan(NamedTuple):
 
 
 class Log(NamedTuple):
-    """What a robot records. Row t: the control that led *to* pose t, and the scan taken there."""
+    """The data of a robot. Row t: the control that led *to* pose t, and the scan taken there."""
 
     control: Float[Array, "T U"]
     """the interval Δt, where a model needs one, is part of it."""
@@ -64,14 +64,14 @@ class Log(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """What only a simulator knows."""
+    """The true states of a simulation."""
 
     pose: Float[Array, "T 3"]
     """true pose at each scan [m, m, rad]."""
     landmarks: Float[Array, "N L"]
     """true landmarks, in the order of their tags."""
     missed: Int[Array, "T"]
-    """landmarks in view for which the scan had no place."""
+    """landmarks in view for which the scan had no free slot."""
     start: Float[Array, "3"]
     """true pose before the first control."""
     origin: Int[Array, "T M"] | None = None
@@ -80,7 +80,7 @@ class Truth(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """What a filter believes, in map coordinates whatever its own error coordinates."""
+    """Means and marginal covariances in map coordinates, whatever the filter's chart."""
 
     pose: Float[Array, "3"]
     """x [m], y [m], θ [rad] in (-π, π]."""
@@ -94,27 +94,27 @@ class Estimate(NamedTuple):
 
 
 class Info(NamedTuple):
-    """What one update did, place by place."""
+    """The results of one update for each measurement slot."""
 
     nis: Float[Array, "M"]
-    """normalized innovation squared of fused and rejected places, else 0. Within a joint
-    update: of a place given the places before it, so that the sum is the joint NIS."""
+    """normalized innovation squared of fused and rejected measurements, else 0. Within a joint
+    update: of a measurement given those before it, so that the sum is the joint NIS."""
     dof: Int[Array, "M"]
     """Z where fused, else 0."""
     innovation: Float[Array, "M Z"]
-    """z ⊖ ẑ of places matched to a landmark (fused, rejected or singular), else 0."""
+    """z ⊖ ẑ of measurements matched to a landmark (fused, rejected or singular), else 0."""
     innovation_cov: Float[Array, "M Z Z"]
-    """S of the same places, else 0."""
+    """S of the same measurements, else 0."""
     slot: Int[Array, "M"]
-    """the landmark slot corrected or born, -1 if none."""
+    """the landmark slot corrected or initialized, -1 if none."""
     status: Int[Array, "M"]
     """see `Status`."""
     log_likelihood: Float[Array, ""]
-    """Σ log N(innovation; 0, S) over fused places."""
+    """Σ log N(innovation; 0, S) over fused measurements."""
     exhausted: Bool[Array, ""] | None = None
     """the search for the best association ended at its budget; None where there is no search"""
     extra: dict[str, Any] | None = None
-    """what one family, or one wrapper of a filter, alone says: its record by its name, as
+    """records of one family or wrapper of filters alone, by name, as
     "particles" for a `filters.particles.particle_info.ParticleInfo`."""
 
     @property
@@ -123,12 +123,12 @@ class Info(NamedTuple):
         return (self.status == Status.OVERFLOW).any(-1)
 
     def tally(self, status: Status) -> jax.Array:
-        """() int: places of this step with that status; over a whole trace, (T,)."""
+        """() int: number of measurements with that status in a step; over a whole trace, (T,)."""
         return (self.status == status).sum(-1)
 
 
 class Trace(NamedTuple):
-    """What `run` returns."""
+    """The result of `run`."""
 
     estimate: Estimate
     """with leading T, after each update."""
@@ -137,4 +137,4 @@ class Trace(NamedTuple):
     final: Any
     """the filter's own state at the end."""
     probe: Any
-    """what the caller's probe saw after each update, leading T; None without one."""
+    """results of the caller's probe after each update, leading T; None without one."""

@@ -1,4 +1,4 @@
-"""Data association: which landmark a measurement is of."""
+"""Data association: methods that match measurements with landmarks."""
 
 from jaxslam.association.certain import certain
 from jaxslam.association.global_nearest import global_nearest

@@ -34,13 +34,13 @@ def check_gates(name: str, gate: float, new_gate: float | None) -> float:
 
 
 def far_from_all(pairs: Pairs, scan: Scan, new_gate: float) -> Bool[Array, "M"]:
-    """Whether a measurement lies beyond the gate of every landmark there is."""
+    """Whether a measurement lies beyond the gate of every landmark of the map."""
     near = pairs.possible & (pairs.distance <= new_gate)
     return scan.valid & ~near.any(axis=1)
 
 
 def mutual(score: Float[Array, "M N"], allowed: Bool[Array, "M N"]) -> Int[Array, "M"]:
-    """The slot of the lowest score for a measurement that is also the slot's lowest, else -1."""
+    """The slot of each measurement whose scores are mutually lowest, else -1."""
     if 0 in score.shape:
         return jnp.full(score.shape[0], -1, jnp.int32)
     score = jnp.where(allowed, score, jnp.inf)

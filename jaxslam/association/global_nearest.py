@@ -1,4 +1,4 @@
-"""Global nearest neighbour: all measurements of a scan at once, at the least sum of distances."""
+"""Global nearest neighbour: the assignment of a whole scan with the least sum of distances."""
 
 import jax.numpy as jnp
 

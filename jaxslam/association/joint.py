@@ -1,4 +1,4 @@
-"""Joint compatibility branch and bound, with fixed memory and a budget."""
+"""Joint compatibility branch and bound (JCBB), with fixed memory and a search budget."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ def joint(
     budget: int = 2000,
     candidates: int = 8,
 ) -> Associate:
-    """JCBB: the largest set of pairs that are compatible *together*; of several, the nearest.
+    """JCBB: the largest jointly compatible set of pairs; of several, that of least distance.
 
     Of a hypothesis H = {(i, j)} with m pairs, D² = ν_Hᵀ S_H⁻¹ ν_H with all cross-covariances, and
     it is compatible if every pair is (d² <= χ²(Z, p)) and D² <= χ²(m·Z, p). Neira & Tardós, "Data
@@ -69,7 +69,7 @@ def joint(
 
 
 def _quantiles(probability: float, m: int, size_z: int) -> np.ndarray:
-    """χ²(k·Z, p) for k = 0 … m."""
+    """The quantiles χ²(k·Z, p) for k = 0 … m."""
     if probability in (0, 1):
         return np.append(0.0, np.full(m, np.inf if probability else 0.0))
     return np.append(0.0, [chi2_quantile(probability, k * size_z) for k in range(1, m + 1)])
@@ -194,7 +194,7 @@ def _search(problem: _Problem, budget: int) -> _Search:
 def _block_row(
     problem: _Problem, at: _Search, which: Int[Array, ""]
 ) -> tuple[Float[Array, "Z MZ"], Float[Array, "Z"], Float[Array, ""], Bool[Array, ""]]:
-    """What the next pair adds to L⁻¹, L⁻¹ ν and D², and whether its block is positive definite.
+    """The next pair's rows of L⁻¹ and L⁻¹ ν, its term of D², and whether S is positive definite.
 
     With W = L⁻¹ C, C the covariance of the pairs before with it, and B = S - WᵀW = l lᵀ: the new
     rows of L⁻¹ are l⁻¹ [-Wᵀ L⁻¹, I], and those of L⁻¹ ν are l⁻¹ (ν - Wᵀ L⁻¹ ν).

@@ -1,4 +1,4 @@
-"""Association given with the data."""
+"""Known data association: the data give each measurement's landmark."""
 
 import jax.numpy as jnp
 
@@ -8,7 +8,7 @@ from jaxslam.types import Scan
 
 
 def known() -> Associate:
-    """A measurement belongs to the landmark of its tag; an unseen tag starts a new one.
+    """Association by tags: each measurement is of the landmark of its tag; a new tag starts one.
 
     A measurement of unknown identity (tag -1) is neither, and the filter counts it as unmatched.
     """

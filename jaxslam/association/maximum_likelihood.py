@@ -1,4 +1,4 @@
-"""Maximum likelihood: each measurement to its most likely landmark, every pair judged alone."""
+"""Maximum-likelihood association of each measurement on its own."""
 
 from jaxslam.association.gates import check_gates, far_from_all, mutual
 from jaxslam.protocols import Associate, Association, Prediction
@@ -6,7 +6,7 @@ from jaxslam.types import Scan
 
 
 def maximum_likelihood(gate: float, new_gate: float | None = None) -> Associate:
-    """As `nearest`, by the least d² + log |S|, which is -2 log N(ν; 0, S) but for a constant.
+    """As `nearest`, by the least d² + log |S|, which is -2 log N(ν; 0, S) up to a constant.
 
     The determinant matters: a landmark of large covariance is near to everything in d², and makes
     nothing likely (Notes, EKF-SLAM with unknown correspondences; Tacher). The gates are of

@@ -1,4 +1,4 @@
-"""Nearest neighbour: each measurement to its nearest landmark, every pair judged alone."""
+"""Nearest-neighbour association of each measurement on its own."""
 
 from typing import Literal
 

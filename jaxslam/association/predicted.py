@@ -1,4 +1,4 @@
-"""What an association method may look at: the one view of every filter's map."""
+"""The predicted measurements of a map, the input of association methods."""
 
 from collections.abc import Callable
 
@@ -19,9 +19,9 @@ def predicted(
     measurements: Callable[[], tuple[Float[Array, "N Z"], Float[Array, "N Z Z"] | None]],
     cross: Callable[[], Float[Array, "N Z N Z"]],
 ) -> Prediction:
-    """The `Prediction` of N landmarks, every measurement against every landmark for itself.
+    """The `Prediction` of N landmarks, from predicted measurements and their covariances.
 
-    ν_ij = z_i ⊖ ẑ_j, S_ij = H_j P H_jᵀ + R_i. What an association does not ask for is not computed.
+    ν_ij = z_i ⊖ ẑ_j, S_ij = H_j P H_jᵀ + R_i. What a method does not call is not computed.
 
     Args:
         tag, alive: of the slots.

@@ -1,4 +1,4 @@
-"""Charts: which error a filter's covariance is the covariance of."""
+"""Charts: error coordinates of the covariance."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""The textbook error: differences of coordinates, heading wrapped."""
+"""The Euclidean error: differences of coordinates, with the heading wrapped."""
 
 import jax.numpy as jnp
 from jax import Array

@@ -1,4 +1,4 @@
-"""The error of the left-invariant filter, in the robot's frame: the published counter-example."""
+"""The left-invariant error, in the robot's frame; its filter is known to be inconsistent."""
 
 import jax.numpy as jnp
 
@@ -12,8 +12,8 @@ def left_invariant() -> Chart:
     """(R, t, l) ← (R, t, l)·exp(ξ), the group SE_{1+N}(2) acting from the right of the estimate.
 
     With dx = (ρ, φ): θ ← θ + φ, t ← t + R V(φ) ρ, l ← l + R V(φ) dl, V as in `se2.exp`. The errors
-    of robot and landmarks are held in the estimated robot's frame, so a correction of its heading
-    turns them all; the directions that no sensor sees depend on the estimate, as in the standard
+    of robot and landmarks are in the estimated robot's frame, so a correction of its heading
+    rotates them all; the unobservable directions depend on the estimate, as in the standard
     EKF. UKF-M (Brossard et al. 2020) shows that this choice is worse. Landmarks l = (x, y) only.
     """
 

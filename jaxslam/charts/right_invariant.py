@@ -1,4 +1,4 @@
-"""The error of the right-invariant EKF: a turn of robot and map together is one direction."""
+"""The right-invariant error, in which a rotation of robot and map is one constant direction."""
 
 import jax.numpy as jnp
 
@@ -16,8 +16,8 @@ def right_invariant(rays: bool = False) -> Chart:
     depend on the estimate, and the filter cannot gain information along them (Barrau & Bonnabel
     2015, arXiv:1510.06263; Zhang et al. 2017). For point landmarks l = (x, y), or with
 
-    rays: for l = (x0, y0, α, ρ), as of `sensors.bearing_inverse_depth`: its place goes as a point
-    does, its direction turns with the map, α ← α + φ + dα, and ρ ← ρ + dρ.
+    rays: for l = (x0, y0, α, ρ), as of `sensors.bearing_inverse_depth`: (x0, y0) changes as a point
+    does, the direction rotates with the map, α ← α + φ + dα, and ρ ← ρ + dρ.
 
     Raises ValueError where `retract` gets a landmark of another size.
     """

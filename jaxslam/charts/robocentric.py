@@ -1,4 +1,4 @@
-"""The error of robocentric mapping: everything as the robot sees it."""
+"""The robocentric error: differences of coordinates in the robot's frame."""
 
 import jax.numpy as jnp
 
@@ -10,13 +10,14 @@ from jaxslam.protocols import Basis, Chart
 
 
 def robocentric() -> Chart:
-    """The world's origin b = pose⁻¹ and the landmarks m = Rᵀ(l - t), seen from the robot, add up.
+    """Additive errors of the world, seen by the robot: its origin b = pose⁻¹, landmarks m = Rᵀ(l - t).
 
     b ← b + dx and m ← m + dl, so pose ← (b + dx)⁻¹ and l ← (b + dx)⁻¹ ∘ (m + dl). What a sensor on
-    the robot measures does not depend on dx at all, hence no measurement can inform about the
-    frame, and the errors of the map are small where the robot is. The last motion stays a variable
-    of its own until the update has corrected it, and only then moves the map into the new frame
-    (`motion_apart`): added to m instead, the turns of many corrections would blow the map up.
+    the robot measures does not depend on dx, hence no measurement has information on the frame,
+    and the errors of the map are small near the robot. The last motion remains a separate variable
+    until the update has corrected it, and only then is the map transformed to the new frame
+    (`motion_apart`): added to m instead, the rotations of many corrections would scale the map
+    up.
     Castellanos, Martinez-Cantin, Tardós, Neira, "Robocentric map joining: improving the consistency
     of EKF-SLAM", Robotics and Autonomous Systems 55(1), 2007. Landmarks l = (x, y) only.
     """

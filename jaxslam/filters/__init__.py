@@ -1,4 +1,4 @@
-"""Filters: recursive estimators behind the one `Filter` protocol."""
+"""Filters: recursive estimators, all of type `Filter`."""
 
 from jaxslam.filters.delayed.delayed_slam import delayed_slam
 from jaxslam.filters.ekf.compressed_ekf_slam import compressed_ekf_slam

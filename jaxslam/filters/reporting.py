@@ -1,4 +1,4 @@
-"""From gate to `Status` to `Info`: the one table that every filter reports by."""
+"""`Status` and `Info` of the measurements of a scan, for all filters."""
 
 from typing import Any, NamedTuple
 
@@ -24,11 +24,11 @@ def status_of(
     stored: Mask = None,
     singular: Mask = None,
 ) -> jax.Array:
-    """`Status` (M,) int32 of each measurement place, by masks (M,) bool; None is False everywhere.
+    """`Status` (M,) int32 of each measurement, from masks (M,) bool; None is False everywhere.
 
     The first row that holds decides:
 
-    | place | status |
+    | measurement | status |
     |---|---|
     | not valid | EMPTY |
     | matched, S not positive definite | SINGULAR |
@@ -37,25 +37,25 @@ def status_of(
     | matched | FUSED |
     | new, its tag earlier in the scan | REPEATED |
     | new, a slot granted | BORN |
-    | new, beyond the quota or postponed | DEFERRED |
+    | new, beyond `births` or postponed | DEFERRED |
     | new, stored for a later initialization | SIGHTED |
     | new, with a covariance that is not positive definite | SINGULAR |
-    | new, nothing of these: no slot is left | OVERFLOW |
+    | new, none of these: no slot is free | OVERFLOW |
     | neither matched nor new | UNMATCHED |
 
-    A singular S is SINGULAR on both sides of the gate: d² = νᵀ S⁻¹ ν needs S⁻¹, so there is no
-    gate to be outside of. A measurement without a finite value is REJECTED by `run` before a filter
-    sees it, and one that concerns a robot without a place in the map is UNMATCHED (`team_slam`).
+    A singular S is SINGULAR whatever the gate, since d² = νᵀ S⁻¹ ν needs S⁻¹. A measurement
+    without a finite value is REJECTED by `run` before a filter
+    sees it, and one that concerns a robot without a pose in the map is UNMATCHED (`team_slam`).
 
     Args:
         valid: there is a measurement.
         matched: association found its landmark (or it is of an absolute sensor); wins over new.
         positive: S is positive definite, alone and with those of the scan that are fused with it,
             and so is whatever the filter needs to compute S.
-        inside: d² is finite and at most the gate. May be anything where S is not positive definite.
-        postponed: known, but the filter has no place to work on it now (`eseif`).
+        inside: d² is finite and at most the gate. Any value where S is not positive definite.
+        postponed: known, but the filter cannot activate it now (`eseif`).
         new: association found it to be of no landmark.
-        repeated, granted, deferred, stored, singular: what became of a new one.
+        repeated, granted, deferred, stored, singular: outcomes of a new one.
     """
     no = jnp.zeros_like(valid)
     matched, new = no if matched is None else matched, no if new is None else new
@@ -93,7 +93,7 @@ def info_of(
     log_likelihood: jax.Array,
     **more: Any,
 ) -> Info:
-    """The `Info` of M places with these statuses, zeros where a number says nothing.
+    """The `Info` of M measurements with these statuses, zeros where a number does not apply.
 
     Args:
         status: (M,) as of `status_of`.
@@ -101,7 +101,7 @@ def info_of(
         size: Z, or (M,) int, which dof is where fused.
         slot: (M,) of the landmark matched.
         born: (M,) of the landmark started; default none is.
-        nis, innovation, innovation_cov: (M,), (M, Z), (M, Z, Z) of the places matched; nis counts
+        nis, innovation, innovation_cov: (M,), (M, Z), (M, Z, Z) of those matched; nis counts
             where `has_distance`.
         log_likelihood: () of the scan.
         more: fields of `Info` that one filter has.
@@ -122,12 +122,12 @@ def info_of(
 
 
 def has_distance(status: jax.Array) -> jax.Array:
-    """Whether a place has a squared Mahalanobis distance, (M,) bool: it was fused or rejected."""
+    """Whether a measurement was fused or rejected, and so has a squared distance, (M,) bool."""
     return (status == Status.FUSED) | (status == Status.REJECTED)
 
 
 def nothing_of(scan: Scan) -> Info:
-    """The `Info` of a scan that is left alone: every valid place is `Status.UNMATCHED`."""
+    """The `Info` of an ignored scan: every valid measurement is `Status.UNMATCHED`."""
     m, size_z = scan.z.shape
     return info_of(
         status_of(scan.valid),
@@ -143,7 +143,7 @@ def nothing_of(scan: Scan) -> Info:
 
 
 def joined(infos: list[Info], size_z: int) -> Info:
-    """One info of all places; innovations and their covariances padded with zeros to size_z."""
+    """The `Info` of several scans joined; innovations and covariances zero-padded to size_z."""
 
     def together(name: str, padded_axes: int = 0) -> jax.Array:
         values = [getattr(info, name) for info in infos]
@@ -166,25 +166,25 @@ def joined(infos: list[Info], size_z: int) -> Info:
 
 
 def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
-    """Whether the same non-negative tag occurs at an earlier place, (M,)."""
+    """Whether the same non-negative tag occurs earlier in the scan, (M,)."""
     earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
     same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
     return (same & earlier).any(axis=1)
 
 
 def with_extra(info: Info, name: str, record: Any) -> Info:
-    """The info with a record of what one family or wrapper alone says, by its name."""
+    """The `Info` with a named record of one filter family or wrapper."""
     return info._replace(extra={**(info.extra or {}), name: record})
 
 
 class Pruned(NamedTuple):
-    """Which landmarks left the map; `info.extra["pruning"]`."""
+    """The landmarks removed from the map; `info.extra["pruning"]`."""
 
     removed: jax.Array
     """(N,) bool: slots whose landmark was removed in this step"""
 
 
 def with_removed(info: Info, removed: jax.Array) -> Info:
-    """The info with slots removed (N,) bool, besides those that it names already."""
+    """The `Info` with slots removed (N,) bool added to those it marks already."""
     before = (info.extra or {}).get("pruning", Pruned(jnp.zeros_like(removed)))
     return with_extra(info, "pruning", Pruned(before.removed | removed))

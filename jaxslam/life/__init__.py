@@ -1,4 +1,4 @@
-"""Which landmarks stay in the map: rules that are asked after every scan."""
+"""Rules that decide after each scan which landmarks stay in the map."""
 
 from jaxslam.life.existence import existence
 from jaxslam.life.recency import recency

@@ -1,4 +1,4 @@
-"""Landmarks are kept or removed by the log-odds that they exist."""
+"""Removal of landmarks by their log-odds of existence."""
 
 import math
 from collections.abc import Callable
@@ -15,16 +15,16 @@ from jaxslam.types import Estimate, Info, Status
 from jaxslam.validation.numbers import check_count
 
 _LARGEST = 10.0
-"""of the log-odds, so that also a landmark that was often measured is removed after some misses"""
+"""bound of the log-odds, so that a landmark that was measured often is removed after some misses"""
 
 
 class Existence(NamedTuple):
-    """What is known of each slot's landmark; zero where dead."""
+    """The existence state of each slot's landmark; zero where dead."""
 
     log_odds: Float[Array, "N"]
     """that it exists"""
     confirmed: Bool[Array, "N"]
-    """its probability once reached `confirm`; before that it is provisional"""
+    """its probability has reached `confirm`; before that it is provisional"""
     seen: Int[Array, "N"]
     """scans that measured it"""
     missed: Int[Array, "N"]
@@ -54,15 +54,15 @@ def existence(
 
     Args:
         visible: (pose, l) -> () bool: whether a scan from there should measure the landmark.
-            Better too strict than too generous: near the edge of its view a sensor misses much.
+            Prefer a strict one: a sensor misses many landmarks near the edge of its view.
         detected: probability that it then does, P(seen | there).
-        false: probability that something else is taken for it, P(seen | not there).
+        false: probability of a false detection, P(seen | not there).
         confirm, remove: probabilities.
         patience: a provisional landmark not measured for so many scans is removed.
         spread: [m] a landmark with a larger standard deviation, √(tr P/2), is removed.
         replace: in a full map, new landmarks take the place of those least likely to exist among
             the provisional ones that the scan did not measure; otherwise the map refuses
-            (`Status.OVERFLOW`). The filter has to know it: `ekf_slam(…, make_room=life)`.
+            (`Status.OVERFLOW`). The filter needs it too: `ekf_slam(…, make_room=life)`.
     Raises:
         ValueError: on a visible that is no function; unless 0 < false < detected < 1 and
             0 < remove < 1/2 < confirm < 1; on a patience below 1 or a spread not above 0.

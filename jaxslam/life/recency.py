@@ -1,4 +1,4 @@
-"""When each landmark was initialized and last measured; those not measured for long are removed."""
+"""Removal of landmarks by the time since their last measurement."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from jaxslam.validation.numbers import check_count
 
 
 class Recency(NamedTuple):
-    """Times in scans since the beginning; zero where dead."""
+    """Times of the first and last measurement of each landmark, in scans; zero where dead."""
 
     now: Int[Array, ""]
     """the scans so far"""
@@ -27,7 +27,7 @@ class Recency(NamedTuple):
 
 
 def recency(patience: int | None = None) -> Life:
-    """The times of each landmark, as `closing` needs them; those not measured for long are removed.
+    """The rule that removes landmarks not measured for long; `closing` reads the times it keeps.
 
     Args:
         patience: a landmark not measured for so many scans, empty ones too, is removed, so that

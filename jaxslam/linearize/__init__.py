@@ -1,4 +1,4 @@
-"""Linearizers: which affine function stands for a model, one a file."""
+"""Linearizers: affine approximations of the models, one a file."""
 
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.linearize.at_truth import at_truth

@@ -1,4 +1,4 @@
-"""Jacobians at the true state: the ideal EKF, the yardstick no real filter can use."""
+"""Jacobians at the true state: the ideal EKF, a reference that only a simulation allows."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""First-estimates Jacobians: every state is linearized at one place for good."""
+"""First-estimates Jacobians: each state has one linearization point that never changes."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ Array = jax.Array
 
 
 class First(NamedTuple):
-    """Where everything was first estimated to be."""
+    """The first estimates of the pose and the landmarks."""
 
     pose: Array
     """(3,) of this step, as predicted, before any measurement of it"""

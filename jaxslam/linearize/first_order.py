@@ -1,4 +1,4 @@
-"""What first-order linearizers share: a model and its Jacobians, each at a place of its own."""
+"""Models and their Jacobians at separate linearization points, for first-order linearizers."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -43,5 +43,5 @@ def invert_at(
 
 
 def turned(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> Float[Array, "L 3"]:
-    """The derivative of a point by the pose (·, 3), the turn's lever longer by an offset (2,)."""
+    """The derivative of a point by the pose (·, 3), with an offset (2,) added to the lever arm."""
     return by_pose.at[:2, 2].add(jnp.stack([-offset[1], offset[0]]))

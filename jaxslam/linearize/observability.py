@@ -1,4 +1,4 @@
-"""Observability-constrained linearization points: the nearest ones that gain no heading."""
+"""Observability-constrained (OC) linearization points, which keep the heading unobservable."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ Array = jax.Array
 
 
 class Constraint(NamedTuple):
-    """The lever arms of a turn of everything, as the linearized system has carried them."""
+    """The unobservable rotation direction of the linearized system, as lever arms."""
 
     pose: Array
     """(3,) of this step, as predicted"""
@@ -25,7 +25,7 @@ class Constraint(NamedTuple):
 
 
 def observability() -> Linearizer:
-    """OC: linearization points as near to the estimates as the constraint on their system allows.
+    """OC-EKF: the linearization points nearest to the estimates that satisfy the constraint.
 
     A turn of everything, (Jα, 1, Jβ_1, …) in the errors of robot position, heading and landmarks,
     J = [0, -1; 1, 0], stays invisible if every H of step k is taken at a landmark l* with

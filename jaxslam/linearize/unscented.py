@@ -14,7 +14,7 @@ Array = jax.Array
 
 
 class Regression(NamedTuple):
-    """y ≈ mean + slope · ξ + rest, ξ ~ N(0, L Lᵀ), as sigma points see y."""
+    """The affine fit y ≈ mean + slope · ξ + rest, ξ ~ N(0, L Lᵀ), through sigma points."""
 
     mean: Array
     """(m,)"""
@@ -147,7 +147,7 @@ def by_variables(slope: Array, root: Array) -> Array:
 
 
 def _root(cov: Array) -> Array:
-    """A regular root of P: what is known exactly counts as known to about the square root of eps.
+    """A regular square root of P; zero variances are raised to about the square root of eps.
 
     Along it the slope is then the derivative; a column of zeros would leave it undetermined.
     """

@@ -1,1 +1,1 @@
-"""Mathematics that knows nothing of robots' maps: angles, SE(2), linear algebra, statistics."""
+"""General mathematics: angles, SE(2), linear algebra, statistics, array types."""

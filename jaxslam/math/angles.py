@@ -1,4 +1,4 @@
-"""Angles on the circle, and the two entire functions that planar motion needs near zero turn."""
+"""Angle wrapping, and sin(x)/x with its derivative, accurate near zero."""
 
 import math
 

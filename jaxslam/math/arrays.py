@@ -1,4 +1,4 @@
-"""Arrays that have names of their own, for signatures; shapes are checked while the tests run.
+"""Named array types for signatures; their shapes are checked in the tests.
 
 Of one pose, one landmark, one measurement; `vmap` and `scan` add leading axes.
 """

@@ -1,4 +1,4 @@
-"""The linear assignment problem inside `jit`: rows to different columns at the least total cost."""
+"""A traceable solver of the linear assignment problem: distinct columns at least total cost."""
 
 from typing import NamedTuple
 
@@ -71,7 +71,7 @@ class _Path(NamedTuple):
 
 
 def _shortest_path(cost: Array, matching: _Matching, row: Array) -> _Path:
-    """From a row to a free column, by Dijkstra's algorithm on reduced costs."""
+    """The shortest path from a row to a free column, by Dijkstra's algorithm on reduced costs."""
     m, n = cost.shape
     start = _Path(
         row=row,
@@ -103,7 +103,7 @@ def _shortest_path(cost: Array, matching: _Matching, row: Array) -> _Path:
 
 
 def _augmented(matching: _Matching, path: _Path, row: Array) -> tuple[Array, Array]:
-    """Rows and columns along the path matched anew, from its free column back to the row."""
+    """The matching updated along the augmenting path, from its free column back to the row."""
 
     def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         column, column_of, row_of = state

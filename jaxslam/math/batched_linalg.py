@@ -1,9 +1,9 @@
-"""Factors and solutions beyond the size that is written out: by library, one by one on a CPU.
+"""Linear algebra of matrices too large to unroll: library calls, in a loop on a CPU.
 
 jaxlib's LAPACK kernels divide a batch among the threads of XLA's pool, and wait for them on a
-thread of that pool (jaxlib 0.10, `ParallelBatchMap`). Where as many of them run at once as the pool
-has threads, all wait for ever: two blocks of a campaign on two cores are enough. Under `vmap` on a
-CPU there is hence a loop of calls, each of one matrix.
+thread of that pool (jaxlib 0.10, `ParallelBatchMap`). If as many kernels run at once as the pool
+has threads, they deadlock; two blocks of a campaign on two cores are enough. So under `vmap` on a
+CPU the calls run in a loop, one matrix each.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 
 def _one_by_one_on_cpu(library: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
-    """The library's function; under vmap on a CPU a loop of it."""
+    """The function, which under vmap on a CPU runs as a loop over the batch."""
     either = jax.custom_batching.custom_vmap(library)
 
     @either.def_vmap
@@ -37,7 +37,7 @@ def _one_by_one_on_cpu(library: Callable[..., jax.Array]) -> Callable[..., jax.A
 
 
 factor = _one_by_one_on_cpu(partial(jnp.linalg.cholesky, symmetrize_input=False))
-"""Lower L (n, n) with L Lᵀ = A, NaN where A is not positive definite. Has no derivative."""
+"""Lower L (n, n) with L Lᵀ = A, NaN where A is not positive definite. No derivative."""
 
 _solve = _one_by_one_on_cpu(partial(jax.scipy.linalg.solve_triangular, lower=True))
 
@@ -72,6 +72,6 @@ def _inverse_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
 
 
 def eigenvalues(matrix: jax.Array) -> jax.Array:
-    """Of a symmetric (n, n) matrix, ascending (n,). Has no derivative in reverse."""
+    """The eigenvalues of a symmetric (n, n) matrix, ascending (n,). No reverse-mode derivative."""
     one = jax.custom_batching.sequential_vmap(lambda matrix: jnp.linalg.eigvalsh(matrix))
     return jnp.asarray(one(matrix))

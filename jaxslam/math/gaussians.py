@@ -14,7 +14,7 @@ LOG_2PI = math.log(2 * math.pi)
 
 
 class GaussianTerms(NamedTuple):
-    """What N(error; 0, cov) is made of; finite also where cov is not positive definite."""
+    """The terms of log N(error; 0, cov); finite also where cov is not positive definite."""
 
     factor: Float[Array, "n n"]
     """L, lower triangular, cov = L Lᵀ"""
@@ -31,7 +31,7 @@ class GaussianTerms(NamedTuple):
 
 
 def gaussian_terms(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> GaussianTerms:
-    """The terms of the density of an error with a covariance."""
+    """The terms of log N(error; 0, cov)."""
     factor, positive = linalg.cholesky(cov)
     whitened = linalg.solve_lower(factor, error)
     distance = linalg.total(whitened**2)

@@ -1,4 +1,4 @@
-"""Small linear algebra: factors of the few-by-few matrices of a filter.
+"""Small linear algebra: products, Cholesky factors and inverses of a filter's small matrices.
 
 A landmark update factors a 2×2 to 6×6 matrix, millions of times, under `vmap`. The library call
 behind `jnp.linalg.cholesky` costs more there than the arithmetic, and hides a non-positive pivot
@@ -29,21 +29,21 @@ _UNROLLED = 8
 
 
 def _tolerance(matrix: jax.Array) -> float:
-    """Of a pivot, as a share of its diagonal entry: what rounding alone leaves of zero."""
+    """The relative tolerance of a pivot: n·eps of its diagonal entry, the size of rounding."""
     return matrix.shape[-1] * float(jnp.finfo(matrix.dtype).eps)
 
 
 def total(terms: Iterable[jax.Array]) -> jax.Array:
-    """The sum of at least one array; written out, it fuses into one elementwise kernel."""
+    """The sum of at least one array, unrolled, so that it fuses into one elementwise kernel."""
     return functools.reduce(operator.add, terms)
 
 
 def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
-    """The function, of which reverse mode keeps the arguments and not each entry that it takes.
+    """The function, rematerialized in reverse mode: only its arguments are stored.
 
-    What is written out entry by entry would otherwise leave an array of the whole loop for each.
+    Unrolled code would otherwise store one array of the whole loop for each entry.
     """
-    # Within a scan or a batch nothing merges the recomputation with what it repeats.
+    # Within a scan or a batch XLA does not merge the recomputation with the original.
     return jax.checkpoint(function, prevent_cse=False)
 
 
@@ -92,8 +92,8 @@ def cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
 
     A pivot not above n·eps times its diagonal entry counts as zero: its column of L is zero and the
     flag is False, so that a positive *semi*-definite A still gets a usable square root, and nothing
-    becomes NaN (beyond 8×8, L is then zero as a whole). Only the lower
-    triangle is read. Non-finite input gives False.
+    becomes NaN (beyond 8×8, the whole L is then zero). Only the lower triangle is read. Non-finite
+    input gives False.
     """
     n = matrix.shape[-1]
     if n == 0:
@@ -121,7 +121,7 @@ def _cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Ar
 
 @_cholesky.defjvp
 def _cholesky_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """dL = L Φ(L⁻¹ dA L⁻ᵀ); where a pivot is zero, its column stays zero, and 1 stands for it."""
+    """dL = L Φ(L⁻¹ dA L⁻ᵀ); the column of a zero pivot stays zero, with 1 used in its place."""
     factor, positive = _cholesky(*primals)
     good = jnp.diagonal(factor) > 0
     regular = factor + jnp.diag((~good).astype(factor.dtype))
@@ -131,12 +131,12 @@ def _cholesky_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _mirrored(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
-    """The symmetric matrix of a lower triangle."""
+    """The symmetric matrix with this lower triangle."""
     return jnp.tril(matrix) + jnp.tril(matrix, -1).T
 
 
 def _lower_half(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
-    """Φ: the lower triangle with half of the diagonal."""
+    """Φ(A): the lower triangle of A with half of the diagonal."""
     return jnp.tril(matrix) - 0.5 * jnp.diag(jnp.diagonal(matrix))
 
 
@@ -147,7 +147,7 @@ def _cholesky_beyond(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
 
 @jax.custom_jvp
 def _factor(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower L with L Lᵀ = A of a symmetric A, zero where a pivot is."""
+    """Lower L with L Lᵀ = A of a symmetric A; all zero if a pivot is numerically zero."""
     factor = jnp.tril(batched_linalg.factor(matrix))
     positive = jnp.all(
         jnp.diagonal(factor) ** 2 > _tolerance(matrix) * jnp.abs(jnp.diagonal(matrix))
@@ -190,8 +190,8 @@ def root_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def triangular_root(wide: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """Lower L (n, n) with L Lᵀ = A Aᵀ and a diagonal not below zero, of A (n, m), m >= n.
 
-    Householder reflections from the right, row by row; nothing is squared, so half the digits of a
-    covariance suffice. A may lack rank, and gradients are finite there.
+    Householder reflections from the right, row by row. A Aᵀ is not formed, so half the digits of a
+    covariance suffice. A may be rank deficient, and gradients are finite there.
     """
     n, m = wide.shape
 
@@ -238,7 +238,7 @@ def solve_lower(
 def _substituted(
     factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
 ) -> Float[Array, "n *rest"]:
-    """L⁻¹ B, row after row written out."""
+    """L⁻¹ B by forward substitution, unrolled."""
     rows: list[jax.Array] = []
     for i in range(len(factor)):
         rest = rhs[i] - sum((factor[i, k] * rows[k] for k in range(i)), jnp.zeros_like(rhs[i]))
@@ -249,11 +249,10 @@ def _substituted(
 
 @jax.custom_jvp
 def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """Lower W = L⁻¹ (n, n), so W A Wᵀ = I, for A = L Lᵀ of a few rows; and `cholesky`'s flag.
+    """The inverse Cholesky factor W = L⁻¹ (n, n) of a small A = L Lᵀ, and `cholesky`'s flag.
 
-    A pivot that counts as zero gives a row of zeros. One division and root a pivot, where
-    `cholesky` and `solve_lower` take three: for a matrix that whitens many columns, millions of
-    times.
+    A pivot that counts as zero gives a row of zeros. It takes one division or square root a pivot,
+    where `cholesky` and `solve_lower` take three.
     """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
     zero = jnp.zeros((), matrix.dtype)
@@ -282,9 +281,9 @@ def _whitener_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """`whitener` as a loop over rows: little to compile, for what is factored once a step.
+    """The inverse Cholesky factor by a loop over rows, which compiles faster than `whitener`.
 
-    Beyond 8×8 by `cholesky`, zero as a whole where a pivot is.
+    Beyond 8×8 by `cholesky`, and all zero if a pivot is zero.
     """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
     if n == 0:
@@ -345,12 +344,12 @@ def mahalanobis_squared(
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """eᵀ P⁻¹ e and whether P (n, n) is numerically regular; 0 and False where it is not.
 
-    P is judged in units of each coordinate's own standard deviation, so that metres, radians and a
-    covariance of 1e-30 are judged alike. Regular means that each Cholesky pivot exceeds 100 n·eps,
-    i.e. no direction is known exactly, and that e is finite.
+    P is scaled by each coordinate's standard deviation, so that the test does not depend on units.
+    Regular means that each Cholesky pivot exceeds 100 n·eps, i.e. no direction is known exactly,
+    and that e is finite.
     """
     n, variance = cov.shape[-1], jnp.diagonal(cov)
-    spread = variance > 0  # the square root's slope at a zero variance is infinite, hence the 1.0
+    spread = variance > 0  # √ has an infinite derivative at zero, hence the 1.0
     unit = jnp.where(spread, 1.0 / jnp.sqrt(jnp.where(spread, variance, 1.0)), 0.0)
     factor = cholesky(cov * unit[:, None] * unit[None, :])[0]
     known = jnp.isfinite(error)

@@ -1,8 +1,8 @@
-"""Chi-square tails, quantiles and bands: what an honest filter's NEES and NIS must look like.
+"""Chi-square tails, quantiles and bands, the distributions of a consistent filter's NEES and NIS.
 
 The tail is traceable and differentiable; quantiles and bands are host numbers, from SciPy (which
 JAX itself depends on), because they become constants of a gate, a table or a plot. They are taken
-from its special functions: to import its distributions takes longer than all of jaxslam.
+from its special functions, because importing its distributions takes longer than importing jaxslam.
 """
 
 import jax
@@ -60,8 +60,8 @@ def chi2_band(dof: float, runs: int, level: float = 0.95) -> tuple[float, float]
 def truncated_chi2_mean(share: float, dof: float) -> float:
     """The mean of χ²_dof below the gate that a share of it exceeds, over dof; 1 where none does.
 
-    F_{dof+2}(g)/F_dof(g) with F_dof(g) = 1 - share: what an honest filter's NIS averages after its
-    gate has dropped that share. Raises ValueError unless 0 <= share < 1 and dof > 0.
+    F_{dof+2}(g)/F_dof(g) with F_dof(g) = 1 - share: the mean NIS of a consistent filter whose gate
+    has dropped that share. Raises ValueError unless 0 <= share < 1 and dof > 0.
     """
     if not 0 <= share < 1:
         raise ValueError(f"expected a share in [0, 1), got {share}")

@@ -18,7 +18,7 @@ Array = jax.Array
 
 
 class Frame(NamedTuple):
-    """Where a frame is in another: mean and covariance."""
+    """The pose of one frame in another: mean and covariance."""
 
     pose: Array
     """(3,)"""
@@ -27,7 +27,7 @@ class Frame(NamedTuple):
 
 
 def compound(a: Frame, b: Frame, cross: Array | None = None) -> Frame:
-    """b, known in a, in what a is known in (series): x = x_a ∘ x_b, and with its Jacobians J_a, J_b
+    """Frame b in the reference of a (series): x = x_a ∘ x_b, and with its Jacobians J_a, J_b
 
         P = J_a P_a J_aᵀ + J_b P_b J_bᵀ + J_a C J_bᵀ + (J_a C J_bᵀ)ᵀ
 
@@ -46,7 +46,7 @@ def compound(a: Frame, b: Frame, cross: Array | None = None) -> Frame:
 
 
 def reverse(a: Frame) -> Frame:
-    """The frame that a is known in, in a."""
+    """The inverse of a: the reference frame of a, expressed in a."""
     (by_a,) = se2.inverse_jacobians(a.pose)
     return Frame(se2.inverse(a.pose), linalg.symmetrize(by_a @ a.cov @ by_a.T))
 
@@ -56,8 +56,8 @@ def merge(a: Frame, b: Frame) -> tuple[Frame, Array]:
 
         K = P_a (P_a + P_b)⁻¹,  x = x_a + K (x_b ⊖ x_a),  P = (I - K) P_a (I - K)ᵀ + K P_b Kᵀ
 
-    so P⁻¹ = P_a⁻¹ + P_b⁻¹ where these exist, and a vague frame does not cancel a sharp one. Where
-    the sum is singular, a is returned.
+    so P⁻¹ = P_a⁻¹ + P_b⁻¹ where these exist, and an uncertain estimate causes no cancellation.
+    Where the sum is singular, a is returned.
     """
     solved, regular = linalg.solve_psd(a.cov + b.cov, a.cov)
     gain = jnp.where(regular, solved.T, 0.0)
@@ -74,7 +74,7 @@ def mahalanobis_squared(a: Frame, b: Frame) -> tuple[Array, Array]:
 
 
 def bhattacharyya(a: Frame, b: Frame) -> tuple[Array, Array]:
-    """-log ∫√(p_a p_b), 0 for the same Gaussian, and whether both covariances are regular:
+    """The Bhattacharyya distance -log ∫√(p_a p_b), and whether both covariances are regular:
 
         D = ⅛ δᵀ P⁻¹ δ + ½ log(|P| / √(|P_a| |P_b|)),  P = (P_a + P_b)/2
 

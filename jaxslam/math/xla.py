@@ -1,4 +1,4 @@
-"""What XLA has to be told: what to compute once, and what to skip for a whole batch."""
+"""Control of XLA: what to compute once, what to skip for a whole batch, compiler options."""
 
 import functools
 from collections.abc import Callable
@@ -16,14 +16,14 @@ def no_inline(function: Callable[..., _T], *arguments: Any) -> _T:
     """function(*arguments), compiled as a computation of its own.
 
     XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
-    of D entries would be computed anew at each of the D² entries of the covariance it updates. It
-    fuses nothing across a call that may not be inlined. (An `optimization_barrier` is gone by the
-    time it fuses.)
+    of D entries would be computed again for each of the D² entries of the covariance it updates. It
+    does not fuse across a call that may not be inlined. (An `optimization_barrier` is removed
+    before fusion.)
     """
 
     @functools.wraps(function)
     def whole(*arguments: Any) -> _T:
-        with set_xla_metadata(inlineable="true"):  # what it calls in turn
+        with set_xla_metadata(inlineable="true"):  # functions that it calls
             return function(*arguments)
 
     with set_xla_metadata(inlineable="false"):
@@ -31,19 +31,19 @@ def no_inline(function: Callable[..., _T], *arguments: Any) -> _T:
 
 
 def quick_options(platform: str) -> dict[str, Any] | None:
-    """Options with which XLA compiles a straight program in less time; None where there are none.
+    """Compiler options that shorten the compilation of loop-free programs; None if there are none.
 
-    A straight program spends its time in long passes over arrays, not in a loop of small ones, or
-    runs but once. On a CPU it is compiled without most of LLVM's optimizations.
+    For programs that run only once, or spend their time in long passes over arrays and not in loops
+    over small ones. On a CPU they are compiled without most of LLVM's optimizations.
     """
     return {"xla_backend_optimization_level": 1} if platform == "cpu" else None
 
 
 def hot_options(platform: str) -> dict[str, Any] | None:
-    """Options with which a program that runs long runs faster; None where there are none.
+    """Compiler options that speed up long-running programs; None if there are none.
 
-    XLA vectorizes code of a CPU for 256 bits unless it is told. Where the processor has AVX-512,
-    512 made 32 runs of EKF-SLAM 1.1 times as fast in float64 and float32.
+    By default XLA vectorizes CPU code for 256 bits. Where the processor has AVX-512, 512 bits made
+    32 runs of EKF-SLAM 1.1 times as fast in float64 and float32.
     """
     return _wide_vectors() if platform == "cpu" else None
 
@@ -68,19 +68,19 @@ def _wide_vectors() -> dict[str, Any] | None:
 
 
 def quick_jit(function: Callable[..., _T]) -> Callable[..., _T]:
-    """jax.jit(function) for a program that runs but once; see `quick_options`."""
+    """jax.jit(function) for a program that runs only once; see `quick_options`."""
     options = quick_options(jax.default_backend())
     return cast(Callable[..., _T], jax.jit(function, compiler_options=options))
 
 
 def materialize(values: _T) -> _T:
-    """The same arrays, computed once and kept; `no_inline` saves a copy of large ones."""
+    """The arrays, computed once and stored; for large ones, `no_inline` avoids a copy."""
     return cast(_T, no_inline(jax.lax.optimization_barrier, values))
 
 
 @jax.custom_batching.custom_vmap
 def anywhere(flag: jax.Array) -> jax.Array:
-    """Whether the flag () is set; under `vmap`, in any run of the batch, one answer for all.
+    """Whether the flag () is set in any run of the batch under `vmap`; not batched itself.
 
     Under `vmap` a `lax.cond` with a predicate of its own for each run becomes a `select`, and both
     branches are computed. One predicate for the whole batch stays a branch.
@@ -104,7 +104,7 @@ def where_any(
 
 
 def change_where(flag: jax.Array, change: Callable[[_T], _T], state: _T) -> _T:
-    """change(state) of a run whose flag () is set, else the state to the bit.
+    """change(state) of a run whose flag () is set, else exactly the state.
 
     Computed only where the flag is set in any run of the batch.
     """

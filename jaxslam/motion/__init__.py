@@ -1,4 +1,4 @@
-"""Motion models, one a file. `REGISTRY` is what the conformance suite runs over."""
+"""Motion models, one a file. The conformance tests run over `REGISTRY`."""
 
 from collections.abc import Callable
 

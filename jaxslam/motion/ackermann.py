@@ -1,4 +1,4 @@
-"""A car steered at its front wheels, known by the pose of the laser it carries."""
+"""The Ackermann model of a car steered at its front wheels; the pose is that of its laser."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +34,7 @@ def ackermann(
     they drove through Victoria Park.
 
     Precondition, not checked: |α| < π/2 and |α| < atan(L/|H|), noise included. At the second bound
-    the car turns about the encoder's wheel, whose speed then says nothing about the car's.
+    the car turns about the encoder's wheel, whose speed then does not determine the car's.
 
     Args:
         noise_cov: (2, 2) covariance of w on (v_e, α), or a function of (pose, u).
@@ -48,7 +48,7 @@ def ackermann(
     _check_lengths(wheelbase, sensor, encoder)
 
     def rates(u: Control) -> tuple[Array, Array, Array]:
-        """By the curvature κ = tan α/L: v; its gain v/v_e; the sensor's twist over v, (3,)."""
+        """Speed v, gain v/v_e and the sensor's twist over v (3,), from curvature κ = tan α/L."""
         a, b = jnp.asarray(sensor, u.dtype)
         curvature = jnp.tan(u[1]) / jnp.asarray(wheelbase, u.dtype)
         gain = 1 / (1 - jnp.asarray(encoder, u.dtype) * curvature)

@@ -1,4 +1,4 @@
-"""Move forward, then turn: the guide's robot."""
+"""A forward motion followed by a turn: the motion model of Solà's guide."""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""Turn, drive, turn again: how wheel odometry tells one pose from the next."""
+"""The odometry motion model: a rotation, a translation and a rotation."""
 
 from collections.abc import Callable
 
@@ -94,8 +94,8 @@ def odometry_control(before: Array, after: Array) -> Array:
         trans = √((x' - x)² + (y' - y)²)
         rot2  = wrap(θ' - θ - rot1)
 
-    trans >= 0, so a robot that backs up turns by π first and last. Without translation rot1 has no
-    value: u is (0, 0, wrap(θ' - θ)) with finite derivatives.
+    trans >= 0, so a robot that backs up turns by π first and last. Without translation rot1 is
+    undefined: u is (0, 0, wrap(θ' - θ)) with finite derivatives.
 
     Args:
         before, after: poses (3,) in one frame, the odometry's own for instance.

@@ -1,4 +1,4 @@
-"""A relative pose, as odometry or scan matching reports it."""
+"""A relative pose as the control, as odometry or scan matching gives it."""
 
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians

@@ -1,4 +1,4 @@
-"""Several controls between two scans, as one: a robot that steers faster than it looks."""
+"""Several controls between two scans, combined into one control."""
 
 import jax
 import jax.numpy as jnp
@@ -87,6 +87,6 @@ def substeps(motion: Motion, count: int) -> Motion:
 
 
 def _numbered(names: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """("v [m/s]",) twice is ("v 1 [m/s]", "v 2 [m/s]"): the unit stays last, for `verify`."""
+    """Numbered names: ("v [m/s]",) twice is ("v 1 [m/s]", "v 2 [m/s]"), units last for `verify`."""
     parts = [name.partition(" [") for name in names]
     return tuple(f"{a} {k + 1}{space}{unit}" for k in range(count) for a, space, unit in parts)

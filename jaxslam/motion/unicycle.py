@@ -1,4 +1,4 @@
-"""Velocities held over an interval, integrated by one Euler step."""
+"""The unicycle model: constant velocities over an interval, integrated by one Euler step."""
 
 import jax.numpy as jnp
 

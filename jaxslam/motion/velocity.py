@@ -1,4 +1,4 @@
-"""Velocities held over an interval, integrated exactly: a circular arc, then a turn on the spot."""
+"""The velocity motion model: constant velocities, integrated exactly, then a final rotation."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Compiled programs, kept: one for each structure, its numbers as arguments."""
+"""A cache of compiled programs: one program a structure, with its numbers as arguments."""
 
 from jaxslam.programs.cache import call, clear, trace
 

@@ -1,20 +1,20 @@
-"""Compiled programs, kept: one for each structure, its numbers as arguments.
+"""A cache of compiled programs: one program a structure, with its numbers as arguments.
 
 `call` runs a function of records of functions (a filter, a scenario) and arrays. Within a trace it
-is the plain call. Outside, three steps lead to the program, and each is left out where it can:
+is the plain call. Outside, three steps lead to the program, each skipped where possible:
 
 1. The same objects and the same shapes as before: the program is known. Nothing is traced.
 2. The function is traced to a jaxpr. What a factory closed over (noises, maps, mounts, gates,
    priors) stands in it as constants and literals; `hoisting` makes inputs of them. What is left is
    the structure.
-3. The structure is lowered. Of a text that has been compiled before, the program is taken as it is;
-   else XLA compiles it.
+3. The structure is lowered. If the same text was compiled before, that program is used; else XLA
+   compiles it.
 
 So another noise, map or gate of the same shapes costs tracing alone. An integer, and a number that
 `hoisting` leaves in the structure (0, ±1, ±π …), costs one compilation for each value.
 
-The programs least recently used are dropped beyond `ROOM`; `clear` drops all. Threads may call at
-once: whoever comes second waits for a program that is being compiled, and compiles nothing.
+The programs least recently used are dropped beyond `ROOM`; `clear` drops all. Concurrent threads
+that need the same program compile it once: the others wait.
 """
 
 import functools
@@ -37,14 +37,14 @@ from jaxslam.programs.hoisting import hoisted
 _T = TypeVar("_T")
 
 ROOM = 256
-"""Programs, and sets of objects that lead to one, that are kept."""
+"""The number of programs, and of sets of objects that lead to one, in the cache."""
 
 
 _ALL: "weakref.WeakSet[Kept]" = weakref.WeakSet()
 
 
 class Kept:
-    """Results by key, each made once, the least recently used dropped beyond `room`."""
+    """A least-recently-used cache of at most `room` results by key."""
 
     def __init__(self, room: int) -> None:
         _ALL.add(self)
@@ -53,7 +53,7 @@ class Kept:
         self._found: OrderedDict[Hashable, Future[Any]] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], _T]) -> _T:
-        """What `make` returned for the key, calling it where nothing has; an error is not kept."""
+        """The cached result for the key, or that of `make()`; errors are not cached."""
         with self._lock:
             promise = self._found.get(key)
             mine = promise is None
@@ -74,12 +74,12 @@ class Kept:
         return cast(_T, promise.result())
 
     def drop(self, key: Hashable) -> None:
-        """Forget what was made for a key."""
+        """Drop the result for a key."""
         with self._lock:
             self._found.pop(key, None)
 
     def clear(self) -> None:
-        """Drop everything."""
+        """Drop all results."""
         with self._lock:
             self._found.clear()
 
@@ -92,13 +92,13 @@ _BY_TEXT = Kept(ROOM)
 
 
 def clear() -> None:
-    """Drop every program that is kept here; what runs goes on."""
+    """Clear the cache of programs; running programs are not affected."""
     for kept in list(_ALL):
         kept.clear()
 
 
 class Same:
-    """An object as a key: equal to itself alone, and kept alive."""
+    """An object as a key, compared by identity and kept alive."""
 
     def __init__(self, what: Any) -> None:
         self._what = what
@@ -111,12 +111,12 @@ class Same:
 
 
 def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any) -> _T:
-    """function(*objects, *arguments), by a program that is compiled once for its structure.
+    """function(*objects, *arguments), computed by a program that is compiled once a structure.
 
     Within a trace, or where JIT is disabled, the plain call.
 
     Args:
-        function: pure; not a lambda made anew at each call, which would be traced anew.
+        function: pure; not a lambda created at each call, which would be traced at each call.
         objects: what the function takes first: records of functions, options. The same objects are
             not traced again; they are kept alive.
         arguments: trees of arrays.
@@ -130,25 +130,25 @@ def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any)
     run, numbers, out = _BY_OBJECTS.get(
         key, lambda: _program(functools.partial(function, *objects), tree, shapes)
     )
-    if numbers is None:  # it closes over tracers after all
+    if numbers is None:  # it closes over tracers
         return function(*objects, *arguments)
     return cast(_T, jax.tree.unflatten(out, run(numbers, *leaves)))
 
 
 def outside(*values: Any) -> bool:
-    """Whether no trace is going on, and no leaf is of one."""
+    """Whether no trace is active and no leaf is a tracer."""
     return jax_core.trace_state_clean() and not any(
         isinstance(leaf, jax_core.Tracer) for leaf in jax.tree.leaves(values)
     )
 
 
 def context() -> Hashable:
-    """What else a trace depends on: precision, promotion, the default device."""
+    """The global settings that a trace depends on: precision, promotion, the default device."""
     return jax_config.trace_context(), jax_config.default_device.value
 
 
 class Shape(NamedTuple):
-    """Of one array: what a program is compiled for."""
+    """The shape and type of one array that a program is compiled for."""
 
     shape: tuple[int, ...]
     dtype: Any
@@ -181,7 +181,7 @@ def _program(
 
 
 class Traced(NamedTuple):
-    """A function without its numbers."""
+    """A traced function whose constants are inputs."""
 
     call: Callable[..., list[Any]]
     """(numbers, *leaves of the arguments) -> leaves of the result"""
@@ -208,9 +208,9 @@ def trace(function: Callable[..., Any], *arguments: Any) -> Traced | None:
 def compiled(
     lowered: jax.stages.Lowered, where: Hashable, options: dict[str, Any] | None = None
 ) -> Callable[..., Any]:
-    """The program of a lowered text, compiled unless the same has been for the same devices."""
+    """The compiled program of a lowered text, from the cache if compiled for the same devices."""
     text = hashlib.sha256(lowered.as_text().encode()).digest()
-    # Arguments that nothing reads are not in the text.
+    # Unused arguments are not in the text.
     told = tuple(sorted(options.items())) if options else ()
     key = (text, where, lowered.in_tree, str(lowered.in_avals), told)
     return _BY_TEXT.get(key, lambda: cast(Callable[..., Any], lowered.compile(options)))

@@ -1,10 +1,10 @@
-"""Constants of a traced function as its inputs, so that it is the same for all their values.
+"""Constants of a traced function turned into inputs, so that one program serves all their values.
 
 A jaxpr holds the arrays that a function closed over as constants, and its scalars as literals among
-the operands. `hoisted` makes inputs of both, through calls, loops and branches. Floating-point
-literals that formulas consist of stay, since XLA simplifies with them: 0, ±1, ±π/2, ±π, ±2π,
-infinities and the limits of the dtype; so do integers, which may say how large something is. A
-primitive that is not known here keeps what it has inside.
+the operands. `hoisted` turns both into inputs, through calls, loops and branches. Literals that
+are common in formulas remain, since XLA simplifies with them: 0, ±1, ±π/2, ±π, ±2π, infinities
+and the limits of the dtype; so do integers, which may be sizes. Unknown primitives keep their
+constants.
 """
 
 import functools
@@ -35,7 +35,7 @@ _PLAIN = frozenset(
 
 
 def _is_number(atom: Any) -> bool:
-    """Whether it is a literal that a parameter may have put there."""
+    """Whether an operand is a literal number that may come from a parameter."""
     if not isinstance(atom, core.Literal) or not jnp.issubdtype(atom.aval.dtype, jnp.floating):
         return False
     value = float(atom.val)
@@ -49,7 +49,7 @@ def _is_number(atom: Any) -> bool:
 
 
 class _Hoisting:
-    """One pass over a jaxpr. What is called twice is rewritten once."""
+    """One pass over a jaxpr, which rewrites each inner jaxpr once."""
 
     def __init__(self) -> None:
         self._done: dict[tuple[int, ...], tuple[Any, Any, Any]] = {}
@@ -87,7 +87,7 @@ class _Hoisting:
         return new, numbers
 
     def inner(self, closed: Any, given: "_Given") -> tuple[Any, list[Any]]:
-        """The jaxpr of a call without its numbers, and what stands for them outside."""
+        """The jaxpr of a call without its numbers, and the outer variables that replace them."""
         jaxpr, numbers = self.of(closed.jaxpr, closed.consts)
         return jaxpr, given(numbers, [var.aval for var in jaxpr.invars[: len(numbers)]])
 
@@ -98,13 +98,13 @@ _Rewrite = Callable[[_Hoisting, Any, _Given], Any]
 
 @functools.cache
 def _plain_call() -> Any:
-    """An equation that calls a function of one argument."""
+    """The handler of an equation that calls one function."""
     (eqn,) = jax.make_jaxpr(jax.jit(lambda x: x + 1.0))(0.0).eqns
     return eqn
 
 
 def _call(work: _Hoisting, eqn: Any, given: _Given) -> Any:
-    """jit."""
+    """The handler of jit."""
     jaxpr, new = work.inner(eqn.params["jaxpr"], given)
     params, plain = dict(eqn.params), _plain_call().params
     params["jaxpr"] = core.ClosedJaxpr(jaxpr, [])
@@ -114,7 +114,7 @@ def _call(work: _Hoisting, eqn: Any, given: _Given) -> Any:
 
 
 def _as_call(name: str) -> _Rewrite:
-    """A call with rules for transformations, of which none comes after this: as a plain one."""
+    """A call with custom differentiation rules, rewritten as a plain call."""
 
     def rewrite(work: _Hoisting, eqn: Any, given: _Given) -> Any:
         plain = _plain_call()
@@ -130,7 +130,7 @@ def _as_call(name: str) -> _Rewrite:
 
 
 def _scan(work: _Hoisting, eqn: Any, given: _Given) -> Any:
-    """scan: constants come first."""
+    """The handler of scan, whose constants come first."""
     jaxpr, new = work.inner(eqn.params["jaxpr"], given)
     params = dict(eqn.params)
     params["jaxpr"] = core.ClosedJaxpr(jaxpr, [])
@@ -147,7 +147,7 @@ def _scan(work: _Hoisting, eqn: Any, given: _Given) -> Any:
 
 
 def _while(work: _Hoisting, eqn: Any, given: _Given) -> Any:
-    """while: constants of the condition, then of the body, come first."""
+    """The handler of while: constants of the condition, then of the body, come first."""
     params, invars = dict(eqn.params), list(eqn.invars)
     at = 0
     for kind in ("cond", "body"):
@@ -160,7 +160,7 @@ def _while(work: _Hoisting, eqn: Any, given: _Given) -> Any:
 
 
 def _cond(work: _Hoisting, eqn: Any, given: _Given) -> Any:
-    """cond: every branch takes the numbers of all."""
+    """The handler of cond: every branch takes the numbers of all branches."""
     found = [work.inner(branch, given) for branch in eqn.params["branches"]]
     new = [var for _, mine in found for var in mine]
     branches = []
@@ -179,7 +179,7 @@ def _cond(work: _Hoisting, eqn: Any, given: _Given) -> Any:
 
 
 def _checkpoint(work: _Hoisting, eqn: Any, given: _Given) -> Any:
-    """checkpoint, whose jaxpr is open."""
+    """The handler of checkpoint, whose jaxpr is open."""
     jaxpr, new = work.inner(core.ClosedJaxpr(eqn.params["jaxpr"], []), given)
     return eqn.replace(invars=[*new, *eqn.invars], params=eqn.params | {"jaxpr": jaxpr})
 

@@ -1,4 +1,4 @@
-"""Resampling methods: which particles are kept and copied. `REGISTRY` is what their tests run over.
+"""Resampling methods of particle filters. Their tests run over `REGISTRY`.
 
 `soft` and `stop_gradient` make a method differentiable; `kld` says how many particles suffice.
 """

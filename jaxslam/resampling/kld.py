@@ -1,4 +1,4 @@
-"""How many particles are enough: the KLD bound, over the bins that a sample occupies."""
+"""KLD sampling: the number of particles by the bins that a sample occupies."""
 
 import math
 
@@ -15,12 +15,12 @@ _FARTHEST = float(2**30)
 
 
 def kld_bound(bins: Int[Array, "*K"], error: float, confidence: float) -> Float[Array, "*K"]:
-    """How many particles k = `bins` occupied bins ask for; 0 where k <= 1.
+    """The number of particles that k = `bins` occupied bins require; 0 where k <= 1.
 
         n = (k-1)/(2ε) · (1 - 2/(9(k-1)) + √(2/(9(k-1))) z)³
 
     with z the standard normal quantile of the confidence: with that probability the Kullback-
-    Leibler divergence of the sample's histogram from the distribution it is of is below ε = error.
+    Leibler divergence of the sample's histogram from its distribution is below ε = error.
     2nK is χ² with k - 1 degrees of freedom, by Wilson & Hilferty's approximation (Fox 2001,
     "KLD-sampling: Adaptive particle filters"; Fox 2003, IJRR 22(12), eq. 7).
 
@@ -48,10 +48,10 @@ def bins_of(pose: Float[Array, "P 3"], size: tuple[float, float, float]) -> Int[
 
 
 def occupied(bins: Int[Array, "P 3"]) -> Int[Array, "P"]:
-    """How many different rows the first 1, 2, …, P of the bins have, int32.
+    """The number of distinct rows among the first 1, 2, …, P bins, int32.
 
-    By sorting, O(P log P) in time and O(P) in memory however large the world is: of equal rows the
-    sort, which is stable, puts the first drawn first.
+    By a stable sort, O(P log P) in time and O(P) in memory for any size of the world: among equal
+    rows the first drawn comes first.
     """
     index = jnp.arange(bins.shape[0], dtype=jnp.int32)
     x, y, heading, order = jax.lax.sort(
@@ -66,7 +66,7 @@ def occupied(bins: Int[Array, "P 3"]) -> Int[Array, "P"]:
 def enough(
     bins: Int[Array, "P 3"], least: int, error: float, confidence: float
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """How many of P exchangeable draws suffice, int32, and whether P were too few.
+    """The sufficient number of P exchangeable draws, int32, and whether P are too few.
 
     Fox's loop in fixed shapes: the first m >= least that is no less than `kld_bound` of the bins
     that the first m draws occupy; P where there is none.

@@ -1,4 +1,4 @@
-"""Multinomial resampling: independent draws, which have the most variance."""
+"""Multinomial resampling: independent draws, the method of the largest variance."""
 
 import jax
 from jax import Array

@@ -1,4 +1,4 @@
-"""Residual resampling: the whole part of P w_j as copies, and the rest by chance."""
+"""Residual resampling: ⌊P w_j⌋ copies of each particle, and random draws for the rest."""
 
 import jax
 import jax.numpy as jnp

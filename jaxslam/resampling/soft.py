@@ -15,14 +15,14 @@ def soft(share: float, resample: Resample = systematic) -> Differentiable:
     """Soft resampling (Karkus, Hsu & Lee 2018, "Particle filter networks with application to visual
     localization", CoRL): draw from the mixture of w and the uniform distribution,
 
-        q_j = share · w_j + (1 - share)/P        the copy of j weighs (w_j/q_j)/P
+        q_j = share · w_j + (1 - share)/P        weight of a copy of j: (w_j/q_j)/P
 
     The weights of the copies are divided by their sum, as a number; gradients go through w_j/q_j.
 
-    **Biased**: expectations keep their value, but as functions of a parameter the draws from q
-    change too, and of that this gradient knows nothing. share = 1 is plain resampling, whose copies
-    all weigh 1/P and pass no gradient; the gradient of share = 0 has no such bias, and resamples
-    nothing. `stop_gradient` is without it for any method.
+    **Biased**: expectations are correct, but the draws from q depend on the parameters too, and
+    the gradient ignores this. share = 1 is plain resampling, whose copies all have weight 1/P and
+    pass no gradient; share = 0 has an unbiased gradient, and does not resample by weight.
+    `stop_gradient` is unbiased for any method.
 
     Args:
         share: of the weights in the mixture, 0 to 1.

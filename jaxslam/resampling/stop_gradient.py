@@ -1,4 +1,4 @@
-"""Any resampling, with weights whose value is 1/P and whose gradient is the score of the draw."""
+"""Stop-gradient resampling: weights of value 1/P whose gradient is the score of the draw."""
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,11 @@ from jaxslam.resampling.weights import even, normalized
 
 def stop_gradient(resample: Resample = systematic) -> Differentiable:
     """The stop-gradient estimator (Ścibior & Wood 2021, "Differentiable particle filtering without
-    modifying the forward pass"): a copy of j weighs
+    modifying the forward pass"): a copy of j has the weight
 
         (1/P) · w_j/⊥(w_j)        ⊥ being `jax.lax.stop_gradient`
 
-    that is 1/P, so no number changes; its derivative is (1/P) ∂ log w_j, and
+    that is 1/P, so values do not change; its derivative is (1/P) ∂ log w_j, and
 
         E Σ_i (1/P) f(a_i) ∂ log w_{a_i} = Σ_j f_j ∂w_j
 
@@ -38,7 +38,7 @@ def stop_gradient(resample: Resample = systematic) -> Differentiable:
         log_w, _, some = normalized(log_weights)
         ancestor = resample(jax.lax.stop_gradient(log_weights), key)
         chosen = jnp.where(some, log_w, 0.0)[ancestor]
-        # Nothing without weight is drawn; the where is for gradients of what is not.
+        # Particles of weight zero are not drawn; the where keeps gradients of the others finite.
         chosen = jnp.where(jnp.isfinite(chosen), chosen, 0.0)
         return ancestor, even(log_weights) + (chosen - jax.lax.stop_gradient(chosen))
 

@@ -1,4 +1,4 @@
-"""What resampling methods share: weights from logarithms, and indices in a cumulative sum."""
+"""Particle weights: normalization, effective sample size, indices in the cumulative sum."""
 
 from typing import TypeVar
 
@@ -16,10 +16,10 @@ _T = TypeVar("_T")
 def normalized(
     log_weights: Float[Array, "P"],
 ) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
-    """log w of Σ w = 1, log Σ exp(log_weights), and whether there was a sum.
+    """Normalized log-weights (Σ w = 1), log Σ exp(log_weights), and whether that sum is positive.
 
-    What is not finite weighs nothing. Where nothing is left, all weigh 1/P and the flag is False:
-    the caller counts it. The log of the sum is then 0.
+    Log-weights that are not finite give weight zero. If all are, each weight is 1/P, the flag is
+    False and the log of the sum is given as 0.
 
     Raises ValueError unless log_weights has shape (P,), P at least 1.
     """
@@ -36,15 +36,15 @@ def normalized(
 
 
 def even(log_weights: Float[Array, "P"]) -> Float[Array, ""]:
-    """log 1/P."""
+    """Equal log-weights: log 1/P each."""
     return -jnp.log(jnp.asarray(float(log_weights.shape[0]), log_weights.dtype))
 
 
 def survivors(
     resample: Resample | Differentiable, log_weights: Float[Array, "P"], key: Array
 ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
-    """The ancestor of each that goes on, and its log-weight: 1/P unless the method, being a
-    `Differentiable`, says something else."""
+    """The ancestors and their log-weights: log 1/P unless the method is a `Differentiable`, which
+    returns its own."""
     found = resample(log_weights, key)
     if isinstance(found, tuple):
         return found
@@ -58,9 +58,9 @@ def resampled_where(
     resample: Resample | Differentiable,
     key: Array,
 ) -> tuple[_T, Float[Array, "P"]]:
-    """Particles, a tree of arrays (P, …), and their log-weights: resampled if due, else the same.
+    """Particles, a tree of arrays (P, …), and their log-weights, resampled if `due`.
 
-    Of a batch in which nothing is due, nothing is copied.
+    In a batch without a due run nothing is copied.
     """
 
     def survive(carried: tuple[_T, Array]) -> tuple[_T, Array]:
@@ -74,7 +74,7 @@ def resampled_where(
 
 
 def weights_of(log_weights: Float[Array, "P"]) -> Float[Array, "P"]:
-    """w with Σ w = 1 of log-weights of any scale; even where all underflow."""
+    """Weights w with Σ w = 1 of log-weights of any scale; equal where all underflow."""
     return jnp.exp(normalized(log_weights)[0])
 
 
@@ -85,7 +85,7 @@ def effective_size(log_weights: Float[Array, "P"]) -> Float[Array, ""]:
 
 
 def at_points(weights: Float[Array, "P"], points: Float[Array, "K"]) -> Int[Array, "K"]:
-    """The index in whose share of the cumulative sum of weights each point lies, int32.
+    """The index of the interval of the cumulative sum of weights in which each point lies, int32.
 
     points are in [0, 1); the share of i is [W_{i-1}, W_i)/W_P, so that no zero weight is chosen,
     also where a point is rounded up to 1.

@@ -1,4 +1,4 @@
-"""Sensors, one a file. `REGISTRY` is what the conformance suite runs over."""
+"""Sensors, one a file. The conformance tests run over `REGISTRY`."""
 
 from collections.abc import Callable
 

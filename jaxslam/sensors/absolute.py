@@ -26,7 +26,7 @@ def absolute(
     jacobian: Callable[[Pose], Float[Array, "Z 3"]],
     noise_cov: NoiseCov,
 ) -> Sensor:
-    """The sensor z = h(pose) + v with L = 0; `invert`, `embed` and `position` are never read.
+    """The sensor z = h(pose) + v with L = 0; its `invert`, `embed` and `position` are not used.
 
     Args:
         observe, jacobian: (pose) -> z, and its derivative by the pose.

@@ -1,4 +1,4 @@
-"""Direction of a landmark that is held as a ray from its first sighting and an inverse distance."""
+"""Bearing of a landmark with inverse-depth parameters: anchor position, direction, 1/distance."""
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +25,10 @@ from jaxslam.sensors.prior import FreeLike, prior
 from jaxslam.validation.numbers import is_concrete
 
 _FAR = 1e-6
-"""[1/m] below this inverse distance `position` places a landmark as if it had this one."""
+"""[1/m] least inverse distance that `position` uses."""
 
 _NEAR = 1e-6
-"""[m] below this distance `embed` starts a landmark as if it had this one."""
+"""[m] least distance with which `embed` starts a landmark."""
 
 
 def bearing_inverse_depth(
@@ -40,26 +40,26 @@ def bearing_inverse_depth(
 ) -> Sensor:
     """z = (bearing [rad]) of l = (x0 [m], y0 [m], alpha [rad], rho [1/m]), Solà 2.3.6.
 
-    p0 = (x0, y0) is where the sensor first saw the landmark from, α the direction in the map, ρ the
-    inverse of the distance (46), (49). From another place t_S, S = pose ∘ mount, the line of sight,
+    p0 = (x0, y0) is the sensor's position at the first measurement, α the direction in the map, ρ
+    the inverse distance (46), (49). From another position t_S, S = pose ∘ mount, the line of sight,
     scaled by ρ, is (51)
 
         v = ρ(p0 - t_S) + (cos α, sin α)        z = bearing of R(θ_S)ᵀ v
 
-    which is linear in ρ and regular at ρ = 0, a landmark at infinity, and below: the noise may take
-    the estimate of a far landmark there. (The unscaled (50) is singular at 0, and for ρ < 0 it has
-    the opposite direction.) Where v = 0, z is 0 with zero derivatives. invert is (53),
+    which is linear in ρ and regular at ρ = 0, a landmark at infinity, and below: noise may make the
+    estimate of a distant landmark negative. (The unscaled (50) is singular at 0, and for ρ < 0 it
+    has the opposite direction.) Where v = 0, z is 0 with zero derivatives. invert is (53),
     l = (t_S, wrap(θ_S + z), s), with s = (inverse depth [1/m]).
 
     position is (48), p0 + (cos α, sin α)/ρ_c, with ρ_c = max(ρ, 1e-6): a landmark at infinity or
-    beyond stands 1000 km off in its direction. Its derivative by ρ is -1/ρ_c² also where ρ is cut
-    off, so that a covariance taken through it is huge there, as it should be, and not zero. embed
-    bounds the distance below by 1e-6 m.
+    beyond is placed 1000 km away in its direction. Its derivative by ρ is -1/ρ_c² also where ρ is
+    clipped, so that a propagated covariance is large there, and not zero. embed bounds the distance
+    below by 1e-6 m.
 
     to_point: a landmark becomes a point (x, y), which frees two of its coordinates, once a point is
-    as good to a first-order filter. With the point at distance d_0 = 1/ρ from p0 and at d from the
-    sensor, and the angle γ between the two lines of sight, the linearity index of Civera, Davison &
-    Montiel ("Inverse depth to depth conversion for monocular SLAM", ICRA 2007)
+    as accurate in a first-order filter. With the point at distance d_0 = 1/ρ from p0 and at d from
+    the sensor, and the angle γ between the two lines of sight, the linearity index of Civera,
+    Davison & Montiel ("Inverse depth to depth conversion for monocular SLAM", ICRA 2007)
 
         L_d = 4 (σ_ρ/ρ²) |cos γ| / d
 
@@ -99,8 +99,8 @@ def bearing_inverse_depth(
         return jnp.concatenate([frame[:2], wrap(frame[2:] + z), s])
 
     def position(landmark: Landmark) -> Point:
-        # max(ρ, _FAR) with slope 1 everywhere. Added to the cut value, not to ρ, the term is an
-        # exact zero: in float32 ρ + (_FAR - ρ) could be 0.
+        # max(ρ, _FAR) with derivative 1 everywhere. Added to the clipped value, not to ρ, the term
+        # is an exact zero: in float32 ρ + (_FAR - ρ) could be 0.
         inverse = landmark[3]
         cut = jax.lax.stop_gradient(jnp.maximum(inverse, _FAR))
         inverse = cut + (inverse - jax.lax.stop_gradient(inverse))

@@ -1,4 +1,4 @@
-"""Direction of a point landmark, without its distance: a camera, a radio direction finder."""
+"""Bearing of a point landmark, without its range: a camera, a radio direction finder."""
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from jaxslam.sensors.mounting import NO_OFFSET, mounting
 from jaxslam.sensors.prior import FreeLike, prior
 
 TEN_METRES = ((10.0,), ((25.0,),))
-"""Range 10 m, σ 5 m: a placeholder for what is known of the world at hand."""
+"""Range 10 m, σ 5 m: a placeholder for the actual prior knowledge."""
 
 
 def bearing_only(
@@ -27,15 +27,14 @@ def bearing_only(
 ) -> Sensor:
     """z = (bearing [rad]) of l = (x, y): the direction of R(θ_S)ᵀ(l - t_S), S = pose ∘ mount.
 
-    The second row of Solà (63). invert is (64) with s = (range [m]) in place of what was not
-    measured: from_frame(S, rectangular((s, z))), s > 0; a negative range lies behind the sensor. A
-    landmark exactly at the sensor gives z = 0 with zero derivatives, not NaN.
+    The second row of Solà (63). invert is (64) with s = (range [m]) for the unmeasured coordinate:
+    from_frame(S, rectangular((s, z))), s > 0; a negative range lies behind the sensor. A landmark
+    exactly at the sensor gives z = 0 with zero derivatives, not NaN.
 
-    Choose the prior for your world. The distance has no upper bound, the bearing bends strongly in
-    it, and an EKF linearizes once over all that the prior allows: narrow, the prior is a claim that
-    the world may refute; wide, the tangent no longer describes the sensor within it, and the filter
-    breaks (Solà 2.3.5). Landmarks started in inverse distance have no such conflict: see
-    `bearing_inverse_depth`.
+    Choose the prior for your application. The range has no upper bound, the bearing is strongly
+    nonlinear in it, and an EKF linearizes once over the whole prior. A narrow prior may be wrong;
+    with a wide one the linearization error makes the filter diverge (Solà 2.3.5). Landmarks
+    initialized by inverse distance avoid this conflict: see `bearing_inverse_depth`.
 
     Args:
         noise_cov: (1, 1) covariance of the bearing, or a function of z.

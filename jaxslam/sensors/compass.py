@@ -1,4 +1,4 @@
-"""The robot's heading in the map: a compass, a sun sensor."""
+"""Measurement of the robot's heading in the map: a compass, a sun sensor."""
 
 from numpy.typing import ArrayLike
 
@@ -13,7 +13,7 @@ def compass(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     """z = (heading [rad]) = wrap(θ + θ_mount), counter-clockwise from the map's x-axis.
 
     An absolute sensor (Williams' list of observations): there is no landmark, L = 0, and `invert`,
-    `embed` and `position` (zeros) only complete the record; nothing reads them.
+    `embed` and `position` (zeros) are not used.
 
     Args:
         noise_cov: (1, 1) covariance of the heading, or a function of z.

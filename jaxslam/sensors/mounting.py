@@ -1,4 +1,4 @@
-"""Where a sensor sits on the robot: Solà's S, a constant pose in the robot's frame."""
+"""The pose of a sensor on the robot: Solà's S, constant in the robot's frame."""
 
 from collections.abc import Callable
 

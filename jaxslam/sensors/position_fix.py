@@ -1,4 +1,4 @@
-"""The robot's position in the map: a satellite receiver, a total station."""
+"""Measurement of the robot's position in the map: a satellite receiver, a total station."""
 
 from numpy.typing import ArrayLike
 
@@ -12,7 +12,7 @@ def position_fix(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     """z = (x [m], y [m]) of the antenna: t + R(θ) t_mount, the translation of pose ∘ mount.
 
     An absolute sensor (GPS in Williams' list of observations): there is no landmark, L = 0, and
-    `invert`, `embed` and `position` (zeros) only complete the record; nothing reads them.
+    `invert`, `embed` and `position` (zeros) are not used.
 
     Args:
         noise_cov: (2, 2) covariance of z, or a function of z.

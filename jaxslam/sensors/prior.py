@@ -1,4 +1,4 @@
-"""The prior of what a measurement cannot see: Solà's s ~ N(s̄, S), checked once, by the factory."""
+"""The prior of the unmeasured landmark parameters: Solà's s ~ N(s̄, S), checked by the factory."""
 
 from typing import Any, cast
 
@@ -14,7 +14,7 @@ FreeLike = Free | tuple[ArrayLike, ArrayLike]
 
 
 def prior(name: str, free: FreeLike, size: int) -> Free:
-    """free = (mean (size,), cov (size, size)), as a `Free` that any dtype can be taken from.
+    """The `Free` of free = (mean (size,), cov (size, size)), in float64 on the host unless traced.
 
     Raises ValueError unless the mean is finite and the covariance positive definite; a traced part
     is checked for its shape alone.
@@ -35,7 +35,7 @@ def prior(name: str, free: FreeLike, size: int) -> Free:
 
 
 def _held(values: Any) -> jax.Array:
-    """On the host in float64, not in the width JAX has when the factory is called."""
+    """The array on the host in float64, whatever the default width of JAX."""
     if not is_concrete(values):
         return jnp.asarray(values)
     array = np.asarray(values)

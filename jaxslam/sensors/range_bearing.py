@@ -1,4 +1,4 @@
-"""Distance and direction of a point landmark: a laser scanner's corner, a sonar's echo."""
+"""Range and bearing of a point landmark, as of a laser scanner or a sonar."""
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike

@@ -1,4 +1,4 @@
-"""Distance and direction of a landmark that also shows a number: a reflectivity, a diameter."""
+"""Range, bearing and signature of a landmark; a signature is a reflectivity or a diameter."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -22,10 +22,10 @@ from jaxslam.sensors.mounting import NO_OFFSET, mounting
 def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     """z = (range [m], bearing [rad], signature [1]) of l = (x, y, signature): D = 3 + 3N.
 
-    polar(to_frame(pose ∘ mount, (x, y))) as in `range_bearing`, and the signature as it is: the
-    landmarks of three parameters that Tacher counts. The signature is in the map, estimated like a
-    coordinate; to recognize landmarks by it is the association's affair. embed knows no signature
-    and gives 0. A landmark exactly at the sensor gives z = (0, 0, signature), not NaN.
+    polar(to_frame(pose ∘ mount, (x, y))) as in `range_bearing`, and the signature unchanged: the
+    landmarks with three parameters of Tacher. The signature is estimated like a coordinate; an
+    association method may use it to recognize landmarks. embed gives a signature of 0. A landmark
+    exactly at the sensor gives z = (0, 0, signature), not NaN.
 
     Args:
         noise_cov: (3, 3) covariance of (range, bearing, signature), or a function of z.

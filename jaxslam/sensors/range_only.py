@@ -1,4 +1,4 @@
-"""Distance of a point landmark, without its direction: a radio beacon, a sonar's echo."""
+"""Range of a point landmark, without its bearing: a radio beacon, a sonar's echo."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,13 +27,13 @@ def range_only(
 ) -> Sensor:
     """z = (range [m]) of l = (x, y): |l - t_S| with S = pose ∘ mount, the first row of Solà (63).
 
-    invert is (64) with s = (bearing [rad]) in the sensor's frame in place of what was not measured:
+    invert is (64) with s = (bearing [rad]) in the sensor's frame for the unmeasured coordinate:
     from_frame(S, rectangular((z, s))), z >= 0. A landmark exactly at the sensor gives z = 0 with
     zero derivatives, not NaN.
 
-    One Gaussian in x and y cannot hold a ring. With the default prior the linearized landmark is an
-    ellipse along the ring's tangent ahead of the sensor, and a filter that starts from it is no
-    honest one; give a narrower prior where the world offers one.
+    One Gaussian in x and y cannot represent a ring. With the default prior the linearized landmark
+    is an ellipse along the ring's tangent ahead of the sensor, and a filter that starts from it is
+    inconsistent; give a narrower prior where one is known.
 
     Args:
         noise_cov: (1, 1) covariance of the range, or a function of z.

@@ -1,4 +1,4 @@
-"""The position of a landmark in the sensor's own frame, Cartesian."""
+"""Cartesian position of a point landmark in the sensor's frame."""
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike

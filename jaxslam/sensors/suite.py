@@ -1,4 +1,4 @@
-"""Several sensors on one robot, each with its own model, mount, rate and places of a scan."""
+"""Several sensors on one robot, each with its own model, mount, rate and measurement slots."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -17,20 +17,20 @@ from jaxslam.validation.numbers import check_count
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One sensor of a suite. Raises ValueError on places or every below 1, or a bad start."""
+    """One sensor of a suite. Raises ValueError on places or every below 1, or an invalid start."""
 
     sensor: Sensor
     places: int
-    """measurement places of a scan that are its own; 1 of an absolute sensor"""
+    """its measurement slots in a scan; 1 of an absolute sensor"""
     every: int = 1
     """in a simulation it measures every so many steps,"""
     start: int = 0
-    """beginning with this one; a filter goes by `Scan.valid` alone"""
+    """beginning with this one; a filter uses `Scan.valid` alone"""
     visible: Callable[[Array, Array], Array] | None = None
     """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
     sees: Literal["landmarks", "robots"] = "landmarks"
-    """what its places are for in a simulation. A filter of one robot leaves places for robots
-    alone (`Status.UNMATCHED`); that of a team goes by the tags, and starts no landmark there."""
+    """what its slots measure in a simulation. A filter of one robot ignores measurements of
+    robots (`Status.UNMATCHED`); that of a team uses the tags, and starts no landmark there."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.sensor, Sensor) or isinstance(self.sensor, Suite):
@@ -48,24 +48,24 @@ class Part:
 
     @property
     def absolute(self) -> bool:
-        """Whether it measures the robot itself, and no landmark."""
+        """Whether it is an absolute sensor, which measures the robot and no landmark."""
         return not self.sensor.landmark
 
 
 @dataclass(frozen=True, eq=False)
 class Suite(Sensor):
-    """Sensors side by side; made by `suite`.
+    """A set of sensors with separate measurement slots; made by `suite`.
 
-    The first places of a scan are the first part's, the next ones the second's, and so on. Rows of
-    z are padded with zeros to the largest measurement. As a `Sensor` it says of what size logs and
-    landmarks are; its parts measure.
+    The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of
+    z are padded with zeros to the largest measurement. As a `Sensor` it only gives the sizes of
+    measurements and landmarks; the models are those of its parts.
     """
 
     parts: tuple[Part, ...] = ()
 
     @property
     def places(self) -> tuple[int, ...]:
-        """How many places of a scan each part has."""
+        """The number of measurement slots of each part."""
         return tuple(part.places for part in self.parts)
 
 
@@ -74,7 +74,7 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
 
     A filter takes the parts one after the other: each corrects by what it measured of known
     landmarks, then starts its new ones, which the next part may correct already in the same scan.
-    A tag may occur once a part. Absent data are places that are not valid, whatever the reason.
+    A tag may occur once a part. Absent measurements are slots that are not valid.
 
         eyes = suite((range_bearing(R, mount=front), 8), Part(compass(S), 1, every=10))
         filter = ekf_slam(motion, eyes, capacity)
@@ -82,8 +82,8 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
     Args:
         parts: a `Part`, or (sensor, places), each.
     Raises:
-        ValueError: without parts, on a part that is none, or if sensors of landmarks do not share
-            landmarks (x, y): only a single one may have others.
+        ValueError: without parts, on a part of another type, or if several sensors of landmarks do
+            not share landmarks (x, y): only a single one may have others.
     """
     made = tuple(part if isinstance(part, Part) else _part(part) for part in parts)
     if not made:
@@ -123,9 +123,9 @@ def _part(given: Any) -> Part:
 
 
 def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
-    """The scan (M,) divided into the places of each sensor, in order.
+    """The scan (M,) divided into the scans of the sensors, in order.
 
-    Raises ValueError unless the scan has as many places as the sensors together.
+    Raises ValueError unless the scan has as many slots as the sensors together.
     """
     if sum(places) != scan.tag.shape[0]:
         raise ValueError(f"expected places {tuple(places)} of a scan, got {scan.tag.shape[0]}")
@@ -137,10 +137,10 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
 
 
 def on_ground(sensor: Sensor, size: int) -> Sensor:
-    """The sensor among landmarks of `size` numbers, the first of which are its own.
+    """The sensor for landmarks of `size` numbers, of which it uses the first.
 
-    Of the others a measurement says nothing: an absolute sensor ignores them all, and a new
-    landmark gets them with zero mean, unit variance and no correlation, as padding has it.
+    A measurement does not depend on the others: an absolute sensor ignores them all, and in a new
+    landmark they have zero mean, unit variance and no correlation, as padding.
     """
     own, spare = len(sensor.landmark), size - len(sensor.landmark)
     if spare == 0:

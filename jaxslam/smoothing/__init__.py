@@ -1,4 +1,4 @@
-"""Smoothing: the whole path and map from the whole log, as estimators that the harness runs."""
+"""Smoothing: estimators of the whole path and map from the whole log."""
 
 from jaxslam.smoothing.batch_map import batch_map
 from jaxslam.smoothing.smooth import smooth

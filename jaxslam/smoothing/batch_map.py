@@ -1,4 +1,4 @@
-"""The maximum a posteriori path and map of a log: the yardstick of accuracy."""
+"""The maximum a posteriori (MAP) path and landmarks of a log, a reference for accuracy."""
 
 import math
 from typing import NamedTuple
@@ -68,7 +68,7 @@ def batch_map(
     gate: float | None = None,
     births: int | None = None,
 ) -> Estimator:
-    """Gauss-Newton on all poses and landmarks at once: the minimum of `problem.cost`.
+    """The MAP estimator: Gauss-Newton on all poses and landmarks, which minimizes `problem.cost`.
 
         ½ |x_0 ⊖ pose|²_{P0} + ½ Σ_t |w_t|²_{Q_t} + ½ Σ_{t,i} |z_ti ⊖ h(x_t, l_i)|²_{R_ti}
         with x_t = f(x_{t-1}, u_t, w_t)
@@ -145,7 +145,7 @@ def _problem_of(
     pose: ArrayLike,
     pose_cov: ArrayLike,
 ) -> tuple[Problem, Iterate, Chain]:
-    """The problem of a log, and where the search begins: the filter's path, and its own chain."""
+    """The problem of a log, and the initial iterate: the filter's path and its chain."""
     kind = log.control.dtype
     mean, cov = jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind)
     # The optimum does not depend on where the search begins, so no derivative goes there.
@@ -187,7 +187,7 @@ def _solved(sensor: Sensor, search: Search, passed: ForwardPass) -> tuple[Estima
 
 
 def _with_exhausted(info: Info, ending: Array) -> Info:
-    """The infos, the last one `exhausted` where the iterations did not converge."""
+    """The infos, with `exhausted` set in the last where the iterations did not converge."""
     if info.exhausted is None or info.exhausted.shape[0] == 0:
         return info
     cut_short = info.exhausted.at[-1].max(ending != Ending.CONVERGED)

@@ -1,4 +1,4 @@
-"""The linear-Gaussian problem of a path and a map, solved backward along the path.
+"""The linear-Gaussian problem of a path and a map, solved by a backward recursion.
 
 Poses form a chain and landmarks stand still, so the least-squares problem of T poses and N
 landmarks needs no matrix larger than the map's. Backward, the information that the future holds on
@@ -23,7 +23,7 @@ from jaxslam.math import linalg
 
 
 class Start(NamedTuple):
-    """δx_0 = L d_0, at a cost of ½ |ξ̄ + d_0|²."""
+    """The initial pose δx_0 = L d_0, at a cost of ½ |ξ̄ + d_0|²."""
 
     root: Float[Array, "3 3"]
     """L, with L Lᵀ the covariance of the start"""
@@ -60,7 +60,7 @@ class Step(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """The cost of a path and a map: all of it is a sum of the squares that its parts name."""
+    """The quadratic cost of a path and a map, the sum of the costs of its parts."""
 
     start: Start
     steps: Step
@@ -68,7 +68,7 @@ class Chain(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """The optimal noise d = k - J a - K δm, with a where the motion leads, F δx + c."""
+    """The gain of the optimal noise d = k - J a - K δm, with a = F δx + c."""
 
     constant: Float[Array, "W"]
     """k"""
@@ -81,7 +81,7 @@ class Gain(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """The solution: what every noise should be, and the map."""
+    """The solution of a chain: the gains of all noises, and the map."""
 
     start: Gain
     """of d_0, where a = 0"""
@@ -99,7 +99,7 @@ class Policy(NamedTuple):
 
 
 class _CostToGo(NamedTuple):
-    """½ aᵀ Λ a - aᵀ y + constant: the least cost of all that comes, by a = (δpose, δmap)."""
+    """The cost to go ½ aᵀ Λ a - aᵀ y + constant, with a = (δpose, δmap)."""
 
     pose: Float[Array, "3 3"]
     """of Λ"""
@@ -148,7 +148,7 @@ def eliminate(chain: Chain, alive: Bool[Array, "N"]) -> Policy:
 
 
 def _by_pose_before(after: _CostToGo, step: Step) -> _CostToGo:
-    """The cost by the pose before a motion: a = F δx + c put in."""
+    """The cost to go as a function of the pose before a motion, a = F δx + c."""
     return _CostToGo(
         pose=linalg.symmetrize(step.by_pose.T @ after.pose @ step.by_pose),
         cross=linalg.matmul(step.by_pose.T, after.cross),
@@ -159,12 +159,12 @@ def _by_pose_before(after: _CostToGo, step: Step) -> _CostToGo:
 
 
 def _add_measurements(to_go: _CostToGo, step: Step, capacity: int) -> _CostToGo:
-    """Λ + (A B)ᵀ (A B) and y + (A B)ᵀ b over the measurements of a scan, where they touch Λ."""
+    """The cost to go plus a scan: Λ + (A B)ᵀ (A B) and y + (A B)ᵀ b, in the rows it involves."""
     a, b, r = step.pose_rows, step.landmark_rows, step.residual
     size = b.shape[2]
 
     def by_slot(each: Array) -> Array:
-        """(M, …) added up by the slots seen, (N, …)."""
+        """Values (M, …) summed by the slots seen, (N, …)."""
         return jnp.zeros((capacity, *each.shape[1:]), r.dtype).at[step.slot].add(each)
 
     cross = by_slot(jnp.einsum("mzi,mzl->mil", a, b)).transpose(1, 0, 2).reshape(3, -1)
@@ -182,7 +182,7 @@ def _add_measurements(to_go: _CostToGo, step: Step, capacity: int) -> _CostToGo:
 def _eliminate_noise(
     to_go: _CostToGo, by_noise: Float[Array, "3 W"], noise: Float[Array, "W"]
 ) -> tuple[_CostToGo, Gain, Float[Array, ""]]:
-    """The least over d of the cost by a + G d; the gain of the best d, and its part of λ²."""
+    """The cost to go at a + G d minimized over d; the gain of the best d, and its term of λ²."""
     seen = linalg.gram(by_noise, to_go.pose)
     square = linalg.symmetrize(seen @ by_noise)
     factor, _ = linalg.cholesky(square + jnp.eye(noise.shape[0], dtype=noise.dtype))

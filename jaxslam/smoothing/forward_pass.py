@@ -1,4 +1,4 @@
-"""The forward pass of a smoother: EKF-SLAM over the log, keeping where it linearized."""
+"""The forward pass of a smoother: EKF-SLAM over the log, which stores its linearization points."""
 
 import dataclasses
 from typing import NamedTuple
@@ -34,7 +34,7 @@ class ForwardPass(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The filter's state, and the first points of linearization of the step it is in."""
+    """The filter's state, and the first linearization points of the current step."""
 
     joint: Joint
     before: Array
@@ -52,7 +52,7 @@ def forward_filter(
     gate: float | None = None,
     births: int | None = None,
 ) -> Filter:
-    """The EKF-SLAM of a forward pass: joint correction, Euclidean, its state a `_State`.
+    """The EKF-SLAM of a forward pass: joint correction, Euclidean chart, state `_State`.
 
     Raises ValueError as `ekf_slam` does, and for sensors that a smoother has no chain for: a suite,
     landmarks that turn into points, or landmarks of which a part is exact when they are initialized
@@ -110,8 +110,8 @@ def run_forward(
 def compiled_once(
     filter: Filter, pose: ArrayLike, pose_cov: ArrayLike, solve: Estimator
 ) -> Estimator:
-    """The estimator that refuses what `run` refuses, by its own name, and calls `solve`, compiled
-    as `run` is."""
+    """The estimator that checks its arguments as `run` does, under its own name, and calls `solve`,
+    compiled as `run` is."""
 
     def estimator(log: Log, key: Array) -> Trace:
         check_run(filter.name, filter, log, pose, pose_cov)

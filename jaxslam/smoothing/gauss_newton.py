@@ -1,4 +1,4 @@
-"""Gauss-Newton on the problem of a path and a map: solve a chain, search along the line, repeat."""
+"""Gauss-Newton with line search on the problem of a path and a map."""
 
 from enum import IntEnum
 from typing import NamedTuple
@@ -19,7 +19,7 @@ _ARMIJO = 1e-4
 
 
 class Ending(IntEnum):
-    """Why the iterations ended."""
+    """The reason for the end of the iterations."""
 
     CONVERGED = 0
     """The next step is shorter than the tolerance, or rounding."""
@@ -30,7 +30,7 @@ class Ending(IntEnum):
 
 
 class Search(NamedTuple):
-    """The state of the iterations, at their end the result."""
+    """The state of the iterations, and their result."""
 
     at: Iterate
     chain: Chain
@@ -57,14 +57,14 @@ def minimize(
     iterations: int,
     tolerance: float | None,
 ) -> Search:
-    """Iterate from a start, whose path need not obey the models; the first step is by the chain
-    given.
+    """The result of the iterations from a start; the first step is by the given chain, so the start
+    need not satisfy the models.
 
     Without tolerance all iterations are made, in a loop of fixed length.
     """
 
     def step(search: Search) -> tuple[Search, Bool[Array, ""]]:
-        """Solve the chain; end there, or step and make the next chain. Whether there was a step."""
+        """The search after one iteration: solve the chain, then step or end. Whether it stepped."""
         policy = eliminate(search.chain, alive)
         converged = jnp.asarray(False)
         if tolerance is not None:
@@ -103,7 +103,7 @@ def minimize(
 
 
 def _unstarted(start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations: int) -> Search:
-    """The search before the first step: nothing is solved, and the cost is infinite."""
+    """The search before the first step: no chain solved, and infinite cost."""
     kind = chain.steps.residual.dtype
     unsolved = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(eliminate, chain, alive)
@@ -129,8 +129,8 @@ def _converged(search: Search, policy: Policy, tolerance: float) -> Bool[Array, 
 def _line_search(
     motion: Motion, sensor: Sensor, problem: Problem, search: Search, policy: Policy
 ) -> tuple[Iterate, Float[Array, ""], Bool[Array, ""]]:
-    """The iterate by the first share of the step that lowers the cost enough, its cost, and whether
-    there is such a share. The first step may raise the cost, if only to what is finite."""
+    """The iterate at the first share of the step that lowers the cost enough, its cost, and whether
+    there is such a share. The first step may raise the cost, if it stays finite."""
     kind = search.cost.dtype
     shares, eps = jnp.asarray(_SHARES, kind), float(jnp.finfo(kind).eps)
     tried = jax.vmap(lambda share: roll_out(motion, problem, search.at, policy, share))(shares)

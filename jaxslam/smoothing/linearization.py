@@ -1,4 +1,4 @@
-"""The chain of a forward pass: the linear system that the filter made of the models."""
+"""The chain of a forward pass: the models as linearized by the filter."""
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +20,13 @@ Rows = tuple[Array, Array, Array, Array]
 def noise_roots(
     motion: Motion, passed: ForwardPass, control: Float[Array, "T U"]
 ) -> Float[Array, "T W W"]:
-    """The roots of the noise covariances of the motions, where the filter took them."""
+    """The square roots of the motions' noise covariances, at the filter's linearization points."""
     cov = jax.vmap(motion.noise_cov)(passed.before, control)
     return jax.vmap(linalg.root_psd)(cov)
 
 
 def start_of(pose_cov: Float[Array, "3 3"]) -> Start:
-    """A start where the prior has its mean."""
+    """The start of a chain at the mean of the prior."""
     return Start(linalg.root_psd(pose_cov), jnp.zeros(3, pose_cov.dtype))
 
 
@@ -38,7 +38,7 @@ def chain_of(
     pose_cov: Float[Array, "3 3"],
     roots: Float[Array, "T W W"],
 ) -> tuple[Chain, Bool[Array, "T M"]]:
-    """The filter's own linear system about its path and final map; and which measurements it uses.
+    """The filter's linear system about its path and final map, and which measurements it uses.
 
     The Kalman filter of this system is the EKF: its posterior of the last pose and the map is the
     filter's, its posterior of the poses before is the fixed-interval smoother's. A new landmark
@@ -56,7 +56,7 @@ def chain_of(
 def _motions(
     motion: Motion, passed: ForwardPass, control: Float[Array, "T U"], roots: Float[Array, "T W W"]
 ) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3 W"], Float[Array, "T 3"]]:
-    """F, G and c of `chain.Step`, of each motion."""
+    """F, G and c of `chain.Step` for each motion."""
 
     def one(
         before: Array, predicted: Array, corrected: Array, u: Array, root: Array
@@ -131,6 +131,6 @@ def _new_landmark_rows(sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, 
 
 
 def pose_difference(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
-    """a - b of two poses by coordinates, the angle wrapped."""
+    """The difference a - b of two poses by coordinates, with the angle wrapped."""
     off = a - b
     return off.at[2].set(wrap(off[2]))

@@ -1,4 +1,4 @@
-"""The means and covariances of the poses of a solved chain, in one pass forward."""
+"""The means and covariances of the poses of a solved chain, by a forward recursion."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ class Marginals(NamedTuple):
 
 
 def marginals(chain: Chain, policy: Policy) -> Marginals:
-    """The means and covariances of the poses: O(T N), and one triangular system of 3T columns.
+    """The marginals of a chain, in O(T N) plus one triangular system of 3T columns.
 
     With n standard normal and M = R Rᵀ the matrix of the gain,
 

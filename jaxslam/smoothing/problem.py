@@ -1,4 +1,4 @@
-"""The nonlinear least-squares problem of a path and a map: its cost, and a step from an iterate.
+"""The nonlinear least-squares problem of a path and a map: cost, linearization and step.
 
 The unknowns are the noises of the start and of the motions, in units of their own standard
 deviations, and the map; the path is what the motions make of the noises. So the models hold
@@ -19,7 +19,7 @@ from jaxslam.smoothing.linearization import pose_difference, whitened_rows
 
 
 class Problem(NamedTuple):
-    """The data: what is given of the start and the motions, and the measurements that count."""
+    """The data of the problem: prior, controls and the measurements used."""
 
     pose: Float[Array, "3"]
     """mean of the start"""
@@ -34,7 +34,7 @@ class Problem(NamedTuple):
 
 
 class Iterate(NamedTuple):
-    """Values of all unknowns, and the path that they lead to."""
+    """Values of all unknowns, and the resulting path."""
 
     start: Float[Array, "3"]
     """ξ"""
@@ -63,7 +63,7 @@ def cost(sensor: Sensor, problem: Problem, at: Iterate) -> Float[Array, ""]:
 
 
 def linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
-    """The chain about an iterate, to first order in the models: that of the Gauss-Newton step.
+    """The chain of the Gauss-Newton step: the models linearized at an iterate.
 
     It has as many rows a measurement as that of `linearization.chain_of`.
     """
@@ -93,7 +93,7 @@ def linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) 
 def roll_out(
     motion: Motion, problem: Problem, at: Iterate, policy: Policy, share: Float[Array, ""]
 ) -> Iterate:
-    """The iterate that lies a share of the step on, on the models themselves.
+    """The iterate after a share of the step, by the nonlinear models.
 
     d_t = share k_t - J a_t - K δm with a_t = f(x_{t-1}, u_t, Q^{1/2} η̄_t) - x̄_t, of the path as it
     comes out: where the models bend, the later noises answer to where the earlier ones led, as

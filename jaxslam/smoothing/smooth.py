@@ -1,4 +1,4 @@
-"""The fixed-interval smoother of EKF-SLAM: each pose given the whole log."""
+"""The fixed-interval smoother of EKF-SLAM: the marginal of each pose given the whole log."""
 
 from typing import NamedTuple
 
@@ -50,7 +50,7 @@ def smooth(
     gate: float | None = None,
     births: int | None = None,
 ) -> Estimator:
-    """The Rauch-Tung-Striebel smoother of `ekf_slam(update="joint")`, without its matrices.
+    """The Rauch-Tung-Striebel smoother of `ekf_slam(update="joint")`, without D×D matrices.
 
     p(x_t | all scans) of the linear system that the EKF made of the log: the Jacobians are where
     the filter took them, so the last pose and the map are the filter's own, to rounding, and every
@@ -120,7 +120,7 @@ def solution(
 
 
 def with_singular(info: Info, used: Bool[Array, "T M"]) -> Info:
-    """The filter's infos, SINGULAR where it used a measurement that a smoother cannot use."""
+    """The filter's infos, with SINGULAR for measurements that the smoother cannot use."""
     taken = (info.status == Status.FUSED) | (info.status == Status.BORN)
     status = jnp.where(taken & ~used, Status.SINGULAR, info.status)
     return info._replace(status=status.astype(info.status.dtype))

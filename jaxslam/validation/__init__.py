@@ -1,4 +1,4 @@
-"""What is refused before anything is traced: one line each, with what was expected."""
+"""Checks of arguments before tracing; each error is one line that states what was expected."""
 
 from jaxslam.validation.logs import check_log
 from jaxslam.validation.models import (

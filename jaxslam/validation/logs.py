@@ -1,4 +1,4 @@
-"""What is refused of a log: shapes, kinds, values that are not finite, tags that repeat."""
+"""Checks of a log: shapes, dtypes, finite values, repeated tags."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ def check_log(
 
     Shapes and kinds are always checked, values (finite controls, finite valid measurements, tags
     >= -1, of 32 bits and not repeated within a scan) only where they are concrete. parts: how many
-    places of a scan each sensor has, where there are several; a tag may then occur once with each.
+    measurement slots each sensor has, where there are several; a tag may then occur once with each.
     """
     control, scan = log.control, log.scan
     if not isinstance(scan, Scan):
@@ -31,7 +31,7 @@ def check_log(
     z, tag, valid = scan
     _expect(f"{name}: log.control", control, ("T", control_size), np.floating)
     steps = np.shape(control)[0]
-    if np.ndim(tag) != 2:  # it says how many places there are
+    if np.ndim(tag) != 2:  # it gives the number of measurement slots
         _expect(f"{name}: log.scan.tag", tag, (steps, "M"), np.integer)
     places = np.shape(tag)[1]
     _expect(f"{name}: log.scan.z", z, (steps, places, measurement_size), np.floating)
@@ -58,7 +58,7 @@ def check_log(
 
 
 def _expect(name: str, value: Any, shape: tuple[int | str, ...], kind: type) -> None:
-    """shape: a letter stands for any number."""
+    """Raise ValueError unless an array has this shape, in which a letter stands for any number."""
     got = shape_told(value)
     there = np.shape(value) if got.startswith("(") else ()
     if len(there) != len(shape) or any(
@@ -73,7 +73,7 @@ def _expect(name: str, value: Any, shape: tuple[int | str, ...], kind: type) -> 
 
 
 def _refuse(name: str, bad: np.ndarray, why: str) -> None:
-    """bad: by row, or by row and place."""
+    """Raise ValueError if an entry of `bad` is set, by row or by row and measurement slot."""
     if bad.any():
         at = zip(("row", "place"), np.argwhere(bad)[0], strict=False)
         raise ValueError(f"{name}: {why} ({', '.join(f'{what} {i}' for what, i in at)})")

@@ -1,5 +1,5 @@
-"""What factories refuse before anything is traced: records of another kind, functions of the wrong
-arguments, results of the wrong size. One line each, with what was expected."""
+"""Checks of models before tracing: types of records, arguments of functions, sizes of results.
+Each error is one line that states what was expected."""
 
 import inspect
 import weakref
@@ -15,7 +15,7 @@ from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
 _Shape = tuple[int, ...]
 
 _SOUND: weakref.WeakSet[Any] = weakref.WeakSet()
-"""Models that have been evaluated and found to be of the right sizes."""
+"""Models whose sizes have been checked."""
 
 
 def check_models(name: str, motion: Any, sensor: Any) -> None:
@@ -34,7 +34,7 @@ def check_models(name: str, motion: Any, sensor: Any) -> None:
 
 
 def check_motion(name: str, motion: Any) -> None:
-    """As `check_models`, of a Motion alone."""
+    """Raise ValueError unless this is a Motion; see `check_models`."""
     check_record(name, "motion", motion, Motion)
     if motion in _SOUND:
         return
@@ -45,7 +45,7 @@ def check_motion(name: str, motion: Any) -> None:
 
 
 def check_sensor(name: str, sensor: Any) -> None:
-    """As `check_models`, of a Sensor alone, or of each in a suite."""
+    """Raise ValueError unless this is a Sensor, or a suite of them; see `check_models`."""
     check_record(name, "sensor", sensor, Sensor)
     if parts := getattr(sensor, "parts", ()):  # of a suite
         for part in parts:
@@ -76,7 +76,7 @@ def check_parts(
     linearize: Any = None,
     associate: Any = None,
 ) -> None:
-    """Raise ValueError unless each is of its kind; None is for the default."""
+    """Raise ValueError unless each part has its type; None stands for the default."""
     if chart is not None:
         check_record(name, "chart", chart, Chart)
     if linearize is not None:
@@ -118,7 +118,7 @@ def check_associate(name: str, associate: Any) -> None:
         raise ValueError(
             f"{name}: expected associate to be a function of (prediction, scan): {error}"
         ) from None
-    except ValueError:  # a builtin, which has no signature to look at
+    except ValueError:  # a builtin, which has no signature
         return
 
 
@@ -129,7 +129,7 @@ def _numbers(*shape: int) -> jax.ShapeDtypeStruct:
 def _check_size(
     name: str, model: Any, field: str, arguments: dict[str, Any], shape: _Shape
 ) -> None:
-    """The function of a model takes these arguments and returns an array of this shape."""
+    """Raise ValueError unless the model's function returns this shape for these arguments."""
     function: Callable[..., Any] = getattr(model, field)
     told = ", ".join(f"{key} {_told(value.shape)}" for key, value in arguments.items())
     call = f"{model.name}.{field}({told})"

@@ -1,4 +1,4 @@
-"""What factories refuse of numbers: counts, keys, gates, covariances."""
+"""Checks of numbers: counts, keys, gates, covariances."""
 
 from numbers import Integral
 from typing import Any
@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 
 
 def is_concrete(*values: Any) -> bool:
-    """Whether values can be looked at, i.e. no leaf is a tracer."""
+    """Whether the values are concrete, i.e. no leaf is a tracer."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
 def shape_told(value: Any) -> str:
-    """For a message: the shape of what should be an array, or what it is where it has none."""
+    """The shape of an array, or the type of anything else, for an error message."""
     try:
         shape = np.shape(value)
     except ValueError:
@@ -35,7 +35,7 @@ def check_count(name: str, value: Any) -> None:
 def check_key(name: str, key: Any) -> None:
     """Raise ValueError unless key is one PRNG key: of `jax.random.key`, or the raw numbers of one.
 
-    A tracer of one will do.
+    A tracer of one is accepted.
     """
     dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
@@ -83,7 +83,7 @@ def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
 
 
 def check_alpha(name: str, alpha: ArrayLike, count: int) -> None:
-    """Raise ValueError unless alpha holds `count` real, finite numbers >= 0, the αs of a noise.
+    """Raise ValueError unless alpha, of a motion noise, holds `count` finite real numbers >= 0.
 
     Values are looked at only where they are concrete; a tracer is checked for its shape alone.
     """

@@ -1,4 +1,4 @@
-"""What a filter of one's own returned: checked by chex where it is traced, by its name."""
+"""Checks of the results of user-defined filters, by chex during tracing."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -12,7 +12,7 @@ _S = TypeVar("_S")
 
 
 def same_state(name: str, before: _S, after: Any) -> _S:
-    """The state after a filter's function, named; ValueError unless it is a state as before.
+    """The state that a filter's function returned; ValueError unless its structure is that before.
 
     Tree, shapes and dtypes must be the same: a loop over steps carries it.
     """
@@ -23,7 +23,7 @@ def same_state(name: str, before: _S, after: Any) -> _S:
 
 
 def state_and_info(name: str, state: _S, scan: Scan, found: Any) -> tuple[_S, Info]:
-    """What a filter's update returned; ValueError unless it is a state as before, and an `Info`."""
+    """The result of a filter's update; ValueError unless it is a state as before, and an `Info`."""
     if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Info)):
         got = type(found).__name__
         if isinstance(found, tuple) and not hasattr(found, "_fields"):
@@ -41,7 +41,7 @@ def state_and_info(name: str, state: _S, scan: Scan, found: Any) -> tuple[_S, In
 
 
 def checked_estimate(name: str, estimate: Any) -> Estimate:
-    """What a filter's estimate returned; ValueError unless it is an `Estimate` of N landmarks."""
+    """The result of a filter's estimate; ValueError unless it is an `Estimate` of N landmarks."""
     if not isinstance(estimate, Estimate):
         raise ValueError(
             f"{name}: expected estimate to return an Estimate, got {type(estimate).__name__}"
@@ -54,7 +54,7 @@ def checked_estimate(name: str, estimate: Any) -> Estimate:
 
 
 def _expect(name: str, assertion: Callable[..., None], *arguments: Any) -> None:
-    """An assertion of chex, whose failure is a ValueError that begins with a name."""
+    """Run an assertion of chex; its failure becomes a ValueError that begins with a name."""
     try:
         assertion(*arguments)
     except AssertionError as error:

@@ -1,1 +1,1 @@
-"""EKF-SLAM with sensors that see a landmark in part, initialized late."""
+"""EKF-SLAM with delayed initialization, for bearing-only and range-only sensors."""

@@ -1,4 +1,4 @@
-"""The second step: stored measurements confirm hypotheses and correct them, or contradict them."""
+"""The second step: hypotheses are confirmed and corrected, or contradicted, by new measurements."""
 
 from typing import NamedTuple
 
@@ -82,7 +82,7 @@ def confirm_hypotheses(
 
 
 class Constraints(NamedTuple):
-    """m residuals g that are truly zero, each of one point and one stored measurement; H = ∂g."""
+    """m constraints g = 0, each between one point and one stored measurement; H = ∂g."""
 
     value: Float[Array, "m"]
     """g"""
@@ -100,7 +100,7 @@ def constraints_of(
     by_point: Float[Array, "m 2"],
     by_stored: Float[Array, "m 3"],
 ) -> Constraints:
-    """The residuals of the points in these slots, each against the stored measurement in that."""
+    """The constraints between the points in these slots and the stored measurements in those."""
     by_point = jnp.pad(by_point, [(0, 0), (0, SIZE - 2)])
     rows = covariance_rows(joint)
     hp = jnp.einsum("mi,mid->md", by_point, rows[points])
@@ -114,7 +114,7 @@ def constraints_of(
 def correct_hypotheses(
     joint: Joint, layout: TableLayout, constraints: Constraints, which: Bool[Array, "C"]
 ) -> Joint:
-    """The joint with each hypothesis corrected by a constraint of its own, and nothing else.
+    """The joint with each hypothesis corrected by its own constraint, and nothing else changed.
 
     g = 0 is a measurement without noise of its own (that of the stored measurement is in P). A
     hypothesis may be false, so of the optimal gain K = P Hᵀ/S only the rows of the hypothesis are

@@ -1,4 +1,4 @@
-"""EKF-SLAM whose landmarks are initialized late, where enough measurements of them intersect."""
+"""EKF-SLAM with delayed initialization of landmarks, from intersections of measurements."""
 
 from typing import NamedTuple
 
@@ -47,7 +47,7 @@ def delayed_slam(
     gate: float | None = None,
     associate: Associate | None = None,
 ) -> Filter:
-    """EKF-SLAM of bearings or ranges alone; a landmark enters where its measurements intersect.
+    """EKF-SLAM with bearings or ranges alone, and delayed initialization of landmarks.
 
     After Costa, Kantor & Choset, "Bearing-only landmark initialization with unknown data
     association", ICRA 2004, as Tacher §2 sums it up, with the correlations that they leave out.
@@ -60,12 +60,13 @@ def delayed_slam(
        by 1, and they are corrected, but not the robot (`confirmation.correct_hypotheses`). Those of
        its tag that it does not confirm lose `decay`; at 0 they are deleted.
     2. if it confirms none it is intersected with older stored measurements. Well conditioned
-       intersections become hypotheses of persistence 1, unless one is there already at that place.
-    3. a hypothesis of enough persistence becomes a landmark, made anew of up to eight of its
-       stored measurements, the oldest and the newest, at once: they give its place and all its
-       covariances, and what they say beyond it corrects the whole map (`initialization`). Then they
-       are marginalized out. It waits where its mirror solution fits nearly as well or its place is
-       not sharp yet, and is deleted where they contradict each other.
+       intersections become hypotheses of persistence 1, unless one exists at that position.
+    3. a hypothesis of enough persistence becomes a landmark, estimated from up to eight of its
+       stored measurements, the oldest and the newest, at once: they give its position and all its
+       covariances, and the redundant ones correct the whole map (`initialization`). Then they are
+       marginalized out. Promotion waits while the mirror solution fits nearly as well or the
+       covariance is too large; the hypothesis is deleted where its measurements contradict each
+       other.
 
     The pose's error is that of coordinates and Jacobians are taken at the estimate: a linearizer's
     memory, or a chart in which landmarks move, has no meaning for stored measurements.
@@ -82,9 +83,9 @@ def delayed_slam(
         stored, hypotheses, promotion: `settings.StoredMeasurements`, `settings.Hypotheses` and
             `settings.Promotion`, which say what they are for; default all defaults.
         gate: chi-square, of one degree of freedom, of every comparison; default that of 99 %.
-        associate: default `association.known()`, and only measurements of one tag intersect. Any
-            other is asked which measurement is of which landmark; those it calls new intersect all
-            others, and tags only name the landmarks.
+        associate: default `association.known()`, and only measurements of one tag intersect. With
+            any other method, the measurements it declares new intersect all others, and tags only
+            name the landmarks.
     Raises:
         ValueError: on a capacity below 1, a gate not above 0, a part of another kind, or a sensor
             that does not fit.
@@ -153,21 +154,21 @@ def delayed_slam(
 
 
 class _Outcome(NamedTuple):
-    """What became of the new measurements of a scan."""
+    """The outcome of the new measurements of a scan."""
 
     stored: Bool[Array, "M"]
     promoted: Promoted
 
 
 def _ekf_settings(settings: DelayedSettings) -> EkfSettings:
-    """How landmarks of the map are associated and corrected: as in `ekf_slam`."""
+    """The settings of `ekf_slam`, by which landmarks of the map are associated and corrected."""
     return EkfSettings(sensor=settings.sensor, associate=settings.associate, gate=settings.gate)
 
 
 def _associated(
     settings: DelayedSettings, state: DelayedState, scan: Scan
 ) -> tuple[Association, Bool[Array, "M"]]:
-    """Of which landmark of the map each measurement is, and which of them are of one.
+    """The landmark slot of each measurement, and which measurements have one.
 
     Hypotheses and stored measurements are no landmarks.
     """
@@ -190,7 +191,7 @@ def _corrected(
 
 
 def _new_measurements(settings: DelayedSettings, scan: Scan, found: Association) -> NewMeasurements:
-    """The measurements of a scan that association calls new."""
+    """The measurements of a scan that association declares new."""
     is_new = scan.valid & found.is_new
     if settings.by_tag:
         return NewMeasurements(scan.z, scan.tag, scan.tag, is_new, seen_before(scan.tag, is_new))
@@ -206,7 +207,7 @@ def _reported(
     new: NewMeasurements,
     outcome: _Outcome,
 ) -> Info:
-    """What became of each measurement of a scan."""
+    """The `Info` of a scan."""
     slot, refused = outcome.promoted
     status = status_of(
         scan.valid,

@@ -1,4 +1,4 @@
-"""Points of the table: their residuals against stored measurements, their spread and distance."""
+"""Residuals of hypotheses against stored measurements, and their spread and distance."""
 
 from typing import NamedTuple
 
@@ -34,7 +34,7 @@ class PointResiduals(NamedTuple):
     """∂g/∂s"""
 
     def squared_distance(self) -> Float[Array, "p q"]:
-        """g²/var(g), infinite where the variance is none."""
+        """g²/var(g), infinite where the variance is not positive."""
         positive = self.variance > 0
         ratio = self.value**2 / jnp.where(positive, self.variance, 1.0)
         return jnp.where(positive, ratio, jnp.inf)
@@ -70,7 +70,7 @@ class UncertainPoints(NamedTuple):
 
 
 def relative_to_robot(joint: Joint, layout: TableLayout) -> UncertainPoints:
-    """Each hypothesis (C,) less the robot's position."""
+    """The positions of the hypotheses (C,) relative to the robot's position."""
     first, count = layout.landmarks, layout.hypotheses
     own = covariance_blocks(joint)[first : first + count][:, :2]
     own = own[jnp.arange(count), :, first + jnp.arange(count), :2]
@@ -81,7 +81,7 @@ def relative_to_robot(joint: Joint, layout: TableLayout) -> UncertainPoints:
 
 
 def relative_spread(points: UncertainPoints) -> Float[Array, "*n"]:
-    """√(largest eigenvalue of the covariance) over the distance from the origin."""
+    """The relative spread: √(largest eigenvalue of the covariance) over the distance from 0."""
     mean, cov = points
     middle = 0.5 * (cov[..., 0, 0] + cov[..., 1, 1])
     half = 0.5 * (cov[..., 0, 0] - cov[..., 1, 1])
@@ -115,6 +115,6 @@ def closer_than(
 
 
 def safe_root(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """√ of what is positive, else 0; with a finite derivative."""
+    """√x where x is positive, else 0, with a finite derivative."""
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)

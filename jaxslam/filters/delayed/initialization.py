@@ -1,4 +1,4 @@
-"""A landmark located by all its stored measurements at once, and their correction of the map."""
+"""Initialization of a landmark from all its stored measurements, which also correct the map."""
 
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ _STEPS = 4
 
 
 class InitialEstimate(NamedTuple):
-    """A landmark as m stored measurements locate it, every Jacobian taken there."""
+    """The estimate of a landmark from m stored measurements, and the Jacobians at it."""
 
     point: Float[Array, "2"]
     """x*"""
@@ -48,7 +48,7 @@ def initial_estimate(
     stored: Int[Array, "m"],
     use: Bool[Array, "m"],
 ) -> InitialEstimate:
-    """Where m stored measurements locate a landmark, and how well they agree.
+    """The least-squares estimate of a landmark from m stored measurements, and its residual.
 
     Each stored measurement of the landmark says g(s_k, x) = 0, to first order
     e + G_s δs + G_x δx = 0. With M = G_s P_ss G_sᵀ = L Lᵀ, x* is where eᵀ M⁻¹ e is least. The
@@ -81,7 +81,7 @@ def initial_estimate(
     ) -> tuple[
         Float[Array, "m"], Float[Array, "m 3"], Float[Array, "m 2"], Float[Array, "m m"], Array
     ]:
-        """L⁻¹ e, G_s, L⁻¹ G_x, L⁻¹, and whether M is positive definite."""
+        """The whitened residual L⁻¹ e, G_s, L⁻¹ G_x, L⁻¹, and whether M is positive definite."""
         value = jnp.where(use, jax.vmap(residual, (0, None))(s, point), 0.0)
         by_stored, by_point = jax.vmap(jax.jacfwd(residual, argnums=(0, 1)), (0, None))(s, point)
         by_stored = jnp.where(use[:, None], by_stored, 0.0)
@@ -128,7 +128,7 @@ def initial_estimate(
 def add_landmark(
     joint: Joint, estimate: InitialEstimate, slot: Int[Array, ""], stored: Int[Array, "m"]
 ) -> Joint:
-    """The joint with the landmark in a dead slot, corrected by what its measurements say beyond it.
+    """The joint with the landmark in a dead slot, corrected by its redundant measurements.
 
     Args:
         estimate: as of `initial_estimate`, of the measurements in the slots `stored`.

@@ -1,4 +1,4 @@
-"""The third step: stored measurements that confirm no hypothesis are intersected with older."""
+"""The third step: new measurements without a hypothesis are intersected with older ones."""
 
 from typing import NamedTuple
 
@@ -35,7 +35,7 @@ def intersect_measurements(
     slot: Int[Array, "M"],
     unexplained: Bool[Array, "M"],
 ) -> DelayedState:
-    """The state with new hypotheses where unexplained measurements intersect older ones sharply.
+    """The state with new hypotheses at the intersections of small covariance.
 
     Where identities are known each is intersected with the partner that gives the sharpest point,
     otherwise with all. No hypothesis is formed where there is one already.
@@ -53,7 +53,7 @@ def intersect_measurements(
 
 
 class _Sharpest(NamedTuple):
-    """The k intersections of least spread, the sharpest first."""
+    """The k intersections of least relative spread, in ascending order."""
 
     points: UncertainPoints
     """(k,); the covariances relative to the sensor"""
@@ -77,7 +77,7 @@ def _sharpest(
     slot: Int[Array, "M"],
     unexplained: Bool[Array, "M"],
 ) -> _Sharpest:
-    """The sharpest intersections of unexplained measurements, as many as hypotheses have slots."""
+    """The intersections of least spread of unexplained measurements, one a hypothesis slot."""
     layout, joint = settings.layout, state.joint
     found = intersections_of(joint, layout, settings.triangulation, slot)
     older = joint.alive[layout.of_stored] & (state.taken_at < state.clock)
@@ -110,7 +110,7 @@ def _sharpest(
 def _form_hypotheses(
     settings: DelayedSettings, state: DelayedState, found: _Sharpest
 ) -> DelayedState:
-    """The state with a hypothesis for each intersection that is no duplicate, while slots last."""
+    """The state with hypotheses at intersections that are no duplicates, while slots are free."""
     layout, joint = settings.layout, state.joint
     wanted = found.ok & ~_duplicates(settings, joint, found)
     place, granted = slots.allocate(joint.alive[layout.of_hypotheses], wanted)
@@ -130,7 +130,7 @@ def _form_hypotheses(
 
 
 def _duplicates(settings: DelayedSettings, joint: Joint, found: _Sharpest) -> Bool[Array, "k"]:
-    """Which intersections are at the place of a sharper one, or of a hypothesis of before.
+    """Which intersections duplicate one of less spread, or an earlier hypothesis.
 
     Mirrored points of one pair are no duplicates of each other.
     """

@@ -1,10 +1,10 @@
-"""The last step: a hypothesis becomes a landmark, made of all its stored measurements at once.
+"""The last step: a hypothesis becomes a landmark, estimated from all its stored measurements.
 
 For the most persistent hypothesis that this scan confirmed, at most `per_scan` times:
 
-1. `_candidate`: it is persistent enough, ahead of those that exclude it, and its place is sharp;
+1. `_candidate`: it is persistent enough, more so than its alternatives, and its spread is small;
 2. `_measurements_of`: its stored measurements; `_outermost`: up to eight of them;
-3. `_locate`: the place that explains these best, and a decision: accept it, wait, or refuse it;
+3. `_locate`: the maximum-likelihood position, and a decision: accept it, wait, or refuse it;
 4. `add_landmark` where accepted; what that uses up or rules out is deleted.
 """
 
@@ -39,18 +39,18 @@ from jaxslam.math.xla import materialize, where_any
 # `linalg` factors without a library call.
 _USED = 8
 
-# A landmark whose measurements fit together so badly, or worse, by chance this seldom is refused.
+# The significance level of the chi-square test that refuses a landmark.
 _UNLIKELY = 1e-3
 
-# By so much -2 log likelihood must the place of a landmark be better than its mirror solution.
+# The least difference of -2 log likelihood between a landmark's position and its mirror solution.
 _AMBIGUOUS = 9.0
 
-# Two estimates so close to each other, relative to the distance, are of one place.
+# Two estimates so close to each other, relative to the distance, are the same position.
 _ONE_PLACE = 0.02
 
 
 class Promoted(NamedTuple):
-    """What became of the hypotheses that each measurement of a scan confirmed last."""
+    """The outcome of the hypotheses that the measurements of a scan confirmed last."""
 
     slot: Int[Array, "M"]
     """of the landmark that one of them became, or -1"""
@@ -59,17 +59,17 @@ class Promoted(NamedTuple):
 
     @classmethod
     def none(cls, new: NewMeasurements) -> Self:
-        """No landmark of any measurement."""
+        """The outcome of a scan in which nothing was promoted."""
         return cls(jnp.full(len(new.tag), -1, jnp.int32), jnp.zeros_like(new.is_new))
 
 
 class _Decision(NamedTuple):
-    """Where neither holds, the measurements of a hypothesis contradict each other."""
+    """The decision on a hypothesis; if neither holds, its measurements contradict each other."""
 
     accepted: Bool[Array, ""]
     """it becomes a landmark"""
     undecided: Bool[Array, ""]
-    """its place is not sharp yet, or another explains the measurements nearly as well"""
+    """its covariance is still too large, or another position fits nearly as well"""
 
 
 def promote_hypotheses(
@@ -114,7 +114,7 @@ def promote_hypotheses(
 def _candidate(
     settings: DelayedSettings, state: DelayedState, confirmed_by: Int[Array, "C"]
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Whether a confirmed hypothesis may be promoted, and which, the most persistent."""
+    """Whether a confirmed hypothesis may be promoted, and which: the most persistent one."""
     layout, promotion, level = settings.layout, settings.promotion, state.persistence
     alive = state.joint.alive[layout.of_hypotheses]
     excluding = (state.group[:, None] == state.group[None, :]) & alive[None, :]
@@ -133,7 +133,7 @@ def _promote(
     name: Int[Array, ""],
     go: Bool[Array, ""],
 ) -> DelayedState:
-    """The state after the decision on a hypothesis; as it was, to the bit, where not `go`.
+    """The state after the decision on a hypothesis; exactly as before where not `go`.
 
     slot, name: of the landmark that it may become.
     """
@@ -141,7 +141,7 @@ def _promote(
     same_tag, own = _measurements_of(settings, state, chosen)
     used, use = _outermost(settings, state, own)
     estimate, decision = _locate(settings, state, chosen, used, use)
-    # Of a batch, the runs without a promotion wait, and keep all they have to the bit.
+    # In a batch, the runs without a promotion stay exactly as they are.
     accepted, undecided = materialize(_Decision(decision.accepted & go, decision.undecided | ~go))
 
     with_landmark = add_landmark(joint, estimate, slot, used)
@@ -166,14 +166,14 @@ def _promote(
 def _measurements_of(
     settings: DelayedSettings, state: DelayedState, chosen: Int[Array, ""]
 ) -> tuple[Bool[Array, "W"], Bool[Array, "W"]]:
-    """The stored measurements of the tag of a hypothesis, and those of them that it explains."""
+    """The stored measurements with the tag of a hypothesis, and which of them it explains."""
     layout, joint = settings.layout, state.joint
     hypothesis = layout.landmarks + chosen
     same_tag = joint.alive[layout.of_stored]
     same_tag = same_tag & (joint.tag[layout.of_stored] == joint.tag[hypothesis])
     found = point_residuals(joint, settings.triangulation, hypothesis[None], layout.stored_slots)
-    # Corrected by its own measurements it leaves g almost no variance: that of the noise is added,
-    # for rounding and curvature.
+    # After the correction by its own measurements g has almost no variance: that of the noise is
+    # added, for rounding and curvature.
     variance = found.variance[0] + state.noise_var
     return same_tag, same_tag & (found.value[0] ** 2 <= settings.gate * variance)
 
@@ -181,9 +181,9 @@ def _measurements_of(
 def _outermost(
     settings: DelayedSettings, state: DelayedState, own: Bool[Array, "W"]
 ) -> tuple[Int[Array, "m"], Bool[Array, "m"]]:
-    """The slots of the oldest and the newest of these stored measurements, and which to use.
+    """The slots of the oldest and the newest of these stored measurements, and which of them exist.
 
-    They were taken from the farthest places.
+    They were taken from the positions farthest apart.
     """
     rank = (own[None, :] & ~is_newer(state.taken_at)).sum(axis=1)
     outer = jnp.where(own, jnp.maximum(rank, own.sum() + 1 - rank), 0)
@@ -198,7 +198,7 @@ def _locate(
     used: Int[Array, "m"],
     use: Bool[Array, "m"],
 ) -> tuple[InitialEstimate, _Decision]:
-    """The place that explains m stored measurements of a hypothesis best, and whether it may stand.
+    """The maximum-likelihood position from m stored measurements, and the decision on it.
 
     Estimated from the hypothesis, and from its mirror solutions in two measurements that were taken
     far from each other.
@@ -233,15 +233,15 @@ def _rivals(
     chosen: Int[Array, ""],
     used_up: Bool[Array, "S"],
 ) -> Bool[Array, "C"]:
-    """The hypotheses that a landmark made of one rules out, itself among them.
+    """The hypotheses excluded by a landmark made of one, including that one.
 
     used_up: the slots of the stored measurements that it is made of.
     """
     rivals = state.group == state.group[chosen]
     if settings.by_tag:
         return rivals
-    # A measurement is of one landmark, so what else was made of these is none; nor is a second
-    # hypothesis of the same place.
+    # A measurement is of one landmark, so other hypotheses made of these measurements are wrong,
+    # and so is a second hypothesis at the same position.
     parents = state.parents
     rivals = rivals | ((parents >= 0) & used_up[jnp.maximum(parents, 0)]).any(axis=1)
     points = relative_to_robot(state.joint, settings.layout)

@@ -1,4 +1,4 @@
-"""What `delayed_slam` is told: three records with defaults, each checked when it is made."""
+"""The settings of `delayed_slam`: three records with defaults, validated when they are created."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -17,7 +17,7 @@ Distance = Literal["mahalanobis", "bhattacharyya"]
 
 @dataclass(frozen=True)
 class StoredMeasurements:
-    """How many measurements of no landmark are kept, and which.
+    """Limits of the stored measurements: how many are kept, and which.
 
     Raises:
         ValueError: on a capacity below 1 or a negative spacing.
@@ -26,7 +26,7 @@ class StoredMeasurements:
     capacity: int = 32
     """W: where all slots are taken, the oldest stored measurement is marginalized out"""
     spacing: float = 0.2
-    """[m] measurements of one identity are stored only from places at least so far from each other;
+    """[m] measurements of one identity are stored only from positions at least so far apart;
     one from nearer is `Status.DEFERRED`"""
 
     def __post_init__(self) -> None:
@@ -36,7 +36,7 @@ class StoredMeasurements:
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Which intersections of stored measurements become hypotheses, and which of these are deleted.
+    """Criteria by which intersections become hypotheses, and hypotheses are deleted.
 
     Raises:
         ValueError: on a count below 1, a spread or `same` not above 0, a negative decay, or an
@@ -79,7 +79,7 @@ class Hypotheses:
 
 @dataclass(frozen=True)
 class Promotion:
-    """When a hypothesis becomes a landmark.
+    """Criteria by which a hypothesis becomes a landmark.
 
     Raises:
         ValueError: on a count below 1, a persistence or spread not above 0, or a negative lead.
@@ -90,7 +90,7 @@ class Promotion:
     lead: float = 2.0
     """by how much its persistence must exceed that of each hypothesis that excludes it"""
     spread: float = 0.3
-    """[1] the largest standard deviation of its place relative to the sensor, over their distance,
+    """[1] the largest standard deviation of its position relative to the sensor, over its range,
     with which it may become a landmark"""
     per_scan: int = 2
     """at most so many promotions a scan"""
@@ -103,7 +103,7 @@ class Promotion:
 
 @dataclass(frozen=True, eq=False)
 class DelayedSettings:
-    """What each step of `delayed_slam` takes beside the state and the scan."""
+    """All settings that the steps of `delayed_slam` take."""
 
     sensor: Sensor
     """of the landmarks of the table, whose third parameter it ignores"""

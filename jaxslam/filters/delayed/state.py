@@ -40,7 +40,7 @@ SIZE = 3
 
 
 class TableLayout(NamedTuple):
-    """How many slots of each kind the table has, in this order."""
+    """The number of slots of each kind in the table, in this order."""
 
     landmarks: int
     """N"""
@@ -51,7 +51,7 @@ class TableLayout(NamedTuple):
 
     @property
     def slots(self) -> int:
-        """S of the whole table."""
+        """The number of slots of the whole table."""
         return self.landmarks + self.hypotheses + self.stored
 
     @property
@@ -91,7 +91,7 @@ class TableLayout(NamedTuple):
 
 
 class DelayedCounts(NamedTuple):
-    """What was deleted, refused and promoted since the start, () int each."""
+    """Counts of deletions, refusals and promotions since the start, () int each."""
 
     evicted: Int[Array, ""]
     """stored measurements that were marginalized as the oldest of a full table"""
@@ -130,7 +130,7 @@ class DelayedState(NamedTuple):
 
 
 class NewMeasurements(NamedTuple):
-    """The M measurements of a scan, and which of them are of no landmark of the map."""
+    """The M measurements of a scan, and which of them have no landmark in the map."""
 
     z: Float[Array, "M 1"]
     tag: Int[Array, "M"]
@@ -144,14 +144,14 @@ class NewMeasurements(NamedTuple):
 
     @property
     def wanted(self) -> Bool[Array, "M"]:
-        """New, and not repeated."""
+        """Mask of the measurements that are new and not repeated."""
         return self.is_new & ~self.repeated
 
 
 def empty_state(
     layout: TableLayout, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]
 ) -> DelayedState:
-    """The state with nothing but the robot."""
+    """The initial state: the robot and nothing else."""
     none = jnp.asarray(0, jnp.int32)
     ints = jnp.zeros(layout.hypotheses, jnp.int32)
     return DelayedState(
@@ -174,7 +174,7 @@ def covariance_blocks(joint: Joint) -> Float[Array, "S 3 S 3"]:
 
 
 def covariance_rows(joint: Joint) -> Float[Array, "S 3 D"]:
-    """The rows of P of each slot, robot's columns first."""
+    """The rows of P of each slot, with the robot's columns first."""
     return joint.cov[3:].reshape(joint.alive.shape[0], SIZE, -1)
 
 
@@ -184,7 +184,7 @@ def slots_where(
     hypotheses: Bool[Array, "C"] | None = None,
     stored: Bool[Array, "W"] | None = None,
 ) -> Bool[Array, "S"]:
-    """Masks of hypotheses and of stored measurements as one of all slots."""
+    """One mask of all slots, from masks of hypotheses and of stored measurements."""
     mask = jnp.zeros(layout.slots, bool)
     if hypotheses is not None:
         mask = mask.at[layout.of_hypotheses].set(hypotheses)
@@ -194,7 +194,7 @@ def slots_where(
 
 
 def delete_slots(layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"]) -> DelayedState:
-    """The state with these slots marginalized out, and forgotten as parents of hypotheses."""
+    """The state with these slots marginalized out, also removed as parents of hypotheses."""
     parents = state.parents
     orphaned = (parents >= 0) & dead[jnp.maximum(parents, 0)]
     persistence = jnp.where(dead[layout.of_hypotheses], 0.0, state.persistence)
@@ -208,12 +208,12 @@ def delete_slots(layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"
 def delete_slots_if_any(
     layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"]
 ) -> DelayedState:
-    """As `delete_slots`, at no cost where no run of a batch deletes one."""
+    """As `delete_slots`, skipped if no run of a batch deletes a slot."""
     return where_any(dead.any(), lambda s: delete_slots(layout, s, dead), lambda s: s, state)
 
 
 def is_newer(time: Int[Array, "W"]) -> Bool[Array, "W W"]:
-    """Whether stored measurement j was taken after i; of one time, whether j > i.
+    """Whether stored measurement j was taken after i; at equal times, whether j > i.
 
     A rank is a row's sum: one kernel, where two sorts are more to compile than all else around.
     """
@@ -223,5 +223,5 @@ def is_newer(time: Int[Array, "W"]) -> Bool[Array, "W W"]:
 
 
 def increased(count: Int[Array, ""], by: Bool[Array, "..."]) -> Int[Array, ""]:
-    """A count, and how many of a mask are set more."""
+    """A count, increased by the number of set entries of a mask."""
     return count + by.sum(dtype=jnp.int32)

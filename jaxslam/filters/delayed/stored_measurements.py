@@ -1,4 +1,4 @@
-"""The first step of delayed initialization: new measurements enter the table as its variables."""
+"""The first step of delayed initialization: new measurements become variables of the state."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Where two measurements locate a landmark: rays of bearings and circles of ranges intersect.
+"""Triangulation of a landmark from two measurements: intersections of rays or circles.
 
 A *stored measurement* is a measurement as a variable of the map, s = (x, y, q) (3,): where the
 sensor was, and what it saw, in the map's frame. A bearing gives the ray from (x, y) in the
@@ -28,7 +28,7 @@ Solutions = tuple[Float[Array, "A 2"], Bool[Array, "A"]]
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """How stored measurements of one kind of sensor locate a landmark, two of them at a time."""
+    """The triangulation functions of one type of sensor, for pairs of stored measurements."""
 
     name: str
     solutions: int
@@ -137,7 +137,7 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
 
 
 def triangulation_of(sensor: Sensor) -> Triangulation:
-    """`rays` or `circles`, by what the sensor measures; ValueError where it is neither."""
+    """`rays` for bearings or `circles` for ranges; ValueError for other measurements."""
     if sensor.measurements == ("range [m]",):
         return circles(sensor)
     return rays(sensor)

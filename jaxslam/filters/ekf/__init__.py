@@ -1,1 +1,1 @@
-"""EKF-SLAM: the Kalman-type filter on a joint state, and its steps, one a file."""
+"""EKF-SLAM and its steps, one a file."""

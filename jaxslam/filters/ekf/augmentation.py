@@ -1,4 +1,4 @@
-"""New landmarks of a Kalman-type SLAM filter on a `Joint`, whatever chart and linearizer."""
+"""State augmentation of a Kalman-type SLAM filter, for any chart and linearizer."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def augment(
     granted: Bool[Array, "m"],
     settings: EkfSettings,
 ) -> Joint:
-    """Start landmarks from measurements z (m, Z) in free slots (m,), where granted (m,).
+    """The joint with new landmarks of measurements z (m, Z) in free slots (m,), where granted (m,).
 
     L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
     with the prior's term of (44); several in one scan are correlated through the robot.

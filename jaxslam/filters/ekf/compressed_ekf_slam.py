@@ -1,4 +1,4 @@
-"""EKF-SLAM that works in a small area of its map and postpones what that means for all the rest."""
+"""Compressed EKF-SLAM: updates of a local area, with those of the rest of the map postponed."""
 
 from typing import Any, NamedTuple
 
@@ -15,12 +15,12 @@ from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 from jaxslam.validation.numbers import check_count
 
-# The tag of places that are no landmark: not -1, which is the tag of a measurement without one.
+# The tag of slots that are no landmark: not -1, which is the tag of a measurement without one.
 _NONE = -2
 
 
 class Compressed(NamedTuple):
-    """A map, and the area of it that a filter has worked in since it was last brought up to date.
+    """A map, its active area, and the postponed update of the landmarks outside the area.
 
     With A the errors of the robot and the K landmarks of the area, B those of all others, and
     index 0 for the time at which the area was opened, the map is now (Guivant & Nebot 2001)
@@ -30,40 +30,40 @@ class Compressed(NamedTuple):
     A motion does Φ ← F Φ. A correction with V = L⁻¹ H P_AA and U = L⁻¹ H Φ does P_AA ← P_AA - VᵀV,
     Φ ← Φ - VᵀU, Ψ ← Ψ + UᵀU, θ ← θ + Uᵀ L⁻¹ ν: so [P_AA Φ; Φᵀ -Ψ] behaves as the covariance of
     a robot, K landmarks and 3 + K·L further variables with mean θ, and any filter on a `Joint`
-    carries them along as landmarks that nobody sees.
+    treats them as landmarks that are never measured.
     """
 
     whole: Joint
-    """all of the map as it was when the area was opened; tags and living slots are those of now"""
+    """the whole map as it was when the area was opened, with the current tags and alive slots"""
     area: Joint
-    """robot, K landmarks, and the places of Φ, Ψ and θ"""
+    """robot, K landmarks, and slots for Φ, Ψ and θ"""
     slot: jax.Array
-    """(K,) which slot of the map each place of the area is, ascending"""
+    """(K,) the slots of the map in the area, ascending"""
 
 
 def compressed_ekf_slam(
     motion: Motion, sensor: Sensor, capacity: int, *, area: int, **options: Any
 ) -> Filter:
-    """`ekf_slam`, with the same result, at a cost a step that follows the area, not the map.
+    """`ekf_slam` with the same results, at a cost a step that depends on the area, not on the map.
 
-    A step costs O(K²) for K = area landmarks; only when a scan asks for a landmark outside the area
-    is the map brought up to date, O(K·N²), and a new area chosen: the landmarks of the scan, room
+    A step costs O(K²) for K = area landmarks. Only when a scan measures a landmark outside the area
+    is the whole map updated, O(K·N²), and a new area chosen: the landmarks of the scan, room
     for new ones, and the landmarks nearest to the robot. J. E. Guivant, E. M. Nebot, "Optimization
     of the simultaneous localization and map-building algorithm for real-time implementation", IEEE
     T-RA 17(3), 2001. Landmarks are associated by their tags.
 
-    The state is a `Compressed`. `estimate` gives the moments of all landmarks, O(K²·N); what of
-    them is not used costs nothing under `jit`. `up_to_date` gives the whole map as a `Joint`, and
+    The state is a `Compressed`. `estimate` gives the moments of all landmarks, O(K²·N); moments
+    that are not used cost nothing under `jit`. `up_to_date` gives the whole map as a `Joint`, and
     `opened` makes a state of one.
 
     Args:
-        area: landmarks K that are worked on; at least the places of a scan.
-        options: those of `ekf_slam` in the Euclidean chart, whose landmarks stand still, with a
-            linearizer that remembers nothing (at_estimate, unscented), but for associate, watch,
-            make_room and the covariance "square_root".
+        area: number K of landmarks in the area; at least the measurement slots of a scan.
+        options: those of `ekf_slam` in the Euclidean chart, with a linearizer without memory
+            (at_estimate, unscented), except associate, watch, make_room and the covariance
+            "square_root".
     Raises:
         ValueError: as `ekf_slam`; on an area below 1, an option that is not for this filter; and,
-            when a scan has more places than the area, from `update`.
+            when a scan has more measurement slots than the area, from `update`.
     """
     validation.check_models("compressed_ekf_slam", motion, sensor)
     check_count("compressed_ekf_slam: capacity", capacity)
@@ -121,7 +121,7 @@ def compressed_ekf_slam(
 
         def anew(state: Compressed) -> Compressed:
             joint = up_to_date(state)
-            # What a run has must not depend on the runs beside it.
+            # The result of a run must not depend on other runs of the batch.
             other = _opened_at(joint, _chosen(joint, own, sensor, seen, new))
             both: Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
             return both
@@ -172,7 +172,7 @@ def opened(joint: Joint, area: int) -> Compressed:
 
 
 def up_to_date(state: Compressed) -> Joint:
-    """The map with all that was postponed, O(K·N²)."""
+    """The map with the postponed update applied, O(K·N²)."""
     joint = state.whole
     at = _rows(state.slot, joint.landmarks.shape[1])
     before = joint.cov[at]
@@ -187,7 +187,7 @@ def up_to_date(state: Compressed) -> Joint:
 
 
 def _moved_map(state: Compressed) -> jax.Array:
-    """The landmarks (N, L) of now."""
+    """The current landmarks (N, L)."""
     landmarks, own = state.whole.landmarks, state.slot.shape[0]
     theta = _postponed(state)[2]
     moved = (theta @ state.whole.cov[_rows(state.slot, landmarks.shape[1])])[3:]
@@ -197,7 +197,7 @@ def _moved_map(state: Compressed) -> jax.Array:
 
 
 def _marginals(state: Compressed) -> tuple[jax.Array, jax.Array]:
-    """P of each landmark with itself (N, L, L) and with the robot (N, 3, L), of now."""
+    """The current P of each landmark with itself (N, L, L) and with the robot (N, 3, L)."""
     capacity, size = state.whole.landmarks.shape
     own, at = state.slot.shape[0], _rows(state.slot, size)
 
@@ -220,7 +220,7 @@ def _marginals(state: Compressed) -> tuple[jax.Array, jax.Array]:
 
 
 def _postponed(state: Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Φ, Ψ (W, W) and θ (W,), W = 3 + K·L."""
+    """The postponed update Φ, Ψ (W, W) and θ (W,), W = 3 + K·L."""
     area, own = state.area, state.slot.shape[0]
     width = 3 + own * area.landmarks.shape[1]
     theta = area.landmarks[own:].reshape(-1)[:width]
@@ -232,7 +232,7 @@ def _postponed(state: Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def _opened_at(joint: Joint, slot: jax.Array) -> Compressed:
-    """A state with nothing postponed, and the landmarks of slots (K,) as its area."""
+    """The state with nothing postponed and the landmarks of slots (K,) as its area."""
     own, size = slot.shape[0], joint.landmarks.shape[1]
     at, more = _rows(slot, size), _more(own, size)
     inside = joint.cov[at][:, at]
@@ -252,10 +252,10 @@ def _opened_at(joint: Joint, slot: jax.Array) -> Compressed:
 
 
 def _chosen(joint: Joint, own: int, sensor: Sensor, seen: jax.Array, new: jax.Array) -> jax.Array:
-    """Slots (own,), ascending: those seen, the first free ones, those nearest to the robot."""
+    """The slots (own,) of a new area, ascending: those seen, free ones, the nearest to the pose."""
     points = jax.vmap(sensor.position)(joint.landmarks)
     distance = ((points - joint.pose[None, :2]) ** 2).sum(axis=1)
-    # A quarter of the area is kept for landmarks to come: each may else ask for another area.
+    # A quarter of the area is reserved for new landmarks: each would else need another area.
     spare = jnp.cumsum(~joint.alive) <= jnp.maximum(new, own // 4)
     rank = jnp.select([seen, ~joint.alive & spare, joint.alive], [0, 1, 2], 3)
     distance = jnp.where(joint.alive, distance, 0.0)
@@ -263,11 +263,11 @@ def _chosen(joint: Joint, own: int, sensor: Sensor, seen: jax.Array, new: jax.Ar
 
 
 def _rows(slot: jax.Array, size: int) -> jax.Array:
-    """Those of the robot and of the landmarks in slots (K,), (3 + K·L,)."""
+    """The rows of the robot and of the landmarks in slots (K,), (3 + K·L,)."""
     of_landmarks = 3 + slot[:, None] * size + jnp.arange(size)[None, :]
     return jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
 
 
 def _more(own: int, size: int) -> int:
-    """How many landmarks' places hold 3 + own·size variables."""
+    """The number of landmark slots that hold 3 + own·size variables."""
     return -(-(3 + own * size) // size)

@@ -1,5 +1,5 @@
-"""What a `Joint` says in map coordinates (x, y, θ, l), whatever the filter's chart: its estimate,
-its covariance, and errors of the chart as moves of the map.
+"""A `Joint` in map coordinates (x, y, θ, l), whatever the filter's chart: estimate, covariance,
+and retraction by errors.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ from jaxslam.types import Estimate
 def estimate_of(
     joint: Joint, sensor: Sensor, chart: Chart, *, square_root: bool = False
 ) -> Estimate:
-    """Means and marginal covariances in map coordinates, whatever the chart and the landmark."""
+    """Means and marginal covariances in map coordinates, for any chart and landmark parameters."""
     capacity, size = joint.landmarks.shape
     cov = joint.cov @ joint.cov.T if square_root else joint.cov
     pose_cov = cov[:3, :3]
@@ -79,7 +79,7 @@ def cov_of_coordinates(
 def with_cov_of_coordinates(
     joint: Joint, chart: Chart, cov: Float[Array, "D D"], *, square_root: bool = False
 ) -> Joint:
-    """The state whose covariance in coordinates is cov (D, D), at its own estimate."""
+    """The state with covariance cov (D, D) in map coordinates, at the same estimate."""
     if chart.basis is not None:
         basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
         alive = joint.alive[:, None, None]

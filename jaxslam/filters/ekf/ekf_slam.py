@@ -1,4 +1,4 @@
-"""EKF-SLAM: the one Kalman-type SLAM filter, of which the published variants are arguments."""
+"""EKF-SLAM; the published variants are arguments of one filter."""
 
 import jax
 import jax.numpy as jnp
@@ -52,13 +52,13 @@ def ekf_slam(
     Every valid measurement of an absolute sensor (L = 0: compass, position fix) corrects the robot,
     whatever its tag, and has slot -1; `associate` and `births` do not apply, and the map is empty.
 
-    Several sensors are one `sensors.suite`, whose parts have their turn one after the other.
+    Several sensors are one `sensors.suite`, whose parts are processed one after the other.
 
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`.
         capacity: landmark slots N. A new landmark that finds the map full is dropped and marked
             `Status.OVERFLOW`.
-        chart: the error P is the covariance of; default `charts.euclidean()`.
+        chart: the error coordinates of P; default `charts.euclidean()`.
         linearize: where Jacobians are taken; default `linearize.at_estimate()`.
         associate: default `association.known()`.
         update: "sequential" corrects by one measurement after the other, linearizing anew each
@@ -66,21 +66,21 @@ def ekf_slam(
         gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
             The guide's 3 σ is `stats.sigma_gate(3)`, and `stats.chi2_quantile` gives a probability.
         iterations: passes of the iterated EKF, each from the same prior; 1 is the plain EKF.
-        covariance: "plain"; "joseph", Joseph's form of the update, dearer, and safer in float32; or
-            "square_root", to hold a root X of P = X Xᵀ instead of P, in which float32 goes as far
-            as float64 does in P; the same filter, dearer (the prediction is O(N³)).
+        covariance: "plain"; "joseph", Joseph's form of the update, which costs more and is safer in
+            float32; or "square_root", a root X of P = X Xᵀ instead of P, as accurate in float32 as
+            P is in float64, at a higher cost (the prediction is O(N³)).
         births: at most so many new landmarks a scan, the rest `Status.DEFERRED`; the guide starts
             one. Default no limit.
-        make_room: removes landmarks from a full map before new ones enter it, by the memory that
-            `map_management.pruning` keeps of the same `Life`: for `pruning(filter, make_room)`
-            alone. Default none is removed.
+        make_room: a `Life` that removes landmarks from a full map before new ones enter it; only
+            for filters wrapped as `map_management.pruning(filter, make_room)`, which keeps its
+            memory. Default: none is removed.
         watch: keep a `slots.Watch` in the state, which campaigns report.
     Raises:
-        ValueError: on models, charts, linearizers or associations that are none or of wrong sizes
+        ValueError: on models, charts, linearizers or associations of another type or size
             (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
             update or covariance, a chart or linearizer that does not fit the sensor's landmarks or
-            one another, a make_room that makes none, a square root in a chart that keeps the last
-            motion apart, several iterations of a statistical linearizer, or a linearizer of
+            one another, a `Life` without `make_room`, a square root in a chart with
+            `motion_apart`, several iterations of a statistical linearizer, or a linearizer of
             landmarks for a suite with an absolute sensor; from `update`, on a make_room without
             `pruning`.
     """
@@ -151,7 +151,7 @@ def initial_state(
     *,
     watch: bool = False,
 ) -> Joint:
-    """A robot whose covariance in coordinates is pose_cov, and no landmark."""
+    """The initial state: a robot with covariance pose_cov in map coordinates, and no landmark."""
     sensor, chart = settings.sensor, settings.chart
     size_l = len(sensor.landmark)
     ground = jnp.zeros((capacity, size_l), pose.dtype)

@@ -1,7 +1,7 @@
-"""The innovations of m measurements, their covariance S, and what they say of a `Joint`'s errors.
+"""The innovations of m measurements, their covariance S, and V = L⁻¹ H P for the correction.
 
-`innovate` linearizes, forms S = H P Hᵀ + R, gates, factors S = L Lᵀ and whitens by L⁻¹: one
-function for each. What the forms of the update (`update`) take of it is an `Innovation`.
+`innovate` linearizes, forms S = H P Hᵀ + R, gates, factors S = L Lᵀ and whitens by L⁻¹, with
+one function for each step. Its result, an `Innovation`, serves all forms of the update (`update`).
 """
 
 from functools import partial
@@ -22,7 +22,7 @@ from jaxslam.slots import Joint
 
 
 class Correction(NamedTuple):
-    """What `correct` did with its m measurements; the numbers are finite for all of them."""
+    """The results of `correct` for its m measurements; the numbers are finite for all of them."""
 
     innovation: Float[Array, "m Z"]
     """against the prior"""
@@ -36,7 +36,7 @@ class Correction(NamedTuple):
 
 
 class View(NamedTuple):
-    """What m measurements see of P, or, of a square-root filter, of its root."""
+    """The rows of P, or of its square root, that m measurements involve."""
 
     robot: Float[Array, "3 D"]
     """rows of the robot"""
@@ -47,7 +47,7 @@ class View(NamedTuple):
 
 
 class Innovation(NamedTuple):
-    """What m measurements say of all errors, and what the forms of the update are made of."""
+    """The whitened innovations and gain factors of m measurements, for all forms of the update."""
 
     xi: Float[Array, "D"]
     """the correction in the chart"""
@@ -72,7 +72,7 @@ class Innovation(NamedTuple):
     seen: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
     """the same by coordinates, at the prior"""
     fuse: Bool[Array, "m"]
-    """known, inside the gate and regular alone"""
+    """known, inside the gate, and with a positive definite S_ii"""
     correction: Correction
 
 
@@ -88,7 +88,7 @@ class _Linearized(NamedTuple):
 
 
 class _Gated(NamedTuple):
-    """Each measurement for itself, against the prior: what the gate looks at."""
+    """The gate of each measurement on its own, against the prior."""
 
     innovation: Float[Array, "m Z"]
     cov: Float[Array, "m Z Z"]
@@ -100,7 +100,7 @@ class _Gated(NamedTuple):
 
 
 class _Factored(NamedTuple):
-    """S = L Lᵀ of the measurements that are fused."""
+    """The factor of S = L Lᵀ of the fused measurements."""
 
     s: Float[Array, "m Z m Z"]
     factor: Float[Array, "m*Z m*Z"]
@@ -112,7 +112,7 @@ class _Factored(NamedTuple):
 
 
 def view_of(joint: Joint, slot: Int[Array, "m"], square_root: bool = False) -> View:
-    """What measurements of the landmarks in slot (m,) see."""
+    """The view of measurements of the landmarks in slot (m,)."""
     own = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
     local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
     return View(joint.cov[:3], own, local)
@@ -127,17 +127,17 @@ def innovate(
     memory: tuple[Joint, Int[Array, "m"]],
     settings: EkfSettings,
 ) -> Innovation:
-    """Solà (26)-(29) for m measurements at once, from the view they have of P.
+    """The innovation of m measurements at once, from their view of P: Solà (26)-(29).
 
         view of P        H                       H P          S = H P Hᵀ + R
         robot (3, D)     by pose (m, Z, 3)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ
         own (m, L, D)    by landmark (m, Z, L)   V = L⁻¹ H P  ξ = Vᵀ L⁻¹ ν (D,)
 
-    Each iteration linearizes at the prior moved by the last ξ; what is gated and reported is of the
-    first one.
+    Each iteration linearizes at the prior retracted by the last ξ; gate and reported numbers are
+    those of the first one.
 
-    memory: the state that the linearizer remembers by, and the landmarks' slots (m,) there. P may
-    have further columns, which count as other errors.
+    memory: the state with the linearizer's memory, and the landmarks' slots (m,) there. P may
+    have further columns, of other errors.
     """
     m, size_z = z.shape
     capacity = joint.landmarks.shape[0]
@@ -192,9 +192,9 @@ def _linearize(
     xi: Float[Array, "D"] | None,
     settings: EkfSettings,
 ) -> _Linearized:
-    """z ≈ ẑ + H (ξ - ξ_i) at the prior moved by ξ_i; None for the prior itself.
+    """The linearization z ≈ ẑ + H (ξ - ξ_i) at the prior retracted by ξ_i; None: at the prior.
 
-    With ν = z - ẑ + H ξ_i, what is solved for is ξ, from the prior.
+    With ν = z - ẑ + H ξ_i, the solution is ξ, relative to the prior.
     """
     whole, slot_in_whole = memory
     chart, sensor = settings.chart, settings.sensor
@@ -252,9 +252,9 @@ def _gate(
     known: Bool[Array, "m"],
     gate: Any,
 ) -> _Gated:
-    """Which measurements are fused, by their distances; inverse: L⁻¹ of each cov = L Lᵀ."""
+    """The gate: which measurements are fused. inverse: L⁻¹ of each cov = L Lᵀ."""
     distance = (_product(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))
-    # A finite measurement so far off that its d² is not is outside any gate.
+    # A finite measurement whose d² overflows is outside any gate.
     inside = jnp.isfinite(distance) if gate is None else distance <= gate
     return _Gated(nu, cov, distance, inside, definite, known & inside & definite)
 
@@ -266,7 +266,7 @@ def _factor(
     definite: Bool[Array, "m"],
     fuse: Bool[Array, "m"],
 ) -> _Factored:
-    """L of the measurements that are fused; S of the others is the identity, L zero.
+    """The factor L of the fused measurements; for the others S is the identity and L zero.
 
     same: 1 where both measurements are the same one.
     """
@@ -278,9 +278,9 @@ def _factor(
     pivots = jnp.diagonal(factor).reshape(m, size_z)
     # Measurements that are regular one by one can still be singular together.
     regular = definite if m == 1 else (pivots > 0).all(axis=1)
-    # A row without a pivot says nothing, and costs no mask of what it would say.
+    # A row without a pivot is zero and so has no effect, without a mask.
     factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
-    if m == 1:  # it has been factored already, alone
+    if m == 1:  # it has been factored already
         pivots = jnp.diagonal(inverse, axis1=1, axis2=2)
     return _Factored(s, factor, inverse, pivots, regular)
 
@@ -291,7 +291,7 @@ def _whiten(
     hp: Float[Array, "K D"],
     nu: Float[Array, "m Z"],
 ) -> tuple[Float[Array, "K D"], Float[Array, "K"]]:
-    """V = L⁻¹ H P and L⁻¹ ν, zero for what is not fused."""
+    """V = L⁻¹ H P and L⁻¹ ν, zero for measurements that are not fused."""
     if len(fuse) == 1:
         inverse = jnp.where((fuse & factored.regular)[:, None, None], factored.inverse, 0.0)
         return no_inline(_multiplied, inverse, hp, nu)
@@ -301,7 +301,7 @@ def _whiten(
 
 
 def _report(gated: _Gated, factored: _Factored, whitened: Float[Array, "K"]) -> Correction:
-    """What is reported: of fused measurements the innovations whitened together, else alone."""
+    """The `Correction`: NIS of fused measurements from their joint S, of the others each alone."""
     m, size_z = gated.innovation.shape
     pivots, positive = factored.pivots, gated.positive & factored.regular
     log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
@@ -322,7 +322,7 @@ def _report(gated: _Gated, factored: _Factored, whitened: Float[Array, "K"]) -> 
 def _seen_rows(
     rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], own: Float[Array, "m L D"]
 ) -> Float[Array, "m Z D"]:
-    """H P of H by pose and landmark, first in rows, and P of the robot and the landmarks seen."""
+    """H P from the blocks of H, first by rows, and P of the robot and the landmarks seen."""
     terms = [rows[:, :, k, None] * robot[None, None, k] for k in range(3)]
     terms += [rows[:, :, 3 + k, None] * own[:, None, k] for k in range(own.shape[1])]
     return linalg.total(terms)
@@ -346,6 +346,6 @@ def _multiplied(
 
 @linalg.kept_whole
 def _product(inverse: Float[Array, "m Z Z"], rhs: Float[Array, "m Z k"]) -> Float[Array, "m Z k"]:
-    """L⁻¹ B, each."""
+    """L⁻¹ B of each measurement."""
     each = range(inverse.shape[1])
     return linalg.total(inverse[:, :, k, None] * rhs[:, k, None] for k in each)

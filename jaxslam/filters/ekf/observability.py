@@ -1,4 +1,4 @@
-"""What a correction says along the directions that should stay unobservable: `slots.Watch`."""
+"""Information gained along directions that should stay unobservable: `slots.Watch`."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def with_information(
     noise: Float[Array, "m Z Z"],
     fused: Bool[Array, "m"],
 ) -> Watch:
-    """The watch with what these measurements say along its directions; H by coordinates."""
+    """The watch with the information of these measurements added; H by coordinates."""
     watch: Watch = joint.watch
     directions = _in_coordinates(chart, joint)
 
@@ -59,14 +59,14 @@ def times_directions(
 def split_directions(
     directions: Float[Array, "D k"], capacity: int
 ) -> tuple[Float[Array, "3 k"], Float[Array, "N L k"]]:
-    """Rows of the robot and of each landmark."""
+    """The directions split into rows of the robot and of each landmark."""
     return directions[:3], directions[3:].reshape(capacity, -1, directions.shape[1])
 
 
 def _in_coordinates(
     chart: Chart, joint: Joint
 ) -> tuple[Float[Array, "3 3"], Float[Array, "N L 3"]]:
-    """The watched directions in coordinates: of the pose and of each landmark."""
+    """The watched directions in map coordinates: of the pose and of each landmark."""
     robot, landmarks = split_directions(joint.watch.directions, joint.landmarks.shape[0])
     if chart.basis is None:
         return robot, landmarks

@@ -1,4 +1,4 @@
-"""The prediction of a Kalman-type SLAM filter on a `Joint`, whatever chart and linearizer."""
+"""The prediction of a Kalman-type SLAM filter, for any chart and linearizer."""
 
 from typing import NamedTuple
 
@@ -15,11 +15,11 @@ from jaxslam.slots import Joint, Last
 
 
 def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfSettings) -> Joint:
-    """Robot motion, O(N) in a chart whose landmarks stand still: Solà (14)-(17).
+    """The state after the robot's motion, O(N) where landmark errors are constant: Solà (14)-(17).
 
-    pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the error of
-    the landmarks moves too, with A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block. Of
-    a square root X, P = X Xᵀ, A X is taken, and the noise's root beside it made part of it; O(N³).
+    pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the errors of
+    the landmarks change too, by A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block. A
+    square root X of P = X Xᵀ becomes the triangular root of [A X, G √N]; O(N³).
     """
     chart, square_root = settings.chart, settings.square_root
     robot = slots.robot_cov(joint, square_root)
@@ -50,12 +50,12 @@ def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfS
 
 
 class Transition(NamedTuple):
-    """How errors move: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise by way of dx]."""
+    """The error model: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise through dx]."""
 
     robot: Float[Array, "3 3"]
     """A"""
     cross: Float[Array, "N L 3"] | None
-    """a_i; None where landmarks stand still"""
+    """a_i; None where landmark errors are constant"""
     landmark: Float[Array, "N L L"] | None
     """B_i; None where they are the identity"""
     noise: Float[Array, "3 3"]
@@ -84,7 +84,7 @@ class Transition(NamedTuple):
         return jnp.concatenate([matrix[:3], turned.reshape(capacity * size, -1)])
 
     def lift(self, size: int) -> Float[Array, "D 3"]:
-        """What noise of the pose's coordinates does to all errors."""
+        """The matrix from noise of the pose's coordinates to all errors."""
         rest = jnp.zeros((size - 3, 3), self.noise.dtype)
         if self.cross_noise is not None:
             rest = self.cross_noise.reshape(size - 3, 3)
@@ -94,7 +94,7 @@ class Transition(NamedTuple):
 def in_charts(
     by_pose: Float[Array, "3 3"], before: Basis, after: Basis, alive: Bool[Array, "N"]
 ) -> Transition:
-    """E(x')⁻¹ F E(x) and E(x')⁻¹ by blocks, dead slots standing still."""
+    """The blocks of E(x')⁻¹ F E(x) and E(x')⁻¹, with dead slots unchanged."""
     times = jax.vmap(linalg.matmul, in_axes=(0, None))
     each = jax.vmap(linalg.matmul)
     undo = linalg.inverse(after.pose[0])
@@ -125,11 +125,11 @@ def moved_cov(
         robot = linalg.matmul(moved.robot, cov[:3])
         own = linalg.matmul(robot[:, :3], moved.robot.T)
         own = linalg.symmetrize(own if noise is None else own + noise)
-        # Kept apart from P, which it is made of, so that P is written in place.
+        # Stored separately from P, from which it is computed, so that P is written in place.
         robot = materialize(jnp.concatenate([own, robot[:, 3:]], axis=1))
         return cov.at[:3].set(robot).at[:, :3].set(robot.T)
     if moved.landmark is not None:
-        # In memory before it is transposed: each entry would be computed twice.
+        # Stored before it is transposed: each entry would else be computed twice.
         cov = materialize(moved.turn(moved.turn(cov).T))
     cov = linalg.symmetrize(cov)
     # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.

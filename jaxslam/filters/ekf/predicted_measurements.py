@@ -1,4 +1,4 @@
-"""What a filter on a `Joint` expects to measure of every landmark: what association looks at."""
+"""Predicted measurements of every landmark of a `Joint`, the input of association."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from jaxslam.slots import Joint
 
 
 def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
-    """The map as an association may see it; what it does not ask for is not computed."""
+    """The `Prediction` of a map; what the association does not call is not computed."""
     sensor, chart, square_root = settings.sensor, settings.chart, settings.square_root
     capacity, size = joint.landmarks.shape
 
@@ -83,7 +83,7 @@ def in_chart(
     by_landmark: Float[Array, "m Z L"],
     moved: tuple[Float[Array, "3"], Float[Array, "m L"]] | None = None,
 ) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]:
-    """Chain Jacobians with the derivative of retract(pose, l, ·), at zero or moved."""
+    """Jacobians by errors of the chart, chained with retract(pose, l, ·) at zero or moved."""
     assert chart.basis is not None
     if moved is None:
         basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)

@@ -1,7 +1,7 @@
-"""The last motion as a variable of its own, for charts that keep it apart (`Chart.motion_apart`).
+"""The last motion as a separate variable of the state (`Chart.motion_apart`).
 
-The errors of the map are e = e_rest + g δ, with δ the error of the last motion and g its lever. A
-correction moves the map by what it says of e_rest, then composes it with the corrected motion.
+The errors of the map are e = e_rest + g δ, with δ the error of the last motion and g its Jacobian.
+A correction updates e_rest and δ, and then composes the map with the corrected motion.
 """
 
 import jax
@@ -17,7 +17,7 @@ from jaxslam.slots import Joint
 
 
 def lever_of_motion(joint: Joint, chart: Chart) -> Float[Array, "D 3"]:
-    """g: what an error of the last motion, in its own frame, does to all errors."""
+    """The Jacobian g of all errors by the error of the last motion in its own frame."""
     assert chart.basis is not None
     still = jnp.eye(3, dtype=joint.pose.dtype)
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
@@ -25,7 +25,7 @@ def lever_of_motion(joint: Joint, chart: Chart) -> Float[Array, "D 3"]:
 
 
 def lever_by(moved: Transition, frame: Float[Array, ""]) -> Float[Array, "D 3"]:
-    """g, of a transition to the charts of now and the heading the last motion began from."""
+    """g, from a transition to the current chart and the heading before the last motion."""
     assert moved.cross_noise is not None
     size = 3 + moved.cross_noise[..., 0].size
     return linalg.matmul(moved.lift(size), out_of(frame))
@@ -38,13 +38,13 @@ def moved_anew(
     lever: Float[Array, "D 3"],
     chart: Chart,
 ) -> Joint:
-    """The map, corrected but for the last motion, composed with that motion changed by a step.
+    """The corrected map composed with the last motion, which a step has corrected.
 
     With T the transition of e_rest and h = g' - T g, P ← T P Tᵀ + h C Tᵀ + (h C Tᵀ)ᵀ + h Q hᵀ,
     C = cov(δ, e) and Q = cov(δ), all after the correction.
 
     Args:
-        turn: by which the frame the motion began from has turned.
+        turn: the rotation of the frame in which the motion began.
         lever: g as it was before the correction.
     """
     assert chart.basis is not None
@@ -71,5 +71,5 @@ def moved_anew(
 
 
 def out_of(frame: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Steps in a frame of that heading as steps in the map."""
+    """Steps of the pose in a frame of that heading, expressed in the map."""
     return se2.adjoint(jnp.stack([jnp.zeros_like(frame), jnp.zeros_like(frame), frame]))

@@ -1,5 +1,5 @@
-"""Corrections one after the other of a map and its last motion, composed with each other at the end
-of the scan (`Chart.motion_apart`)."""
+"""Sequential corrections of a map and its last motion, which are composed at the end of the scan
+(`Chart.motion_apart`)."""
 
 from typing import Any, NamedTuple
 
@@ -22,10 +22,10 @@ from jaxslam.slots import Joint, Last
 
 
 class MapAndMotion(NamedTuple):
-    """The map as if its last motion were known, and that motion's error δ beside it.
+    """The map given its last motion, and that motion's error δ as a separate variable.
 
-    The errors of the map are e = T x + g δ, with x those of `rest`. To a map in the frame of the
-    robot the motion is affine, so x and δ are corrected by adding to them, whatever the order.
+    The errors of the map are e = T x + g δ, with x those of `rest`. In the frame of the robot the
+    motion is affine in the map, so x and δ are corrected by addition, in any order.
     """
 
     rest: Joint
@@ -33,7 +33,7 @@ class MapAndMotion(NamedTuple):
     frame: Float[Array, ""]
     """heading of the frame the motion began from"""
     step: Float[Array, "3"]
-    """by which the motion has been corrected"""
+    """the correction of the motion"""
 
 
 class Composition(NamedTuple):
@@ -68,7 +68,7 @@ def separate_motion(joint: Joint, chart: Chart, columns: int) -> MapAndMotion:
 
 
 def composition_of(state: MapAndMotion, chart: Chart) -> Composition:
-    """The motion with its step, put behind the rest."""
+    """The composition of the map with the corrected last motion."""
     assert chart.basis is not None
     rest, frame = state.rest, state.frame
     change = linalg.matmul(out_of(frame), state.step[:, None])[:, 0]
@@ -82,7 +82,7 @@ def composition_of(state: MapAndMotion, chart: Chart) -> Composition:
 
 
 def compose_map(state: MapAndMotion, chart: Chart) -> Joint:
-    """The map again: P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ, C = cov(δ, x)."""
+    """The composed map: P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ, C = cov(δ, x)."""
     found, rest = composition_of(state, chart), state.rest
     size = rest.cov.shape[0] - 3
     own, lever = rest.cov[size:, size : size + 3], found.lever.T
@@ -102,10 +102,10 @@ def correct_map_and_motion(
     part: tuple[Float[Array, "g Z"], Int[Array, "g"], Bool[Array, "g"]],
     settings: EkfSettings,
 ) -> tuple[MapAndMotion, Correction]:
-    """Correct x and δ by g measurements in turn: z (g, Z), slot (g,), known (g,).
+    """x and δ corrected by g measurements in turn: z (g, Z), slot (g,), known (g,).
 
-    As `update.correct_in_turn` does it: each corrects what the group sees of P, the rows P_I of
-    the robot, of its landmarks and of δ, and the whole P is read and written once.
+    As in `update.correct_in_turn`: each measurement corrects the rows P_I of the robot, the group's
+    landmarks and δ, and the whole P is read and written once.
     """
     rest, (_, slot, known) = state.rest, part
     size_l, size = rest.landmarks.shape[1], rest.cov.shape[0] - 3
@@ -115,7 +115,7 @@ def correct_map_and_motion(
     watch: Any = rest.watch
     if watch:
         watch = watch._replace(directions=watch.directions[at[:-3]])
-    # The local map, and beside its P the matrix that takes P_I of before to P_I of now.
+    # The local map, with the matrix from the initial P_I to the current P_I appended to its P.
     local = rest._replace(
         landmarks=rest.landmarks[slot],
         cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
@@ -129,7 +129,7 @@ def correct_map_and_motion(
     ) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:
         return _correct_one(state, measurement, rest, settings)
 
-    # A gradient keeps what each begins with, and computes the rest of these few rows again.
+    # A gradient stores the input of each step, and recomputes the rest.
     after, (reach, whitened, done) = jax.lax.scan(
         jax.checkpoint(one, prevent_cse=False),
         state._replace(rest=local),
@@ -142,7 +142,7 @@ def correct_map_and_motion(
         watch = after.rest.watch._replace(directions=rest.watch.directions)
     rest = rest._replace(
         pose=after.rest.pose,
-        landmarks=jnp.where(known.any(), landmarks, rest.landmarks),  # a move by zero would round
+        landmarks=jnp.where(known.any(), landmarks, rest.landmarks),  # adding zero would round
         cov=rest.cov - linalg.gram(v[:, : size + 3], v),
         watch=watch,
     )
@@ -155,10 +155,10 @@ def _correct_one(
     whole: Joint,
     settings: EkfSettings,
 ) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:
-    """Correct a local x and δ by a measurement of its landmark i (); the whole map's slot beside.
+    """A local x and δ corrected by a measurement of its landmark i (), of slot () in the map.
 
-    It sees e of the robot and its landmark, E = [T g] of their rows of (x, δ). With P that of
-    (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V. Returns V in the columns beside P
+    It measures e of the robot and its landmark, E = [T g] of their rows of (x, δ). With P that of
+    (x, δ) and V = L⁻¹ H E P: ξ = Vᵀ L⁻¹ ν and P ← P - Vᵀ V. Returns V in the columns appended to P
     (Z, ·), and L⁻¹ ν (Z,).
     """
     i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], measurement)

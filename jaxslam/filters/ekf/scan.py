@@ -1,8 +1,8 @@
-"""What a scan does to a `Joint`: each of its sensors corrects the map, then initializes landmarks.
+"""The update of a `Joint` by a scan: each sensor corrects the map, then initializes landmarks.
 
 The steps are those of the textbook, one function each: `associate_scan` predicts the measurements
-and says of which landmark each is, `update.correct` gates and corrects, `initialize_landmarks`
-starts the new landmarks, and `report_scan` says what became of every measurement.
+and associates them, `update.correct` gates and corrects, `initialize_landmarks` starts the new
+landmarks, and `report_scan` makes the `Info`.
 """
 
 import dataclasses
@@ -28,16 +28,16 @@ from jaxslam.types import Info, Scan
 
 
 class SensorTurn(NamedTuple):
-    """One sensor's turn in a scan."""
+    """The measurement slots and settings of one sensor in a scan."""
 
     places: int | None
     """measurement slots of the scan that are its own; None where all are"""
     settings: EkfSettings | None
-    """None where its measurements are left alone: `Status.UNMATCHED`"""
+    """None where its measurements are ignored: `Status.UNMATCHED`"""
 
 
 class NewLandmarks(NamedTuple):
-    """What became of the measurements of a scan that are of no landmark of the map, (M,) each."""
+    """The outcome of the measurements without a landmark in the map, (M,) each."""
 
     slot: Int[Array, "M"]
     granted: Bool[Array, "M"]
@@ -48,9 +48,9 @@ class NewLandmarks(NamedTuple):
 
 
 def turns_of(sensor: Sensor, settings: EkfSettings) -> list[SensorTurn]:
-    """The turn of each sensor of a suite, in order; one of a sensor that is no suite.
+    """The turns of the sensors of a suite, in order; a single one for a sensor that is no suite.
 
-    Measurements of robots are left alone.
+    Measurements of robots are ignored.
     """
     if not isinstance(sensor, Suite):
         return [SensorTurn(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
@@ -63,7 +63,7 @@ def turns_of(sensor: Sensor, settings: EkfSettings) -> list[SensorTurn]:
 
 
 def turn_of(part: Part, size: int, settings: EkfSettings) -> SensorTurn:
-    """The turn of one sensor of a suite, among landmarks of `size` numbers."""
+    """The turn of one sensor of a suite, for landmarks of `size` numbers."""
     sensor = on_ground(part.sensor, size)
     return SensorTurn(
         part.places, dataclasses.replace(settings, sensor=sensor, absolute=part.absolute)
@@ -73,7 +73,7 @@ def turn_of(part: Part, size: int, settings: EkfSettings) -> SensorTurn:
 def update_by_scan(
     joint: Joint, scan: Scan, turns: Sequence[SensorTurn]
 ) -> tuple[Joint, Info, Bool[Array, "N"]]:
-    """The update by each sensor in its turn; what became of the scan, and the slots evicted.
+    """The state after the update by each sensor in turn, the `Info`, and the slots evicted.
 
     Raises ValueError if the scan does not have their measurement slots.
     """
@@ -96,8 +96,8 @@ def update_by_scan(
 def update_by_sensor(
     joint: Joint, scan: Scan, settings: EkfSettings
 ) -> tuple[Joint, Info, Bool[Array, "N"]]:
-    """The update by the scan of one sensor; what became of it, and the slots (N,) evicted."""
-    # Padding may hold anything, and is multiplied by zero further down.
+    """The state after the scan of one sensor, the `Info`, and the slots (N,) evicted."""
+    # Padding may hold any number, and is multiplied by zero below.
     scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
     found, matched = associate_scan(joint, scan, settings)
     at_once = settings.update == "joint" and len(scan.tag) > 0
@@ -110,9 +110,9 @@ def update_by_sensor(
 def associate_scan(
     joint: Joint, scan: Scan, settings: EkfSettings
 ) -> tuple[Association, Bool[Array, "M"]]:
-    """Of which landmark each measurement is, by what is predicted of the map; and which correct it.
+    """The association of a scan, and which measurements correct the map.
 
-    Those of an absolute sensor are of none, and all valid ones correct.
+    Measurements of an absolute sensor have no landmark, and all valid ones correct.
     """
     if settings.absolute:
         none = jnp.full_like(scan.tag, -1)
@@ -130,7 +130,7 @@ def initialize_landmarks(
     done: Correction,
     settings: EkfSettings,
 ) -> tuple[Joint, NewLandmarks]:
-    """The map with the new landmarks of a scan, as many as it may start and there are slots for.
+    """The map with the new landmarks of a scan, up to `births` and the free slots.
 
     matched, done: the measurements of known landmarks, and their correction; landmarks that were
     corrected do not make room for new ones.
@@ -165,7 +165,7 @@ def _with_room(
     used: Bool[Array, "M"],
     settings: EkfSettings,
 ) -> tuple[Joint, Bool[Array, "N"]]:
-    """The map without the landmarks that `Life.make_room` gives up for new ones, and which."""
+    """The map without the landmarks that `Life.make_room` removes for new ones, and which."""
     if settings.make_room is None or settings.make_room.make_room is None:
         return joint, jnp.zeros_like(joint.alive)
     needed = wanted.sum() - (~joint.alive).sum()
@@ -181,9 +181,9 @@ def _started(
     rank: Int[Array, "M"],
     settings: EkfSettings,
 ) -> tuple[Joint, Int[Array, "M"], Bool[Array, "M"]]:
-    """Landmarks where wanted, in free slots; the slot of each measurement, and where granted.
+    """The map with landmarks started in free slots, the slot of each, and whether it was granted.
 
-    rank: (M,) how many are wanted up to each measurement.
+    rank: (M,) the number wanted up to each measurement.
     """
     births = settings.births
     taken = joint.alive if settings.reserved is None else joint.alive | settings.reserved
@@ -207,7 +207,7 @@ def report_scan(
     new: NewLandmarks,
     settings: EkfSettings,
 ) -> Info:
-    """What became of the measurements of one sensor."""
+    """The `Info` of the measurements of one sensor."""
     status = status_of(
         scan.valid,
         matched=matched,
@@ -233,9 +233,9 @@ def report_scan(
 
 
 def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
-    """The map without the landmarks of the slots `dead`; of a batch, a run without such is kept.
+    """The map without the landmarks of the slots `dead`, exactly as before where there are none.
 
-    A root is made triangular anew; a run without a removal keeps its own to the bit.
+    A root is made triangular again; a run without a removal keeps exactly its own.
     """
     remove = partial(slots.remove, dead=dead, square_root=square_root)
     return change_where(dead.any(), remove, joint)

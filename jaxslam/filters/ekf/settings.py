@@ -1,4 +1,4 @@
-"""What a Kalman-type SLAM filter on a `Joint` is set to, and what its factories refuse."""
+"""The settings of a Kalman-type SLAM filter, and their validation."""
 
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -16,15 +16,15 @@ from jaxslam.validation.numbers import check_count, check_gate
 Update = Literal["sequential", "joint"]
 
 Covariance = Literal["plain", "joseph", "square_root"]
-"""P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or a root X of P = X Xᵀ is held and updated"""
+"""P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or the update of a root X of P = X Xᵀ"""
 
 
 @dataclass(frozen=True, eq=False)
 class EkfSettings:
-    """The models and options of a Kalman-type SLAM filter, which each of its steps takes last.
+    """The models and options of a Kalman-type SLAM filter, the last argument of each step.
 
-    A factory makes it once and checks it; `dataclasses.replace` gives each sensor of a suite its
-    own. Options as `ekf_slam` has them.
+    A factory creates and validates it once; `dataclasses.replace` makes one for each sensor of a
+    suite. The options are those of `ekf_slam`.
     """
 
     sensor: Sensor
@@ -59,9 +59,7 @@ def check_options(
     births: int | None,
     covariance: str = "plain",
 ) -> None:
-    """Counts are counts, the update and the covariance of a known form, the gate positive; errors
-    name the filter.
-    """
+    """Raise ValueError, which names the filter, on invalid counts, gate, update or covariance."""
     for name, value in (("capacity", capacity), ("iterations", iterations), ("births", births)):
         if value is not None or name != "births":
             check_count(f"{filter}: {name}", value)
@@ -72,20 +70,20 @@ def check_options(
 
 
 def check_covariance_form(filter: str, covariance: str, forms: tuple[str, ...]) -> None:
-    """The form of the covariance is one of those that the filter has."""
+    """Raise ValueError unless the filter has this form of the covariance."""
     if covariance not in forms:
         expected = " or ".join(f'"{form}"' for form in forms)
         raise ValueError(f"{filter}: expected covariance {expected}, got {covariance!r}")
 
 
 def check_iterations(filter: str, linearize: Linearizer, iterations: int) -> None:
-    """A linearizer that does not iterate is asked for one pass alone."""
+    """Raise ValueError on several iterations with a linearizer that does not iterate."""
     if iterations > 1 and not linearize.iterates:
         raise ValueError(f"{filter}: the linearizer {linearize.name} does not iterate")
 
 
 def check_chart(sensor: Sensor, chart: Chart) -> None:
-    """The chart acts on landmarks of the sensor's size."""
+    """Raise ValueError unless the chart acts on landmarks of the sensor's size."""
     pose, landmark = jnp.zeros(3), jnp.zeros(len(sensor.landmark))
     try:
         _, moved = jax.eval_shape(chart.retract, pose, landmark, pose, landmark)
@@ -105,7 +103,7 @@ def check_chart(sensor: Sensor, chart: Chart) -> None:
 
 
 def check_settings(settings: EkfSettings) -> None:
-    """Sensor, chart, linearizer and form of the covariance go together."""
+    """Raise ValueError unless sensor, chart, linearizer and covariance form are compatible."""
     sensor, chart, linearize = settings.sensor, settings.chart, settings.linearize
     check_chart(sensor, chart)
     if linearize.euclidean and (chart.basis is not None or len(sensor.landmark) != 2):
@@ -134,7 +132,7 @@ def check_settings(settings: EkfSettings) -> None:
 
 
 def check_make_room(make_room: Life | None) -> None:
-    """What makes room in a full map is a `Life` that does so."""
+    """Raise ValueError unless `life` is a `Life` with `make_room`."""
     if make_room is not None and (not isinstance(make_room, Life) or make_room.make_room is None):
         raise ValueError(
             "ekf_slam: expected make_room to be a Life that makes room, as of "

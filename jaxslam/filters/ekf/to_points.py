@@ -1,4 +1,4 @@
-"""Landmarks that become points: fewer parameters, once a first-order filter can do with them."""
+"""Reduction of inverse-depth landmarks to points, once first-order linearization is accurate."""
 
 import dataclasses
 from functools import partial
@@ -16,14 +16,14 @@ from jaxslam.slots import Joint
 
 
 class ToPoints(NamedTuple):
-    """Which landmarks became points; `info.extra["points"]`."""
+    """Landmarks reduced to points; `info.extra["points"]`."""
 
     reduced: Bool[Array, "N"]
     """slots whose landmark became a point in this step"""
 
 
 def seen_as(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
-    """The sensor as it sees a landmark, by whether it is a point (x, y, padding); None: none is."""
+    """The sensor for a landmark that may be a point (x, y, padding); None: no landmark is one."""
     if sensor.reduced is None or reduced is None:
         return sensor
     of_points = sensor.reduced.sensor
@@ -39,14 +39,14 @@ def seen_as(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
 
 
 def at_slot(sensor: Sensor, joint: Joint, slot: Int[Array, ""]) -> Sensor:
-    """The sensor as it sees the landmark of a slot () of the map."""
+    """The sensor for the landmark of a slot () of the map."""
     return sensor if joint.reduced is None else seen_as(sensor, joint.reduced[slot])
 
 
 def reduced_where_ready(
     joint: Joint, sensor: Sensor, square_root: bool
 ) -> tuple[Joint, Bool[Array, "N"]]:
-    """The map with the landmarks that may become points turned into them, and which."""
+    """The map with all landmarks reduced that may become points, and which."""
     which = ready(joint, sensor, square_root)
 
     def reduced(joint: Joint) -> Joint:
@@ -66,11 +66,11 @@ def ready(joint: Joint, sensor: Sensor, square_root: bool) -> Bool[Array, "N"]:
 
 
 def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: bool) -> Joint:
-    """Turn the landmarks of the slots `which` into points.
+    """The map with the landmarks of the slots `which` reduced to points.
 
     With J = ∂position/∂l (2, L), l ← position(l) and, of all errors, e_l ← J e_l, in rows and
-    columns of P. The other L - 2 coordinates become padding. In a chart whose landmarks have errors
-    of their own beside a motion of the whole (`Basis.landmark` None), J is by these.
+    columns of P. The other L - 2 coordinates become padding. In a chart with identity
+    `Basis.landmark` (None), J is the derivative by e_l at a fixed pose error.
     """
     capacity, size = joint.landmarks.shape
     points = jax.vmap(sensor.position)(joint.landmarks)
@@ -93,7 +93,7 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
         cov = linalg.triangular_root(jnp.concatenate([turned(joint.cov), unit], axis=1))
     else:
         cov = linalg.symmetrize(turned(turned(joint.cov).T)) + unit
-    # The same to the bit for a run that another run of the batch makes come here.
+    # Exactly the same for a run that gets here only because of another run of the batch.
     cov = jnp.where(which.any(), cov, joint.cov)
     watch = joint.watch
     if watch:

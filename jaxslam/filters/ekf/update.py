@@ -1,8 +1,8 @@
-"""The correction of a Kalman-type SLAM filter on a `Joint`, by a scan at once or one by one.
+"""The correction of a Kalman-type SLAM filter by measurements at once or sequentially.
 
-With `predict`, they exploit that a motion touches the robot alone, and a measurement
-the robot and one landmark: no dense D×D product is formed. The models are records of the settings,
-so one set of equations serves every sensor, chart and linearizer.
+As in `predict`, the sparsity of the models is used (a motion involves the robot alone, a
+measurement the robot and one landmark): no dense D×D product is formed. The models are records of
+the settings, so one set of equations serves every sensor, chart and linearizer.
 """
 
 from collections.abc import Callable
@@ -27,8 +27,8 @@ from jaxslam.slots import Joint
 # vectors of this many entries at a time, and what is left of a row costs as much again.
 _CACHED, _LANES = 128, 16
 
-# Measurements that one pass over P corrects by, where it is cached and where it is not. More cost
-# more loads of P_I, fewer more of P.
+# Measurements a pass over P, where P is cached and where it is not. More of them cost more loads of
+# P_I, fewer cost more loads of P.
 _GROUP, _GROUP_BEYOND = 3, 4
 
 _State = TypeVar("_State")
@@ -44,12 +44,12 @@ def correct(
     known: Bool[Array, "m"],
     settings: EkfSettings,
 ) -> tuple[Joint, Correction]:
-    """Correct by m measurements at once, z (m, Z) of the landmarks in slot (m,): Solà (26)-(30).
+    """The joint corrected by m measurements z (m, Z) of landmarks in slot (m,): Solà (26)-(30).
 
     With S = H P Hᵀ + R = L Lᵀ and V = L⁻¹ H P: x ← x ⊞ Vᵀ L⁻¹ ν and P ← P - Vᵀ V, symmetric as it
-    stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot means nothing.
+    stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot is not used.
     Measurements not known (m,), outside the gate (ν_iᵀ S_ii⁻¹ ν_i above it, each against the prior)
-    or with a singular S do nothing.
+    or with a singular S have no effect.
 
     Each further iteration linearizes at the newest estimate x_i = x ⊞ ξ_i but starts again from the
     prior: ξ_{i+1} = K (z - h(x_i) + H ξ_i) (Bell & Cathey 1993).
@@ -91,7 +91,7 @@ def _corrected_cov(
 def _with_last_motion(
     joint: Joint, found: Innovation, cov: Float[Array, "D D"], slot: Int[Array, "m"], chart: Chart
 ) -> Joint:
-    """The map corrected but for the last motion, then composed with the corrected motion."""
+    """The map corrected, then composed with the corrected last motion."""
     last, capacity = joint.last, joint.landmarks.shape[0]
     seen_last = times_directions(*found.jacobians, *split_directions(last.cov.T, capacity), slot)
     seen_last = linalg.solve_lower(found.factor, seen_last.reshape(-1, 3))
@@ -113,7 +113,7 @@ def correct_in_turn(
     known: Bool[Array, "m"],
     settings: EkfSettings,
 ) -> tuple[Joint, Correction]:
-    """Correct by m measurements one after the other, each linearized at what those before left.
+    """The joint corrected by m measurements in turn, each linearized at the estimate before it.
 
     The same numbers as `correct` on each alone, with P read and written once a group of them:
 
@@ -126,9 +126,9 @@ def correct_in_turn(
     localization and map-building algorithm for real-time implementation", IEEE T-RA 17(3)), over
     one scan. A group without a known measurement in any run of a batch costs nothing.
 
-    In a chart that keeps the last motion apart, map and motion are corrected side by side, and
-    composed once (`robocentric_update`). A form of the covariance that needs all of P is corrected
-    by `correct`, one measurement at a time.
+    In a chart with `motion_apart`, map and motion are corrected separately and composed once
+    (`robocentric_update`). A form of the covariance that needs all of P is corrected by
+    `correct`, one measurement at a time.
     """
     measurements = z, slot, known
     size = joint.cov.shape[1]
@@ -151,7 +151,7 @@ def correct_in_turn(
 def _in_turn_with_motion(
     joint: Joint, measurements: Measurements, group: int, settings: EkfSettings
 ) -> tuple[Joint, Correction]:
-    """`correct_in_turn` in a chart that keeps the last motion apart; P has columns for it."""
+    """`correct_in_turn` in a chart with `motion_apart`; P has columns for the last motion."""
     z, _, known = measurements
     size = joint.cov.shape[1]
     columns = size + 3 + (-(size + 3) % _LANES if size <= _CACHED else 0)
@@ -164,7 +164,7 @@ def _in_turn_with_motion(
             group,
             joint,
         )
-        # A run without a measurement must keep its map to the bit.
+        # A run without a measurement must keep exactly its map.
         after = robocentric_update.compose_map(rest, settings.chart)
         kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)
         return kept, done
@@ -182,7 +182,7 @@ def _in_groups(
 ) -> tuple[_State, Correction]:
     """The state after work(state, g measurements) on each group of m, padded: (⌈m/g⌉, g, …).
 
-    joint: the map, of whose precision what is reported is.
+    joint: the map, whose dtype the reported numbers have.
     """
     m = len(measurements[0])
     groups = -(-m // group)
@@ -204,7 +204,7 @@ def _in_groups(
 def correct_group(
     joint: Joint, part: Measurements, settings: EkfSettings
 ) -> tuple[Joint, Correction]:
-    """Correct by a group of g measurements in turn: the local map by each, then P by them all.
+    """The joint corrected by g measurements in turn: local states by each, then P by all at once.
 
         local P (W, W) | M (W, W)    P_I of now = M P_I of before, W = 3 + g·L
         V (g·Z, D) = reach (g·Z, W) P_I of before
@@ -230,7 +230,7 @@ def correct_group(
     def one(local: Joint, measurement: tuple[jax.Array, Any]) -> tuple[Joint, Any]:
         return _correct_local(local, measurement, joint, settings)
 
-    # A gradient keeps what each begins with, and computes the rest of these few rows again.
+    # A gradient stores the input of each step, and recomputes the rest.
     local, (reach, whitened, done) = jax.lax.scan(
         jax.checkpoint(one, prevent_cse=False),
         local,
@@ -247,7 +247,7 @@ def correct_group(
 def _correct_local(
     local: Joint, measurement: tuple[jax.Array, Any], whole: Joint, settings: EkfSettings
 ) -> tuple[Joint, tuple[jax.Array, jax.Array, Correction]]:
-    """Correct a local map by a measurement of its landmark i (); the whole map's slot beside.
+    """A local map corrected by a measurement of its landmark i (), of slot () in the whole map.
 
     P of the local map and the matrix M beside it are corrected as one:
     [P M] ← [P M] - Vᵀ [V reach].
@@ -265,7 +265,7 @@ def _correct_local(
 
 
 def _nothing(joint: Joint, z: Float[Array, "m Z"]) -> Correction:
-    """The `Correction` of m measurements that nothing is done with, all zero."""
+    """The `Correction` of m unused measurements, all zero."""
     m, size = z.shape
     dtype = jnp.result_type(z, joint.pose, joint.cov)
     each, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
@@ -286,7 +286,7 @@ def _moved(
     slot: Int[Array, "m"],
     chart: Chart,
 ) -> Joint:
-    """The means moved by ξ, and what the measurements tell a watch; P as it was."""
+    """The means retracted by ξ, and the watch updated by the measurements; P is not changed."""
     pose, landmarks = retracted(chart, joint, xi)
     watch = joint.watch
     if watch:
@@ -299,7 +299,7 @@ def _moved_map(
     joint: Joint, v: Float[Array, "K D"], whitened: Float[Array, "g Z"], chart: Chart
 ) -> Float[Array, "N L"]:
     """The landmarks after corrections V (g·Z, D), L⁻¹ ν, one after the other."""
-    if chart.basis is None:  # moves add up
+    if chart.basis is None:  # retractions are additive
         xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
         return retracted(chart, joint, xi)[1]
 

@@ -1,1 +1,1 @@
-"""Information filters: the exact one, and two that keep the information matrix sparse."""
+"""Information filters: EIF-SLAM, and the sparse filters SEIF and ESEIF."""

@@ -1,4 +1,4 @@
-"""The active set of a `SparseState`: who is in it, who enters it, and who leaves for the lists.
+"""The active set of a `SparseState`: its landmarks, activation and deactivation.
 
 A landmark leaves without a link to the robot: `seif` cuts it (`sparsification.sparsify`), `eseif`
 waits until there is none.
@@ -21,7 +21,7 @@ from jaxslam.math.xla import materialize
 
 
 def active_matches(state: SparseState, association: TagAssociation) -> Bool[Array, "M A"]:
-    """Whose landmark is at which index of the active set."""
+    """Which measurements are of the landmark at each index of the active set."""
     same = association.slot[:, None] == state.active[None, :]
     return association.has_slot[:, None] & same
 
@@ -32,7 +32,7 @@ def assign_indices(
     enters: Bool[Array, "M"],
     matches: Bool[Array, "M A"],
 ) -> tuple[Int[Array, "M"], Bool[Array, "A"]]:
-    """The index of each measured landmark in the active set, and which indices are given anew.
+    """The index of each measured landmark in the active set, and which indices are newly assigned.
 
     Landmarks that enter get the indices with the least `order`, by their `rank`; the others have
     theirs (`active_matches`).
@@ -46,7 +46,7 @@ def assign_indices(
 def deactivate(
     state: SparseState, leaving: Bool[Array, "A"], most: int, conservative: bool
 ) -> SparseState:
-    """The active landmarks that leave, at most `most`, without a link to the robot, made passive.
+    """The state with at most `most` active landmarks without robot links made passive.
 
     Their links to active landmarks go to the lists; a full list drops one (`link_lists`).
     """
@@ -97,7 +97,7 @@ def activate(
     slot: Int[Array, "M"],
     enters: Bool[Array, "M"],
 ) -> SparseState:
-    """The landmarks of these slots made active at empty indices, where they enter.
+    """The state with the landmarks of these slots active at empty indices, where they enter.
 
     Their diagonal blocks, and their links to others that are active now, move to the dense block.
     """

@@ -1,4 +1,4 @@
-"""The canonical (information) form of a Gaussian over a robot and A landmarks: the filter's steps.
+"""Filter steps in the canonical (information) form of a Gaussian over a robot and A landmarks.
 
 The error e = x - μ, D = 3 + A·L numbers, has the information matrix Ω (D, D), the inverse of its
 covariance, and the information residual ρ = Ω E[e] (D,): the textbooks' information vector is
@@ -34,7 +34,7 @@ from jaxslam.types import Estimate, Info, Scan
 
 
 class CanonicalInnovations(NamedTuple):
-    """Innovations of the M measurements (Z) of a scan, and the information that they bring."""
+    """Innovations of the M measurements (Z) of a scan, and their information."""
 
     whitened_jacobian: Float[Array, "MZ D"]
     """N⁻¹ H, R = N Nᵀ; zero where not fused"""
@@ -59,7 +59,7 @@ class CanonicalInnovations(NamedTuple):
 
 
 def initial_information(pose_cov: Float[Array, "3 3"], floor: float) -> Float[Array, "3 3"]:
-    """P0⁻¹, of P0 + floor² I where P0 is not positive definite: certainty has no inverse."""
+    """P0⁻¹, or (P0 + floor² I)⁻¹ where P0 is not positive definite."""
     eye = jnp.eye(3, dtype=pose_cov.dtype)
     positive = linalg.cholesky(pose_cov)[1]
     safe = jnp.where(positive, pose_cov, pose_cov + floor**2 * eye)
@@ -73,7 +73,7 @@ def motion_update(
     omega: Float[Array, "D D"],
     residual: Float[Array, "D"],
 ) -> tuple[Float[Array, "3"], Float[Array, "D D"], Float[Array, "D"]]:
-    """Pose, Ω and ρ after a control; 3x3 inversions alone.
+    """Pose, Ω and ρ after a control, by 3×3 inversions only.
 
     With F = ∂f/∂pose and S Sᵀ = W Q Wᵀ (any rank), Φ = F⁻ᵀ Ω F⁻¹ and φ = F⁻ᵀ ρ on the robot's rows,
 
@@ -105,7 +105,7 @@ def innovations(
     index: Int[Array, "M"],
     known: Bool[Array, "M"],
 ) -> CanonicalInnovations:
-    """ν = z ⊖ h(x, l), S = H Ω⁻¹ Hᵀ + R and what of them passes the gate; Ω is factored once.
+    """Gated innovations ν = z ⊖ h(x, l) and S = H Ω⁻¹ Hᵀ + R; Ω is factored once.
 
     A measurement whose R or S is not positive definite does nothing and is `Status.SINGULAR`, as
     are all where Ω is not.
@@ -185,7 +185,7 @@ def _densities_in_turn(
 def measurement_update(
     omega: Float[Array, "D D"], residual: Float[Array, "D"], of: CanonicalInnovations
 ) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
-    """Ω ← Ω + Σ Hᵀ R⁻¹ H, ρ ← ρ + Σ Hᵀ R⁻¹ ν."""
+    """The update Ω ← Ω + Σ Hᵀ R⁻¹ H, ρ ← ρ + Σ Hᵀ R⁻¹ ν."""
     rows = of.whitened_jacobian
     return linalg.symmetrize(omega + rows.T @ rows), residual + rows.T @ of.whitened
 
@@ -214,7 +214,7 @@ def initialize_landmarks(
     index: Int[Array, "M"],
     wanted: Bool[Array, "M"],
 ) -> tuple[Float[Array, "D D"], Float[Array, "M L"], Bool[Array, "M"]]:
-    """Ω with new landmarks at empty indices, where wanted; the landmarks; which were initialized.
+    """Ω with new landmarks at empty indices where wanted, the landmarks, and which were started.
 
     l = g(x, z), with C = G_z R G_zᵀ + G_s S G_sᵀ: Ω ← Ω + Jᵀ C⁻¹ J, J = [-G_x, I], the same as
     augmentation in covariance form (Solà (32)-(38)), and ρ as it is. A landmark whose C is not
@@ -238,14 +238,14 @@ def initialize_landmarks(
 
 
 def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """Ω with √eps of its diagonal added: what is tried where rounding has made it indefinite."""
+    """Ω plus √eps of its diagonal, used where rounding made Ω indefinite."""
     share = math.sqrt(float(jnp.finfo(omega.dtype).eps))
     load: Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
     return omega + load
 
 
 def refuse_unless(solved: Bool[Array, ""], of: CanonicalInnovations) -> CanonicalInnovations:
-    """The innovations where the mean could be solved for; or else all of them are singular."""
+    """The innovations, all marked singular if the mean could not be solved for."""
     return of._replace(
         positive=of.positive & solved,
         log_likelihood=jnp.where(solved, of.log_likelihood, 0.0),

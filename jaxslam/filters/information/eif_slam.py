@@ -1,4 +1,4 @@
-"""EIF-SLAM: the extended Kalman filter in its exact canonical form."""
+"""EIF-SLAM: the extended Kalman filter in exact canonical (information) form."""
 
 from typing import NamedTuple
 
@@ -34,7 +34,7 @@ class CanonicalState(NamedTuple):
 
     @property
     def xi(self) -> Float[Array, "D"]:
-        """The information vector ξ = Ω μ + ρ, of the heading as it is wrapped."""
+        """The information vector ξ = Ω μ + ρ, with the heading wrapped."""
         mean = jnp.concatenate([self.pose, self.landmarks.reshape(-1)])
         return self.omega @ mean + self.residual
 
@@ -123,7 +123,7 @@ def eif_slam(
 def corrected_means(
     state: CanonicalState, error: Float[Array, "D"]
 ) -> tuple[Float[Array, "3"], Float[Array, "N L"]]:
-    """Pose and landmarks moved by the error of the mean."""
+    """Pose and landmarks corrected by the error of the mean."""
     moved = state.landmarks + error[3:].reshape(state.landmarks.shape)
     return (
         canonical.correct_pose(state.pose, error[:3]),

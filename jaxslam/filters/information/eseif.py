@@ -1,4 +1,4 @@
-"""The exactly sparse extended information filter: sparse because the robot is relocated."""
+"""The exactly sparse extended information filter, which relocates the robot to stay sparse."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -65,9 +65,9 @@ def eseif(
         Ω ← Ω + H_βᵀ R⁻¹ H_β, ρ ← ρ + H_βᵀ R⁻¹ ν_β                   and estimated from z_β alone.
 
     The robot then has links to the landmarks of z_β, and exactly none to the others, which may
-    leave the active set. What is given up is what odometry said between map and z_β: for the same
+    leave the active set. The odometry between the map and z_β is discarded: for the same
     linearization Ω ⪯ Ω of the full filter, so the covariance is at least the full filter's. In
-    other scans nothing is given up. All of z_β relocates, none of it corrects the old pose.
+    other scans nothing is discarded. All of z_β relocates, none of it corrects the old pose.
 
     Landmarks that are not active yet are activated then, and their measurements fused; then new
     ones are initialized. z_β must determine the whole pose (`relocation.determines_pose`: two
@@ -178,7 +178,7 @@ def merge_passes(
     waiting: Bool[Array, "M"],
     solved: Bool[Array, ""],
 ) -> CanonicalInnovations:
-    """For the report, the second pass's innovations where late, else the first's.
+    """The innovations for the `Info`: of the second pass where late, else of the first.
 
     Those of landmarks that wait are to be deferred, not rejected: they count as inside the gate,
     and as singular only where the scan could not be solved for. Whitened rows are the first's.

@@ -1,4 +1,4 @@
-"""Entering links in the lists of a `SparseState`; a full list drops its weakest link."""
+"""Insertion of links into the lists of a `SparseState`; a full list drops its weakest link."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -17,7 +17,7 @@ def enter_link(
     on: Bool[Array, ""],
     conservative: bool = False,
 ) -> SparseState:
-    """The link Ω_ij entered in the lists of landmarks i and j, where on and it is not 0.
+    """The state with the link Ω_ij in the lists of landmarks i and j, where on and it is not 0.
 
     A full list drops its weakest link (least |Ω_ij|), or the new one is not entered if that is the
     weakest: `sparsification.drop_link`. `diagonal` must be current for both landmarks.

@@ -45,7 +45,7 @@ def information_of(state: SparseState, slot: Int[Array, "B"]) -> Float[Array, "D
 
 
 def blanket_cov(state: SparseState, slot: Int[Array, ""]) -> Float[Array, "5 5"]:
-    """P of the robot and the landmark of a slot, given all landmarks beyond their Markov blankets.
+    """P of the robot and the landmark of a slot, given all landmarks outside their Markov blankets.
 
     The blankets are the active landmarks and those of the landmark's list: a matrix of 3 + 2(1 + A
     + K) is factored, whatever N.
@@ -60,7 +60,7 @@ def blanket_cov(state: SparseState, slot: Int[Array, ""]) -> Float[Array, "5 5"]
 
 
 def blanket_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Array, "N 2 2"]]:
-    """P of the robot and of each landmark, given all beyond their Markov blankets."""
+    """P of the robot and of each landmark, given all landmarks outside their Markov blankets."""
     omega = state.omega
     eye = jnp.eye(omega.shape[0], 3, dtype=omega.dtype)
     pose_cov = linalg.symmetrize(linalg.solve_psd(omega, eye)[0][:3])
@@ -69,7 +69,7 @@ def blanket_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Ar
 
 
 def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Array, "N 2 2"]]:
-    """P of the robot and of landmarks, of the whole Ω inverted, O(N³)."""
+    """P of the robot and of each landmark by inverting the whole Ω, O(N³)."""
     count = state.alive.shape[0]
     omega = information_of(state, jnp.arange(count, dtype=jnp.int32))
     cov = linalg.inverse_psd(omega)
@@ -86,7 +86,7 @@ def whole_information(state: SparseState) -> scipy.sparse.csc_array:
     rows, columns, values = [], [], []
 
     def add(first: np.ndarray, second: np.ndarray, blocks: np.ndarray) -> None:
-        """Blocks (m, 2, 2) at landmarks first (m,), second (m,)."""
+        """Add blocks (m, 2, 2) at landmarks first (m,), second (m,)."""
         i = 3 + 2 * first[:, None, None] + np.arange(2)[None, :, None]
         j = 3 + 2 * second[:, None, None] + np.arange(2)[None, None, :]
         rows.append(np.broadcast_to(i, blocks.shape).ravel())

@@ -23,7 +23,7 @@ from jaxslam.math.xla import materialize
 def move_landmarks(
     state: SparseState, slot: Int[Array, "B"], step: Float[Array, "B 2"]
 ) -> SparseState:
-    """The means of landmarks moved, and the residuals of those in their lists changed by it."""
+    """The state with the means of landmarks moved, and the residuals of linked ones updated."""
     n = state.alive.shape[0]
     row = state.neighbours.at[slot].get(mode="fill", fill_value=n)
     links = state.links.at[slot].get(mode="fill", fill_value=0)
@@ -38,7 +38,7 @@ def move_landmarks(
 
 
 def recover_passive_means(state: SparseState, count: int) -> SparseState:
-    """The means of the next `count` landmarks, those that are passive, one after the other."""
+    """The state with the passive means among the next `count` landmarks recovered in turn."""
     n = state.alive.shape[0]
 
     def recover_one(state: SparseState, i: Array) -> tuple[SparseState, None]:

@@ -1,4 +1,4 @@
-"""Relocation, what `eseif` does in place of sparsification: the pose is estimated anew.
+"""Relocation of the robot in `eseif`, which replaces sparsification: the pose is estimated anew.
 
 With z_β the scan's measurements of active landmarks, the pose is marginalized out of the active
 block, and estimated from z_β alone:
@@ -6,7 +6,7 @@ block, and estimated from z_β alone:
     Ω_m ← Ω_mm - Ω_mx Ω_xx⁻¹ Ω_xm,   ρ_m ← ρ_m - Ω_mx Ω_xx⁻¹ ρ_x,   all of the robot's rows ← 0,
     Ω ← Ω + H_βᵀ R⁻¹ H_β,            ρ ← ρ + H_βᵀ R⁻¹ ν_β.
 
-What is given up is what odometry said between map and z_β, so Ω claims no more than before.
+The odometry between the map and z_β is discarded, so Ω contains no more information than before.
 """
 
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ def relocate_or_correct(
     measured: TagAssociation,
     matches: Bool[Array, "M A"],
 ) -> tuple[SparseState, CanonicalInnovations, Bool[Array, ""]]:
-    """The state corrected by z_β, with its old pose or relocated; and whether it could be solved.
+    """The state corrected by z_β, relocated or not, and whether its mean could be solved for.
 
     The robot is relocated where free indices of the active set run out (`runs_out`) and z_β
     determines a pose (`determines_pose`).
@@ -83,7 +83,7 @@ def runs_out(
     measured: TagAssociation,
     matches: Bool[Array, "M A"],
 ) -> Bool[Array, ""]:
-    """Whether the scan needs more indices of the active set than are free, less a reserve.
+    """Whether the scan needs more indices of the active set than are free, minus a reserve.
 
     Free is an index that is empty, or whose landmark is not linked to the robot, nor measured now;
     and a relocation must free some.
@@ -111,7 +111,7 @@ def marginalize_pose(
 
 
 def determines_pose(rows: Float[Array, "MZ 3"], turn: float) -> Bool[Array, ""]:
-    """Whether measurements give the whole pose where landmarks are given.
+    """Whether measurements of known landmarks determine the whole pose.
 
     rows: their whitened Jacobians by the pose, J = rowsᵀ rows. All of J's pivots at unit
     diagonal are above √eps, and the heading's standard deviation, of J⁻¹, is at most turn [rad].

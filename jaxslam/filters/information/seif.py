@@ -1,4 +1,4 @@
-"""The sparse extended information filter: a step costs the same in a map of any size."""
+"""The sparse extended information filter (SEIF), whose steps take constant time."""
 
 import jax.numpy as jnp
 from jax import Array

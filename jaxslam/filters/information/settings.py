@@ -1,4 +1,4 @@
-"""What the factories of the information filters were asked for, checked once."""
+"""The settings of the information filters, validated once."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from jaxslam.validation.numbers import check_count, check_gate
 
 @dataclass(frozen=True, eq=False)
 class InformationSettings:
-    """Models and options of every information filter; ValueError, by its name, on bad ones."""
+    """Models and options of an information filter. Raises ValueError, by its name, if invalid."""
 
     name: str
     motion: Motion
@@ -39,7 +39,7 @@ class InformationSettings:
 
 @dataclass(frozen=True, eq=False)
 class SparseSettings(InformationSettings):
-    """The same of a filter with an active set and lists of links."""
+    """The settings of a filter with an active set and lists of links."""
 
     active: int
     """landmarks that may be active, if the map has as many"""
@@ -70,13 +70,13 @@ class SparseSettings(InformationSettings):
 
     @property
     def recovered(self) -> int:
-        """How many passive means a round of mean recovery takes."""
+        """The number of passive means that a round of mean recovery updates."""
         return min(self.passive, self.capacity)
 
 
 @dataclass(frozen=True, eq=False)
 class RelocationSettings(SparseSettings):
-    """The same of a filter that relocates the robot."""
+    """The settings of a filter that relocates the robot."""
 
     turn: float
     """greatest standard deviation of the heading [rad] that a relocation may leave"""

@@ -1,4 +1,4 @@
-"""What `seif` and `eseif` share: start, motion, estimate, and what a scan leaves in the state."""
+"""The common parts of `seif` and `eseif`: initialization, prediction, estimate, end of a scan."""
 
 from collections.abc import Callable
 
@@ -22,7 +22,7 @@ Update = Callable[[SparseState, Scan, Array], tuple[SparseState, Info]]
 
 
 def sparse_filter(settings: SparseSettings, update: Update) -> Filter:
-    """The filter of an update of a `SparseState`."""
+    """The `Filter` with this update of a `SparseState`."""
 
     def init(pose: Array, pose_cov: Array) -> SparseState:
         information = canonical.initial_information(pose_cov, settings.floor).astype(pose.dtype)
@@ -82,7 +82,7 @@ def finish_scan(
     omega: Float[Array, "D D"],
     solved: Bool[Array, ""],
 ) -> SparseState:
-    """The state with Ω of the active block, loaded if it could not be solved for; a scan more.
+    """The state with Ω of the active block, with diagonal loading if not solved; one more scan.
 
     index, active: of the measured landmarks, which of them are active, and where.
     """

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 
 class ApproximationCounts(NamedTuple):
-    """What was approximated so far, or went wrong."""
+    """Counts of approximations and failures since the start."""
 
     cut: Int[Array, ""]
     """landmarks whose link to the robot was removed, by `sparsification.sparsify` or a relocation
@@ -69,7 +69,7 @@ def empty_map(
     active: int,
     links: int,
 ) -> SparseState:
-    """A robot and no landmark."""
+    """The initial state: a robot and no landmark."""
     dtype, none = pose.dtype, jnp.zeros((), jnp.int32)
     zero = jnp.zeros((), dtype)
     return SparseState(
@@ -110,13 +110,13 @@ def with_active_residual(state: SparseState, residual: Float[Array, "D"]) -> Spa
 
 
 def linked_to_robot(omega: Float[Array, "D D"]) -> Bool[Array, "A"]:
-    """Which active landmarks have a link to the robot."""
+    """Which active landmarks are linked to the robot."""
     linked: Array = (omega[:3, 3:] != 0).any(axis=0).reshape(-1, 2).any(axis=1)
     return linked
 
 
 def landmark_blocks(omega: Float[Array, "D D"]) -> Float[Array, "A A 2 2"]:
-    """Ω of the active landmarks, in blocks."""
+    """The blocks of Ω of the active landmarks."""
     count = (omega.shape[0] - 3) // 2
     return omega[3:, 3:].reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
 
@@ -124,7 +124,7 @@ def landmark_blocks(omega: Float[Array, "D D"]) -> Float[Array, "A A 2 2"]:
 def with_landmark_blocks(
     omega: Float[Array, "D D"], blocks: Float[Array, "A A 2 2"]
 ) -> Float[Array, "D D"]:
-    """Ω with other blocks of the active landmarks."""
+    """Ω with the blocks of the active landmarks replaced."""
     count = blocks.shape[0]
     flat = blocks.transpose(0, 2, 1, 3).reshape(2 * count, 2 * count)
     return omega.at[3:, 3:].set(flat)

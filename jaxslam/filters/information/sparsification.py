@@ -1,4 +1,4 @@
-"""What SEIF drops, and where: two kinds of links, each in one function here.
+"""Sparsification: functions that drop links to the robot and links between landmarks.
 
 1. Robot to landmark, `sparsify`: when landmarks m0 leave the active set, the links between them and
    the robot x are set to zero, so that x and m0 are independent given the other active landmarks:
@@ -28,7 +28,7 @@ from jaxslam.math.gaussians import log_det_of
 def sparsify(
     omega: Float[Array, "D D"], leaving: Bool[Array, "A"]
 ) -> tuple[Float[Array, "D D"], Float[Array, ""]]:
-    """Ω̃ of the active block without links between the robot and the landmarks that leave; nats.
+    """Ω̃ of the active block without links from the robot to leaving landmarks; the nats dropped.
 
     x and m0 are made independent given the other active landmarks m+ (ERRATA's formula, Ω⁰ being
     the active block: passive landmarks are held at their means there):
@@ -37,8 +37,8 @@ def sparsify(
 
     (..) the block of Ω that F selects. With G = Ω F_x - Ω F_m0 Ω_m0⁻¹ Ω_m0,x (D, 3) and Σ = F_xᵀ G,
     the information of x given m+ and not m0, that is Ω + G Σ⁻¹ Gᵀ - Ω F_x Ω_x⁻¹ F_xᵀ Ω. Positive
-    definite as Ω is; ρ stays. Dropped is I(x; m0 | m+) = (log|Ω_x| - log|Σ|)/2 [nats]. Ω̃ claims
-    more than Ω in some directions.
+    definite as Ω is; ρ stays. I(x; m0 | m+) = (log|Ω_x| - log|Σ|)/2 [nats] is dropped. Ω̃ contains
+    more information than Ω in some directions (it is overconfident there).
     """
     leaves = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(leaving, 2)])
     by_robot = omega[:, :3]
@@ -61,7 +61,7 @@ def sparsify(
 
 
 def cut_robot_links(state: SparseState, leaving: Bool[Array, "A"]) -> SparseState:
-    """The state sparsified, and counted: active landmarks that leave lose their robot links."""
+    """The state with the robot links of leaving active landmarks dropped, and counted."""
     omega, nats = sparsify(state.omega, leaving)
     counts = state.counts._replace(
         cut=state.counts.cut + (leaving & linked_to_robot(state.omega)).sum(dtype=jnp.int32),

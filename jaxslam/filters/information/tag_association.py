@@ -1,4 +1,4 @@
-"""Data association of a scan by tags: which landmark slot each measurement is of."""
+"""Data association of a scan by tags: the landmark slot of each measurement."""
 
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ class TagAssociation(NamedTuple):
 
 
 def associate_by_table(tag: Int[Array, "N"], alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
-    """Landmarks are in the slots with their tags; new ones get the free slots, lowest first.
+    """Association by a table of tags; new landmarks get the free slots, lowest first.
 
     A known landmark may be measured twice in a scan.
     """
@@ -41,7 +41,7 @@ def associate_by_table(tag: Int[Array, "N"], alive: Bool[Array, "N"], scan: Scan
 
 
 def associate_by_index(alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
-    """The slot of a landmark is its tag; where there is none the slot is N.
+    """Association where a landmark's slot is its tag; measurements without a tag get slot N.
 
     Of several measurements of one landmark the first counts, the others are repeated.
     """

@@ -1,1 +1,1 @@
-"""Filters with half of SLAM known: the map, the poses, or no measurements at all."""
+"""Filters with a known map or known poses, and dead reckoning."""

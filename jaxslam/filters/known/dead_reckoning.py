@@ -1,4 +1,4 @@
-"""Dead reckoning: the pose by the motion alone, as a baseline."""
+"""Dead reckoning: prediction of the pose without measurements, as a baseline."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ def dead_reckoning(
     chart: Chart | None = None,
     linearize: Linearizer | None = None,
 ) -> Filter:
-    """The pose by motion alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (16)).
+    """The predicted pose alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (16)).
 
     Every measurement is `Status.UNMATCHED`, and the map stays empty. The sensor only says of what
     size measurements are; chart and linearize are those of `ekf_slam`, and raise as there.

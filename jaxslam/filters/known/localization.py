@@ -1,4 +1,4 @@
-"""EKF localization: where the robot is in a map that is known."""
+"""EKF localization: the robot's pose in a known map."""
 
 import dataclasses
 from typing import Any
@@ -58,7 +58,7 @@ def localization(
     iterations: int = 1,
     covariance: Covariance = "plain",
 ) -> Filter:
-    """Extended Kalman filter of the pose alone, in a map without error (Williams; the Notes).
+    """Extended Kalman filter of the pose in a known map without errors (Williams; the Notes).
 
     The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the pose only, P (3, 3). A step
     costs what its scan does, but for finding tags among N (0.09 ms a step with 10,000); association
@@ -157,7 +157,7 @@ def localization(
 
 
 def _in_map(sensor: Sensor, points: Any, settings: EkfSettings) -> EkfSettings:
-    """The settings for one sensor of landmarks that are known, or of none."""
+    """The settings for one sensor of known landmarks, or for an absolute sensor."""
     absolute = not sensor.landmark
     linearize = settings.linearize if absolute else _on_map(settings.linearize, sensor, points)
     return dataclasses.replace(
@@ -166,7 +166,7 @@ def _in_map(sensor: Sensor, points: Any, settings: EkfSettings) -> EkfSettings:
 
 
 def _on_map(linearize: Linearizer, sensor: Sensor, points: Any) -> Linearizer:
-    """The linearizer, for which the landmark of a slot is a constant of the sensor."""
+    """The linearizer with the landmark of a slot as a constant of the sensor."""
 
     def observe(flat: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
         landmark = jnp.asarray(points, here.pose.dtype)[here.slot]
@@ -177,7 +177,7 @@ def _on_map(linearize: Linearizer, sensor: Sensor, points: Any) -> Linearizer:
 
 
 def _without_landmark(sensor: Sensor) -> Sensor:
-    """A sensor whose landmarks have no parameters."""
+    """The sensor with landmarks without parameters."""
     none = jnp.zeros(0)
     return Sensor(
         name=sensor.name,
@@ -194,7 +194,7 @@ def _without_landmark(sensor: Sensor) -> Sensor:
 
 
 def _of_pose(chart: Chart) -> Chart:
-    """The chart's part of the pose, beside landmarks without parameters."""
+    """The chart restricted to the pose, for landmarks without parameters."""
     if chart.motion_apart:
         raise ValueError(f"localization: the chart {chart.name} composes a map with the motion")
     whole_basis = chart.basis

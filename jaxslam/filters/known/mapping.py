@@ -1,4 +1,4 @@
-"""Mapping from known poses: landmarks that are independent of one another."""
+"""Mapping from known poses, with independent landmarks."""
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ def mapping(
     births: int | None = None,
     life: Life | None = None,
 ) -> Filter:
-    """The map alone, of a robot whose poses are known (Williams): the control *is* the pose.
+    """A filter of the map alone, for known poses (Williams): the control *is* the pose.
 
     Given the path, landmarks are independent: each has an EKF of its own, l ← l + C Hᵀ S⁻¹ ν with
     S = H C Hᵀ + R, and a measurement costs O(1) however large the map is. It is what one particle
@@ -96,7 +96,7 @@ def as_prior(
     pose: ArrayLike,
     pose_cov: ArrayLike,
 ) -> Joint:
-    """The state of a filter that begins in this map, with nothing correlated yet.
+    """The initial state of a SLAM filter with this map as an uncorrelated prior.
 
     `run` begins in it by `dataclasses.replace(filter, init=partial(as_prior, final, filter))`.
 

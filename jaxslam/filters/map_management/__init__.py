@@ -1,1 +1,1 @@
-"""Map management: landmarks removed, duplicates merged, loops closed, a lost robot relocalized."""
+"""Map management: pruning, merging of duplicates, loop closure, relocalization."""

@@ -1,4 +1,4 @@
-"""The rigid motion that aligns a cluster of points with points of a map, by least squares."""
+"""Weighted least-squares alignment of a cluster of points with points of a map."""
 
 from typing import NamedTuple
 
@@ -25,11 +25,11 @@ class Alignment(NamedTuple):
     jacobian: Float[Array, "2*M 3"]
     """∂r/∂T"""
     factor: Float[Array, "2*M 2*M"]
-    """Cholesky factor of Σ; the identity for what is no pair"""
+    """Cholesky factor of Σ; the identity where there is no pair"""
 
 
 class _Residuals(NamedTuple):
-    """r_i = T z_i - m_i about the centroids, with the covariance and the derivative."""
+    """The residuals r_i = T z_i - m_i about the centroids, their covariance and derivative."""
 
     error: Float[Array, "2*M"]
     jacobian: Float[Array, "2*M 3"]
@@ -43,10 +43,10 @@ def align(points: PointSets, slot: Int[Array, "M"]) -> Alignment:
     """The pose that aligns cluster points with their map points, -1 for none.
 
     The closed form without weights (as `se2.align`), and from there one step of generalized least
-    squares. More steps would each be linearized where the last has left the map behind, and wander
-    along what it knows worst. For the same reason ∂r/∂θ is taken where the map puts the points,
-    (m - t)⊥ and not (R z)⊥, which differ by the residual: then a turn of the whole map turns the
-    pose with it, and no residual tells about it.
+    squares. Further steps would change the linearization point but not the map, and drift along the
+    most uncertain directions. For the same reason ∂r/∂θ is evaluated at the map points, (m - t)⊥
+    and not (R z)⊥, which differ by the residual: then a rotation of the whole map rotates the pose
+    with it, and the residuals do not depend on it.
     """
     there, target = slot >= 0, points.map[jnp.maximum(slot, 0)]
     weight = jnp.where(there, 1.0, 0.0).astype(target.dtype)
@@ -87,7 +87,7 @@ def _residuals(
     goal: Float[Array, "M 2"],
     pose: Float[Array, "3"],
 ) -> _Residuals:
-    """Of points z and goals about their centroids; zeros and the identity for what is no pair."""
+    """The residuals of points z and goals about their centroids; 0 and identity without a pair."""
     m, there, at = slot.shape[0], slot >= 0, jnp.maximum(slot, 0)
     rotation = se2.rotation(pose[2])
     mixed = jnp.einsum("xy,iyjw->ixjw", rotation, points.cross_cov[:, :, at])
@@ -106,7 +106,7 @@ def _residuals(
 def with_unit_blocks(
     cov: Float[Array, "M 2 M 2"], there: Bool[Array, "M"]
 ) -> Float[Array, "M 2 M 2"]:
-    """The covariance, with the identity in rows and columns of what is not there."""
+    """The covariance with the identity in the rows and columns of absent points."""
     m = there.shape[0]
     both = jnp.broadcast_to(there[:, None, None, None] & there[None, None, :, None], cov.shape)
     return jnp.where(both, cov, jnp.eye(2 * m, dtype=cov.dtype).reshape(m, 2, m, 2))

@@ -1,4 +1,4 @@
-"""A filter that closes long loops, and merges what was initialized twice before it did."""
+"""A filter wrapper that closes long loops and merges successive duplicates."""
 
 import dataclasses
 from typing import Any
@@ -33,11 +33,11 @@ def closing(
     spread: float = 0.5,
     **options: Any,
 ) -> Filter:
-    """The filter, which looks after each scan whether a loop has closed (`close_loop`).
+    """The filter with a search for a closed loop after each scan (`close_loop`).
 
     `info.extra["closing"]` is the `Closing` of the step; a landmark merged into an older one counts
-    as removed (`info.extra["pruning"]`). The filter must keep times, and decide by itself what a
-    measurement is of: `pruning(ekf_slam(…, associate=association.certain(…)), life.recency())`.
+    as removed (`info.extra["pruning"]`). The filter must keep times and associate without tags, as
+    `pruning(ekf_slam(…, associate=association.certain(…)), life.recency())`.
 
     Args:
         filter: the filter.

@@ -1,7 +1,7 @@
-"""Which points of a cluster are which points of a map, by their distances from one another alone.
+"""Geometric matching of a cluster of points with points of a map, by pairwise distances.
 
-The cluster's own frame means nothing: a scan of a robot that does not know where it is, or a part
-of the map whose place has drifted. Both have a joint covariance, and all of it counts.
+The cluster's frame is arbitrary: that of a scan of a lost robot, or of a part of the map whose
+position has drifted. The full joint covariance of both is used.
 """
 
 from typing import NamedTuple
@@ -43,7 +43,7 @@ class Match(NamedTuple):
 
 
 class SearchLimits(NamedTuple):
-    """How far a search goes; made by `search_limits`."""
+    """The limits of a search; made by `search_limits`."""
 
     single: tuple[float, float]
     """χ² of one and of two degrees of freedom"""
@@ -71,7 +71,7 @@ def search_limits(
 
 
 class _Hypotheses(NamedTuple):
-    """P pairs of cluster points times C candidates: where each leads."""
+    """The hypotheses of P pairs of cluster points times C candidates, with their matches."""
 
     slot: Int[Array, "P C M"]
     """the map point of each cluster point, -1 for none"""
@@ -83,7 +83,7 @@ class _Hypotheses(NamedTuple):
 
 
 def match(points: PointSets, limits: SearchLimits) -> Match:
-    """The match that explains most cluster points, of several the one of least D².
+    """The match with the most cluster points; among equals, that of least D².
 
     Each of a few pairs (a, b) of cluster points, the longest, is compared with all pairs (j, k) of
     the map: with s and r the two distances, (s - r)²/var(s - r) <= χ²(1). Each agreement fixes the
@@ -105,7 +105,7 @@ def match(points: PointSets, limits: SearchLimits) -> Match:
 
 
 def _hypotheses(points: PointSets, limits: SearchLimits) -> _Hypotheses:
-    """Each of the longest cluster pairs, with the map pairs that agree with its length best."""
+    """Hypotheses of the longest cluster pairs with the map pairs whose lengths agree best."""
     n = points.map.shape[0]
     room = min(limits.candidates, n * n)
 
@@ -125,12 +125,12 @@ def _hypotheses(points: PointSets, limits: SearchLimits) -> _Hypotheses:
 
 
 def _merit(count: Int[Array, "*batch"], distance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Many pairs first, then a small distance, in one number."""
+    """The score of a match: the number of pairs first, then the distance."""
     return count - distance / (1 + distance)
 
 
 def _finalists(found: _Hypotheses) -> Int[Array, "K"]:
-    """Which to fit: the best of each cluster pair, then the best of all.
+    """The hypotheses to fit: the best of each cluster pair, then the best of all.
 
     The best of all alone may be one hypothesis, found from each of its pairs.
     """
@@ -141,7 +141,7 @@ def _finalists(found: _Hypotheses) -> Int[Array, "K"]:
 
 
 def fit_hypothesis(points: PointSets, slot: Int[Array, "M"], limits: SearchLimits) -> Match:
-    """One hypothesis as a whole: the frame by least squares, without pairs that do not fit.
+    """The match of one hypothesis: the least-squares frame of the pairs that fit.
 
     r_i = T z_i - m_i over the pairs, Σ their joint covariance: min rᵀ Σ⁻¹ r over T, to first order
     about the unweighted closed form. The pair of largest r_iᵀ Σ_ii⁻¹ r_i goes until D² <= χ²(2n-3).

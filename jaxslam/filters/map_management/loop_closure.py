@@ -1,4 +1,4 @@
-"""Loops closed at the scale of a map: recent landmarks, together, are found to be old ones."""
+"""Loop closure by matching a cluster of recent landmarks with the old map."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ from jaxslam.validation.numbers import check_count
 
 
 class Closing(NamedTuple):
-    """What one search for a closed loop found; `info.extra["closing"]`."""
+    """The result of one search for a closed loop; `info.extra["closing"]`."""
 
     explained: Int[Array, ""]
     """recent landmarks that are old ones under the best hypothesis"""
@@ -38,33 +38,33 @@ class Closing(NamedTuple):
     exhausted: Bool[Array, ""]
     """more pairs agreed than were tried"""
     refused: Bool[Array, ""]
-    """enough is explained, but not clearly more than by another hypothesis, or it is unlikely"""
+    """enough landmarks match, but another hypothesis has nearly as many, or D² is too large"""
     duplicates: Int[Array, ""]
     """landmarks merged one by one, 0 or 1, by `closing(…, reach=…)`"""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoopSettings:
-    """How `close_loop` searches."""
+    """The settings of `close_loop`."""
 
     window: int = 50
-    """scans: a landmark is recent if one of the last so many measured it"""
+    """number of scans: a landmark is recent if one of the last `window` scans measured it"""
     cluster: int = 12
     """recent landmarks that are compared, those measured last"""
     sightings: int = 1
-    """by how many scans they must have been measured"""
+    """least number of scans that measured them"""
     least: int = 5
     """pairs that must agree, at least 3"""
     margin: int = 2
-    """by how many more than under any other hypothesis"""
+    """least number of matches more than under any other hypothesis"""
     probability: float = 0.99
     """of each chi-square test of the geometry"""
     drift: float = 0.9999
     """probability that the true pairs lie within the filter's covariance"""
     pairs: int = 8
-    """of recent landmarks whose distances are looked for; long ones"""
+    """number of pairs of recent landmarks whose distances are searched for; long ones"""
     candidates: int = 64
-    """agreeing pairs of old landmarks that are tried with each, the best"""
+    """number of best agreeing pairs of old landmarks that are tried with each"""
 
 
 def loop_settings(caller: str, options: Mapping[str, Any]) -> LoopSettings:
@@ -89,26 +89,27 @@ def loop_settings(caller: str, options: Mapping[str, Any]) -> LoopSettings:
 
 
 def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
-    """Raise ValueError unless landmarks are points, and times are kept of when each was seen."""
+    """Raise ValueError unless landmarks are points and their times are kept (`life.recency`)."""
     check_points(caller, joint, chart)
     if not isinstance(joint.life, Recency):
         raise ValueError(f"{caller}: expected a filter with times, pruning(…, life.recency())")
 
 
 def close_loop(joint: Joint, chart: Chart, **options: Any) -> tuple[Joint, Closing]:
-    """Match the cluster of recent landmarks with the old map, and merge what is the same.
+    """The map with recent landmarks matched with the old map and merged, and the report.
 
     A landmark is recent if it was measured within the last `window` scans, and it may be an old one
-    only if it was born after that was last measured: landmarks observed over overlapping periods
-    cannot be duplicates. The pair must agree with the joint covariance of both, δ = l_i - l_k,
-    δᵀ cov(δ)⁻¹ δ <= χ²(2, drift), and of these `geometric_matching.match` finds the most whose
-    geometry agrees, whatever the drift. They are merged (`merging.merge`) if they are enough,
-    clearly more than any other hypothesis has, and D² of all δ together is at most χ²(2n, drift).
+    only if it was initialized after that was last measured: landmarks observed over overlapping
+    periods cannot be duplicates. The pair must agree with the joint covariance of both,
+    δ = l_i - l_k, δᵀ cov(δ)⁻¹ δ <= χ²(2, drift). Of these pairs `geometric_matching.match` finds
+    the largest set of consistent geometry, whatever the drift. They are merged (`merging.merge`)
+    if there are enough of them, clearly more than any other hypothesis has, and D² of all δ
+    together is at most χ²(2n, drift).
     The old slot keeps the landmark.
 
     The joint compatibility of Neira & Tardós 2001, on relative geometry first, so that a large
-    error of the heading bends nothing; the map is joined as by Castellanos, Neira, Tardós, "Limits
-    to the consistency of EKF-based SLAM", IAV 2004, one cluster at a time.
+    heading error does not matter; clusters are joined as in Castellanos, Neira, Tardós, "Limits
+    to the consistency of EKF-based SLAM", IAV 2004, one at a time.
 
     Args:
         joint: whose `life` is that of `life.recency()`.
@@ -140,7 +141,7 @@ def no_closing() -> Closing:
 def recent_cluster(
     joint: Joint, settings: LoopSettings
 ) -> tuple[Int[Array, "M"], Bool[Array, "M N"]]:
-    """Slots of the M recent landmarks measured last, and which old landmarks each may be."""
+    """The slots of the M recent landmarks measured last, and their candidate old landmarks."""
     known: Recency = joint.life
     capacity = joint.landmarks.shape[0]
     recent = joint.alive & (known.now - known.last <= settings.window)
@@ -158,7 +159,7 @@ def search(
     candidates: Bool[Array, "M N"],
     settings: LoopSettings,
 ) -> tuple[Int[Array, "M"], Closing]:
-    """The old slot of each recent landmark, -1 where none are to be merged, and the report."""
+    """The old slot of each recent landmark, -1 where none is to be merged, and the report."""
     capacity, m = joint.landmarks.shape[0], recent.shape[0]
     levels = jnp.asarray(
         [0.0, *(chi2_quantile(settings.drift, 2 * n) for n in range(1, settings.cluster + 1))]
@@ -198,7 +199,7 @@ def search(
 
 
 def _merge_all(joint: Joint, chart: Chart, old: Int[Array, "M"], recent: Int[Array, "M"]) -> Joint:
-    """Each recent landmark made the old one, one pair after the other; -1 for none."""
+    """The map with each recent landmark merged into its old one, pair by pair; -1 for none."""
 
     def one(joint: Joint, pair: tuple[Array, Array]) -> tuple[Joint, None]:
         kept, freed = pair
@@ -210,7 +211,7 @@ def _merge_all(joint: Joint, chart: Chart, old: Int[Array, "M"], recent: Int[Arr
 def _joint_distance(
     delta: Float[Array, "M N 2"], points: PointSets, found: Match
 ) -> Float[Array, ""]:
-    """δᵀ cov(δ)⁻¹ δ over all pairs found, with the drift in it."""
+    """The joint distance δᵀ cov(δ)⁻¹ δ of all pairs, including the drift."""
     m, there, at = found.slot.shape[0], found.slot >= 0, jnp.maximum(found.slot, 0)
     crossed = points.cross_cov[:, :, at]
     cov = points.cluster_cov + points.map_cov[at][:, :, at]

@@ -22,14 +22,14 @@ from jaxslam.validation.numbers import is_concrete
 
 
 class Merged(NamedTuple):
-    """Which landmarks became one; `info.extra["merging"]`."""
+    """The pair of landmarks merged; `info.extra["merging"]`."""
 
     pair: Int[Array, "2"]
     """the slot of the landmark kept and the slot freed, or -1, -1 where none were merged"""
 
 
 def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
-    """The filter, which after each scan merges the two landmarks that are most likely duplicates.
+    """The filter, which after each scan merges the pair of landmarks most likely to be duplicates.
 
     Two landmarks may be duplicates if they are within reach, the joint test of their difference
     passes (`closest_pair`), and no scan of one sensor measured both: a landmark gives a sensor one
@@ -38,13 +38,12 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
 
     Args:
         filter: whose state is a `slots.Joint`.
-        reach: [m] no two true landmarks stand as near to one another. The test alone cannot tell
-            two landmarks from one where their difference is known worse than that.
-        probability: of merging two that are one, by the test.
+        reach: [m] no two true landmarks are as near to one another. The test alone cannot separate
+            two landmarks from one where their difference is less certain than that.
+        probability: of the test, that two estimates of one landmark are merged.
     Raises:
-        ValueError: on no filter, a reach not above 0, a probability outside 0 to 1, landmarks that
-            may be one although their parameters differ (an inverse depth); from `init`, on another
-            state.
+        ValueError: on no filter, a reach not above 0, a probability outside 0 to 1, landmarks whose
+            parameters are not unique (an inverse depth); from `init`, on another state.
     """
     validation.check_record("merging", "filter", filter, Filter)
     if not reach > 0:
@@ -85,9 +84,9 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
 
 
 def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[Array, "N N"]:
-    """Which pairs of landmarks one sensor measured together, in this scan or one before.
+    """Mask of the pairs of landmarks that one sensor measured in one scan, up to this one.
 
-    places: how many of a scan each sensor has; () where all are of one.
+    places: number of measurement slots of each sensor; () where all are of one.
     """
     capacity = joint.alive.shape[0]
     before = joint.co_observed
@@ -109,12 +108,11 @@ def closest_pair(
     *,
     square_root: bool = False,
 ) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
-    """Slots i < j of the two landmarks that are most likely one, and their squared distance.
+    """Slots i < j of the pair most likely to be duplicates, and their squared distance.
 
-    d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), in which the correlation of the two counts:
-    of landmarks that are each known badly, but well against one another, d² is large. i = j = 0 and
-    d² infinite where no pair is within reach [m] of another and allowed (N, N). square_root: as in
-    `merge`.
+    d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), including the correlation of the two: for
+    landmarks with large covariances but a certain difference d² is large. i = j = 0 and d² infinite
+    where no pair is within reach [m] of another and allowed (N, N). square_root: as in `merge`.
 
     Raises ValueError on a reach not above 0, or allowed of another shape.
     """
@@ -156,7 +154,7 @@ def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Floa
 
 
 def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False) -> Joint:
-    """The map given that the landmarks of slots i and j are one, which slot i keeps.
+    """The map conditioned on equal landmarks in slots i and j, of which slot i is kept.
 
     The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with
     S = cov(δ) = L Lᵀ and V = L⁻¹ cov(δ, ·), x ← x ⊞ -Vᵀ L⁻¹ δ and P ← P - Vᵀ V, for points exact.
@@ -183,7 +181,7 @@ def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool =
     if square_root:
         cov = linalg.root_psd(cov)
     together = joint.co_observed
-    if together is not None:  # of the landmark kept: what was measured together with either
+    if together is not None:  # the landmark kept takes over the co-observations of both
         with_one = together[i] | (ok & (together[i] | together[j]))
         together = together.at[i].set(with_one).at[:, i].set(with_one)
     merged = joint._replace(
@@ -198,7 +196,7 @@ def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool =
 
 
 def _derivatives(joint: Joint, chart: Chart) -> tuple[Float[Array, "N L 3"], Float[Array, "N L L"]]:
-    """Of each landmark's coordinates by errors of the pose and its own."""
+    """The derivatives of each landmark's coordinates by errors of the pose and its own."""
     capacity, size = joint.landmarks.shape
     still = jnp.broadcast_to(jnp.eye(size, dtype=joint.cov.dtype), (capacity, size, size))
     if chart.basis is None:

@@ -1,4 +1,4 @@
-"""Hypotheses of a geometric match: a pair of cluster points is a pair of map points."""
+"""Hypotheses of a geometric match: a pair of cluster points matched with a pair of map points."""
 
 from typing import NamedTuple
 
@@ -19,13 +19,13 @@ class PointSets(NamedTuple):
     cross_cov: Float[Array, "M 2 N 2"]
     """of cluster with map"""
     allowed: Bool[Array, "M N"]
-    """which map points a cluster point may be"""
+    """the candidate map points of each cluster point"""
 
 
 def longest_pairs(points: PointSets, count: int) -> tuple[Int[Array, "P"], Int[Array, "P"]]:
-    """Ends a, b of long pairs of cluster points, at most `count`, each point's share limited.
+    """The ends a, b of at most `count` long pairs of cluster points, with few pairs a point.
 
-    A spurious point far out would be an end of all the longest pairs. So each use of a point halves
+    A distant spurious point would be an end of all the longest pairs. So each use of a point halves
     the length of its further pairs.
     """
     m = points.cluster.shape[0]
@@ -50,10 +50,10 @@ def longest_pairs(points: PointSets, count: int) -> tuple[Int[Array, "P"], Int[A
 def equal_lengths(
     points: PointSets, a: Int[Array, ""], b: Int[Array, ""], gate: float
 ) -> tuple[Float[Array, "N N"], Bool[Array, "N N"]]:
-    """Test all map pairs (j, k) for the length of the cluster pair (a, b).
+    """The squared distances of the lengths of all map pairs (j, k) to that of cluster pair (a, b).
 
     With s = |z_b - z_a| and r = |m_k - m_j|: (s - r)²/var(s - r), and whether it is within the gate
-    of a pair that may be and has a direction.
+    of an allowed pair whose direction is determined.
     """
     eps = jnp.finfo(points.map.dtype).eps
     n = points.map.shape[0]
@@ -68,12 +68,12 @@ def equal_lengths(
     cross = u @ (points.cross_cov[b] - points.cross_cov[a]).reshape(2, -1)
     cross = cross.reshape(n, 2)
     both = (v * (cross[None, :] - cross[:, None])).sum(axis=2)
-    # Exact points may differ by what rounding leaves of their distance.
+    # Lengths between exact points may differ by rounding.
     variance = variance + u @ cluster_cov @ u - 2 * both + (8 * eps * (s + r)) ** 2
     test = (s - r) ** 2 / jnp.maximum(variance, jnp.finfo(s.dtype).tiny)
     possible = points.allowed[a][:, None] & points.allowed[b][None, :]
     possible = possible & (every[:, None] != every[None, :]) & (a != b)
-    # A pair no longer than its own uncertainty has no direction.
+    # The direction of a pair shorter than its own uncertainty is undetermined.
     directed = (s**2 > 9 * u @ cluster_cov @ u) & (s > 0)
     return test, possible & directed & (variance > 0) & (test <= gate)
 
@@ -173,7 +173,7 @@ def moved_covs(
 
 
 def turned(points: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
-    """Turned by 90°."""
+    """Vectors rotated by 90°."""
     return jnp.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 

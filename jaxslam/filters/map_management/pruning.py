@@ -1,4 +1,4 @@
-"""A filter that removes landmarks from its map by a rule, after each scan."""
+"""A filter wrapper that removes landmarks by a rule after each scan."""
 
 import dataclasses
 
@@ -14,19 +14,19 @@ from jaxslam.types import Info, Scan
 
 
 def pruning(filter: Filter, life: Life) -> Filter:
-    """The filter, whose map loses the landmarks that a rule gives up after each scan.
+    """The filter with the landmarks removed that a rule selects after each scan.
 
-    The rule's memory is `Joint.life`. `info.extra["pruning"].removed` (N,) bool tells the slots.
+    The rule's memory is `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots.
 
-    A rule that makes room in a full map acts between association and new landmarks, so the filter
-    has to know it: `pruning(ekf_slam(…, make_room=life), life)`.
+    A rule that makes room in a full map acts between association and new landmarks, so it must also
+    be an argument of the filter: `pruning(ekf_slam(…, make_room=life), life)`.
 
     Args:
         filter: whose state is a `slots.Joint`.
         life: as of `jaxslam.life`.
     Raises:
-        ValueError: on a filter or life that is none; from `init`, on another state; from `update`,
-            on a life that makes room, of which the filter does not know.
+        ValueError: on a filter or life of another type; from `init`, on another state; from
+            `update`, on a life that makes room, if the filter does not have it.
     """
     validation.check_record("pruning", "filter", filter, Filter)
     validation.check_record("pruning", "life", life, Life)

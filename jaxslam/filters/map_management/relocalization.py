@@ -1,4 +1,4 @@
-"""A lost robot: its pose is forgotten, found again in its map by geometry, and initialized anew."""
+"""Relocalization of a lost robot in its map by geometric matching of one scan."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from jaxslam.validation.numbers import check_count, check_covariance
 
 
 class Relocalization(NamedTuple):
-    """Where a scan was taken."""
+    """The pose from which a scan was taken, and its match with the map."""
 
     pose: Float[Array, "3"]
     """of the robot [m, m, rad]; zeros where nothing agreed"""
@@ -28,11 +28,11 @@ class Relocalization(NamedTuple):
     explained: Int[Array, ""]
     """measurements that fit jointly"""
     runner_up: Int[Array, ""]
-    """as many would fit at another place"""
+    """another pose fits as many points"""
     distance: Float[Array, ""]
     """D² of those explained, χ² of 2·explained - 3 degrees of freedom"""
     ok: Bool[Array, ""]
-    """enough is explained, and clearly more than at any other place"""
+    """enough points match, and clearly more than at any other pose"""
     exhausted: Bool[Array, ""]
     """more pairs agreed than were tried"""
 
@@ -73,12 +73,12 @@ def relocalize(
     pairs: int = 8,
     candidates: int = 512,
 ) -> Relocalization:
-    """Where in a map a scan was taken, without any prior: by distances between pairs of points.
+    """The pose of a scan in a map without a prior, by distances between pairs of points.
 
     `geometric_matching.match` has the search. Another hypothesis is one that shares fewer than two
     of the best one's pairs, for two pairs fix a pose; the scan is ambiguous where such a one
-    explains almost as much, as in a symmetric map. Errors of the map that are common to all of it
-    (where its origin is) do not count: its cross-covariances see to that.
+    explains almost as much, as in a symmetric map. Errors common to the whole map (of its origin)
+    do not matter, because the cross-covariances are used.
 
     Args:
         points: (N, 2) the map [m].
@@ -89,8 +89,8 @@ def relocalize(
         valid: (M,) bool.
         probability: of each chi-square test.
         least: measurements that must be explained, at least 3.
-        margin: by how many more than at any other place.
-        pairs: of measurements whose distances are looked for; long ones.
+        margin: least number of matches more than at any other pose.
+        pairs: number of pairs of measurements whose distances are searched for; long ones.
         candidates: agreeing pairs of landmarks that are tried with each, the best; where there are
             more, `exhausted` is set.
     Raises:
@@ -148,7 +148,7 @@ def _nothing(size: int, dtype: jnp.dtype) -> Match:
 def map_of(
     joint: Joint, chart: Chart, *, square_root: bool = False
 ) -> tuple[Float[Array, "N 2"], Float[Array, "2*N 2*N"], Bool[Array, "N"]]:
-    """Points, their joint covariance in coordinates, and which are alive, for `relocalize`.
+    """The points of a map, their joint covariance in coordinates, and which are alive.
 
     Raises ValueError unless the landmarks are points.
     """
@@ -158,7 +158,7 @@ def map_of(
 
 
 def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool = False) -> Joint:
-    """The state of a robot that no longer knows where it is; its map knows what it knew.
+    """The state with the robot's pose unknown and its map unchanged.
 
     In coordinates P_RR ← pose_cov, P_RM ← 0, P_MM as it is: the pose is marginalized out and given
     an independent prior, at the estimate there was.
@@ -183,12 +183,12 @@ def relocated(
     *,
     square_root: bool = False,
 ) -> Joint:
-    """The robot of a scan at the pose that aligns it with its landmarks; what it was before is out.
+    """The state with the robot's pose replaced by the one that aligns its scan with the map.
 
     With r = T z - m over the pairs, J = ∂r/∂T, Σ = cov(r) = R Z Rᵀ + P_mm, N = (Jᵀ Σ⁻¹ J)⁻¹ and
     A = Σ⁻¹ - Σ⁻¹ J N Jᵀ Σ⁻¹, T the generalized least squares: P_TT = N, P_TM = N Jᵀ Σ⁻¹ P_mM,
     M ← M + P_Mm A r and P_MM ← P_MM - P_Mm A P_mM. So it is the limit of an update from an infinite
-    covariance of the pose, linearized at the answer. The scan is used up: do not update with it.
+    covariance of the pose, linearized at the result. Do not use the scan in an update again.
     Nothing happens with fewer than two pairs, or where the pose is not determined.
 
     Args:
@@ -235,7 +235,7 @@ def relocated(
 
 
 def check_points(caller: str, joint: Joint, chart: Chart) -> None:
-    """Raise ValueError unless landmarks are points, and nothing remembers where the robot was."""
+    """Raise ValueError unless landmarks are points and the state keeps no earlier poses."""
     if joint.landmarks.shape[1] != 2:
         raise ValueError(
             f"{caller}: expected landmarks (x, y), got {joint.landmarks.shape[1]} each"

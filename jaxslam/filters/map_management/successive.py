@@ -1,4 +1,4 @@
-"""Duplicates by their times: one landmark was initialized after the other was last measured."""
+"""Successive duplicates: one landmark was initialized after the other was last measured."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -12,7 +12,7 @@ from jaxslam.slots import Joint
 
 
 def merge_histories(joint: Joint, chart: Chart, old: Int[Array, ""], new: Int[Array, ""]) -> Joint:
-    """`merging.merge` of slot new into slot old, which gets the times of both; same if equal."""
+    """The map with slot new merged into slot old, including their times; unchanged if equal."""
     after = merge(joint, chart, old, new)
     known: Recency = joint.life
     freed = joint.alive & ~after.alive
@@ -32,7 +32,7 @@ def merge_histories(joint: Joint, chart: Chart, old: Int[Array, ""], new: Int[Ar
 def successive_duplicate(
     joint: Joint, chart: Chart, reach: float, spread: float
 ) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
-    """The older and the younger slot of the pair most likely one, and its squared distance.
+    """The older and the younger slot of the likeliest duplicates, and their squared distance.
 
     Of pairs within reach [m] of which one was initialized after the other was last measured, and
     whose difference is known to √(tr cov(δ)/2) <= spread [m]; infinite where there is none.

@@ -1,4 +1,4 @@
-"""What the map managers that wrap a filter ask of it."""
+"""The check of the filter's state that map managers share."""
 
 from typing import Any
 

@@ -1,6 +1,6 @@
-"""How a robot without a pose in the map is initialized from one scan.
+"""Initialization of a robot's pose in the map from one scan.
 
-Its pose x_b is a function g(y, q) of what the map holds, y, and of what was measured, q, so its
+Its pose x_b is a function g(y, q) of variables y of the map and of measurements q, so its
 covariances are P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a
 landmark): correlated with the whole joint state. Every measurement is taken as a point in the frame
 of the robot that made it, whatever the sensor.
@@ -47,7 +47,7 @@ def best_initialization(
     there: Bool[Array, "R"],
     settings: TeamSettings,
 ) -> Candidate:
-    """The pose for a robot, of all that are possible, whose heading has the least variance.
+    """The candidate pose of a robot whose heading has the least variance.
 
     observed: by each robot. there: which robots are in the map.
     """
@@ -72,7 +72,7 @@ def _mutual_candidate(
     there: Bool[Array, ""],
     settings: TeamSettings,
 ) -> Candidate:
-    """By another robot, if that is in the map and the two measure each other."""
+    """The pose from another robot in the map, if the two measure each other."""
     mine, theirs, rows = observed[robot], observed[other], rows_of(other, settings)
     i, sees = _first(theirs, settings.tags[robot])
     j, sees_back = _first(mine, settings.tags[other])
@@ -92,7 +92,7 @@ def _mutual_candidate(
 def _landmark_candidate(
     joint: Joint, robot: int, observed: list[ObservedPoints], settings: TeamSettings
 ) -> Candidate:
-    """By the two landmarks of the map, farthest apart, that the robot measures."""
+    """The pose from the two measured landmarks of the map that are farthest apart."""
     mine, capacity = observed[robot], settings.capacity
     slot, known = slots.find(joint.tag[:capacity], joint.alive[:capacity], mine.tag)
     i, j, two = farthest_pair(mine.point, known & mine.valid)
@@ -118,7 +118,7 @@ def _first(observed: ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Arr
 
 
 def observed_points(sensors: Suite, scan: Scan) -> ObservedPoints:
-    """A robot's scan; not valid are measurements that do not determine a point, or without tag."""
+    """A robot's scan as points; valid if a measurement has a tag and determines a point."""
     found = []
     for part, own in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
         if measures_points(part.sensor):
@@ -140,7 +140,7 @@ def _points_of(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[A
         point, _, cov = first_order.invert_at(sensor, origin, z, origin, z)
         return point, cov
 
-    # What is not there is put where every model is smooth.
+    # Absent measurements are replaced by a value at which every model is smooth.
     points: tuple[Array, Array] = jax.vmap(one)(jnp.where(scan.valid[:, None], z, 1.0))
     return points
 
@@ -154,9 +154,9 @@ def by_mutual_sight(
 ) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
     """The pose of a robot b that robot a measures and that measures a: mean, rows, covariance.
 
-    With v where a sees b and w where b sees a, |v| and |w| are one distance measured twice, r their
-    average, weighted by their variances. In the frame of a, b stands at r v/|v| and is turned by
-    atan2(-v) - atan2(w); then x_b = x_a ∘ that.
+    With v the position of b measured by a, and w that of a measured by b, r is the mean of |v| and
+    |w| weighted by their inverse variances. In the frame of a, b is at r v/|v| with heading
+    atan2(-v) - atan2(w); then x_b = x_a ∘ that pose.
 
     Args:
         other, rows, cov: x_a, its covariance with all errors and its own.
@@ -187,8 +187,8 @@ def by_two_landmarks(
 ) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
     """The pose of a robot that measures two landmarks of the map: mean, rows, covariance.
 
-    The rigid motion that carries what is seen, q, onto the landmarks l best (`se2.align`): headings
-    of l_2 - l_1 and q_2 - q_1 agree, and so do the midpoints.
+    The rigid motion that aligns the measured points q with the landmarks l (`se2.align`): the
+    directions of l_2 - l_1 and q_2 - q_1 agree, and so do the midpoints.
 
     Args:
         points, rows, cov: l, its covariance with all errors and its own.
@@ -218,7 +218,7 @@ def farthest_pair(
 
 
 def _distance_variance(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Float[Array, ""]:
-    """Of the distance of a point with that covariance; positive."""
+    """The variance of the distance of a point with that covariance; positive."""
     square = (point**2).sum()
     there = square > 0
     along = point @ cov @ point / jnp.where(there, square, 1.0)

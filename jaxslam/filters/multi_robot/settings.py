@@ -1,4 +1,4 @@
-"""What `team_slam` is made of, and what it refuses."""
+"""The settings of `team_slam`, and their validation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ SIZE = 3
 
 @dataclass(frozen=True, eq=False)
 class TeamSettings:
-    """Robots, the layout of state, control and scan, and how the EKF of each works."""
+    """The robots, the layout of state, control and scan, and the EKF settings of each robot."""
 
     robots: tuple[Robot, ...]
     capacity: int
@@ -25,9 +25,9 @@ class TeamSettings:
     tags: tuple[int, ...]
     """(R,) that mean robots"""
     ekf: EkfSettings
-    """what the prediction and the correction of each robot are set to"""
+    """settings of the prediction and the correction of each robot"""
     turns: tuple[list[SensorTurn], ...]
-    """of each robot, the turn of each of its sensors in a scan"""
+    """turns of the sensors of each robot in a scan"""
 
     @property
     def started(self) -> list[int]:
@@ -41,7 +41,7 @@ class TeamSettings:
 
     @property
     def places(self) -> tuple[int, ...]:
-        """Measurement slots of a scan that each robot has."""
+        """The number of measurement slots of each robot."""
         return tuple(sum(robot.sensors.places) for robot in self.robots)
 
     def slot_of(self, robot: int) -> int:
@@ -58,7 +58,7 @@ def check_options(
     iterations: int,
     births: int | None,
 ) -> None:
-    """Raise ValueError unless `team_slam` can do with these options."""
+    """Raise ValueError unless `team_slam` supports these options."""
     for name, value in (("iterations", iterations), ("births", births)):
         if value is not None:
             check_count(f"team_slam: {name}", value)
@@ -88,5 +88,5 @@ def check_sensors(robots: Sequence[Robot]) -> None:
 
 
 def measures_points(sensor: Sensor) -> bool:
-    """Whether one measurement of a point (x, y) determines it, given the pose."""
+    """Whether one measurement determines a point (x, y), given the pose."""
     return len(sensor.landmark) == 2 and np.shape(sensor.free.mean) == (0,)

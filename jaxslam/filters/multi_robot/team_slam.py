@@ -58,14 +58,14 @@ def team_slam(
 
     The state is a `slots.Joint`: robot 0 is its pose, slots 0 … N-1 hold landmarks (x, y, padding),
     and slot N - 1 + b robot b = 1 … R-1, as a landmark (x, y, θ). Robot b moves and measures by
-    changing places with robot 0. So a measurement of one robot by another is the correction of a
+    exchanging it with robot 0. So a measurement of one robot by another is the correction of a
     landmark, and with R = 1 this is `ekf_slam`. Jacobians are taken at the estimate.
 
     The control of a step is (u_0, …, u_{R-1}); the measurement slots of a scan are those of robot
     0's sensors in order, then robot 1's, and so on. All robots move; then each in turn (those
     without start last) corrects the map sensor by sensor, and initializes its new landmarks. Info
-    of a robot that was measured has that robot's slot. Whom a measurement is of, its tag says; in
-    slots of a `Part` that sees "robots" no landmark is initialized (`Status.DEFERRED`).
+    of a robot that was measured has that robot's slot. The tag of a measurement identifies the
+    robot; in slots of a `Part` that sees "robots" no landmark is initialized (`Status.DEFERRED`).
 
     A robot without start has no pose in the map, and its control and measurements change nothing
     (those of it and by it are `Status.UNMATCHED`), until in some step, after the corrections of
@@ -73,7 +73,7 @@ def team_slam(
     (`by_mutual_sight` of `pose_initialization`), or it measures two landmarks of the map
     (`by_two_landmarks`, of the two farthest apart). Of several poses it takes the one whose heading
     has the least variance. The two measurements used are `Status.BORN` with its slot, and the rest
-    of its scan corrects. That takes tags, and sensors whose measurement determines a point.
+    of its scan corrects. This requires tags, and sensors whose measurement determines a point.
 
     Args:
         robots: `team.Robot`s; robot 0 starts where the run does, the others relative to it.
@@ -82,10 +82,10 @@ def team_slam(
         report: which robot `estimate` is of; `team.poses` has all.
         chart: `charts.euclidean()` or None; no other.
         associate, update, gate, iterations, covariance, births: as for `ekf_slam`, but for the
-            covariance "square_root"; births are a sensor.
+            covariance "square_root"; births is a limit for each sensor.
     Raises:
         ValueError: without robots, on tags that clash, another chart, no such robot to report,
-            landmarks that are not (x, y), a robot without start whose sensors cannot tell it where
+            landmarks that are not (x, y), a robot without start whose sensors cannot tell where
             it is, or as `ekf_slam` does.
     """
     check_count("team_slam: capacity", capacity)
@@ -167,7 +167,7 @@ def team_slam(
 
 
 def _turn_of(part: Part, ekf: EkfSettings) -> SensorTurn:
-    """The turn of one sensor in a scan; one that sees robots starts no landmarks."""
+    """The turn of one sensor in a scan; sensors of robots start no landmarks."""
     births = 0 if part.sees == "robots" else ekf.births
     return turn_of(part, SIZE, dataclasses.replace(ekf, births=births))
 
@@ -186,7 +186,7 @@ def _headings_wrapped() -> Chart:
 def initial_state(
     pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"], settings: TeamSettings
 ) -> Joint:
-    """Robot 0 at a pose, the others where their start is relative to it: x_b = x_0 ∘ start_b."""
+    """The initial state: robot 0 at a pose, the others relative to it, x_b = x_0 ∘ start_b."""
     slots_in_all = settings.capacity + len(settings.robots) - 1
     joint = slots.empty(pose, pose_cov, slots_in_all, SIZE)
     for b, robot in enumerate(settings.robots):
@@ -202,7 +202,7 @@ def initial_state(
 
 
 def moved(joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings) -> Joint:
-    """The prediction of one robot, if it is in the map."""
+    """The state after the prediction of one robot, if it is in the map."""
     after = propagate(
         seen_from(joint, robot, settings), u, settings.robots[robot].motion, settings.ekf
     )
@@ -217,7 +217,7 @@ def moved(joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings
 def initialized(
     joint: Joint, robot: int, scans: list[Scan], settings: TeamSettings
 ) -> tuple[Joint, list[Bool[Array, "M"]]]:
-    """A robot that has no pose in the map gets one, if possible; which measurements that takes."""
+    """The state with a robot's pose initialized, if possible, and the measurements used for it."""
 
     absent = ~joint.alive[settings.slot_of(robot)]
 
@@ -240,7 +240,7 @@ def initialized(
 
 
 def corrected(joint: Joint, robot: int, scan: Scan, settings: TeamSettings) -> tuple[Joint, Info]:
-    """The correction by one robot's scan, of measurements whose robots are all in the map."""
+    """The state corrected by one robot's scan, by measurements whose robots are all in the map."""
     there = robots_in_map(joint, settings)
     of_robot = scan.tag[:, None] == jnp.asarray(settings.tags, jnp.int32)[None, :]
     others = jnp.where(jnp.arange(len(there)) == robot, False, there)
@@ -253,7 +253,7 @@ def corrected(joint: Joint, robot: int, scan: Scan, settings: TeamSettings) -> t
 
 
 def _reported_initialized(info: Info, used: Bool[Array, "M"], slot: int) -> Info:
-    """The info, which says that these measurements initialized a robot."""
+    """The `Info` with these measurements marked as having initialized a robot."""
     return info._replace(
         status=jnp.where(used, Status.BORN, info.status).astype(jnp.int32),
         slot=jnp.where(used, slot, info.slot).astype(info.slot.dtype),

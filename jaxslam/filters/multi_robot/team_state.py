@@ -1,4 +1,4 @@
-"""The joint state of a team: where robots and landmarks are in a `slots.Joint`.
+"""The joint state of a team: the slots of robots and landmarks in a `slots.Joint`.
 
 Robot 0 is the joint's pose, slots 0 … N-1 hold landmarks (x, y, padding), and slot N - 1 + b holds
 robot b = 1 … R-1 as a landmark (x, y, θ).
@@ -14,7 +14,7 @@ from jaxslam.slots import Joint
 
 
 class InitialPose(NamedTuple):
-    """A pose that a robot may be initialized at."""
+    """A candidate pose for the initialization of a robot."""
 
     pose: Float[Array, "3"]
     rows: Float[Array, "3 D"]
@@ -42,7 +42,7 @@ def robots_in_map(joint: Joint, settings: TeamSettings) -> Bool[Array, "R"]:
 
 
 def with_robot(joint: Joint, robot: int, new: InitialPose, settings: TeamSettings) -> Joint:
-    """The joint with a robot, b > 0, in its slot, which was empty."""
+    """The joint with a robot b > 0 added in its empty slot."""
     slot, rows = settings.slot_of(robot), rows_of(robot, settings)
     cov = joint.cov.at[rows].set(new.rows).at[:, rows].set(new.rows.T)
     return joint._replace(
@@ -54,7 +54,7 @@ def with_robot(joint: Joint, robot: int, new: InitialPose, settings: TeamSetting
 
 
 def seen_from(joint: Joint, robot: int, settings: TeamSettings) -> Joint:
-    """The joint whose pose is that of a robot, with robot 0 as a landmark in its slot."""
+    """The joint with robot b as the pose and robot 0 as a landmark in the slot of b."""
     if robot == 0:
         return joint
     slot = settings.slot_of(robot)
@@ -65,7 +65,7 @@ def seen_from(joint: Joint, robot: int, settings: TeamSettings) -> Joint:
 
 
 def seen_from_first(joint: Joint, robot: int, before: Joint, settings: TeamSettings) -> Joint:
-    """The inverse of `seen_from`; before: the joint it was of, which knows who is in the map."""
+    """The inverse of `seen_from`; before: the joint it was applied to, for `alive` and `tag`."""
     if robot == 0:
         return joint
     slot = settings.slot_of(robot)
@@ -76,10 +76,10 @@ def seen_from_first(joint: Joint, robot: int, before: Joint, settings: TeamSetti
 
 
 def _exchanged(joint: Joint, robot: int, settings: TeamSettings) -> Joint:
-    """Robot 0 and another in each other's place; its own inverse, but for who is alive."""
+    """The joint with robot 0 and another exchanged; its own inverse except for `alive`."""
     slot, first, other = settings.slot_of(robot), slice(0, 3), rows_of(robot, settings)
     cov = joint.cov
-    # Whole rows and columns are copied; a gather by index takes every entry singly.
+    # Whole rows and columns are copied; a gather by index would copy single entries.
     cov = cov.at[first].set(cov[other]).at[other].set(cov[first])
     cov = cov.at[:, first].set(cov[:, other]).at[:, other].set(cov[:, first])
     return joint._replace(

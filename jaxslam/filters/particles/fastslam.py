@@ -52,8 +52,8 @@ def fastslam(
     births: int | None = None,
     life: Life | None = None,
 ) -> Filter:
-    """FastSLAM: the posterior of the path by weighted particles, of the map given each path exactly
-    (but for linearization) by independent landmark Gaussians. The state is a
+    """FastSLAM: weighted particles for the posterior of the path, and for each path independent
+    landmark Gaussians (exact except for linearization). The state is a
     `slam_state.SlamParticles`.
 
     "motion", FastSLAM 1.0 (Montemerlo, Thrun, Koller & Wegbreit 2002, "FastSLAM: A factored
@@ -63,18 +63,18 @@ def fastslam(
     predicts and the scan corrects, measurement by measurement; the pose is drawn from the result.
     The weight is the density of the scan with the pose integrated out (`proposal.propose_pose`),
     which does not depend on the draw. So resampling comes first here, and copies of one particle
-    get poses of their own.
+    get different poses.
 
     Resampling happens in steps with ESS = 1/Σ w² below threshold·P. Where all weights underflow,
-    all become 1/P and `ParticleInfo.underflow` says so; the log-likelihood, -∞, is then given as 0,
-    so a sum of log-likelihoods has to look at `underflow` too. A particle that a motion or a scan
-    leaves without a finite pose keeps the one before and weighs nothing (`ParticleInfo.invalid`).
+    all become 1/P and `ParticleInfo.underflow` is set; the log-likelihood, -∞, is then given as 0,
+    so `underflow` must be checked in a sum of log-likelihoods. A particle that a motion or a scan
+    leaves without a finite pose keeps the one before, with weight zero (`ParticleInfo.invalid`).
 
     The measurements in an `Info` are those of the most likely particle (by its weight before
     resampling), whose slots are those of the estimate; its innovations are given its path, with the
     covariance of a pose not drawn yet in 2.0. Only nis is the mean over the particles by their
-    weights after the scan: of an honest filter that is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p =
-    Σ_p w_p E_{N_p} d²_p, where the most likely particle's, chosen for fitting well, is less. Its
+    weights after the scan: of a consistent filter that is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p =
+    Σ_p w_p E_{N_p} d²_p, while that of the most likely particle is biased low by selection. Its
     log_likelihood is that of the scan given all before, log Σ w p(scan | particle), of the
     measurements that a particle has landmarks for. `info.extra["particles"]` is a `ParticleInfo`.
     Estimates: `moments.slam_estimate`.
@@ -86,14 +86,15 @@ def fastslam(
         particles: P, at least 1.
         proposal: what poses are drawn from.
         resample: one of `jaxslam.resampling`. Through `stop_gradient` of one, the gradient of
-            `Info.log_likelihood` is consistent; through `soft` it is biased, and more so through
-            none, which leaves out what resampling does to it.
+            `Info.log_likelihood` is consistent; through `soft` it is biased, and more so without
+            either, since the effect of resampling is then ignored.
         threshold: of ESS, as a share of P; 0 never resamples, 1 in every step with unequal weights.
-        associate: default `association.known()`. Any other decides for each particle by its map.
+        associate: default `association.known()`. Other methods associate by each particle's map.
         gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
         births: at most so many new landmarks a scan and particle, the rest `Status.DEFERRED`.
-        life: which landmarks stay in each particle's map (`jaxslam.life`), as by negative evidence:
-            `life.existence` keeps log-odds (P, N) in `SlamParticles.life`; default all.
+        life: rule that removes landmarks from each particle's map (`jaxslam.life`), e.g. by
+            negative evidence: `life.existence` keeps log-odds (P, N) in `SlamParticles.life`.
+            Default none.
     Raises:
         ValueError: on a capacity, particles or births below 1, a threshold outside [0, 1], a
             gate not above 0, an unknown proposal, a life that is none, a resample that is no
@@ -173,7 +174,7 @@ def fastslam(
 def weight_particles(
     state: SlamParticles, proposed: PoseProposal
 ) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
-    """log w_p p(scan | particle) with Σ w = 1, the log-likelihood of the measurements that have
+    """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of measurements with
     landmarks, and whether any weight was left."""
     seen = state.log_weight + proposed.log_matched
     weight, _, some = normalized(seen + proposed.log_unmatched)
@@ -181,7 +182,7 @@ def weight_particles(
 
 
 def with_drawn_poses(state: SlamParticles, key: Array) -> SlamParticles:
-    """The state after each pose was drawn from its Gaussian, all of them finite."""
+    """The state with each pose drawn from its Gaussian, all finite."""
     return state._replace(
         pose=draw_poses(state, key),
         pose_cov=jnp.zeros_like(state.pose_cov),

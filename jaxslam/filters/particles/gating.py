@@ -1,4 +1,4 @@
-"""The gate on squared Mahalanobis distances, as the weight of a particle takes it."""
+"""The gate on squared Mahalanobis distances in particle weights."""
 
 from typing import NamedTuple
 
@@ -13,13 +13,13 @@ class GatedDistance(NamedTuple):
     inside: Bool[Array, "..."]
     """within the gate; without one, d² is finite"""
     counted: Float[Array, "..."]
-    """d² as the weight counts it: that of the gate where it lies beyond"""
+    """d² in the weight, clipped at the gate"""
     reported: Float[Array, "..."]
     """d², a large number where it is not finite"""
 
 
 def gate_distance(distance: Float[Array, "*M"], gate: float | None) -> GatedDistance:
-    """Whether d² passes the gate, and what of it a weight and an `Info` take."""
+    """The gated distance: whether d² passes, and its values for weights and for `Info`."""
     finite = jnp.isfinite(distance)
     inside = finite if gate is None else finite & (distance <= gate)
     counted = distance if gate is None else jnp.where(inside, distance, gate)

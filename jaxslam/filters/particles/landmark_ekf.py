@@ -1,6 +1,6 @@
-"""The map of one particle after a scan, from a pose that is drawn, hence known.
+"""The landmark EKFs of one particle, given its drawn pose.
 
-Everything here acts on one particle; `fastslam` vmaps it, `mapping` has but one.
+All functions act on one particle; `fastslam` vmaps them, `mapping` has only one.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ def update_map(
     scan: Scan,
     settings: ParticleMapSettings,
 ) -> tuple[SlamParticles, Info]:
-    """One particle with its landmarks corrected, new ones initialized, and judged by its `Life`.
+    """One particle with its landmarks corrected, new ones initialized, and `Life` applied.
 
     The log-likelihood of the `Info` is left at 0.
     """
@@ -74,7 +74,7 @@ def correct_landmarks(
     scan: Scan,
     settings: ParticleMapSettings,
 ) -> SlamParticles:
-    """Each landmark measured, corrected by its own EKF from a pose that is known.
+    """The landmarks of a particle, each corrected by its own EKF at a known pose.
 
     With S = H_l C H_lᵀ + R: l ← l + C H_lᵀ S⁻¹ ν, C ← C - C H_lᵀ S⁻¹ H_l C.
     """
@@ -102,7 +102,7 @@ def evict_for_new(
     used: Bool[Array, "M"],
     life: Life | None,
 ) -> tuple[SlamParticles, Bool[Array, "N"]]:
-    """The particle without the landmarks that make room for new ones, and which those are."""
+    """The particle without the landmarks evicted for new ones, and which those are."""
     alive = particle.alive
     if life is None or life.make_room is None:
         return particle, jnp.zeros_like(alive)
@@ -113,13 +113,13 @@ def evict_for_new(
 
 
 class AllocatedSlots(NamedTuple):
-    """What becomes of the measurements of no landmark."""
+    """The slots of new landmarks, and the outcome of measurements without a landmark."""
 
     slot: Int[Array, "M"]
     """a free landmark slot, where granted"""
     granted: Bool[Array, "M"]
     deferred: Bool[Array, "M"]
-    """beyond the quota of a scan"""
+    """beyond `births`, the limit of a scan"""
     repeated: Bool[Array, "M"]
     """of a tag that occurs earlier in the scan"""
 
@@ -154,7 +154,7 @@ def initialize_particle_landmarks(
 def invert_scan(
     pose: Float[Array, "3"], z: Float[Array, "M Z"], sensor: Sensor
 ) -> tuple[Float[Array, "M L"], Float[Array, "M L L"]]:
-    """The landmarks that measurements would begin, and their covariances.
+    """The new landmarks of measurements, and their covariances.
 
     l = g(x, z, s̄), C = G_z R G_zᵀ + G_s S G_sᵀ: the pose of a particle has no error.
     """
@@ -169,7 +169,7 @@ def invert_scan(
 def allocate_slots(
     is_new: Bool[Array, "M"], tag: Int[Array, "M"], alive: Bool[Array, "N"], quota: int | None
 ) -> AllocatedSlots:
-    """A free slot for each new landmark, the first in the scan first."""
+    """A free slot for each new landmark, in the order of the scan."""
     repeated = is_new & seen_before(tag, is_new)
     wanted = is_new & ~repeated
     deferred = wanted & (jnp.cumsum(wanted) > (tag.shape[0] if quota is None else quota))
@@ -180,7 +180,7 @@ def allocate_slots(
 def remove_landmarks(
     particle: SlamParticles, info: Info, evicted: Bool[Array, "N"], settings: ParticleMapSettings
 ) -> tuple[SlamParticles, Info]:
-    """The particle without the landmarks that its `Life` gives up; `Pruned.removed` names them."""
+    """The particle without the landmarks that its `Life` removes; `Pruned.removed` marks them."""
     life = settings.life
     if life is None:
         return particle, info
@@ -194,13 +194,13 @@ def remove_landmarks(
 
 
 def _as_joint(particle: SlamParticles) -> Joint:
-    """As a `Life` sees it; the covariance is that of each landmark alone, (N, L, L)."""
+    """The particle as a `Joint` for `Life`, with landmark covariances (N, L, L) as its cov."""
     own = particle
     return Joint(own.pose, own.landmarks, own.covs, own.alive, own.tag, lin=(), life=own.life)
 
 
 def _without_landmarks(particle: SlamParticles, dead: Bool[Array, "N"]) -> SlamParticles:
-    """These slots emptied."""
+    """The particle with these slots emptied."""
     eye = jnp.eye(particle.landmarks.shape[1], dtype=particle.covs.dtype)
     return particle._replace(
         landmarks=jnp.where(dead[:, None], 0.0, particle.landmarks),

@@ -1,7 +1,7 @@
-"""How likely a scan is from one pose in a known map.
+"""The likelihood of a scan given a pose in a known map.
 
-Everything here acts on one pose; `particle_localization` vmaps it. The pose has no error of its own
-and the map none at all, so the covariance of an innovation is the sensor's noise.
+All functions act on one pose; `particle_localization` vmaps them. Pose and map have no error here,
+so the covariance of an innovation is the sensor's noise.
 """
 
 from typing import NamedTuple
@@ -22,10 +22,10 @@ from jaxslam.types import Scan
 
 
 class ScanLikelihood(NamedTuple):
-    """A scan against one pose, measurement by measurement."""
+    """The likelihood of a scan at one pose, for each measurement."""
 
     measured: Bool[Array, "*P M"]
-    """a measurement that counts"""
+    """a measurement that enters the likelihood"""
     slot: Int[Array, "*P M"]
     """of the landmark measured; -1 of an absolute sensor"""
     matched: Bool[Array, "*P M"]
@@ -41,8 +41,8 @@ class ScanLikelihood(NamedTuple):
     dof: Int[Array, "*P M"]
     """Z of the sensor"""
     counted: Float[Array, "*P M"]
-    """d² as the weight has it: the gate's where it is beyond, `unmatched_distance` where of no
-    landmark, 0 where there is no measurement"""
+    """d² in the weight: clipped at the gate, `unmatched_distance` without a landmark, 0 where
+    there is no measurement"""
     log_density: Float[Array, "*P M"]
     """-(counted + log |2πR|)/2 of measurements matched to a landmark, else 0"""
     exhausted: Bool[Array, "*P"]
@@ -52,7 +52,7 @@ class ScanLikelihood(NamedTuple):
 def scan_likelihood(
     pose: Float[Array, "3"], scan: Scan, sensors: tuple[KnownMapSensor, ...]
 ) -> ScanLikelihood:
-    """The likelihood of a scan whose first measurement slots are the first sensor's, and so on.
+    """The likelihood of the scan of a suite of sensors.
 
     Raises ValueError if the scan does not have their slots.
     """
@@ -76,9 +76,9 @@ def sensor_likelihood(
 ) -> ScanLikelihood:
     """The likelihood of one sensor's measurements.
 
-    One outside the gate counts as one on the gate, and one that is of no landmark as one at d² =
-    `unmatched_distance`: a particle gains nothing by explaining less. So with a gate no weight
-    underflows for a single outlier.
+    A measurement outside the gate gets the d² of the gate, and one without a landmark
+    `unmatched_distance`, so that a particle with fewer associations is not preferred. With a gate
+    no weight underflows because of a single outlier.
     """
     sensor = settings.sensor
     size_z, size_l = len(sensor.measurements), len(sensor.landmark)
@@ -118,7 +118,7 @@ def sensor_likelihood(
 def ignored_likelihood(
     pose: Float[Array, "3"], scan: Scan, settings: KnownMapSensor
 ) -> ScanLikelihood:
-    """Of measurements that are left alone, as those of other robots: nothing counts."""
+    """The likelihood of ignored measurements, as of other robots: zero terms."""
     m, size = scan.z.shape
     zero, none, no = (jnp.zeros(m, kind) for kind in (pose.dtype, jnp.int32, bool))
     return ScanLikelihood(
@@ -143,7 +143,7 @@ def associate_known(
     landmarks: Float[Array, "N L"],
     settings: KnownMapSensor,
 ) -> ParticleAssociation:
-    """The association with a known map, which an absolute sensor does not need."""
+    """The association with a known map; an absolute sensor needs none."""
     if not settings.sensor.landmark:
         none = jnp.zeros(scan.tag.shape, jnp.int32)
         return ParticleAssociation(none, scan.valid, jnp.zeros_like(scan.valid), jnp.asarray(False))
@@ -154,7 +154,7 @@ def associate_known(
 def predict_known(
     pose: Float[Array, "3"], landmarks: Float[Array, "N L"], settings: KnownMapSensor
 ) -> Prediction:
-    """A known map as an association may see it from a pose without error: S_ij = R_i."""
+    """The `Prediction` of a known map from an exact pose: S_ij = R_i."""
     sensor, count = settings.sensor, landmarks.shape[0]
     size = len(sensor.measurements)
 

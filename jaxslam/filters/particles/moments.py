@@ -1,4 +1,4 @@
-"""Means and covariances that weighted particles stand for."""
+"""Means and covariances of weighted particles."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxslam.types import Estimate
 def weighted_nis(
     nis: Float[Array, "P M"], matched: Bool[Array, "P M"], log_weight: Float[Array, "P"]
 ) -> Float[Array, "M"]:
-    """Σ w nis / Σ w over the particles that have a landmark for a measurement."""
+    """The weighted mean NIS of each measurement, over the particles that associate it."""
     share = jnp.where(matched, jnp.exp(log_weight)[:, None], 0.0)
     whole = share.sum(axis=0)
     return (share * nis).sum(axis=0) / jnp.where(whole > 0, whole, 1.0)
@@ -24,24 +24,24 @@ def weighted_nis(
 def weighted_pose_moments(
     pose: Float[Array, "P 3"], log_weight: Float[Array, "P"], best: Int[Array, ""]
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Mean and covariance of poses x_p of weights Σ w = 1.
+    """Mean and covariance of poses x_p with weights Σ w = 1.
 
     The heading's mean is that of the circle, atan2(Σ w sin θ, Σ w cos θ), and d_p = x_p - mean has
     its heading wrapped. Then
 
         cov = (1 + Σw²)/(1 - Σw²) Σ w_p d_p d_pᵀ
 
-    A sample is all that is known: 1 - Σw² because distances are from the sample's own mean, 1 + Σw²
-    because that mean is itself one of 1/Σw² draws; of independent draws cov is the expected square
-    of (truth - mean). Two errors remain. Its inverse is biased: the NEES of n honest
+    1 - Σw² accounts for differences from the sample mean instead of the true one, and 1 + Σw² for
+    the variance of the sample mean of 1/Σw² draws; for independent draws cov is the expected square
+    of (truth - mean). Two errors remain. Its inverse is biased: the NEES of n consistent
     independent draws has mean 3 (n - 1)/(n - 5), 5.4 of 10 particles and 3.1 of 100. And copies
-    made by resampling are not independent: when all descend from few, the spread is theirs, and too
-    small (Bailey, Nieto & Nebot 2006). Of one particle cov is zero, which says that nothing is
-    known of the error, not that there is none.
+    made by resampling are not independent: with few distinct ancestors the spread is too small
+    (Bailey, Nieto & Nebot 2006). For one particle cov is zero, which means that the error is
+    unknown, not that it is zero.
     """
     w = jnp.exp(log_weight)
     xy = (w[:, None] * pose[:, :2]).sum(axis=0)
-    # Headings that cancel have no mean; there the one of the most likely particle.
+    # Headings that cancel have no mean; then the heading of the most likely particle is used.
     sine, cosine = (w * jnp.sin(pose[:, 2])).sum(), (w * jnp.cos(pose[:, 2])).sum()
     cancel = sine**2 + cosine**2 < jnp.finfo(w.dtype).eps ** 2
     own = pose[best, 2]
@@ -59,8 +59,8 @@ def weighted_pose_moments(
 
 
 def slam_pose_moments(state: SlamParticles) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Mean and covariance of the pose: `weighted_pose_moments`, and Σ w_p P_p more, with P_p what
-    was not drawn yet."""
+    """Mean and covariance of the pose: `weighted_pose_moments` plus Σ w_p P_p, with P_p the
+    covariance not yet drawn."""
     assert state.best is not None, "one particle has no moments: see `as_only_particle`"
     mean, spread = weighted_pose_moments(state.pose, state.log_weight, state.best)
     w = jnp.exp(state.log_weight)
@@ -68,12 +68,12 @@ def slam_pose_moments(state: SlamParticles) -> tuple[Float[Array, "3"], Float[Ar
 
 
 def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
-    """What the particles say together: the pose of `slam_pose_moments`, and a map by slots.
+    """The estimate of all particles: the pose of `slam_pose_moments`, and a map by slots.
 
     The map has the slots of the most likely particle. The point of a slot is the mean over the
     particles that hold the same tag there, by weight, and its covariance the mixture's, Σ w C + Σ w
-    d dᵀ. Where tags are unknown, nothing says that two particles hold the same landmark, and the
-    point is the most likely particle's own, its covariance given that particle's path.
+    d dᵀ. Where tags are unknown, landmarks of different particles cannot be matched, and the point
+    is the most likely particle's own, with its covariance given that particle's path.
     """
     pose, pose_cov = slam_pose_moments(state)
     best = state.best
@@ -81,7 +81,7 @@ def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
     named = (state.tag == state.tag[best][None]) & (state.tag[best] >= 0)[None]
     own = (jnp.arange(state.pose.shape[0]) == best)[:, None]
     same = state.alive & state.alive[best][None] & (named | own)
-    # A most likely particle without weight would leave nothing to divide by.
+    # A most likely particle of weight zero would cause a division by zero.
     w = jnp.where(same, jnp.exp(state.log_weight)[:, None], 0.0)
     w = jnp.where((w.sum(axis=0) > 0)[None], w, own.astype(w.dtype))
     w = w / w.sum(axis=0)[None]
@@ -95,7 +95,7 @@ def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
     points, covs = jax.vmap(jax.vmap(point))(state.landmarks, state.covs)
     alive = state.alive[best]
 
-    # Coordinate by coordinate: XLA goes through (P, N) much faster than through (P, N, 2, 2).
+    # Coordinate by coordinate: XLA processes (P, N) much faster than (P, N, 2, 2).
     def average(values: Float[Array, "P N"]) -> Float[Array, "N"]:
         return jnp.where(w > 0, w * values, 0.0).sum(axis=0)
 

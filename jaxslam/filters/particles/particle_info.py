@@ -1,4 +1,4 @@
-"""What an update says of the particles, beside what every filter says of its measurements."""
+"""The particle-specific results of an update."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 
 class ParticleInfo(NamedTuple):
-    """`info.extra["particles"]` of a particle filter; None is what this filter does not have."""
+    """`info.extra["particles"]` of a particle filter; None for fields this filter does not have."""
 
     ess: Float[Array, "*T"]
     """effective number of particles, 1/Σ w², after the scan and before resampling"""
@@ -18,7 +18,7 @@ class ParticleInfo(NamedTuple):
     -∞"""
     invalid: Int[Array, "*T"]
     """particles that a motion or a scan left with a pose that is not finite; they keep the pose
-    before, and weigh nothing"""
+    before, and have weight zero"""
     active: Int[Array, "*T"] | None = None
     """particles in use, of a filter that chooses their number"""
     injected: Int[Array, "*T"] | None = None

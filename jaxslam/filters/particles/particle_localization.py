@@ -1,4 +1,4 @@
-"""Monte-Carlo localization: where the robot is in a known map, by particles, from anywhere."""
+"""Monte-Carlo localization in a known map, including global localization."""
 
 import math
 from functools import partial
@@ -70,10 +70,10 @@ def particle_localization(
     Robotics", table 8.2). The state is a `PoseParticles`. Particles are resampled before a motion,
     if the last scan left ESS = 1/Σ w² below threshold · (particles in use); then so many of the
     draws are used as the KLD bound asks for the bins that these occupy after the motion (Fox 2001;
-    `resampling.kld`), at most `particles`, of which the others weigh nothing. In
+    `resampling.kld`), at most `particles`, of which the others have weight zero. In
     `info.extra["particles"]`, a `ParticleInfo`, these are `active` and `capped`.
 
-    A robot that was carried away is found again by particles from the whole box (table 8.3). With
+    A kidnapped robot is found again by particles from the whole box (table 8.3). With
     c the average over the particles, by weight, of exp(-Σ d²/2m) over the m measurements of a scan,
 
         slow ← slow + α_slow (c - slow)     fast ← fast + α_fast (c - fast)
@@ -84,29 +84,28 @@ def particle_localization(
     without a measurement change nothing. slack above 1 injects less (Gutmann & Fox 2002).
 
     The estimate is that of the weighted particles after a scan, before anything is drawn anew:
-    `moments.weighted_pose_moments`, which is one point and one ellipse also where the particles are
-    in several places. Where all weights underflow, all in use become equal (`underflow`). A motion
-    that leaves a pose which is not finite is undone, and the particle weighs nothing (`invalid`).
+    `moments.weighted_pose_moments`, a single mean and covariance even if the particles form several
+    modes. Where all weights underflow, all in use become equal (`underflow`). A motion
+    that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
     The measurements in an `Info` are those of the most likely particle, and nis is the mean over
     the particles by weight, as of `fastslam`; log_likelihood is log Σ w p(scan | x) of measurements
     matched to a landmark.
 
-    Shapes are fixed, so that a step costs what its capacity does, however few particles are in use.
+    Shapes are fixed, so the cost of a step depends on the capacity, not on the particles in use.
 
-    Particles stand for a density that the scan makes sharper than they are dense: with a precise
-    sensor none may lie within its noise, and all may agree on a wrong place. Then take more
-    particles, or give the sensor more noise than it has, as is customary; the estimate then claims
-    less than it could.
+    With a precise sensor no particle may lie within its noise (particle deprivation), and all may
+    converge to a wrong position. Then take more particles, or inflate the sensor noise, as is
+    customary; the estimate is then conservative.
 
     Args:
-        motion, sensor: any; with a `sensors.suite`, absolute sensors weigh too.
+        motion, sensor: any; with a `sensors.suite`, absolute sensors enter the weights too.
         landmarks: (N, L) the map, in the sensor's parameters.
         particles: the capacity P, at least 1.
         tags: (N,) int, different; default the row numbers.
         box: (2, 2) the lowest and the highest (x, y) [m] where the robot may be; without one,
             nothing is injected.
-        start: "gaussian", the pose and covariance that `run` is told (the latter may be zero), or
-            "uniform", the whole box and any heading, whatever it is told (global localization).
+        start: "gaussian", the pose and covariance given to `run` (the latter may be zero), or
+            "uniform", the whole box and any heading, whatever is given (global localization).
         associate: default `association.known()`, by tag. Any other decides for each particle, by
             its pose alone (maximum_likelihood with an infinite gate: the most likely landmark).
         gate: a measurement whose squared Mahalanobis distance exceeds this counts as one on the
@@ -114,7 +113,7 @@ def particle_localization(
         resample: one of `jaxslam.resampling`; also `soft` or `stop_gradient` of one.
         threshold: of ESS, as a share; 1 resamples (and chooses the number) in every step with
             unequal weights, 0 only to inject. Where odometry is precise beside the scans, copies
-            stay together, and a lower one is more honest.
+            stay together, and a lower threshold gives a more consistent covariance.
         bins: sizes in x [m], y [m], θ [rad].
         error, confidence: of the bound: with this probability the Kullback-Leibler divergence is
             below the error.
@@ -126,7 +125,7 @@ def particle_localization(
         ValueError: on counts below 1 or least above particles, a map or tags as `localization`
             refuses them, a box that is not finite or has no inside, start "uniform" without a box,
             a threshold outside [0, 1], a gate, bins, error or slack not above 0, a confidence not
-            within (0, 1), or rates that do not fit.
+            within (0, 1), or invalid rates.
     """
     validation.check_models("particle_localization", motion, sensor)
     points, names = checked_map("particle_localization", sensor, landmarks, tags)
@@ -156,7 +155,7 @@ def particle_localization(
         state, scan = draw_start(state, key, settings), zero_padding(scan)
         likelihood = jax.vmap(partial(scan_likelihood, scan=scan, sensors=sensors))(state.pose)
         log_likelihood = normalized(state.log_weight + likelihood.log_density.sum(axis=1))[1]
-        # Beside d², a weight has log |2πR|, which is the same for all.
+        # Besides d², a weight has the term log |2πR|, which is the same for all.
         misfit = 0.5 * likelihood.counted.sum(axis=1)
         weight, some = weight_poses(state, misfit)
         ess = effective_size(weight)
@@ -201,8 +200,8 @@ def particle_localization(
 def weight_poses(
     state: PoseParticles, misfit: Float[Array, "P"]
 ) -> tuple[Float[Array, "P"], Bool[Array, ""]]:
-    """log w exp(-misfit) with Σ w = 1, equal for all in use where nothing is left, and whether
-    anything was."""
+    """Log-weights log w exp(-misfit) with Σ w = 1, equal where all underflow, and whether any
+    weight was left."""
     weight, _, some = normalized(state.log_weight - misfit)
     even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
     return jnp.where(some, weight, even), some
@@ -214,7 +213,7 @@ def info_of_scan(
     log_weight: Float[Array, "P"],
     log_likelihood: Float[Array, ""],
 ) -> Info:
-    """What the most likely particle makes of a scan; nis is the mean by weight."""
+    """The `Info` of the most likely particle, with the weighted mean NIS."""
     best = jnp.argmax(log_weight)
     own: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
     return info_of(
@@ -233,7 +232,7 @@ def info_of_scan(
 def predict_particles(
     state: PoseParticles, u: Float[Array, "U"], key: Array, settings: MonteCarloSettings
 ) -> PoseParticles:
-    """Resample where due, draw from the motion, and keep as many as the KLD bound asks for."""
+    """The particles resampled where due and moved, as many as the KLD bound requires."""
     key_start, key_renew, key_noise = jax.random.split(key, 3)
     state = draw_start(state, key_start, settings)
     due, particles = state.due, settings.particles

@@ -15,19 +15,19 @@ from jaxslam.math.angles import wrap
 
 
 class ParticleEvents(NamedTuple):
-    """What became of the particles since the last scan."""
+    """Events of the particles since the last scan."""
 
     resampled: Bool[Array, ""]
     injected: Int[Array, ""]
     """drawn from the box"""
     invalid: Int[Array, ""]
-    """left without a finite pose by the motion"""
+    """with a non-finite pose after the motion"""
     capped: Bool[Array, ""]
     """more particles were wanted than there may be"""
 
 
 class PoseParticles(NamedTuple):
-    """P particles, of which the first `active` are in use; the others weigh nothing."""
+    """P particles, of which the first `active` are in use; the others have weight zero."""
 
     pose: Float[Array, "P 3"]
     """finite also where not in use"""
@@ -41,18 +41,18 @@ class PoseParticles(NamedTuple):
     start_cov: Float[Array, "3 3"]
     """of the start while it is not drawn yet, then zero"""
     fast: Float[Array, ""]
-    """short-term average of how well scans fit"""
+    """short-term average of the scans' likelihood, in units of its peak"""
     slow: Float[Array, ""]
     """long-term average of the same; both 0 before the first scan"""
     due: Bool[Array, ""]
     """to be resampled before the next motion"""
     injection: Float[Array, ""]
-    """the probability of a particle to be drawn from the whole box then"""
+    """the probability of each particle to be drawn from the whole box then"""
     events: ParticleEvents
 
 
 def no_events() -> ParticleEvents:
-    """Nothing became of the particles."""
+    """The record of no events."""
     no, none = jnp.asarray(False), jnp.zeros((), jnp.int32)
     return ParticleEvents(resampled=no, injected=none, invalid=none, capped=no)
 
@@ -60,7 +60,7 @@ def no_events() -> ParticleEvents:
 def initial_pose_particles(
     pose: Float[Array, "3"], start_cov: Float[Array, "3 3"], settings: MonteCarloSettings
 ) -> PoseParticles:
-    """P times the same pose, not yet drawn from N(pose, start_cov), or from the box."""
+    """The initial state: P copies of the pose, to be drawn from N(pose, start_cov) or the box."""
     kind, particles = pose.dtype, settings.particles
     if settings.start == "uniform":
         pose, start_cov = uniform_pose_moments(jnp.asarray(settings.box, kind))
@@ -81,7 +81,7 @@ def initial_pose_particles(
 
 
 def draw_start(state: PoseParticles, key: Array, settings: MonteCarloSettings) -> PoseParticles:
-    """The state with its start drawn, where that was not done yet."""
+    """The state with its initial poses drawn, if not done before."""
     if settings.start == "uniform":
         box = jnp.asarray(settings.box, state.pose.dtype)
         first = draw_uniform_poses(box, settings.particles, key)
@@ -102,7 +102,7 @@ def active_mask(state: PoseParticles) -> Bool[Array, "P"]:
 def pose_particle_moments(
     state: PoseParticles,
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Mean and covariance of the pose: `weighted_pose_moments`, or what the start says."""
+    """Mean and covariance of the pose: `weighted_pose_moments`, or those of the undrawn start."""
     mean, spread = weighted_pose_moments(state.pose, state.log_weight, state.best)
     return mean, spread + state.start_cov
 
@@ -110,13 +110,13 @@ def pose_particle_moments(
 def draw_gaussian_poses(
     pose: Float[Array, "P 3"], cov: Float[Array, "3 3"], key: Array
 ) -> Float[Array, "P 3"]:
-    """A pose of N(pose_p, cov) each; cov may be singular or zero."""
+    """Poses drawn from N(pose_p, cov); cov may be singular or zero."""
     normals = jax.random.normal(key, pose.shape, pose.dtype)
     return jax.vmap(draw_pose, (0, None, 0))(pose, cov, normals)
 
 
 def draw_uniform_poses(box: Float[Array, "2 2"], count: int, key: Array) -> Float[Array, "P 3"]:
-    """Poses in a box, rows its lowest and highest (x, y); any heading."""
+    """Poses drawn uniformly in a box, rows its lowest and highest (x, y), with any heading."""
     share = jax.random.uniform(key, (count, 3), box.dtype)
     low, high = box[0][None], box[1][None]
     heading = wrap(2 * math.pi * share[:, 2:])
@@ -126,7 +126,7 @@ def draw_uniform_poses(box: Float[Array, "2 2"], count: int, key: Array) -> Floa
 def uniform_pose_moments(
     box: Float[Array, "2 2"],
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Mean and covariance of `draw_uniform_poses`; of the heading, which has no mean, 0 ± π/√3."""
+    """Mean and covariance of `draw_uniform_poses`; the heading, uniform, gets 0 ± π/√3."""
     width = box[1] - box[0]
     mean = jnp.concatenate([0.5 * (box[0] + box[1]), jnp.zeros(1, box.dtype)])
     variance = jnp.concatenate([width**2, jnp.full(1, 4 * math.pi**2, box.dtype)]) / 12

@@ -1,4 +1,4 @@
-"""Where a particle's pose may be: drawn from the motion, or given the scan too.
+"""Proposal distributions of a particle's pose: from the motion, or from motion and scan.
 
 The functions of a `SlamParticles` act on one particle; `fastslam` vmaps them.
 """
@@ -27,7 +27,7 @@ from jaxslam.types import Scan
 def sample_motion(
     motion: Motion, pose: Float[Array, "P 3"], u: Float[Array, "U"], key: Array
 ) -> Float[Array, "P 3"]:
-    """f(x_p, u, w_p) of each particle, w_p drawn from N(0, Q(x_p, u))."""
+    """The pose f(x_p, u, w_p) of each particle, w_p drawn from N(0, Q(x_p, u))."""
     normals = jax.random.normal(key, (pose.shape[0], len(motion.noises)), pose.dtype)
 
     def move(pose: Float[Array, "3"], normal: Float[Array, "W"]) -> Float[Array, "3"]:
@@ -39,7 +39,7 @@ def sample_motion(
 def predict_pose(
     motion: Motion, pose: Float[Array, "3"], cov: Float[Array, "3 3"], u: Float[Array, "U"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """The Gaussian after a motion: f(x, u, 0) and F P Fᵀ + W Q Wᵀ."""
+    """The predicted pose and covariance: f(x, u, 0) and F P Fᵀ + W Q Wᵀ."""
     moved, by_pose, noise = first_order.motion_at(motion, pose, u, pose)
     return moved, linalg.symmetrize(linalg.matmul(linalg.matmul(by_pose, cov), by_pose.T) + noise)
 
@@ -53,18 +53,18 @@ def associate_particle(
 
 
 class PoseProposal(NamedTuple):
-    """The pose of one particle given motion and scan, and how likely the scan is."""
+    """The Gaussian of a particle's pose given motion and scan, and the scan's likelihood."""
 
     pose: Float[Array, "*P 3"]
     pose_cov: Float[Array, "*P 3 3"]
     log_matched: Float[Array, "*P"]
     """log-likelihood of the measurements matched to a landmark"""
     log_unmatched: Float[Array, "*P"]
-    """what the others count with"""
+    """the terms of the other measurements"""
 
 
 class ParticleInnovations(NamedTuple):
-    """Each measurement against its landmark in one particle, before a pose is drawn."""
+    """The innovations of one particle before its pose is drawn."""
 
     positive: Bool[Array, "*P M"]
     """S is positive definite"""
@@ -83,20 +83,20 @@ def propose_pose(
     scan: Scan,
     settings: ParticleMapSettings,
 ) -> tuple[PoseProposal, ParticleInnovations]:
-    """The pose Gaussian given the scan too, and the scan's likelihood with the pose integrated out.
+    """The Gaussian of the pose given the scan, and the scan's likelihood marginal over the pose.
 
-    Measurement by measurement, each linearized where those before left the pose (Montemerlo et al.
-    2003, FastSLAM 2.0): with H_x, H_l at the pose's mean and the landmark's, C the landmark's
+    Measurement by measurement, each linearized at the pose corrected by those before (Montemerlo
+    et al. 2003, FastSLAM 2.0): with H_x, H_l at the means of pose and landmark, C the landmark's
     covariance,
 
         S = H_x P H_xᵀ + H_l C H_lᵀ + R    x ← x + P H_xᵀ S⁻¹ ν    P ← P - P H_xᵀ S⁻¹ H_x P
         log w += log N(ν; 0, S)
 
     the product of which is the density of the scan given the path. P = 0 (a pose that is drawn
-    already) moves nothing, and leaves the weights of FastSLAM 1.0. P is not inverted, so it may be
-    singular. A measurement outside the gate counts as one on the gate, and one that is of no
-    landmark as one at d² = `unmatched_distance` of a landmark known exactly, log N = -(d² +
-    log |2πR|)/2: a particle gains nothing by explaining less.
+    already) is not changed, and gives the weights of FastSLAM 1.0. P is not inverted, so it may be
+    singular. A measurement outside the gate gets the d² of the gate, and one without a landmark
+    d² = `unmatched_distance` of a landmark known exactly, log N = -(d² + log |2πR|)/2, so that a
+    particle with fewer associations is not preferred.
     """
     sensor, gate = settings.sensor, settings.gate
     size_z = len(sensor.measurements)
@@ -143,7 +143,7 @@ def propose_pose(
 
 
 def predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
-    """One particle's map as an association may see it: landmarks share the pose's error alone."""
+    """The `Prediction` of one particle's map, with landmarks correlated by the pose alone."""
 
     def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
         """ẑ, H_x and H_l C H_lᵀ of each landmark."""

@@ -1,4 +1,4 @@
-"""How Monte-Carlo localization finds a robot that was carried away: particles from the whole box.
+"""Recovery of a kidnapped robot: injection of particles from the whole box.
 
 Thrun, Burgard & Fox, "Probabilistic Robotics", table 8.3, augmented MCL.
 """
@@ -22,7 +22,7 @@ def update_averages(
     measured: Int[Array, ""],
     settings: MonteCarloSettings,
 ) -> PoseParticles:
-    """The state with its averages of how well scans fit, and the probability to inject.
+    """The state with updated likelihood averages and the injection probability.
 
     Args:
         misfit: Σ d²/2 of each particle.
@@ -50,7 +50,7 @@ def update_averages(
 
 
 class DrawnPoses(NamedTuple):
-    """P poses to go on with, in random order."""
+    """P resampled or injected poses, in random order."""
 
     pose: Float[Array, "P 3"]
     log_weight: Float[Array, "P"]
@@ -61,7 +61,7 @@ class DrawnPoses(NamedTuple):
 def resample_and_inject(
     state: PoseParticles, key: Array, settings: MonteCarloSettings
 ) -> DrawnPoses:
-    """Each pose that of a particle by its weight or, with the state's probability, from the box."""
+    """Poses resampled by weight or, with the state's injection probability, drawn from the box."""
     particles = settings.particles
     key_resample, key_order, key_which, key_box = jax.random.split(key, 4)
     ancestor, log_weight = survivors(settings.resample, state.log_weight, key_resample)

@@ -1,4 +1,4 @@
-"""Which landmarks of one particle the measurements of a scan are of."""
+"""Data association of a scan with the landmarks of one particle."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class ParticleAssociation(NamedTuple):
 def particle_association(
     prediction: Prediction, scan: Scan, associate: Associate
 ) -> ParticleAssociation:
-    """What the method finds, for the measurements that are there."""
+    """The association of the valid measurements of a scan."""
     found = Association(*associate(prediction, scan))
     return ParticleAssociation(
         slot=jnp.maximum(found.slot, 0),
@@ -35,5 +35,5 @@ def particle_association(
 
 
 def zero_padding(scan: Scan) -> Scan:
-    """The scan with zeros in its padding, which may hold anything and is multiplied by zero."""
+    """The scan with its padding set to zero; padding may hold any value."""
     return scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))

@@ -1,4 +1,4 @@
-"""What the particle filters were told: records of settings, made and checked by the factories."""
+"""The settings of the particle filters, created and validated by the factories."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -12,16 +12,16 @@ from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Differentiable, Life, Motion, Resample, Sensor
 from jaxslam.sensors.suite import Suite
 
-# The probability that a measurement of a landmark lies within d², where no gate says more.
+# The probability that a measurement of a landmark lies within d², where there is no gate.
 _NEAR = 0.99
 
-# Particles that are kept at least, where the caller does not say.
+# The default least number of particles.
 _LEAST = 50
 
 
 @dataclass(frozen=True, eq=False)
 class AssociationSettings:
-    """Which measurements of one sensor are of which landmarks, and which count."""
+    """The association method, gate and new-landmark options of one sensor."""
 
     sensor: Sensor
     associate: Associate
@@ -29,7 +29,7 @@ class AssociationSettings:
 
     @property
     def unmatched_distance(self) -> float:
-        """d² that a measurement of no landmark counts with: the gate, or one that few exceed."""
+        """The d² assigned to a measurement without a landmark: the gate, or a high quantile."""
         if self.gate is not None:
             return self.gate
         return chi2_quantile(_NEAR, len(self.sensor.measurements))
@@ -37,7 +37,7 @@ class AssociationSettings:
 
 @dataclass(frozen=True, eq=False)
 class ParticleMapSettings(AssociationSettings):
-    """How a scan corrects the map of one particle: of `fastslam`, and of `mapping`."""
+    """The settings of one particle's map update, of `fastslam` and `mapping`."""
 
     quota: int | None
     """new landmarks a scan at the most"""
@@ -46,7 +46,7 @@ class ParticleMapSettings(AssociationSettings):
 
 @dataclass(frozen=True, eq=False)
 class KnownMapSensor(AssociationSettings):
-    """One sensor in a known map, as `particle_localization` weighs by it."""
+    """One sensor in a known map, for the weights of `particle_localization`."""
 
     landmarks: ArrayLike
     """(N, L)"""
@@ -55,14 +55,14 @@ class KnownMapSensor(AssociationSettings):
     measured: int | None
     """measurement slots M of a scan that are its own; None for all"""
     ignored: bool
-    """it measures other robots, and is left alone"""
+    """it measures other robots, and is ignored"""
 
 
 @dataclass(frozen=True, eq=False)
 class MonteCarloSettings:
-    """The particles of `particle_localization`: where they come from, and how many there are.
+    """The settings of the particles of `particle_localization`: origin and number.
 
-    Raises ValueError on numbers that mean nothing.
+    Raises ValueError on invalid numbers.
     """
 
     motion: Motion
@@ -100,7 +100,7 @@ class MonteCarloSettings:
 
     @property
     def injects(self) -> bool:
-        """Whether a lost robot is looked for in the whole box."""
+        """Whether recovery injects particles from the whole box."""
         return self.box is not None and self.rates is not None
 
 
@@ -114,7 +114,7 @@ def particle_map_settings(
     births: int | None,
     life: Life | None,
 ) -> ParticleMapSettings:
-    """The settings, or a ValueError that begins with a filter's name."""
+    """The settings; ValueError, which begins with a filter's name, on invalid ones."""
     validation.check_parts(name, associate=associate)
     validation.check_count(f"{name}: capacity", capacity)
     if births is not None:
@@ -138,7 +138,7 @@ def known_map_sensors(
     associate: Associate | None,
     gate: float | None,
 ) -> tuple[KnownMapSensor, ...]:
-    """The sensors of a suite, or the one that is none, in a map; or a ValueError."""
+    """The sensors of a suite, or the single sensor, in a known map; ValueError if invalid."""
     validation.check_parts(name, associate=associate)
     validation.check_gate(name, gate)
 
@@ -152,7 +152,7 @@ def known_map_sensors(
 
 
 def check_resampling(name: str, resample: Any, threshold: float) -> None:
-    """A resampling method is a function, and its threshold a share."""
+    """Raise ValueError unless the method is a function and the threshold in [0, 1]."""
     if not callable(resample):
         raise ValueError(f"{name}: expected resample to be a function, got {resample!r}")
     if validation.is_concrete(threshold) and not 0 <= threshold <= 1:

@@ -1,4 +1,4 @@
-"""Particles with maps of their own: the state of FastSLAM, and of mapping from known poses."""
+"""Particles with a map each: the state of FastSLAM and of mapping from known poses."""
 
 from typing import Any, NamedTuple
 
@@ -20,8 +20,8 @@ class SlamParticles(NamedTuple):
 
     pose: Float[Array, "*P 3"]
     pose_cov: Float[Array, "*P 3 3"]
-    """of the pose, of what was not drawn yet: of the start, or of a motion whose scan is still to
-    come; zero after an update"""
+    """covariance of the pose not drawn yet: of the start, or of a motion before its scan; zero
+    after an update"""
     log_weight: Float[Array, "*P"]
     """Σ exp = 1"""
     landmarks: Float[Array, "*P N L"]
@@ -34,10 +34,10 @@ class SlamParticles(NamedTuple):
     best: Int[Array, ""] | None
     """the most likely particle, by its weight before the last resampling; None of one particle"""
     lost: Int[Array, "*P"]
-    """new landmarks that found a particle's map full since the start, along its own ancestry"""
+    """new landmarks dropped from full maps since the start, along the particle's ancestry"""
     invalid: Bool[Array, "*P"]
-    """the last motion left a pose that was not finite; it was left out, and the particle has no
-    weight"""
+    """the last motion gave a pose that was not finite; it was discarded, and the particle has
+    weight zero"""
     life: Any = None
     """the memory (P, …) of the filter's `Life`, where it has one"""
 
@@ -49,7 +49,7 @@ def initial_slam_particles(
     capacity: int,
     landmark_size: int,
 ) -> SlamParticles:
-    """P times the same robot, not yet drawn, and no landmark."""
+    """The initial state: P copies of the robot, not yet drawn, and no landmark."""
     kind, shape = pose.dtype, (particles, capacity)
     return SlamParticles(
         pose=jnp.broadcast_to(pose, (particles, 3)),
@@ -66,7 +66,7 @@ def initial_slam_particles(
 
 
 def as_only_particle(particle: SlamParticles) -> SlamParticles:
-    """One particle as a state of P = 1, with all of the weight."""
+    """One particle as a state of P = 1 with weight 1."""
     alone: SlamParticles = jax.tree.map(lambda leaf: leaf[None], particle)
     return alone._replace(
         log_weight=jnp.zeros_like(alone.log_weight), best=jnp.zeros((), jnp.int32)
@@ -76,13 +76,13 @@ def as_only_particle(particle: SlamParticles) -> SlamParticles:
 def draw_pose(
     pose: Float[Array, "3"], cov: Float[Array, "3 3"], normal: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """A pose of N(pose, cov) from standard normals; cov may be singular or zero."""
+    """A pose drawn from N(pose, cov) with given standard normals; cov may be singular or zero."""
     at = pose + (linalg.cholesky(cov)[0] * normal[None]).sum(axis=1)
     return jnp.concatenate([at[:2], wrap(at[2:])])
 
 
 def draw_poses(state: SlamParticles, key: Array) -> Float[Array, "P 3"]:
-    """A pose of N(pose_p, P_p) for each particle."""
+    """A pose drawn from N(pose_p, P_p) for each particle."""
     normals = jax.random.normal(key, state.pose.shape, state.pose.dtype)
     return jax.vmap(draw_pose)(state.pose, state.pose_cov, normals)
 
@@ -90,8 +90,8 @@ def draw_poses(state: SlamParticles, key: Array) -> Float[Array, "P 3"]:
 def with_finite_poses(
     state: SlamParticles, pose: Float[Array, "P 3"], cov: Float[Array, "P 3 3"]
 ) -> SlamParticles:
-    """The state with new poses and their covariances; where one is not finite, the old ones,
-    without weight."""
+    """The state with new poses and covariances; where one is not finite, the old pose with weight
+    zero."""
     good = jnp.isfinite(pose).all(axis=1) & jnp.isfinite(cov).all(axis=(1, 2))
     return state._replace(
         pose=jnp.where(good[:, None], pose, state.pose),
