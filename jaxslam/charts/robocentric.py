@@ -10,7 +10,7 @@ from jaxslam.protocols import Basis, Chart
 
 
 def robocentric() -> Chart:
-    """Additive errors of the world's origin b = pose⁻¹ and the landmarks m = Rᵀ(l - t) in its frame.
+    """Additive errors of the origin b = pose⁻¹ and landmarks m = Rᵀ(l - t) in the robot's frame.
 
     b ← b + dx and m ← m + dl, so pose ← (b + dx)⁻¹ and l ← (b + dx)⁻¹ ∘ (m + dl). What a sensor on
     the robot measures does not depend on dx, hence no measurement has information on the frame,
