@@ -10,7 +10,7 @@ from jaxslam.validation.numbers import is_concrete
 
 
 def certain(associate: Associate, spread: float) -> Associate:
-    """Another method, restricted to landmarks with √(tr S/Z) <= spread.
+    """An association method restricted to landmarks with √(tr S/Z) <= spread.
 
     S is the covariance of the innovation. After a long loop that of the first landmarks exceeds the
     distances between landmarks, and single measurements may be associated wrongly. Landmarks

@@ -13,7 +13,7 @@ def nearest(
     *,
     ambiguous: Literal["nearest", "leave"] = "nearest",
 ) -> Associate:
-    """Individual compatibility nearest neighbour (Neira & Tardós 2001, section II).
+    """Individual compatibility nearest neighbour (ICNN; Neira & Tardós 2001, section II).
 
     A pair is compatible if d² = νᵀ S⁻¹ ν <= gate. A measurement is associated with the landmark
     of its least d² if it is also the nearest of that landmark's measurements. One with no landmark

@@ -12,7 +12,7 @@ Array = jax.Array
 
 
 def at_truth(truth: Truth) -> Linearizer:
-    """Every Jacobian at the truth of a simulation; the mean is still the filter's own.
+    """The linearizer of the ideal EKF: Jacobians at the truth; means are still the filter's.
 
     The linearized system then has the observability of the true one, so a NEES above its dof is not
     due to the linearization points (Huang, Mourikis, Roumeliotis 2010, "ideal EKF"). In

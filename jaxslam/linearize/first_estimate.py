@@ -23,7 +23,7 @@ class First(NamedTuple):
 
 
 def first_estimate() -> Linearizer:
-    """FEJ: the pose of a step at its prediction, a landmark at its first estimate.
+    """The FEJ linearizer: a pose at its prediction, a landmark at its first estimate.
 
     With x̂_k the predicted pose of step k and x̂_k⁺ the corrected one, the transition becomes
     F = [I, J(p̂_{k+1} - p̂_k); 0, 1], J = [0, -1; 1, 0], in place of J(p̂_{k+1} - p̂_k⁺), and

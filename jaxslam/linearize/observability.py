@@ -25,7 +25,7 @@ class Constraint(NamedTuple):
 
 
 def observability() -> Linearizer:
-    """OC-EKF: the linearization points nearest to the estimates that satisfy the constraint.
+    """The OC linearizer: points nearest to the estimates that satisfy the observability constraint.
 
     A rotation of robot and map, (Jα, 1, Jβ_1, …) in the errors of robot position, heading and
     landmarks, J = [0, -1; 1, 0], stays unobservable if every H of step k is taken at a landmark l*

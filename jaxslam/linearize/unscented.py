@@ -25,7 +25,7 @@ class Regression(NamedTuple):
 
 
 def unscented(alpha: float | None = None) -> Linearizer:
-    """The UKF: sigma points of the robot, or of robot and one landmark, retracted by the chart.
+    """The linearizer of the UKF: sigma points of the pose, or of pose and landmark, in the chart.
 
     With n variables and P = L Lᵀ, points at 0 and ±α√n L_j, weights 1/(2α²n) and, for the centre,
     1 - 1/α² for means and that + 3 - α² for covariances (UKF-M: Brossard, Barrau, Bonnabel, "A Code

@@ -55,7 +55,7 @@ class _Hoisting:
         self._done: dict[tuple[int, ...], tuple[Any, Any, Any]] = {}
 
     def of(self, jaxpr: Any, consts: Sequence[Any]) -> tuple[Any, list[Any]]:
-        """`hoisted`, of a jaxpr and its constants."""
+        """The result of `hoisted` for a jaxpr and its constants."""
         which = id(jaxpr), *map(id, consts)
         known = self._done.get(which)
         if known is not None:

@@ -81,12 +81,12 @@ class TableLayout(NamedTuple):
 
     @property
     def hypothesis_slots(self) -> Int[Array, "C"]:
-        """`of_hypotheses` as numbers."""
+        """The slot numbers of hypotheses."""
         return self.landmarks + jnp.arange(self.hypotheses)
 
     @property
     def stored_slots(self) -> Int[Array, "W"]:
-        """`of_stored` as numbers."""
+        """The slot numbers of stored measurements."""
         return self.first_stored + jnp.arange(self.stored)
 
 

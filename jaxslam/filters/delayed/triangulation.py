@@ -46,7 +46,7 @@ class Triangulation:
 
 
 def rays(sensor: Sensor, *, parallax: float = 0.1) -> Triangulation:
-    """Bearings: p + t (cos q, sin q), t > 0. Two rays intersect in at most one point.
+    """Triangulation of bearings: rays p + t (cos q, sin q), t > 0, intersect in at most one point.
 
     With δ = p' - p and c = sin(q' - q), the lengths are t = δ × d'/c and t' = δ × d/c. The
     intersection lies in front of both sensors, where the rays cross at an angle of at least
@@ -87,7 +87,7 @@ def rays(sensor: Sensor, *, parallax: float = 0.1) -> Triangulation:
 
 
 def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
-    """Ranges: |x - p| = q. Two circles intersect in two mirrored points.
+    """Triangulation of ranges: circles |x - p| = q intersect in two mirrored points.
 
     With δ = p' - p, d = |δ|, a = (d² + q² - q'²)/(2d) and h² = q² - a², the points are
     p + (a δ ± h δ^⊥)/d. The circles must cross at an angle φ, sin φ = d h/(q q'), of at least

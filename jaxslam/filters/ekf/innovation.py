@@ -77,7 +77,7 @@ class Innovation(NamedTuple):
 
 
 class _Linearized(NamedTuple):
-    """m measurements as affine functions of the errors."""
+    """The linearization of m measurements as affine functions of the errors."""
 
     rows: Float[Array, "m Z 3+L+1"]
     """H by the errors of pose and landmark, and ν beside them"""
@@ -229,7 +229,7 @@ def _linearize(
 def _split_rows(
     rows: Float[Array, "m Z C"],
 ) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"], Float[Array, "m Z"]]:
-    """H by the errors of pose and landmark, and ν."""
+    """The Jacobian H by the errors of pose and landmark, and ν."""
     return rows[:, :, :3], rows[:, :, 3:-1], rows[:, :, -1]
 
 

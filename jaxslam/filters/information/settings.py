@@ -65,7 +65,7 @@ class SparseSettings(InformationSettings):
 
     @property
     def active_size(self) -> int:
-        """A, the size of the active set."""
+        """The size A of the active set."""
         return min(self.active, self.capacity)
 
     @property
