@@ -51,7 +51,7 @@ def existence(
 
     A landmark begins at even odds. Each scan that measures it adds log(detected/false), each that
     should have and does not adds log((1 - detected)/(1 - false)). Where the probability comes to
-    `confirm` it is confirmed for good, where it falls to `remove` it is removed from the map.
+    `confirm` it is confirmed permanently, where it falls to `remove` it is removed from the map.
     Provisional landmarks are corrected as all others are.
 
     Args:

@@ -1,6 +1,6 @@
 """Constants of a traced function turned into inputs, so that one program serves all their values.
 
-A jaxpr holds the arrays that a function closed over as constants, and its scalars as literals among
+A jaxpr has the arrays that a function closed over as constants, and its scalars as literals among
 the operands. `hoisted` turns both into inputs, through calls, loops and branches. Literals that
 are common in formulas remain, since XLA simplifies with them: 0, ±1, ±π/2, ±π, ±2π, infinities
 and the limits of the dtype; so do integers, which may be sizes. Unknown primitives keep their

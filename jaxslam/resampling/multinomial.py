@@ -14,7 +14,7 @@ def multinomial(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
     1993, "Novel approach to nonlinear/non-Gaussian Bayesian state estimation", IEE Proc. F 140(2)).
 
     Args:
-        log_weights: of any scale; what is not finite is never drawn, unless nothing is.
+        log_weights: of any scale; non-finite ones are never drawn, unless none is finite.
         key: a PRNG key, consumed.
     """
     weights = weights_of(log_weights)

@@ -17,7 +17,7 @@ def residual(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
     for dynamic systems", JASA 93(443)). The copies come first, ascending.
 
     Args:
-        log_weights: of any scale; what is not finite is never drawn, unless nothing is.
+        log_weights: of any scale; non-finite ones are never drawn, unless none is finite.
         key: a PRNG key, consumed.
     """
     weights = weights_of(log_weights)

@@ -18,7 +18,7 @@ def systematic(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
     nonlinear problems", IEE Proc. Radar Sonar Navig. 146(1)).
 
     Args:
-        log_weights: of any scale; what is not finite is never drawn, unless nothing is.
+        log_weights: of any scale; non-finite ones are never drawn, unless none is finite.
         key: a PRNG key, consumed.
     """
     weights = weights_of(log_weights)

@@ -43,7 +43,7 @@ class Search(NamedTuple):
     taken: Int[Array, ""]
     """steps"""
     ending: Int[Array, ""]
-    """EXHAUSTED while it goes on"""
+    """EXHAUSTED while the iterations continue"""
 
 
 def minimize(

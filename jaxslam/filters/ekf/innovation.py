@@ -56,7 +56,7 @@ class Innovation(NamedTuple):
     whitened: Float[Array, "m*Z"]
     """L⁻¹ ν"""
     factor: Float[Array, "m*Z m*Z"]
-    """L, with rows of zeros for what is not fused"""
+    """L, with rows of zeros for measurements that are not fused"""
     s: Float[Array, "m Z m Z"]
     """S, the identity where not fused"""
     hp: Float[Array, "m*Z D"]
@@ -64,7 +64,7 @@ class Innovation(NamedTuple):
     hx: Float[Array, "m Z D"]
     """H X of a square-root filter, else H P"""
     noise: Float[Array, "m Z Z"]
-    """R with what the linearizer added"""
+    """R with the linearizer's addition"""
     own_noise: Float[Array, "m Z Z"]
     """R"""
     jacobians: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
@@ -82,7 +82,7 @@ class _Linearized(NamedTuple):
     rows: Float[Array, "m Z 3+L+1"]
     """H by the errors of pose and landmark, and ν beside them"""
     rest: Float[Array, "m Z Z"]
-    """what the linearizer adds to R"""
+    """the linearizer's addition to R"""
     seen: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
     """H by coordinates"""
 

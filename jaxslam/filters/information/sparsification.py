@@ -7,7 +7,7 @@
 
    `seif` does it in every scan that needs room; `eseif` relocates instead (`relocation`), unless
    wait=False. `ApproximationCounts.cut` and `.cut_nats` count what was dropped.
-2. Landmark to landmark, `drop_link`: a landmark's list of links holds K; a full list drops its
+2. Landmark to landmark, `drop_link`: a landmark's list has room for K links; a full list drops its
    weakest link Ω_ij (`link_lists`), and the two diagonal blocks change so that Ω̃ stays positive
    definite. Both filters do it; `.dropped`, `.dropped_links` and `.anchored` count it.
 """

@@ -98,7 +98,7 @@ def as_prior(
 ) -> Joint:
     """The initial state of a SLAM filter with this map as an uncorrelated prior.
 
-    `run` begins in it by `dataclasses.replace(filter, init=partial(as_prior, final, filter))`.
+    Used by `run` with `dataclasses.replace(filter, init=partial(as_prior, final, filter))`.
 
     Args:
         state: the final state of `mapping`.
