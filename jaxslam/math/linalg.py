@@ -251,8 +251,8 @@ def _substituted(
 def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """The inverse Cholesky factor W = L⁻¹ (n, n) of a small A = L Lᵀ, and `cholesky`'s flag.
 
-    A pivot that counts as zero gives a row of zeros. It takes one division or square root a pivot,
-    where `cholesky` and `solve_lower` take three.
+    A pivot that counts as zero gives a row of zeros. It takes one division and one square root a
+    pivot, where `cholesky` and `solve_lower` take three.
     """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
     zero = jnp.zeros((), matrix.dtype)
