@@ -94,7 +94,7 @@ def _drive(
     def step(state: Any, row: tuple[Log, jax.Array]) -> tuple[Any, Any]:
         (control, scan), (key_predict, key_update) = row
         state = same_state(f"{name}: predict", state, filter.predict(state, control, key_predict))
-        # Under jit nobody has looked for NaN, and one would go through the whole state.
+        # Under jit values are not checked before, and a NaN would spread through the whole state.
         lost = scan.valid & ~jnp.isfinite(scan.z).all(axis=1)
         scan = scan._replace(valid=scan.valid & ~lost)
         found = filter.update(state, scan, key_update)

@@ -17,7 +17,7 @@ from jaxslam.math.xla import materialize
 
 
 class Joint(NamedTuple):
-    """Robot and map (Solà (5), (6)); D = 3 + N·L, slot i owns rows 3 + i·L to 3 + (i+1)·L."""
+    """The joint state (Solà (5), (6)); D = 3 + N·L, slot i owns rows 3 + i·L to 3 + (i+1)·L."""
 
     pose: Float[Array, "3"]
     landmarks: Float[Array, "N L"]
@@ -151,12 +151,12 @@ def gather(joint: Joint, slot: Int[Array, ""]) -> tuple[Float[Array, "L"], Float
 
 
 def robot_cov(joint: Joint, square_root: bool = False) -> Float[Array, "3 3"]:
-    """P of the robot, (3, 3)."""
+    """The covariance of the robot, (3, 3)."""
     return joint.cov[:3] @ joint.cov[:3].T if square_root else joint.cov[:3, :3]
 
 
 def local_cov(joint: Joint, slot: Int[Array, ""], square_root: bool = False) -> Float[Array, "K K"]:
-    """P of the robot and the landmark of a slot (), (3+L, 3+L)."""
+    """The covariance of the robot and the landmark of a slot (), (3+L, 3+L)."""
     size = joint.landmarks.shape[1]
     rows = jnp.concatenate([joint.cov[:3], gather(joint, slot)[1]])
     if square_root:
@@ -181,7 +181,7 @@ def scatter(
     *,
     square_root: bool = False,
 ) -> Joint:
-    """Fill dead slots with m landmarks that depend on the map through the pose: Solà (35)-(38).
+    """The joint with m landmarks in dead slots, correlated through the pose: Solà (35)-(38).
 
     With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM, P_LL = G P_RR Gᵀ + diag(own_cov).
     So the landmarks of one scan are correlated with each other through the robot. Written as
@@ -242,7 +242,7 @@ def _add_blocks(cov: Float[Array, "D D"], blocks: Float[Array, "N L L"]) -> Floa
 
 
 def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
-    """Marginalize out the landmarks of the slots dead (N,) bool, and free the slots.
+    """The joint with the landmarks of the slots dead (N,) bool marginalized out and the slots free.
 
     In covariance form the marginal is what is left when rows and columns are dropped (Solà Table 1,
     state reduction); here they are overwritten with padding. Removing a dead slot changes nothing.

@@ -10,15 +10,15 @@ from jaxslam.validation.numbers import is_concrete
 
 
 def certain(associate: Associate, spread: float) -> Associate:
-    """Another method, restricted to landmarks with √(tr S/Z) <= spread.
+    """An association method restricted to landmarks with √(tr S/Z) <= spread.
 
     S is the covariance of the innovation. After a long loop that of the first landmarks exceeds the
-    distances between landmarks, and a measurement judged alone may then fit a wrong one.
-    Landmarks measured there become new ones at first; `filters.map_management.closing` finds
-    jointly which of the old ones they are.
+    distances between landmarks, and single measurements may be associated wrongly. Landmarks
+    measured there become new ones at first; `filters.map_management.closing` then associates them
+    jointly with the old ones.
 
     Args:
-        associate: the method; one that goes by tags alone, as `known`, is not restricted.
+        associate: the method; one that uses tags alone, as `known`, is not restricted.
         spread: in units of the measurement, which should all be of one kind.
     Raises:
         ValueError: on a spread not above 0.

@@ -9,10 +9,10 @@ from jaxslam.types import Scan
 
 
 def global_nearest(gate: float, new_gate: float | None = None) -> Associate:
-    """Global nearest neighbour: the assignment that minimizes Σ d² over the pairs it makes, a
-    measurement left without a landmark costing as much as the gate.
+    """Global nearest neighbour: the assignment that minimizes Σ d² over its pairs, with the gate as
+    the cost of a measurement without a landmark.
 
-    Of compatible pairs (d² <= gate) alone; with an infinite gate, of the largest number of
+    Only compatible pairs (d² <= gate) are used; with an infinite gate, the largest number of
     possible pairs. Solved exactly (`assignment.assign`). Blackman & Popoli, "Design and analysis
     of modern tracking systems", 1999, section 6.4. The gates are as those of `nearest`.
 
@@ -28,7 +28,7 @@ def global_nearest(gate: float, new_gate: float | None = None) -> Associate:
         within = jnp.where(compatible, pairs.distance, 0.0)
         alone = jnp.minimum(gate, 1 + within.sum())
         cost = jnp.where(compatible, pairs.distance, 2 * alone + 1)
-        # A column of its own for each measurement that stays alone.
+        # One more column for each measurement, which stands for no landmark.
         cost = jnp.concatenate([cost, jnp.broadcast_to(alone, (m, m))], axis=1)
         column = assign(cost)
         slot = jnp.where(column < n, column, -1)

@@ -83,7 +83,7 @@ class _Problem(NamedTuple):
     cov: Float[Array, "M K Z Z"]
     cross: Float[Array, "N Z N Z"]
     levels: Float[Array, "M+1"]
-    """what D² of k pairs may be"""
+    """the gate of D² of k pairs"""
     left: Int[Array, "M+1"]
     """how many measurements from the i-th on have candidates"""
     cut: Bool[Array, ""]

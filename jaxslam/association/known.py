@@ -10,7 +10,7 @@ from jaxslam.types import Scan
 def known() -> Associate:
     """Association by tags: each measurement is of the landmark of its tag; a new tag starts one.
 
-    A measurement of unknown identity (tag -1) is neither, and the filter counts it as unmatched.
+    A measurement of unknown identity (tag -1) is neither, and becomes `Status.UNMATCHED`.
     """
 
     def associate(prediction: Prediction, scan: Scan) -> Association:

@@ -6,11 +6,11 @@ from jaxslam.types import Scan
 
 
 def maximum_likelihood(gate: float, new_gate: float | None = None) -> Associate:
-    """As `nearest`, by the least d² + log |S|, which is -2 log N(ν; 0, S) up to a constant.
+    """Maximum-likelihood association: as `nearest`, by the least d² + log |S|.
 
-    The determinant matters: a landmark of large covariance is near to everything in d², and makes
-    nothing likely (Notes, EKF-SLAM with unknown correspondences; Tacher). The gates are of
-    d², as those of `nearest`.
+    d² + log |S| is -2 log N(ν; 0, S) up to a constant. The determinant matters: a landmark of large
+    covariance has small d² to all measurements, but a low likelihood (Notes, EKF-SLAM with unknown
+    correspondences; Tacher). The gates are of d², as those of `nearest`.
 
     Raises:
         ValueError: on a negative gate, or a new_gate below it.

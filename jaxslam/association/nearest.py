@@ -13,20 +13,20 @@ def nearest(
     *,
     ambiguous: Literal["nearest", "leave"] = "nearest",
 ) -> Associate:
-    """Individual compatibility nearest neighbour (Neira & Tardós 2001, section II).
+    """Individual compatibility nearest neighbour (ICNN; Neira & Tardós 2001, section II).
 
     A pair is compatible if d² = νᵀ S⁻¹ ν <= gate. A measurement is associated with the landmark
-    of its least d² if it is also the nearest of that landmark's measurements. One with no
-    landmark within new_gate is new; what lies between, or lost its landmark to another, is left
-    alone (the two gates of Bailey, "Mobile robot localisation and mapping in extensive outdoor
-    environments", 2002, section 2.3). Tags are not looked at.
+    of its least d² if it is also the nearest of that landmark's measurements. One with no landmark
+    within new_gate is new; one between the gates, or whose landmark has a nearer measurement, is
+    ignored (the two gates of Bailey, "Mobile robot localisation and mapping in extensive outdoor
+    environments", 2002, section 2.3). Tags are not used.
 
     Args:
         gate: of squared Mahalanobis distance, 0 (nothing is compatible but a perfect match) to
             infinity; `stats.chi2_quantile` gives it by probability.
         new_gate: at least the gate; the same by default.
-        ambiguous: "leave" leaves alone a measurement that is compatible with several landmarks,
-            and several that are compatible with one.
+        ambiguous: "leave" ignores a measurement that is compatible with several landmarks, and
+            several that are compatible with one.
     Raises:
         ValueError: on a negative gate, a new_gate below it, or an unknown policy.
     """

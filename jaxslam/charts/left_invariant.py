@@ -9,7 +9,7 @@ from jaxslam.protocols import Basis, Chart
 
 
 def left_invariant() -> Chart:
-    """(R, t, l) ← (R, t, l)·exp(ξ), the group SE_{1+N}(2) acting from the right of the estimate.
+    """The left-invariant chart: (R, t, l) ← (R, t, l)·exp(ξ), ξ in the Lie algebra of SE_{1+N}(2).
 
     With dx = (ρ, φ): θ ← θ + φ, t ← t + R V(φ) ρ, l ← l + R V(φ) dl, V as in `se2.exp`. The errors
     of robot and landmarks are in the estimated robot's frame, so a correction of its heading

@@ -9,7 +9,7 @@ from jaxslam.protocols import Basis, Chart
 
 
 def right_invariant(rays: bool = False) -> Chart:
-    """(R, t, l) ← exp(ξ)·(R, t, l), the group SE_{1+N}(2) acting from the left of the estimate.
+    """The right-invariant chart: (R, t, l) ← exp(ξ)·(R, t, l), ξ in the Lie algebra of SE_{1+N}(2).
 
     With dx = (ρ, φ): θ ← θ + φ, t ← R(φ)t + V(φ)ρ, l ← R(φ)l + V(φ)dl, V as in `se2.exp`. A turn φ
     of the whole map about the origin leaves ρ and dl at zero, so the unobservable directions do not

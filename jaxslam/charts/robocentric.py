@@ -10,14 +10,14 @@ from jaxslam.protocols import Basis, Chart
 
 
 def robocentric() -> Chart:
-    """Additive errors of origin b = pose⁻¹ and landmarks m = Rᵀ(l - t) in the robot's frame.
+    """The robocentric chart: additive errors of the origin and the landmarks in the robot's frame.
 
-    b ← b + dx and m ← m + dl, so pose ← (b + dx)⁻¹ and l ← (b + dx)⁻¹ ∘ (m + dl). What a sensor on
-    the robot measures does not depend on dx, hence no measurement has information on the frame,
-    and the errors of the map are small near the robot. The last motion remains a separate variable
-    until the update has corrected it, and only then is the map transformed to the new frame
-    (`motion_apart`): added to m instead, the rotations of many corrections would scale the map
-    up.
+    With b = pose⁻¹ and m = Rᵀ(l - t): b ← b + dx and m ← m + dl, so pose ← (b + dx)⁻¹ and
+    l ← (b + dx)⁻¹ ∘ (m + dl). The measurements of a sensor on the robot do not depend on dx, hence
+    they have no information on the frame, and the errors of the map are small near the robot. The
+    last motion remains a separate variable until the update has corrected it, and only then is the
+    map transformed to the new frame (`motion_apart`): added to m instead, the rotations of many
+    corrections would scale the map up.
     Castellanos, Martinez-Cantin, Tardós, Neira, "Robocentric map joining: improving the consistency
     of EKF-SLAM", Robotics and Autonomous Systems 55(1), 2007. Landmarks l = (x, y) only.
     """

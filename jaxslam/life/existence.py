@@ -22,13 +22,13 @@ class Existence(NamedTuple):
     """The existence state of each slot's landmark; zero where dead."""
 
     log_odds: Float[Array, "N"]
-    """that it exists"""
+    """log-odds that it exists"""
     confirmed: Bool[Array, "N"]
     """its probability has reached `confirm`; before that it is provisional"""
     seen: Int[Array, "N"]
     """scans that measured it"""
     missed: Int[Array, "N"]
-    """scans that should have, and did not"""
+    """scans that should have measured it, and did not"""
     since: Int[Array, "N"]
     """scans since it was last measured"""
 
@@ -44,12 +44,14 @@ def existence(
     spread: float | None = None,
     replace: bool = False,
 ) -> Life:
-    """Log-odds of existence, as of a cell of an occupancy map (Thrun, Burgard, Fox, "Probabilistic
+    """The rule that keeps and removes landmarks by their log-odds of existence.
+
+    These are updated as those of an occupancy map's cell (Thrun, Burgard, Fox, "Probabilistic
     Robotics", 2005, sections 9.2 and 13.9, where landmarks are removed by negative evidence).
 
     A landmark begins at even odds. Each scan that measures it adds log(detected/false), each that
     should have and does not adds log((1 - detected)/(1 - false)). Where the probability comes to
-    `confirm` it is confirmed for good, where it falls to `remove` it is removed from the map.
+    `confirm` it is confirmed permanently, where it falls to `remove` it is removed from the map.
     Provisional landmarks are corrected as all others are.
 
     Args:

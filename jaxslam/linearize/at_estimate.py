@@ -9,7 +9,7 @@ Array = jax.Array
 
 
 def at_estimate() -> Linearizer:
-    """Every Jacobian at the newest estimate of its arguments (Solà (13), (25), (33)); no memory."""
+    """The EKF linearizer: Jacobians at the current estimate (Solà (13), (25), (33)); no memory."""
 
     def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
         return (*first_order.motion_at(motion, here.pose, u, here.pose), ())

@@ -12,10 +12,10 @@ Array = jax.Array
 
 
 def at_truth(truth: Truth) -> Linearizer:
-    """Every Jacobian at the truth of a simulation; the mean is still the filter's own.
+    """The linearizer of the ideal EKF: Jacobians at the truth; means are still the filter's.
 
-    The linearized system then has the observability of the true one, and what NEES is left above
-    its dof is not the fault of linearization (Huang, Mourikis, Roumeliotis 2010, "ideal EKF"). In
+    The linearized system then has the observability of the true one, so a NEES above its dof is not
+    due to the linearization points (Huang, Mourikis, Roumeliotis 2010, "ideal EKF"). In
     the transition, F = [I, J(p_{k+1} - p_k); 0, 1], the displacement is the true one too, not that
     of the control.
 

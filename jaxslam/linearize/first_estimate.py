@@ -23,13 +23,13 @@ class First(NamedTuple):
 
 
 def first_estimate() -> Linearizer:
-    """FEJ: the pose of a step at its prediction, a landmark at its first estimate.
+    """The FEJ linearizer: a pose at its prediction, a landmark at its first estimate.
 
     With x̂_k the predicted pose of step k and x̂_k⁺ the corrected one, the transition becomes
     F = [I, J(p̂_{k+1} - p̂_k); 0, 1], J = [0, -1; 1, 0], in place of J(p̂_{k+1} - p̂_k⁺), and
     H = H(x̂_k, first l̂). So each state has one value in all Jacobians, and the linearized system
-    keeps the three unobservable directions of the true one, at the price of linearizing at first
-    estimates, which may be poor. Huang, Mourikis, Roumeliotis, "Analysis and improvement of the
+    keeps the three unobservable directions of the true one, but linearizes at first estimates,
+    which may be poor. Huang, Mourikis, Roumeliotis, "Analysis and improvement of the
     consistency of extended Kalman filter based SLAM", ICRA 2008; IJRR 29(5), 2010.
 
     A new landmark is linearized at the predicted position of the robot, too, from which its

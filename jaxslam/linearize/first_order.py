@@ -13,7 +13,7 @@ from jaxslam.protocols import Here, Motion, Sensor
 def motion_at(
     motion: Motion, pose: Pose, u: Control, at: Pose
 ) -> tuple[Pose, PoseMatrix, PoseMatrix]:
-    """f(pose, u, 0), and ∂f/∂pose (3, 3) and W Q Wᵀ (3, 3) with the Jacobians at another pose."""
+    """The motion f(pose, u, 0), with ∂f/∂pose (3, 3) and W Q Wᵀ (3, 3) taken at another pose."""
     by_pose, by_noise = derivatives.motion_jacobians(motion, at, u)
     moved = motion.step(pose, u, jnp.zeros(by_noise.shape[1], pose.dtype))
     noise = motion.noise_cov(pose, u)
@@ -23,7 +23,7 @@ def motion_at(
 def observe_at(
     sensor: Sensor, here: Here, at_pose: Pose, at_landmark: Landmark
 ) -> tuple[Measurement, Float[Array, "Z 3"], Float[Array, "Z L"], Float[Array, "Z Z"]]:
-    """h(pose, l), its Jacobians at another pose and landmark, and no added noise (Z, Z)."""
+    """The measurement h(pose, l), Jacobians at another pose and landmark, and no added noise."""
     by_pose, by_landmark = derivatives.observe_jacobians(sensor, at_pose, at_landmark)
     expected = sensor.observe(here.pose, here.landmark)
     return expected, by_pose, by_landmark, jnp.zeros((expected.shape[0],) * 2, expected.dtype)
@@ -32,9 +32,10 @@ def observe_at(
 def invert_at(
     sensor: Sensor, pose: Pose, z: Measurement, at_pose: Pose, at_z: Measurement
 ) -> tuple[Landmark, Float[Array, "L 3"], Float[Array, "L L"]]:
-    """g(pose, z, s̄), ∂g/∂pose (L, 3) and G_z R G_zᵀ + G_s S G_sᵀ (L, L), Jacobians elsewhere.
+    """The landmark g(pose, z, s̄), ∂g/∂pose (L, 3) and its covariance; Jacobians at another pose.
 
-    The noise is that of z: Solà (32)-(38), with the prior's term of (44).
+    The covariance is G_z R G_zᵀ + G_s S G_sᵀ (L, L), with R at z: Solà (32)-(38), with the prior's
+    term of (44).
     """
     mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
     by_pose, by_z, by_s = derivatives.invert_jacobians(sensor, at_pose, at_z, mean)

@@ -19,19 +19,19 @@ class Constraint(NamedTuple):
     pose: Array
     """(3,) of this step, as predicted"""
     robot: Array
-    """(2,) α [m]: the turn moves the robot by J α"""
+    """(2,) α [m]: the rotation moves the robot by J α"""
     landmarks: Array
     """(N, 2) β_i [m]: and the landmarks by J β_i"""
 
 
 def observability() -> Linearizer:
-    """OC-EKF: the linearization points nearest to the estimates that satisfy the constraint.
+    """The OC linearizer: points nearest to the estimates that satisfy the observability constraint.
 
-    A turn of everything, (Jα, 1, Jβ_1, …) in the errors of robot position, heading and landmarks,
-    J = [0, -1; 1, 0], stays invisible if every H of step k is taken at a landmark l* with
-    l*_i - p̂_k = β_i - α_k, while F, taken between p* and p̂_{k+1}, carries
-    α_{k+1} = α_k + p̂_{k+1} - p*. Both are met by l*_i = β_i - α_k + p*; p* and all l*_i together
-    are the solution of min |p̂_k⁺ - p*|² + Σ_i |l̂_i - l*_i|² over the n landmarks of the map,
+    A rotation of robot and map, (Jα, 1, Jβ_1, …) in the errors of robot position, heading and
+    landmarks, J = [0, -1; 1, 0], stays unobservable if every H of step k is taken at a landmark l*
+    with l*_i - p̂_k = β_i - α_k, while F, taken between p* and p̂_{k+1}, propagates
+    α_{k+1} = α_k + p̂_{k+1} - p*. Both conditions hold for l*_i = β_i - α_k + p*; p* and all l*_i
+    minimize |p̂_k⁺ - p*|² + Σ_i |l̂_i - l*_i|² over the n landmarks of the map,
 
         p* = p̂_k⁺ + Σ_i (l̂_i - p̂_k⁺ - β_i + α_k)/(1 + n),
 

@@ -25,23 +25,22 @@ class Regression(NamedTuple):
 
 
 def unscented(alpha: float | None = None) -> Linearizer:
-    """The UKF: sigma points of the robot, or of robot and one landmark, retracted by the chart.
+    """The linearizer of the UKF: sigma points of the pose, or of pose and landmark, in the chart.
 
     With n variables and P = L Lᵀ, points at 0 and ±α√n L_j, weights 1/(2α²n) and, for the centre,
     1 - 1/α² for means and that + 3 - α² for covariances (UKF-M: Brossard, Barrau, Bonnabel, "A Code
-    for Unscented Kalman Filtering on Manifolds", ICRA 2020). The fit's slope takes the place of the
-    Jacobian, and what it leaves unexplained counts as noise; so the correction
-    by one measurement is that of a UKF on the whole map, of which sigma points touch only robot and
-    landmark, and P may be singular. A joint update takes the unexplained parts of different
-    measurements for uncorrelated, which in a UKF of the whole scan they are not. The unexplained
-    covariance counts here, as in UKF-M; the authors' own program for SLAM (JUKF) drops it. As
-    there, a predicted pose and a new landmark are those of the centre. In the charts
-    `right_invariant` and `left_invariant` this is their UKF on SE_{1+N}(2).
+    for Unscented Kalman Filtering on Manifolds", ICRA 2020). The slope of the fit replaces the
+    Jacobian, and the residual covariance is added to the noise; so the correction by one
+    measurement is that of a UKF on the whole map, in which only robot and landmark are perturbed,
+    and P may be singular. A joint update assumes uncorrelated residuals of different measurements,
+    which in a UKF of the whole scan they are not. The residual covariance is used here, as in
+    UKF-M; the authors' own program for SLAM (JUKF) drops it. As there, the predicted pose and a
+    new landmark are those of the centre. In the charts `right_invariant` and `left_invariant` this
+    is their UKF on SE_{1+N}(2).
 
     Args:
-        alpha: spread of the sigma points; default 1e-3 in float64, as theirs, with which the UKF is
-            an EKF but for rounding, and 0.1 in float32, which has no digits for less. 1 reaches
-            √n σ.
+        alpha: spread of the sigma points; default 1e-3 in float64, as theirs, with which the UKF
+            equals an EKF to rounding, and 0.1 in float32, because of rounding. 1 reaches √n σ.
     Raises:
         ValueError: unless 0 < alpha <= 1.
     """
@@ -130,7 +129,7 @@ def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> R
 
     With o_j and e_j the odd and even parts of f at α√n L_j, the transform's sums come to
     mean = Σ e_j/(α²n), slope·L = (o_j/(α√n))_j and rest = Σ e_j e_jᵀ/(α²n) + (2 - α²) mean meanᵀ,
-    in which nothing large cancels.
+    without cancellation of large terms.
     """
     reach2 = alpha**2 * root.shape[0]
     points = jnp.sqrt(reach2) * root.T
@@ -149,7 +148,8 @@ def by_variables(slope: Array, root: Array) -> Array:
 def _root(cov: Array) -> Array:
     """A regular square root of P; zero variances are raised to about the square root of eps.
 
-    Along it the slope is then the derivative; a column of zeros would leave it undetermined.
+    Along such a direction the slope is then the derivative; a column of zeros would leave it
+    undetermined.
     """
     root = linalg.cholesky(cov)[0]
     floor = float(jnp.finfo(cov.dtype).eps) ** 0.5

@@ -25,7 +25,7 @@ StepJacobians = tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]
 Landmark = Float[Array, "L"]
 Measurement = Float[Array, "Z"]
 Unmeasured = Float[Array, "K"]
-"""what a measurement leaves free of its landmark"""
+"""landmark parameters that the measurement does not determine"""
 ObserveJacobians = tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]
 """∂z/∂(pose, l)"""
 InvertJacobians = tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]

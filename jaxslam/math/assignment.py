@@ -55,7 +55,7 @@ def assign(cost: Array) -> Array:
 
 class _Path(NamedTuple):
     row: Array
-    """() from which the search goes on"""
+    """() the row from which the search continues"""
     least: Array
     """() length of the path there"""
     length: Array

@@ -50,7 +50,7 @@ def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
 def gram(a: Float[Array, "k D"], b: Float[Array, "k E"]) -> Float[Array, "D E"]:
     """Aᵀ B of A (k, D), B (k, E), for small k."""
     if a.shape[0] > _OUTER_PRODUCTS or a.shape[0] == 0:
-        # Not a.T @ b, of which a gradient would keep a transposed copy of A.
+        # Not a.T @ b, for which a gradient would store a transposed copy of A.
         return jax.lax.dot_general(a, b, (((0,), (0,)), ((), ())))
     return _outer_products(a, b)
 
@@ -213,7 +213,7 @@ def triangular_root(wide: Float[Array, "n m"]) -> Float[Array, "n n"]:
 def solve_lower(
     factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
 ) -> Float[Array, "n *rest"]:
-    """L⁻¹ B for lower L (n, n) and B (n, …); rows whose pivot is zero come out zero."""
+    """L⁻¹ B for lower L (n, n) and B (n, …), with rows of zeros where a pivot is zero."""
     n = factor.shape[-1]
     if n == 0:
         return rhs
@@ -251,8 +251,8 @@ def _substituted(
 def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """The inverse Cholesky factor W = L⁻¹ (n, n) of a small A = L Lᵀ, and `cholesky`'s flag.
 
-    A pivot that counts as zero gives a row of zeros. It takes one division or square root a pivot,
-    where `cholesky` and `solve_lower` take three.
+    A pivot that counts as zero gives a row of zeros. It takes one division and one square root a
+    pivot, where `cholesky` and `solve_lower` take three.
     """
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
     zero = jnp.zeros((), matrix.dtype)
@@ -335,7 +335,7 @@ def solve_psd(
 
 
 def inverse_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A⁻¹ of a positive definite A (n, n), symmetric as it stands; zero where A is not (n > 8)."""
+    """A⁻¹ of a positive definite A (n, n), exactly symmetric; zero where A is not (n > 8)."""
     return square(whitener_by_rows(matrix)[0])
 
 

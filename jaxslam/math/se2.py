@@ -19,13 +19,13 @@ from jaxslam.math.arrays import Point, PointByPose, PointMatrix, Pose, PoseMatri
 
 
 def rotation(theta: Scalar) -> PointMatrix:
-    """R(θ) = [cos θ, -sin θ; sin θ, cos θ], (2, 2) (Solà (54))."""
+    """The rotation matrix R(θ) = [cos θ, -sin θ; sin θ, cos θ], (2, 2) (Solà (54))."""
     c, s = jnp.cos(theta), jnp.sin(theta)
     return _rows([c, -s], [s, c])
 
 
 def compose(a: Pose, b: Pose) -> Pose:
-    """a ∘ b = (t_a + R(θ_a) t_b, θ_a + θ_b): Williams' ⊕, Solà (59), (60)."""
+    """The composition a ∘ b = (t_a + R(θ_a) t_b, θ_a + θ_b): Williams' ⊕, Solà (59), (60)."""
     c, s = jnp.cos(a[2]), jnp.sin(a[2])
     return jnp.stack([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap(a[2] + b[2])])
 
@@ -38,7 +38,7 @@ def compose_jacobians(a: Pose, b: Pose) -> tuple[PoseMatrix, PoseMatrix]:
 
 
 def inverse(a: Pose) -> Pose:
-    """a⁻¹ = (-R(θ)ᵀ t, -θ), so that a ∘ a⁻¹ is the identity."""
+    """The inverse pose a⁻¹ = (-R(θ)ᵀ t, -θ), so that a ∘ a⁻¹ is the identity."""
     c, s = jnp.cos(a[2]), jnp.sin(a[2])
     return jnp.stack([-c * a[0] - s * a[1], s * a[0] - c * a[1], wrap(-a[2])])
 
@@ -50,7 +50,7 @@ def inverse_jacobians(a: Pose) -> tuple[PoseMatrix]:
 
 
 def between(a: Pose, b: Pose) -> Pose:
-    """a⁻¹ ∘ b: pose b seen from a."""
+    """The relative pose a⁻¹ ∘ b: b in the frame of a."""
     p = to_frame(a, b[:2])
     return jnp.stack([p[0], p[1], wrap(b[2] - a[2])])
 
@@ -99,17 +99,17 @@ def log_jacobians(pose: Pose) -> tuple[PoseMatrix]:
 
 
 def boxplus(pose: Pose, tau: Pose) -> Pose:
-    """pose ⊞ τ = pose ∘ exp(τ)."""
+    """The pose moved by a local twist: pose ⊞ τ = pose ∘ exp(τ)."""
     return compose(pose, exp(tau))
 
 
 def boxminus(a: Pose, b: Pose) -> Pose:
-    """a ⊟ b = log(b⁻¹ ∘ a), the twist that leads from b to a."""
+    """The twist from b to a: a ⊟ b = log(b⁻¹ ∘ a)."""
     return log(between(b, a))
 
 
 def adjoint(pose: Pose) -> PoseMatrix:
-    """Ad (3, 3) with pose ∘ exp(τ) = exp(Ad τ) ∘ pose: [R, (y, -x)ᵀ; 0, 1]."""
+    """The adjoint Ad (3, 3), pose ∘ exp(τ) = exp(Ad τ) ∘ pose: [R, (y, -x)ᵀ; 0, 1]."""
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     return _rows([c, -s, pose[1]], [s, c, -pose[0]], [0, 0, 1])
 

@@ -72,7 +72,7 @@ def truncated_chi2_mean(share: float, dof: float) -> float:
 
 
 def t_quantile(p: float, dof: float) -> float:
-    """Student's t quantile, for the interval of a mean whose variance the runs estimate.
+    """Student's t quantile, for confidence intervals of a mean with estimated variance.
 
     dof > 0, not necessarily whole.
     """

@@ -69,7 +69,7 @@ def merge(a: Frame, b: Frame) -> tuple[Frame, Array]:
 
 
 def mahalanobis_squared(a: Frame, b: Frame) -> tuple[Array, Array]:
-    """δᵀ (P_a + P_b)⁻¹ δ, δ = x_a ⊖ x_b, of independent estimates, and whether that is regular."""
+    """The distance δᵀ (P_a + P_b)⁻¹ δ, δ = x_a ⊖ x_b, of independent frames, and its validity."""
     return linalg.mahalanobis_squared(_difference(a, b), a.cov + b.cov)
 
 

@@ -13,7 +13,7 @@ _U = TypeVar("_U")
 
 
 def no_inline(function: Callable[..., _T], *arguments: Any) -> _T:
-    """function(*arguments), compiled as a computation of its own.
+    """function(*arguments), compiled as a separate computation that XLA does not inline.
 
     XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
     of D entries would be computed again for each of the D² entries of the covariance it updates. It

@@ -18,7 +18,9 @@ def ackermann(
     sensor: ArrayLike = (3.78, 0.5),
     encoder: ArrayLike = 0.76,
 ) -> Motion:
-    """u = (v_e [m/s], steering α [rad], Δt [s]), noise added to v_e and α; exact arc.
+    """The Ackermann motion model, integrated exactly along an arc.
+
+    u = (v_e [m/s], steering α [rad], Δt [s]), with noise added to v_e and α.
 
     v_e is the speed of the rear wheel with the encoder, H to the left of the axle's centre. The
     centre moves at v = v_e/(1 - (H/L) tan α) and the car turns at ω = v tan α/L. The pose is that

@@ -9,7 +9,9 @@ from jaxslam.protocols import Motion
 
 
 def increment(noise_cov: NoiseCov) -> Motion:
-    """u = (forward d [m], turn δ [rad]), noise added to it: Solà C.2.1.
+    """The motion model of a forward motion followed by a turn: Solà C.2.1.
+
+    u = (forward d [m], turn δ [rad]), with additive noise:
 
     pose ← (x + (d+w_d) cos θ, y + (d+w_d) sin θ, wrap(θ + δ + w_δ)).
 

@@ -15,7 +15,9 @@ from jaxslam.validation.numbers import check_alpha
 
 
 def odometry(noise_cov: NoiseCov) -> Motion:
-    """u = (rot1 [rad], trans [m], rot2 [rad]), noise added to it: Notes 3, odometry model.
+    """The odometry motion model: Notes 3.
+
+    u = (rot1 [rad], trans [m], rot2 [rad]), with additive noise.
 
     With the direction of travel h = θ + rot1 + w1,
 
@@ -59,7 +61,7 @@ def odometry(noise_cov: NoiseCov) -> Motion:
 
 
 def odometry_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
-    """(pose, u) -> the diagonal (3, 3) covariance of `odometry`'s noise, from four constants.
+    """The function (pose, u) -> (3, 3), the diagonal covariance of `odometry`'s noise.
 
         var rot1  = α1 rot1² + α2 trans²
         var trans = α3 trans² + α4 (rot1² + rot2²)

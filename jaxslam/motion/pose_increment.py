@@ -7,7 +7,9 @@ from jaxslam.protocols import Motion
 
 
 def pose_increment(noise_cov: NoiseCov) -> Motion:
-    """u = (δx [m], δy [m], δθ [rad]) in the robot's frame, noise added to it: pose ⊕ (u + w).
+    """The motion model of a relative pose with additive noise: pose ⊕ (u + w).
+
+    u = (δx [m], δy [m], δθ [rad]) in the robot's frame.
 
     t ← t + R(θ)(δt + w_t), θ ← wrap(θ + δθ + w_θ): Solà A.3 (59), (60); Williams' ⊕.
 

@@ -13,7 +13,7 @@ _Jacobians = tuple[Array, Array, Array]
 
 
 def substeps(motion: Motion, count: int) -> Motion:
-    """u = (u_1, …, u_n): n = count controls of another model, one after another between two scans.
+    """The motion model of n = count steps of another model between two scans, u = (u_1, …, u_n).
 
     pose_k = motion.step(pose_{k-1}, u_k, w_k), from pose_0 = pose to pose_n. The noises are
     independent: noise_cov is block diagonal, block k being the model's own Q(pose_{k-1}, u_k) on

@@ -9,7 +9,9 @@ from jaxslam.protocols import Motion
 
 
 def unicycle(noise_cov: NoiseCov) -> Motion:
-    """u = (v [m/s], ω [rad/s], Δt [s]), noise added to the velocities; Euler step.
+    """The unicycle model, integrated by one Euler step.
+
+    u = (v [m/s], ω [rad/s], Δt [s]), with noise added to the velocities.
 
     pose ← (x + (v+w_v)Δt cos θ, y + (v+w_v)Δt sin θ, wrap(θ + (ω+w_ω)Δt)). The robot of Huang et
     al. 2010 and of UKF-M's 2-D SLAM example (Brossard et al. 2020); Δt = 0 is no motion, no noise.

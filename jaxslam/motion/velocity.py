@@ -14,7 +14,9 @@ from jaxslam.validation.numbers import check_alpha
 
 
 def velocity(noise_cov: NoiseCov) -> Motion:
-    """u = (v [m/s], ω [rad/s], Δt [s]); w = (w_v [m/s], w_ω [rad/s], w_γ [rad/s]): Notes 3.
+    """The velocity motion model: Notes 3.
+
+    u = (v [m/s], ω [rad/s], Δt [s]); w = (w_v [m/s], w_ω [rad/s], w_γ [rad/s]).
 
     With v̂ = v + w_v and ω̂ = ω + w_ω, an arc of radius v̂/ω̂ followed by the final rotation w_γ Δt:
 
@@ -63,7 +65,7 @@ def velocity(noise_cov: NoiseCov) -> Motion:
 
 
 def velocity_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
-    """(pose, u) -> the diagonal (3, 3) covariance of `velocity`'s noise, from six constants.
+    """The function (pose, u) -> (3, 3), the diagonal covariance of `velocity`'s noise.
 
         var v = α1 v² + α2 ω²,   var ω = α3 v² + α4 ω²,   var γ = α5 v² + α6 ω²
 

@@ -5,8 +5,8 @@ is the plain call. Outside, three steps lead to the program, each skipped where 
 
 1. The same objects and the same shapes as before: the program is known. Nothing is traced.
 2. The function is traced to a jaxpr. What a factory closed over (noises, maps, mounts, gates,
-   priors) stands in it as constants and literals; `hoisting` makes inputs of them. What is left is
-   the structure.
+   priors) is in it as constants and literals; `hoisting` turns them into inputs. The rest is the
+   structure.
 3. The structure is lowered. If the same text was compiled before, that program is used; else XLA
    compiles it.
 
@@ -117,8 +117,8 @@ def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any)
 
     Args:
         function: pure; not a lambda created at each call, which would be traced at each call.
-        objects: what the function takes first: records of functions, options. The same objects are
-            not traced again; they are kept alive.
+        objects: the first arguments of the function: records of functions, options. The same
+            objects are not traced again; they are kept alive.
         arguments: trees of arrays.
     """
     if not outside(arguments) or jax_config.disable_jit.value:

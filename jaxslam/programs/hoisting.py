@@ -1,6 +1,6 @@
 """Constants of a traced function turned into inputs, so that one program serves all their values.
 
-A jaxpr holds the arrays that a function closed over as constants, and its scalars as literals among
+A jaxpr has the arrays that a function closed over as constants, and its scalars as literals among
 the operands. `hoisted` turns both into inputs, through calls, loops and branches. Literals that
 are common in formulas remain, since XLA simplifies with them: 0, ±1, ±π/2, ±π, ±2π, infinities
 and the limits of the dtype; so do integers, which may be sizes. Unknown primitives keep their
@@ -55,7 +55,7 @@ class _Hoisting:
         self._done: dict[tuple[int, ...], tuple[Any, Any, Any]] = {}
 
     def of(self, jaxpr: Any, consts: Sequence[Any]) -> tuple[Any, list[Any]]:
-        """`hoisted`, of a jaxpr and its constants."""
+        """The result of `hoisted` for a jaxpr and its constants."""
         which = id(jaxpr), *map(id, consts)
         known = self._done.get(which)
         if known is not None:

@@ -72,8 +72,8 @@ def enough(
     that the first m draws occupy; P where there is none.
 
     Args:
-        bins: of the draws in the order in which they were drawn; an ordered sample (as
-            systematic resampling gives) has to be shuffled before.
+        bins: of the draws, in random order; an ordered sample (as from systematic resampling)
+            has to be shuffled before.
     """
     count = bins.shape[0]
     size = jnp.arange(1, count + 1)

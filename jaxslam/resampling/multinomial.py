@@ -8,13 +8,13 @@ from jaxslam.resampling.weights import at_points, weights_of
 
 
 def multinomial(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
-    """Ancestors (P,): P independent draws with P(a_i = j) = w_j.
+    """Ancestors (P,) by multinomial resampling: P independent draws with P(a_i = j) = w_j.
 
     The number of copies of j has mean P w_j and variance P w_j (1 - w_j) (Gordon, Salmond & Smith
     1993, "Novel approach to nonlinear/non-Gaussian Bayesian state estimation", IEE Proc. F 140(2)).
 
     Args:
-        log_weights: of any scale; what is not finite is never drawn, unless nothing is.
+        log_weights: of any scale; non-finite ones are never drawn, unless none is finite.
         key: a PRNG key, consumed.
     """
     weights = weights_of(log_weights)

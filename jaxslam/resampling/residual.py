@@ -9,14 +9,15 @@ from jaxslam.resampling.weights import at_points, weights_of
 
 
 def residual(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
-    """Ancestors (P,): ⌊P w_j⌋ copies of each j, then R = P - Σ ⌊P w_j⌋ independent draws with
-    probabilities (P w_j - ⌊P w_j⌋)/R.
+    """Ancestors (P,) by residual resampling: ⌊P w_j⌋ copies of each j, then random draws.
+
+    The R = P - Σ ⌊P w_j⌋ draws are independent with probabilities (P w_j - ⌊P w_j⌋)/R.
 
     Unbiased as `multinomial`, with less variance (Liu & Chen 1998, "Sequential Monte Carlo methods
     for dynamic systems", JASA 93(443)). The copies come first, ascending.
 
     Args:
-        log_weights: of any scale; what is not finite is never drawn, unless nothing is.
+        log_weights: of any scale; non-finite ones are never drawn, unless none is finite.
         key: a PRNG key, consumed.
     """
     weights = weights_of(log_weights)

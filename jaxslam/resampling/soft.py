@@ -12,8 +12,10 @@ from jaxslam.validation.numbers import is_concrete
 
 
 def soft(share: float, resample: Resample = systematic) -> Differentiable:
-    """Soft resampling (Karkus, Hsu & Lee 2018, "Particle filter networks with application to visual
-    localization", CoRL): draw from the mixture of w and the uniform distribution,
+    """Soft resampling: draws from a mixture of the weights and the uniform distribution.
+
+    Karkus, Hsu & Lee 2018, "Particle filter networks with application to visual localization",
+    CoRL:
 
         q_j = share · w_j + (1 - share)/P        weight of a copy of j: (w_j/q_j)/P
 

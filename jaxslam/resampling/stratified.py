@@ -9,13 +9,15 @@ from jaxslam.resampling.weights import at_points, weights_of
 
 
 def stratified(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
-    """Ancestors (P,) where points (i + u_i)/P, u_i uniform and independent, fall; ascending.
+    """Ancestors (P,) by stratified resampling, ascending: those of the points (i + u_i)/P.
+
+    The u_i are uniform in [0, 1) and independent.
 
     Unbiased as `multinomial`; the number of copies of j is within 2 of P w_j (Kitagawa 1996, "Monte
     Carlo filter and smoother for non-Gaussian nonlinear state space models", JCGS 5(1)).
 
     Args:
-        log_weights: of any scale; what is not finite is never drawn, unless nothing is.
+        log_weights: of any scale; non-finite ones are never drawn, unless none is finite.
         key: a PRNG key, consumed.
     """
     weights = weights_of(log_weights)

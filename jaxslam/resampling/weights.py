@@ -79,8 +79,8 @@ def weights_of(log_weights: Float[Array, "P"]) -> Float[Array, "P"]:
 
 
 def effective_size(log_weights: Float[Array, "P"]) -> Float[Array, ""]:
-    """ESS = 1/Σ w², between 1 and P (Kong, Liu & Wong 1994, "Sequential imputations and Bayesian
-    missing data problems", JASA 89(425))."""
+    """Effective sample size 1/Σ w², between 1 and P (Kong, Liu & Wong 1994, "Sequential imputations
+    and Bayesian missing data problems", JASA 89(425))."""
     return 1.0 / (weights_of(log_weights) ** 2).sum()
 
 

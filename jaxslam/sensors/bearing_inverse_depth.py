@@ -38,7 +38,9 @@ def bearing_inverse_depth(
     free: FreeLike | None = None,
     to_point: float | None = None,
 ) -> Sensor:
-    """z = (bearing [rad]) of l = (x0 [m], y0 [m], alpha [rad], rho [1/m]), Solà 2.3.6.
+    """The bearing sensor with landmarks in inverse-depth parameters: Solà 2.3.6.
+
+    z = (bearing [rad]) of l = (x0 [m], y0 [m], alpha [rad], rho [1/m]).
 
     p0 = (x0, y0) is the sensor's position at the first measurement, α the direction in the map, ρ
     the inverse distance (46), (49). From another position t_S, S = pose ∘ mount, the line of sight,
@@ -83,7 +85,7 @@ def bearing_inverse_depth(
         raise ValueError(f"bearing_inverse_depth: expected to_point above 0, got {to_point}")
 
     def sight(frame: Array, landmark: Landmark) -> tuple[Array, Array]:
-        """v, and the frame's axes at the map's origin, where v is a point."""
+        """The vector v, and the sensor's frame moved to the map's origin."""
         v = landmark[3] * (landmark[:2] - frame[:2]) + _direction(landmark[2])
         return v, frame.at[:2].set(0.0)
 

@@ -25,7 +25,9 @@ TEN_METRES = ((10.0,), ((25.0,),))
 def bearing_only(
     noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET, free: FreeLike = TEN_METRES
 ) -> Sensor:
-    """z = (bearing [rad]) of l = (x, y): the direction of R(θ_S)ᵀ(l - t_S), S = pose ∘ mount.
+    """The bearing-only sensor of point landmarks.
+
+    z = (bearing [rad]) of l = (x, y): the direction of R(θ_S)ᵀ(l - t_S), S = pose ∘ mount.
 
     The second row of Solà (63). invert is (64) with s = (range [m]) for the unmeasured coordinate:
     from_frame(S, rectangular((s, z))), s > 0; a negative range lies behind the sensor. A landmark

@@ -10,7 +10,9 @@ from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
 def compass(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
-    """z = (heading [rad]) = wrap(θ + θ_mount), counter-clockwise from the map's x-axis.
+    """The compass, an absolute sensor of the heading.
+
+    z = (heading [rad]) = wrap(θ + θ_mount), counter-clockwise from the map's x-axis.
 
     An absolute sensor (Williams' list of observations): there is no landmark, L = 0, and `invert`,
     `embed` and `position` (zeros) are not used.

@@ -9,7 +9,9 @@ from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
 def position_fix(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
-    """z = (x [m], y [m]) of the antenna: t + R(θ) t_mount, the translation of pose ∘ mount.
+    """The position fix, an absolute sensor of the antenna's position.
+
+    z = (x [m], y [m]) of the antenna: t + R(θ) t_mount, the translation of pose ∘ mount.
 
     An absolute sensor (GPS in Williams' list of observations): there is no landmark, L = 0, and
     `invert`, `embed` and `position` (zeros) are not used.

@@ -20,7 +20,9 @@ from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
 def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
-    """z = (range [m], bearing [rad], signature [1]) of l = (x, y, signature): D = 3 + 3N.
+    """The range-bearing sensor of landmarks with a signature.
+
+    z = (range [m], bearing [rad], signature [1]) of l = (x, y, signature): D = 3 + 3N.
 
     polar(to_frame(pose ∘ mount, (x, y))) as in `range_bearing`, and the signature unchanged: the
     landmarks with three parameters of Tacher. The signature is estimated like a coordinate; an
@@ -77,5 +79,5 @@ def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -
 
 
 def _beside_one(block: Array) -> Array:
-    """diag(block, 1), (3, 3)."""
+    """The matrix diag(block, 1), (3, 3)."""
     return jnp.eye(3, dtype=block.dtype).at[:2, :2].set(block)

@@ -25,7 +25,9 @@ ANY_DIRECTION = ((0.0,), ((np.pi**2 / 3,),))
 def range_only(
     noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET, free: FreeLike = ANY_DIRECTION
 ) -> Sensor:
-    """z = (range [m]) of l = (x, y): |l - t_S| with S = pose ∘ mount, the first row of Solà (63).
+    """The range-only sensor of point landmarks.
+
+    z = (range [m]) of l = (x, y): |l - t_S| with S = pose ∘ mount, the first row of Solà (63).
 
     invert is (64) with s = (bearing [rad]) in the sensor's frame for the unmeasured coordinate:
     from_frame(S, rectangular((z, s))), z >= 0. A landmark exactly at the sensor gives z = 0 with

@@ -18,7 +18,9 @@ from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
 def relative_position(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
-    """z = (ahead [m], left [m]) of l = (x, y): R(θ_S)ᵀ(l - t_S) with S = pose ∘ mount; Solà (56).
+    """The sensor of the Cartesian position of point landmarks in its frame.
+
+    z = (ahead [m], left [m]) of l = (x, y): R(θ_S)ᵀ(l - t_S) with S = pose ∘ mount; Solà (56).
 
     The measurement of Huang et al. 2010 and of UKF-M's 2-D SLAM example. invert is Solà (55).
 

@@ -72,8 +72,8 @@ class Suite(Sensor):
 def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
     """The sensors of one robot (Solà's loop over sensors), to be used where a `Sensor` is.
 
-    A filter takes the parts one after the other: each corrects by what it measured of known
-    landmarks, then starts its new ones, which the next part may correct already in the same scan.
+    A filter processes the parts one after the other: each corrects by its measurements of known
+    landmarks, then starts its new ones, which the next part may correct in the same scan.
     A tag may occur once a part. Absent measurements are slots that are not valid.
 
         eyes = suite((range_bearing(R, mount=front), 8), Part(compass(S), 1, every=10))

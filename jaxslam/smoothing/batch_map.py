@@ -33,11 +33,11 @@ class Solved(NamedTuple):
     """pose before the first control"""
     start_cov: Float[Array, "3 3"]
     joint: Joint
-    """the last pose and the map, which a filter may go on from"""
+    """the last pose and the map, a possible initial state of a filter"""
     regular: Bool[Array, ""]
-    """the information on the map is positive definite; else covariances mean nothing"""
+    """the information on the map is positive definite; else covariances are invalid"""
     filtered: Estimate
-    """with leading T, of the filter that went first"""
+    """with leading T, of the filter that gave the initial path"""
     start_noise: Float[Array, "3"]
     """ξ, the start's error in standard deviations: start = pose + P0^{1/2} ξ"""
     noise: Float[Array, "T W"]
@@ -73,32 +73,32 @@ def batch_map(
         ½ |x_0 ⊖ pose|²_{P0} + ½ Σ_t |w_t|²_{Q_t} + ½ Σ_{t,i} |z_ti ⊖ h(x_t, l_i)|²_{R_ti}
         with x_t = f(x_{t-1}, u_t, w_t)
 
-    over x_0, w_1 … w_T and the landmarks, which have no prior. An EKF-SLAM goes first; its smoother
-    (`smooth`) is the first step. Each further one linearizes the same models along the newest path
-    and solves for all unknowns exactly (`chain.eliminate`): a Gauss-Newton step is a smoother, and
+    over x_0, w_1 … w_T and the landmarks, which have no prior. EKF-SLAM gives the initial path; its
+    smoother (`smooth`) is the first step. Each further step linearizes the models along the newest
+    path and solves for all unknowns (`chain.eliminate`): a Gauss-Newton step is a smoother, and
     iterating the smoother is Gauss-Newton (Bell 1994, "The iterated Kalman smoother as a
     Gauss-Newton method", SIAM J. Optimization 4(3)). A step is shortened until the cost falls
     (Armijo). P0 and Q may be singular; O(T N²) a step.
 
     What it returns maps (log, key) to a `Trace`: estimates with leading T, the poses at the optimum
     with their covariances there (Laplace's), the map the same at every step; the infos of the
-    filter that went first, the last one `exhausted` where the batch did not converge, so that
-    campaigns count it; and a `Solved`. Every measurement is used that the filter fused or
-    initialized a landmark with, but those of a singular R, whose status becomes `Status.SINGULAR`.
-    Where Q depends on the pose, it is taken where the filter was, and stays.
+    filter, the last one `exhausted` where the batch did not converge, so that campaigns count it;
+    and a `Solved`. Every measurement is used that the filter fused or initialized a landmark with,
+    except those of a singular R, whose status becomes `Status.SINGULAR`. Where Q depends on the
+    pose, it is evaluated once at the filter's path.
 
     Args:
-        motion, sensor: the models; Jacobians come from `jax.jacfwd`. The sensor must see all of a
+        motion, sensor: the models; Jacobians come from `jax.jacfwd`. The sensor must determine its
             landmark (K = 0), or be an absolute one.
         capacity: landmark slots N.
-        pose, pose_cov: (3,) and (3, 3) where the robot is before the first control.
+        pose, pose_cov: (3,) and (3, 3) of the robot before the first control.
         iterations: at most so many steps.
         tolerance: end when the next step is shorter than so many posterior standard deviations
-            (the Newton decrement), or than √eps of the dtype, 3e-4 in float32, or where rounding
-            lets steps grow no shorter. None makes all iterations in a loop of fixed length, which
-            reverse-mode derivatives can go through; they are those of the optimum as far as the
+            (the Newton decrement), or than √eps of the dtype, 3e-4 in float32, or where steps do
+            not get shorter because of rounding. None runs all iterations in a loop of fixed
+            length, which supports reverse-mode derivatives; they are those of the optimum if the
             search has converged.
-        associate, gate, births: of the filter that goes first, as for `ekf_slam`.
+        associate, gate, births: of the filter, as for `ekf_slam`.
     Raises:
         ValueError: as `smooth` does; on a sensor with K > 0, iterations below 1, or a tolerance
             that is not above 0.
@@ -148,7 +148,7 @@ def _problem_of(
     """The problem of a log, and the initial iterate: the filter's path and its chain."""
     kind = log.control.dtype
     mean, cov = jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind)
-    # The optimum does not depend on where the search begins, so no derivative goes there.
+    # The optimum does not depend on the initial iterate, so it has no derivative by it.
     passed = jax.lax.stop_gradient(passed)
     roots = noise_roots(motion, passed, log.control)
     chain, used = jax.lax.stop_gradient(chain_of(motion, sensor, passed, log, cov, roots))
@@ -164,7 +164,7 @@ def _solved(sensor: Sensor, search: Search, passed: ForwardPass) -> tuple[Estima
     """The estimates at the end of a search."""
     at, policy = search.at, search.policy
     joint = jax.lax.stop_gradient(passed.trace.final)._replace(landmarks=at.landmarks)
-    # The step that is left is shorter than the tolerance, and is not taken.
+    # The last step computed is shorter than the tolerance, and is not taken.
     no_step = policy._replace(
         start=policy.start._replace(constant=jnp.zeros_like(at.start)),
         steps=policy.steps._replace(constant=jnp.zeros_like(at.noise)),

@@ -1,16 +1,17 @@
 """The linear-Gaussian problem of a path and a map, solved by a backward recursion.
 
-Poses form a chain and landmarks stand still, so the least-squares problem of T poses and N
-landmarks needs no matrix larger than the map's. Backward, the information that the future holds on
-(pose, map) is carried from pose to pose, and the noise of each motion is eliminated: its optimum is
-an affine function of where the motion leads and of the map. What remains at the start is the map.
-Forward, these functions give the path (`marginals`). It is dynamic programming; among smoothers the
-one of backward information and forward means (Mayne 1966, "A solution of the smoothing problem for
-linear dynamic systems", Automatica 4(2); Fraser & Potter 1969, IEEE TAC 14(4)).
+Poses form a chain and landmarks are static, so the least-squares problem of T poses and N
+landmarks needs no matrix larger than the map's. Backward, the information of later measurements on
+(pose, map) is propagated from pose to pose, and the noise of each motion is eliminated: its optimum
+is an affine function of the pose after the motion and of the map. The map remains at the start.
+Forward, these functions give the path (`marginals`). This is dynamic programming, and among
+smoothers the one of backward information and forward means (Mayne 1966, "A solution of the
+smoothing problem for linear dynamic systems", Automatica 4(2); Fraser & Potter 1969, IEEE TAC
+14(4)).
 
 No covariance of a motion, of the start or of a pose is inverted, so all may be singular; no prior
-of a landmark is needed, so it does not matter when one is initialized; and covariances come out as
-sums of squares. O(T N²) time, and O(T N) memory beside a few matrices of N².
+of a landmark is needed, so it does not matter when one is initialized; and covariances are
+sums of squares. O(T N²) time, and O(T N) memory besides a few matrices of N².
 """
 
 from typing import NamedTuple
@@ -37,8 +38,8 @@ class Step(NamedTuple):
         δx_t = F δx_{t-1} + c + G d_t    ½ |η̄ + d_t|²
         b = A δx_t + B δl_slot + e       ½ |e|²
 
-    Noises are in units of their own standard deviations: the roots of their covariances are within
-    G; and so are e, b, A, B. Rows of zeros say nothing. M measurement slots, Z rows each.
+    Noises, and e, b, A and B, are in units of standard deviations: the roots of the motions' noise
+    covariances are factors of G. Rows of zeros have no effect. M measurement slots, Z rows each.
     """
 
     by_pose: Float[Array, "3 3"]
@@ -46,11 +47,11 @@ class Step(NamedTuple):
     by_noise: Float[Array, "3 W"]
     """G"""
     drift: Float[Array, "3"]
-    """c: where the motion leads from the reference, minus the next reference"""
+    """c: the pose after the motion from the reference, minus the next reference"""
     noise: Float[Array, "W"]
     """η̄"""
     slot: Int[Array, "M"]
-    """of the landmark seen; anything where the rows are zeros"""
+    """of the landmark measured; any number where the rows are zeros"""
     pose_rows: Float[Array, "M Z 3"]
     """A"""
     landmark_rows: Float[Array, "M Z L"]
@@ -92,8 +93,8 @@ class Policy(NamedTuple):
     map_factor: Float[Array, "NL NL"]
     """lower Cholesky factor of the information on the map, 1 at dead slots"""
     decrement: Float[Array, ""]
-    """λ²: where c = 0, twice what the optimum is below the reference's cost, and the squared
-    length of the way there in posterior standard deviations (the Newton decrement)"""
+    """λ²: where c = 0, twice the decrease from the reference's cost to the optimum, and the squared
+    length of the step in posterior standard deviations (the Newton decrement)"""
     regular: Bool[Array, ""]
     """the information on the map is positive definite"""
 
@@ -113,9 +114,9 @@ class _CostToGo(NamedTuple):
 def eliminate(chain: Chain, alive: Bool[Array, "N"]) -> Policy:
     """The solution of a chain. alive: the landmarks that are measured at all.
 
-    With Λ and y of what comes after motion t, its noise costs min over d of ½ |η̄ + d|² plus
+    With Λ and y of all terms after motion t, its noise costs min over d of ½ |η̄ + d|² plus
     ½ (a + G d)ᵀ Λ (a + G d) - (a + G d)ᵀ y: at d = M⁻¹ (Gᵀ y - η̄ - Gᵀ Λ a), M = I + Gᵀ Λ G, which
-    leaves Λ - Λ G M⁻¹ Gᵀ Λ and y - Λ G M⁻¹ (Gᵀ y - η̄); then a = F δx + c is put in.
+    leaves Λ - Λ G M⁻¹ Gᵀ Λ and y - Λ G M⁻¹ (Gᵀ y - η̄); then a = F δx + c is substituted.
     """
     capacity, size = alive.shape[0], chain.steps.landmark_rows.shape[3]
     wide, kind = capacity * size, chain.steps.residual.dtype

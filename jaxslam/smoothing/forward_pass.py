@@ -25,7 +25,7 @@ class ForwardPass(NamedTuple):
     before: Float[Array, "T 3"]
     """the pose from which each motion was linearized"""
     predicted: Float[Array, "T 3"]
-    """the pose to which it led, where known landmarks were linearized"""
+    """the pose after it, at which known landmarks were linearized"""
     predicted_map: Float[Array, "T N L"]
     """the map there"""
     corrected: Float[Array, "T 3"]
@@ -54,9 +54,9 @@ def forward_filter(
 ) -> Filter:
     """The EKF-SLAM of a forward pass: joint correction, Euclidean chart, state `_State`.
 
-    Raises ValueError as `ekf_slam` does, and for sensors that a smoother has no chain for: a suite,
-    landmarks that turn into points, or landmarks of which a part is exact when they are initialized
-    (the anchor of a ray, where the robot was).
+    Raises ValueError as `ekf_slam` does, and for sensors that the smoother does not support: a
+    suite, landmarks that become points, or landmarks with parameters that are exact given the pose
+    (the anchor of a ray).
     """
     validation.check_models(name, motion, sensor)
     validation.check_parts(name, associate=associate)

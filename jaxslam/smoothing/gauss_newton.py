@@ -15,7 +15,7 @@ _SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
 """of the Gauss-Newton step that are tried, all at once; the first that lowers the cost is taken."""
 
 _ARMIJO = 1e-4
-"""of the decrease that the gradient promises, which the cost must make good."""
+"""least share of the decrease predicted by the gradient (Armijo)."""
 
 
 class Ending(IntEnum):
@@ -43,7 +43,7 @@ class Search(NamedTuple):
     taken: Int[Array, ""]
     """steps"""
     ending: Int[Array, ""]
-    """EXHAUSTED while it goes on"""
+    """EXHAUSTED while the iterations continue"""
 
 
 def minimize(
@@ -90,7 +90,7 @@ def minimize(
         return found, moved
 
     begin = _unstarted(start, chain, alive, iterations)
-    # Once more than there are steps: the last time to solve where the last step led.
+    # One iteration more than steps: the last solves the chain at the final iterate.
     if tolerance is None:
         fixed: Search = jax.lax.fori_loop(
             0, iterations + 1, lambda _, search: step(search)[0], begin
@@ -116,8 +116,8 @@ def _unstarted(start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations
 def _converged(search: Search, policy: Policy, tolerance: float) -> Bool[Array, ""]:
     """Whether the next step is shorter than the tolerance, in posterior standard deviations.
 
-    A step of √eps is rounding of the gradient; so is one that the cost cannot tell and that is
-    hardly shorter than the last. The first step is always made.
+    A step of √eps is rounding of the gradient; so is one whose decrease of the cost is below
+    rounding and that is hardly shorter than the last. The first step is always made.
     """
     eps = float(jnp.finfo(search.cost.dtype).eps)
     least = jnp.maximum(tolerance, eps**0.5)
@@ -135,7 +135,7 @@ def _line_search(
     shares, eps = jnp.asarray(_SHARES, kind), float(jnp.finfo(kind).eps)
     tried = jax.vmap(lambda share: roll_out(motion, problem, search.at, policy, share))(shares)
     costs = jax.vmap(lambda at: cost(sensor, problem, at))(tried)
-    # To first order, share · λ² is what a step lowers the cost by; beyond the rounding of sums.
+    # To first order a step lowers the cost by share · λ²; the margin is the rounding of sums.
     first = search.taken == 0
     known = jnp.where(first, 0.0, search.cost)
     enough = known * (1 + 10 * eps) - _ARMIJO * shares * policy.decrement

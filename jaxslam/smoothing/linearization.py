@@ -42,9 +42,9 @@ def chain_of(
 
     The Kalman filter of this system is the EKF: its posterior of the last pose and the map is the
     filter's, its posterior of the poses before is the fixed-interval smoother's. A new landmark
-    l = g(pose, z, s̄) + G_z v + G_s e is a measurement of itself and of the pose; before, nothing is
-    known of it. A measurement is used where the filter fused it or initialized a landmark with it,
-    and its noise is regular.
+    l = g(pose, z, s̄) + G_z v + G_s e is a measurement of itself and of the pose, without a prior.
+    A measurement is used where the filter fused it or initialized a landmark with it, and its
+    noise is regular.
     """
     by_pose, by_noise, drift = _motions(motion, passed, log.control, roots)
     slot, a, b, r, used = _measurements(sensor, passed, log)
@@ -95,7 +95,7 @@ def _measurements(
             landmark = jnp.where(new, corrected_map[slot], landmark)
         use = (fused | new) & positive
         a, b, r = (jnp.where(use, row, jnp.zeros_like(row)) for row in rows)
-        # From where it was linearized to the reference.
+        # From its linearization point to the reference.
         r = r - a @ pose_difference(corrected, pose) - b @ (final.landmarks[slot] - landmark)
         return a, b, r, use
 

@@ -27,8 +27,8 @@ def marginals(chain: Chain, policy: Policy) -> Marginals:
 
         δx_t = (I - G J)(F δx_{t-1} + c) + G (k - K δm + R⁻ᵀ n):
 
-    for a given map δx_t has a covariance S_t of its own, and it moves with the map, by T_t δm. Its
-    covariance is S_t + T_t Σ T_tᵀ, where Σ is that of the map.
+    for a given map δx_t has covariance S_t and depends on the map by T_t δm. Its covariance is
+    S_t + T_t Σ T_tᵀ, where Σ is that of the map.
     """
     delta = policy.landmarks.reshape(-1)
     wide = delta.shape[0]

@@ -1,8 +1,8 @@
 """The nonlinear least-squares problem of a path and a map: cost, linearization and step.
 
 The unknowns are the noises of the start and of the motions, in units of their own standard
-deviations, and the map; the path is what the motions make of the noises. So the models hold
-exactly at every iterate, and noise that cannot move the pose in every direction is no special case.
+deviations, and the map; the path follows from the noises by the motion models. So the models hold
+exactly at every iterate, and singular process noise is no special case.
 """
 
 from typing import NamedTuple
@@ -48,8 +48,8 @@ class Iterate(NamedTuple):
 def cost(sensor: Sensor, problem: Problem, at: Iterate) -> Float[Array, ""]:
     """The cost ½ |ξ|² + ½ Σ |η_t|² + ½ Σ |R^{-1/2} (z ⊖ h(x_t, l))|² of an iterate.
 
-    Minus the log posterior density, up to a constant, as long as the noise covariances are taken
-    for given. The path is read from the iterate.
+    Minus the log posterior density, up to a constant, for fixed noise covariances. The path is that
+    of the iterate.
     """
 
     def square(z: Array, slot: Array, used: Array, pose: Array) -> Array:
@@ -95,11 +95,11 @@ def roll_out(
 ) -> Iterate:
     """The iterate after a share of the step, by the nonlinear models.
 
-    d_t = share k_t - J a_t - K δm with a_t = f(x_{t-1}, u_t, Q^{1/2} η̄_t) - x̄_t, of the path as it
-    comes out: where the models bend, the later noises answer to where the earlier ones led, as
-    differential dynamic programming does (Jacobson & Mayne 1970). Without that, a small turn early
-    would swing all of a long path. To first order it is share times the Gauss-Newton step. The path
-    of the iterate it starts from (x̄) need not obey the models; what comes out does.
+    d_t = share k_t - J a_t - K δm with a_t = f(x_{t-1}, u_t, Q^{1/2} η̄_t) - x̄_t along the new
+    path: later noises react to the nonlinear effect of earlier ones, as in differential dynamic
+    programming (Jacobson & Mayne 1970). Otherwise a small early rotation would move the whole later
+    path. To first order it is share times the Gauss-Newton step. The path of the initial iterate
+    (x̄) need not satisfy the models; that of the result does.
     """
     shift = share * policy.landmarks
     delta = shift.reshape(-1)

@@ -32,11 +32,11 @@ class Smoothed(NamedTuple):
     """pose before the first control"""
     start_cov: Float[Array, "3 3"]
     joint: Joint
-    """the last pose and the map, which a filter may go on from"""
+    """the last pose and the map, a possible initial state of a filter"""
     regular: Bool[Array, ""]
-    """the information on the map is positive definite; else covariances mean nothing"""
+    """the information on the map is positive definite; else covariances are invalid"""
     filtered: Estimate
-    """with leading T, of the filter that went first"""
+    """with leading T, of the filter"""
 
 
 def smooth(
@@ -52,18 +52,17 @@ def smooth(
 ) -> Estimator:
     """The Rauch-Tung-Striebel smoother of `ekf_slam(update="joint")`, without D×D matrices.
 
-    p(x_t | all scans) of the linear system that the EKF made of the log: the Jacobians are where
-    the filter took them, so the last pose and the map are the filter's own, to rounding, and every
-    pose before knows what came after. The recursion of Rauch, Tung & Striebel 1965 ("Maximum
-    likelihood estimates of linear dynamic systems", AIAA Journal 3(8)) would keep T covariances of
-    the map and invert each, where landmarks may not be initialized yet and the noise of a motion
-    may be singular; `chain.eliminate` gives the same numbers from the Jacobians alone, O(T N²). A
-    landmark has no prior: its initialization is a measurement of it.
+    p(x_t | all scans) of the linear system of the EKF: the Jacobians are those of the filter, so
+    the last pose and the map equal the filter's, to rounding, and every earlier pose uses the later
+    scans. The recursion of Rauch, Tung & Striebel 1965 ("Maximum likelihood estimates of linear
+    dynamic systems", AIAA Journal 3(8)) would store T covariances of the map and invert each, where
+    landmarks may not be initialized yet and the noise of a motion may be singular;
+    `chain.eliminate` gives the same numbers from the Jacobians alone, O(T N²). A landmark has no
+    prior: its initialization is a measurement of it.
 
     What it returns maps (log, key) to a `Trace`: estimates with leading T, the poses smoothed and
-    the map, which stands still, the same final one at every step; the filter's infos, where a
-    measurement whose noise is singular becomes `Status.SINGULAR`, since it cannot be smoothed with;
-    and a `Smoothed`.
+    the final map at every step; the filter's infos, in which measurements of singular noise, which
+    the smoother cannot use, become `Status.SINGULAR`; and a `Smoothed`.
 
         estimator = smooth(world.motion, world.sensor, 20, world.pose, world.pose_cov)
         trace = estimator(log, jax.random.key(0))
@@ -71,11 +70,11 @@ def smooth(
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`.
         capacity: landmark slots N.
-        pose, pose_cov: (3,) and (3, 3) where the robot is before the first control.
+        pose, pose_cov: (3,) and (3, 3) of the robot before the first control.
         associate, gate, births: of the filter, as for `ekf_slam`.
     Raises:
-        ValueError: as `ekf_slam` does; for a suite, landmarks that turn into points, or landmarks
-            with more parameters than are measured and have a prior (rays); and, when called, as
+        ValueError: as `ekf_slam` does; for a suite, landmarks that become points, or landmarks with
+            parameters that are neither measured nor have a prior (rays); and, when called, as
             `run` does.
     """
     filter = forward_filter(

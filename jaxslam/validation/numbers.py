@@ -55,7 +55,7 @@ def check_gate(name: str, gate: Any) -> None:
 def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
     """Raise ValueError unless cov is real, finite, symmetric, positive semi-definite (size, size).
 
-    Values are looked at only where they are concrete; a tracer is checked for its shape alone.
+    Values are checked only where they are concrete; a tracer is checked for its shape alone.
     """
     got = shape_told(cov)
     if got != str((size, size)):
@@ -85,7 +85,7 @@ def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
 def check_alpha(name: str, alpha: ArrayLike, count: int) -> None:
     """Raise ValueError unless alpha, of a motion noise, holds `count` finite real numbers >= 0.
 
-    Values are looked at only where they are concrete; a tracer is checked for its shape alone.
+    Values are checked only where they are concrete; a tracer is checked for its shape alone.
     """
     shape = np.shape(alpha) if is_concrete(alpha) else jnp.asarray(alpha).shape
     if shape != (count,):

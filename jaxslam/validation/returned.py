@@ -14,7 +14,7 @@ _S = TypeVar("_S")
 def same_state(name: str, before: _S, after: Any) -> _S:
     """The state that a filter's function returned; ValueError unless its structure is that before.
 
-    Tree, shapes and dtypes must be the same: a loop over steps carries it.
+    Tree, shapes and dtypes must be the same, since the state is the carry of a `lax.scan`.
     """
     _expect(name, chex.assert_trees_all_equal_structs, before, after)
     _expect(name, chex.assert_trees_all_equal_shapes_and_dtypes, before, after)

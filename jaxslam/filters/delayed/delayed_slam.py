@@ -50,15 +50,15 @@ def delayed_slam(
     """EKF-SLAM with bearings or ranges alone, and delayed initialization of landmarks.
 
     After Costa, Kantor & Choset, "Bearing-only landmark initialization with unknown data
-    association", ICRA 2004, as Tacher §2 sums it up, with the correlations that they leave out.
-    Measurements of landmarks of the map correct it, within the gate, as in `ekf_slam`. One of no
-    landmark of the map becomes a *stored measurement*, a variable of the map (`state` has a
+    association", ICRA 2004, as summarized in Tacher §2, with the correlations that they neglect.
+    Measurements of landmarks of the map correct it, within the gate, as in `ekf_slam`. One without
+    a landmark in the map becomes a *stored measurement*, a variable of the state (`state` has a
     diagram). Then
 
-    1. it confirms the *hypotheses* it passes through: g² <= gate·var(g), g the difference of what
-       it saw from what it would see of the point, with all correlations. Their persistence rises
-       by 1, and they are corrected, but not the robot (`confirmation.correct_hypotheses`). Those of
-       its tag that it does not confirm lose `decay`; at 0 they are deleted.
+    1. it confirms the *hypotheses* that agree with it: g² <= gate·var(g), g the difference between
+       the measurement and its prediction from the point, with all correlations. Their persistence
+       rises by 1, and they are corrected, but not the robot (`confirmation.correct_hypotheses`).
+       Those of its tag that it does not confirm lose `decay`; at 0 they are deleted.
     2. if it confirms none it is intersected with older stored measurements. Well conditioned
        intersections become hypotheses of persistence 1, unless one exists at that position.
     3. a hypothesis of enough persistence becomes a landmark, estimated from up to eight of its
@@ -68,12 +68,12 @@ def delayed_slam(
        covariance is too large; the hypothesis is deleted where its measurements contradict each
        other.
 
-    The pose's error is that of coordinates and Jacobians are taken at the estimate: a linearizer's
-    memory, or a chart in which landmarks move, has no meaning for stored measurements.
+    Errors are Euclidean and Jacobians are taken at the estimate: linearizers with memory and other
+    charts are not defined for stored measurements.
 
     Two circles intersect in two points: both become hypotheses, of one group, and none is promoted
-    before it is ahead of the other by `lead` and fits its measurements clearly better than its
-    mirror solution does. So a range-only landmark needs a path that turns.
+    before its persistence exceeds that of the other by `lead` and it fits its measurements clearly
+    better than its mirror solution. So a range-only landmark needs a path that is not straight.
 
     Args:
         motion, sensor: the models; the sensor measures one bearing or one range of points.
@@ -81,7 +81,7 @@ def delayed_slam(
         triangulation: how stored measurements intersect; default `triangulation.rays` or
             `triangulation.circles`, by what the sensor measures.
         stored, hypotheses, promotion: `settings.StoredMeasurements`, `settings.Hypotheses` and
-            `settings.Promotion`, which say what they are for; default all defaults.
+            `settings.Promotion`, which document their fields; default all defaults.
         gate: chi-square, of one degree of freedom, of every comparison; default that of 99 %.
         associate: default `association.known()`, and only measurements of one tag intersect. With
             any other method, the measurements it declares new intersect all others, and tags only
@@ -110,7 +110,7 @@ def delayed_slam(
         return state._replace(joint=ekf.predict(state.joint, u, key))
 
     def update(state: DelayedState, scan: Scan, key: Array) -> tuple[DelayedState, Info]:
-        # Padding may hold anything, and is multiplied by zero further down.
+        # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
         found, matched = _associated(settings, state, scan)

@@ -102,7 +102,7 @@ def closer_than(
     measure = _DISTANCES[distance]
 
     def frame(point: UncertainPoints) -> Frame:
-        # Points are frames whose heading is known equally well, and the same.
+        # Points as frames with equal headings and heading variances.
         inert = jnp.pad(point.cov, [(0, 1), (0, 1)]).at[2, 2].set(1.0)
         return Frame(jnp.pad(point.mean, [(0, 1)]), inert)
 

@@ -15,7 +15,7 @@ from jaxslam.math.angles import wrap
 from jaxslam.math.xla import materialize
 from jaxslam.slots import Joint
 
-# Gauss-Newton steps from a hypothesis, which is near already.
+# The number of Gauss-Newton steps; the hypothesis is a good initial value.
 _STEPS = 4
 
 
@@ -33,12 +33,12 @@ class InitialEstimate(NamedTuple):
     minus_r_inv: Float[Array, "2 2"]
     """-R⁻¹"""
     nis: Float[Array, ""]
-    """what the measurements disagree by: chi-square with m - 2 degrees of freedom"""
+    """residual of the measurements: chi-square with m - 2 degrees of freedom"""
     spread: Float[Array, ""]
-    """the largest standard deviation of the point, relative to where the first measurement was
-    taken, over their distance"""
+    """the largest standard deviation of the point, relative to the position of the first
+    measurement, over their distance"""
     regular: Bool[Array, ""]
-    """the measurements locate it"""
+    """the measurements determine it"""
 
 
 def initial_estimate(
@@ -50,7 +50,7 @@ def initial_estimate(
 ) -> InitialEstimate:
     """The least-squares estimate of a landmark from m stored measurements, and its residual.
 
-    Each stored measurement of the landmark says g(s_k, x) = 0, to first order
+    Each stored measurement of the landmark is a constraint g(s_k, x) = 0, to first order
     e + G_s δs + G_x δx = 0. With M = G_s P_ss G_sᵀ = L Lᵀ, x* is where eᵀ M⁻¹ e is least. The
     orthogonal Qᵀ (two Householder reflections) that makes L⁻¹ G_x upper triangular divides the rows
     Qᵀ L⁻¹ (e + G_s δs + G_x δx) = 0 into two parts of unit covariance, uncorrelated:
@@ -58,12 +58,11 @@ def initial_estimate(
     - the first two, R δx = -(e₁ + G₁ δs), give the landmark: P_x· = -R⁻¹ G₁ P_s·, P_xx = (RᵀR)⁻¹;
     - the others, in which x does not occur, measure e₂ = -G₂ δs, and correct the whole map.
 
-    So each measurement counts once, and no prior of the landmark is needed. (What is done with
+    So each measurement is used once, and no prior of the landmark is needed. (The same is done with
     feature tracks by A. I. Mourikis, S. I. Roumeliotis, "A multi-state constraint Kalman filter for
     vision-aided inertial navigation", ICRA 2007, who keep the second part alone.) A hypothesis only
-    says which measurements belong together: corrected by one after the other, each linearized at
-    another point, it holds Jacobians that contradict each other, and a robot corrected through it
-    would take the difference for information.
+    groups the measurements: it was corrected by them in turn, each linearized at another point, and
+    these inconsistent Jacobians would give the robot spurious information.
 
     Args:
         start: where Gauss-Newton begins.
@@ -97,7 +96,7 @@ def initial_estimate(
         step, regular = linalg.solve_psd(by_point.T @ by_point, by_point.T @ value)
         return (point - jnp.where(regular & positive, step, 0.0), point, terms), None
 
-    # The terms at the end of the last step are those of one more, whose end is not used.
+    # The terms after the last step are those of one more step, whose result is not used.
     zeros = jnp.zeros((m, 3 + SIZE + m), s.dtype)
     none = zeros[:, 0], zeros[:, :SIZE], zeros[:, :2], zeros[:, 6:], jnp.asarray(True)
     _, point, terms = jax.lax.scan(gauss_newton, (start, start, none), None, length=_STEPS + 1)[0]
@@ -108,7 +107,7 @@ def initial_estimate(
     safe = jnp.where(regular, r, jnp.eye(2, dtype=r.dtype))
     minus_r_inv = -linalg.inverse(safe.at[1, 0].set(0.0))
     point = point + minus_r_inv @ value[:2]
-    # The covariance of the point less where the first measurement was taken.
+    # The covariance of the point relative to the position of the first measurement.
     with_first = transform @ jnp.einsum("mi,mij->mj", by_stored, blocks[:, :, 0, :2])
     cross = minus_r_inv @ with_first[:2]
     own = minus_r_inv @ minus_r_inv.T
@@ -142,7 +141,7 @@ def add_landmark(
     # Padding's unit variance goes first, to an exact zero.
     cov = joint.cov.at[mine, mine].add(-1.0)
     cov = cov.at[mine].add(half).at[:, mine].add(half.T)
-    # Of unit covariance, and none with the landmark: S = I, and S⁻¹ costs nothing.
+    # Unit covariance, uncorrelated with the landmark: S = I.
     v, value = hp[2:], estimate.value[2:]
     moved = -linalg.gram(v, value[:, None])[:, 0]
     pose = joint.pose + moved[:3]

@@ -37,8 +37,8 @@ def intersect_measurements(
 ) -> DelayedState:
     """The state with new hypotheses at the intersections of small covariance.
 
-    Where identities are known each is intersected with the partner that gives the sharpest point,
-    otherwise with all. No hypothesis is formed where there is one already.
+    Where identities are known each is intersected with the partner that gives the least spread,
+    otherwise with all. No hypothesis is formed where one exists already.
 
     Args:
         slot: of the measurements in the table.
@@ -58,7 +58,7 @@ class _Sharpest(NamedTuple):
     points: UncertainPoints
     """(k,); the covariances relative to the sensor"""
     ok: Bool[Array, "k"]
-    """allowed, and sharp enough for a hypothesis"""
+    """allowed, and of spread small enough for a hypothesis"""
     pair: Int[Array, "k"]
     """a number of the two stored measurements, which mirrored points have in common"""
     parents: Int[Array, "k 2"]
@@ -157,7 +157,7 @@ class Intersections(NamedTuple):
     ok: Bool[Array, "q W A"]
     """whether it is a point"""
     cov: Float[Array, "q W A 2 2"]
-    """of the point less the position of the first of the two"""
+    """of the point relative to the position of the first of the two"""
     spread: Float[Array, "q W A"]
     """√(largest eigenvalue of that) over the distance, infinite where not ok"""
 
@@ -167,8 +167,8 @@ def intersections_of(
 ) -> Intersections:
     """The intersections of the measurements in these slots; J P Jᵀ with the P of each two.
 
-    Relative to the sensor's position, because what the robot does not know of its own frame is no
-    fault of an intersection.
+    Relative to the sensor's position, so that the uncertainty of the robot's own pose in the map
+    does not affect the spread of an intersection.
     """
     intersect = triangulation.intersect
     first, count = layout.first_stored, layout.stored
@@ -212,8 +212,8 @@ def add_hypotheses(
 ) -> Joint:
     """The joint with hypotheses in dead slots, each an intersection of two stored measurements.
 
-    δx = J δs to first order, so P_xx = J P_ss Jᵀ and the covariance with all else is J P_s·: no
-    measurement's noise is counted twice, however many intersections it takes part in.
+    δx = J δs to first order, so P_xx = J P_ss Jᵀ and the covariance with all else is J P_s·: the
+    noise of a measurement is not counted twice, even if it is in many intersections.
 
     Args:
         formed: the slots, all dead.

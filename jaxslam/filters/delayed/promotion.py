@@ -5,7 +5,7 @@ For the most persistent hypothesis that this scan confirmed, at most `per_scan` 
 1. `_candidate`: it is persistent enough, more so than its alternatives, and its spread is small;
 2. `_measurements_of`: its stored measurements; `_outermost`: up to eight of them;
 3. `_locate`: the maximum-likelihood position, and a decision: accept it, wait, or refuse it;
-4. `add_landmark` where accepted; what that uses up or rules out is deleted.
+4. `add_landmark` where accepted; its stored measurements and excluded hypotheses are deleted.
 """
 
 from typing import Any, NamedTuple, Self
@@ -35,8 +35,8 @@ from jaxslam.filters.delayed.state import (
 from jaxslam.math.stats import chi2_quantiles
 from jaxslam.math.xla import materialize, where_any
 
-# Stored measurements that a landmark is made of: two locate it, and the others are a matrix that
-# `linalg` factors without a library call.
+# The largest number of stored measurements of a landmark: two locate it, and the matrix of the
+# others is small enough for the unrolled factors of `linalg`.
 _USED = 8
 
 # The significance level of the chi-square test that refuses a landmark.
@@ -220,7 +220,7 @@ def _locate(
     scale = (_ONE_PLACE**2) * ((best.point - s[0, :2]) ** 2).sum()
     ambiguous = ((cost < best.nis + _AMBIGUOUS) & (far > scale)).any()
     undecided = best.regular & (ambiguous | (best.spread > settings.promotion.spread))
-    # By degrees of freedom, from 1 on; of numbers, since the tail itself is much code to compile.
+    # By degrees of freedom, from 1 on; constants, because the tail function is slow to compile.
     limits = jnp.asarray(chi2_quantiles(1 - _UNLIKELY, np.arange(1, _USED)), best.nis.dtype)
     dof = jnp.maximum(use.sum() - 2, 1)
     likely = best.nis <= limits[dof - 1]

@@ -47,7 +47,7 @@ class Hypotheses:
     """C: where all slots are taken, intersections are refused, and counted"""
     spread: float = 0.3
     """[1] the largest standard deviation of the intersection relative to the sensor, over their
-    distance, with which a hypothesis may begin: beyond, it is not Gaussian"""
+    distance, with which a hypothesis may begin; with a larger one it is not Gaussian"""
     distance: Distance = "mahalanobis"
     """between intersection and hypothesis as Gaussians relative to the sensor: d² of mahalanobis,
     or bhattacharyya"""

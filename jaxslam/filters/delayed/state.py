@@ -13,12 +13,12 @@ All three are rows of the landmark table of one `slots.Joint`, three parameters 
     stored measurement    N+C … S-1     │ x   y   q │    │  ·  │  ·  │  ·  │  ·  │
                                         └───────────┘    └─────┴─────┴─────┴─────┘
 
-with S = N + C + W slots and D = 3 + 3 S. A stored measurement is (x, y), where the sensor was, and
-q, what it saw: a direction [rad] or a distance [m], in the map's frame (`triangulation`). The third
-parameter of a point is padding (-). No block of P is left out, so the noise of a measurement that
-takes part in several intersections is one variable, and is never counted as independent.
+with S = N + C + W slots and D = 3 + 3 S. A stored measurement is the sensor's position (x, y) and
+the measurement q, a direction [rad] or a distance [m], in the map's frame (`triangulation`). The
+third parameter of a point is padding (-). P is a full matrix, so the noise of a measurement in
+several intersections is one variable, and is never counted as independent.
 
-The way of a measurement of no landmark of the map through the table:
+The processing of a measurement without a landmark in the map:
 
     measurement ──► stored measurement ──► hypothesis ──► landmark
             stored             two intersect       confirmed often enough; made of all its stored
@@ -81,12 +81,12 @@ class TableLayout(NamedTuple):
 
     @property
     def hypothesis_slots(self) -> Int[Array, "C"]:
-        """`of_hypotheses` as numbers."""
+        """The slot numbers of hypotheses."""
         return self.landmarks + jnp.arange(self.hypotheses)
 
     @property
     def stored_slots(self) -> Int[Array, "W"]:
-        """`of_stored` as numbers."""
+        """The slot numbers of stored measurements."""
         return self.first_stored + jnp.arange(self.stored)
 
 
@@ -96,7 +96,7 @@ class DelayedCounts(NamedTuple):
     evicted: Int[Array, ""]
     """stored measurements that were marginalized as the oldest of a full table"""
     refused: Int[Array, ""]
-    """intersections that found all slots of hypotheses taken"""
+    """intersections refused because all slots of hypotheses were taken"""
     vanished: Int[Array, ""]
     """hypotheses deleted because they were not confirmed often enough"""
     rivals: Int[Array, ""]
@@ -215,7 +215,7 @@ def delete_slots_if_any(
 def is_newer(time: Int[Array, "W"]) -> Bool[Array, "W W"]:
     """Whether stored measurement j was taken after i; at equal times, whether j > i.
 
-    A rank is a row's sum: one kernel, where two sorts are more to compile than all else around.
+    A rank is a row's sum, which compiles faster than two sorts.
     """
     place = jnp.arange(len(time))
     later = time[None, :] > time[:, None]

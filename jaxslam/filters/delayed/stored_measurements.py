@@ -22,8 +22,8 @@ def store_measurements(
 ) -> tuple[DelayedState, Int[Array, "M"], Bool[Array, "M"]]:
     """The state with new measurements stored; their slots, and which were stored.
 
-    One is stored if the sensor is far enough from where others of its tag were taken. Where the
-    table is full the oldest are marginalized out.
+    One is stored if the sensor is far enough from its positions at other measurements of the same
+    tag. Where the table is full the oldest are marginalized out.
     """
     layout, joint = settings.layout, state.joint
     store = settings.triangulation.store

@@ -1,8 +1,8 @@
 """Triangulation of a landmark from two measurements: intersections of rays or circles.
 
-A *stored measurement* is a measurement as a variable of the map, s = (x, y, q) (3,): where the
-sensor was, and what it saw, in the map's frame. A bearing gives the ray from (x, y) in the
-direction q [rad], a range the circle of radius q [m] about it.
+A *stored measurement* is a measurement as a variable of the state, s = (x, y, q) (3,): the
+sensor's position and the measurement, in the map's frame. A bearing gives the ray from (x, y) in
+the direction q [rad], a range the circle of radius q [m] about it.
 """
 
 from collections.abc import Callable
@@ -39,22 +39,22 @@ class Triangulation:
     """(s, s') -> points (A, 2) and whether each is one, (A,) bool: where it is not, or badly
     conditioned, the point is finite and without meaning"""
     residual: Callable[[Stored, Point], Float[Array, ""]]
-    """(s, point) -> g: what was seen less what that point would have been seen as, zero for the
-    true point of a perfect sensor [rad or m]"""
+    """(s, point) -> g: the measurement minus its prediction from that point, zero for the true
+    point without noise [rad or m]"""
     mirror_solutions: Callable[[Stored, Stored, Point], Float[Array, "B 2"]]
     """(s, s', point) -> the other A - 1 points that two measurements of a landmark there allow"""
 
 
 def rays(sensor: Sensor, *, parallax: float = 0.1) -> Triangulation:
-    """Bearings: p + t (cos q, sin q), t > 0. Two rays intersect in at most one point.
+    """Triangulation of bearings: rays p + t (cos q, sin q), t > 0, intersect in at most one point.
 
     With δ = p' - p and c = sin(q' - q), the lengths are t = δ × d'/c and t' = δ × d/c. The
     intersection lies in front of both sensors, where the rays cross at an angle of at least
     `parallax`.
 
     Args:
-        sensor: a bearing z (1,) of points, as `sensors.bearing_only`; where it is mounted is read
-            from its `invert`, of which the prior of the range plays no part.
+        sensor: a bearing z (1,) of points, as `sensors.bearing_only`; its mounting is computed
+            from its `invert`, whatever the prior of the range.
         parallax: [rad] in (0, π/2).
     Raises:
         ValueError: on another sensor, or a parallax out of range.
@@ -87,11 +87,11 @@ def rays(sensor: Sensor, *, parallax: float = 0.1) -> Triangulation:
 
 
 def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
-    """Ranges: |x - p| = q. Two circles intersect in two mirrored points.
+    """Triangulation of ranges: circles |x - p| = q intersect in two mirrored points.
 
     With δ = p' - p, d = |δ|, a = (d² + q² - q'²)/(2d) and h² = q² - a², the points are
     p + (a δ ± h δ^⊥)/d. The circles must cross at an angle φ, sin φ = d h/(q q'), of at least
-    `angle` from touching: where they touch, h is all noise.
+    `angle` from tangency, where h is undetermined.
 
     Args:
         sensor: a range z (1,) of points, as `sensors.range_only`.
@@ -114,7 +114,7 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
         safe = jnp.where(apart, square, 1.0)
         share = 0.5 * (safe + a[2] ** 2 - b[2] ** 2) / safe  # a/d
         rest = jnp.where(apart, a[2] ** 2 / safe - share**2, 0.0)  # h²/d²
-        # sin φ = d h/(q q'), compared by squares so that nothing is rooted below zero
+        # sin φ = d h/(q q'), compared by squares to avoid roots of negative numbers
         size = jnp.where(apart, (a[2] * b[2]) ** 2, 1.0)
         crossing = apart & (rest > 0) & (safe**2 * rest >= least**2 * size)
         height = jnp.sqrt(jnp.where(crossing, rest, 1.0))

@@ -56,7 +56,7 @@ class Innovation(NamedTuple):
     whitened: Float[Array, "m*Z"]
     """L⁻¹ ν"""
     factor: Float[Array, "m*Z m*Z"]
-    """L, with rows of zeros for what is not fused"""
+    """L, with rows of zeros for measurements that are not fused"""
     s: Float[Array, "m Z m Z"]
     """S, the identity where not fused"""
     hp: Float[Array, "m*Z D"]
@@ -64,7 +64,7 @@ class Innovation(NamedTuple):
     hx: Float[Array, "m Z D"]
     """H X of a square-root filter, else H P"""
     noise: Float[Array, "m Z Z"]
-    """R with what the linearizer added"""
+    """R with the linearizer's addition"""
     own_noise: Float[Array, "m Z Z"]
     """R"""
     jacobians: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
@@ -77,12 +77,12 @@ class Innovation(NamedTuple):
 
 
 class _Linearized(NamedTuple):
-    """m measurements as affine functions of the errors."""
+    """The linearization of m measurements as affine functions of the errors."""
 
     rows: Float[Array, "m Z 3+L+1"]
     """H by the errors of pose and landmark, and ν beside them"""
     rest: Float[Array, "m Z Z"]
-    """what the linearizer adds to R"""
+    """the linearizer's addition to R"""
     seen: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
     """H by coordinates"""
 
@@ -229,7 +229,7 @@ def _linearize(
 def _split_rows(
     rows: Float[Array, "m Z C"],
 ) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"], Float[Array, "m Z"]]:
-    """H by the errors of pose and landmark, and ν."""
+    """The Jacobian H by the errors of pose and landmark, and ν."""
     return rows[:, :, :3], rows[:, :, 3:-1], rows[:, :, -1]
 
 

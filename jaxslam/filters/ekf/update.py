@@ -24,7 +24,7 @@ from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
 
 # Up to this many rows P stays in the cache next to a core: the pass over it is bound by arithmetic,
-# vectors of this many entries at a time, and what is left of a row costs as much again.
+# on vectors of this many entries, and the rest of a row costs as much as a whole vector.
 _CACHED, _LANES = 128, 16
 
 # Measurements a pass over P, where P is cached and where it is not. More of them cost more loads of

@@ -1,7 +1,7 @@
 """The active set of a `SparseState`: its landmarks, activation and deactivation.
 
-A landmark leaves without a link to the robot: `seif` cuts it (`sparsification.sparsify`), `eseif`
-waits until there is none.
+A landmark leaves only without a link to the robot: `seif` cuts the link
+(`sparsification.sparsify`), `eseif` waits until there is none.
 """
 
 import jax
@@ -58,7 +58,7 @@ def deactivate(
         diagonal=state.diagonal.at[state.active].set(blocks[every, every], mode="drop")
     )
     order = jnp.argsort(~leaving, stable=True)[:most]
-    # Each pair once: of two that leave, by the one that has its turn first.
+    # Each pair once: of two that leave, by the one that is processed first.
     earlier = (order[:, None] == every[None, :])[None, :, :] & (
         jnp.arange(len(order))[None, :] < jnp.arange(len(order))[:, None]
     )[:, :, None]

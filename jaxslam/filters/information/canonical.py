@@ -2,9 +2,9 @@
 
 The error e = x - μ, D = 3 + A·L numbers, has the information matrix Ω (D, D), the inverse of its
 covariance, and the information residual ρ = Ω E[e] (D,): the textbooks' information vector is
-ξ = Ω μ + ρ. Holding ρ instead of ξ changes no equation: a heading may wrap, a large map does not
-cancel in float32, ρ = 0 says that μ is the mean, and what leaves the mean alone (sparsification:
-ξ̃ = ξ + (Ω̃ - Ω) μ) leaves ρ alone.
+ξ = Ω μ + ρ. Storing ρ instead of ξ is equivalent, and has advantages: a heading may wrap, a large
+map causes no cancellation in float32, ρ = 0 means that μ is the mean, and operations that keep the
+mean (sparsification: ξ̃ = ξ + (Ω̃ - Ω) μ) keep ρ.
 
 Padding, an index without a landmark: zero mean, zero links, unit diagonal of Ω, zero of ρ.
 Sources: Thrun et al., "Simultaneous localization and mapping with sparse extended information
@@ -79,8 +79,8 @@ def motion_update(
 
         G = Φ S (I + Sᵀ Φ S)⁻¹,   Ω ← (I - G Sᵀ) Φ (I - G Sᵀ)ᵀ + G Gᵀ,   ρ ← φ - G Sᵀ φ,
 
-    which is (Φ⁻¹ + W Q Wᵀ)⁻¹ by the inversion lemma, in Joseph's form: rounding cannot make it
-    indefinite as quickly. G is zero beyond the landmarks that the robot is linked to.
+    which is (Φ⁻¹ + W Q Wᵀ)⁻¹ by the inversion lemma, in Joseph's form, which is less sensitive to
+    rounding. G is zero except for the landmarks that the robot is linked to.
     """
     after, by_pose, noise = first_order.motion_at(motion, pose, u, pose)
     root = linalg.root_psd(noise)
@@ -107,7 +107,7 @@ def innovations(
 ) -> CanonicalInnovations:
     """Gated innovations ν = z ⊖ h(x, l) and S = H Ω⁻¹ Hᵀ + R; Ω is factored once.
 
-    A measurement whose R or S is not positive definite does nothing and is `Status.SINGULAR`, as
+    A measurement whose R or S is not positive definite has no effect and is `Status.SINGULAR`, as
     are all where Ω is not.
 
     Args:
@@ -259,7 +259,7 @@ def report(
     initialized: Bool[Array, "M"],
     waiting: Bool[Array, "M"] | None = None,
 ) -> Info:
-    """The info of a scan; measurements of landmarks that are waiting are deferred."""
+    """The `Info` of a scan; measurements of landmarks that are not active yet are DEFERRED."""
     status = status_of(
         scan.valid,
         matched=association.known,

@@ -49,8 +49,8 @@ def eif_slam(
 ) -> Filter:
     """Extended information filter SLAM: `ekf_slam(update="joint")` in canonical form.
 
-    The steps are those of `canonical`; the mean is Ω⁻¹ ξ, solved for after each scan, O(D³). It
-    gives the numbers of the EKF to rounding, costs more, and is what `seif` approximates.
+    The steps are those of `canonical`; the mean is Ω⁻¹ ξ, solved for after each scan, O(D³). The
+    results equal those of the EKF to rounding, at a higher cost; `seif` approximates this filter.
     Measurements are associated with landmarks by their tags.
 
     Where rounding has made Ω indefinite (float32), the scan is refused: its measurements are

@@ -73,16 +73,15 @@ def eseif(
     ones are initialized. z_β must determine the whole pose (`relocation.determines_pose`: two
     landmarks by range and bearing). Where it does not, relocation is postponed, and measurements of
     landmarks for which the active set has no room are `Status.DEFERRED`, new landmarks before known
-    ones. So indices of the active set are kept free: as many as a scan has measurement slots, or
+    ones. So indices of the active set are reserved: as many as a scan has measurement slots, or
     half of those beyond a scan, but no more than there are landmarks beyond the active set: with
     active = capacity it is `eif_slam`. Where scans are of one or two landmarks only, so much is
     deferred that the map fails (Victoria Park as GTSAM has it); with wait = False links are cut as
     by `seif` instead, overconfidently, and counted.
 
-    `ApproximationCounts.relocated` says how often, `.cut` how many links to the robot went, and
-    `.cut_nats` how much the entropy of the active block grew by it, or what `seif` counts. Still
-    overconfident, as in `seif`, are linearization, full lists of links, and covariances of Markov
-    blankets.
+    `ApproximationCounts.relocated` counts relocations, `.cut` the links to the robot removed, and
+    `.cut_nats` the increase of the active block's entropy by it, or that of `seif`. As in `seif`,
+    linearization, full lists of links, and covariances of Markov blankets cause overconfidence.
 
     Args:
         motion, sensor, capacity, active, links, passive, sweeps, conservative, whole, gate, floor:
@@ -147,9 +146,9 @@ def activate_others(
     """The state with measured landmarks active, as far as there is room; their indices in the
     active set; and which of them have entered it. None enters where not solved.
 
-    Empty indices are given first, then those of landmarks without a link to the robot, not measured
-    for longest, which become passive; to known landmarks before new ones. With wait=False also
-    those of landmarks with a link, which is cut.
+    Empty indices are assigned first, then those of the least recently measured landmarks without a
+    link to the robot, which become passive; known landmarks get indices before new ones. With
+    wait=False also those of landmarks with a link, which is cut.
     """
     enters = measured.has_slot & ~matches.any(axis=1)
     empty, in_scan = state.active >= settings.capacity, matches.any(axis=0)
@@ -180,8 +179,8 @@ def merge_passes(
 ) -> CanonicalInnovations:
     """The innovations for the `Info`: of the second pass where late, else of the first.
 
-    Those of landmarks that wait are to be deferred, not rejected: they count as inside the gate,
-    and as singular only where the scan could not be solved for. Whitened rows are the first's.
+    Those of landmarks that wait are deferred, not rejected: they count as inside the gate, and as
+    singular only where the scan could not be solved for. Whitened rows are those of the first pass.
     """
 
     def pick(a: Array, b: Array) -> Array:

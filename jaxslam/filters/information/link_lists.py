@@ -34,7 +34,7 @@ def enter_link(
         at = jnp.argmin(weight)
         return at, row[at], links[at], weight[at]
 
-    # Read before anything is written: else XLA reads again later, from a copy of all N lists.
+    # Read before any write: XLA would else copy all N lists to read them later.
     found = materialize((weakest(i), weakest(j)))
     (at_i, p, link_p, least_i), (at_j, q, link_q, least_j) = found
     keep = on & (size > least_i) & (size > least_j)

@@ -1,10 +1,10 @@
 """Covariances and means of a `SparseState`: of Markov blankets, or of the whole map.
 
-The inverse of a block of Ω is the covariance of its variables given all others, which is below the
-marginal covariance, never above it. With the Markov blanket of a variable (all that it is linked
-to) in the block, the inverse is near the marginal as long as the neighbourhood is known well, and
-far below it where a whole map has drifted, since what lies outside is held at its mean. A wider
-blanket postpones this, and does not end it. For consistency take `whole_marginals`.
+The inverse of a block of Ω is the covariance of its variables given all others; it is at most the
+marginal covariance. With the Markov blanket of a variable (all that it is linked to) in the block,
+the inverse is near the marginal if the uncertainty of the neighbourhood is small, and far below it
+where a whole map has drifted, since the other variables are fixed at their means. A wider blanket
+only delays this. For consistency take `whole_marginals`.
 """
 
 import jax

@@ -1,7 +1,7 @@
 """Mean recovery in a `SparseState`: coordinate descent on ½ eᵀ Ω e - ρᵀ e, block by block.
 
-A block that is solved for its error δ moves its mean by δ, has no residual any more, and changes
-that of the landmarks it is linked to: ρ_j ← ρ_j - Ω_ji δ_i. Ω and ξ = Ω μ + ρ stay as they are.
+A block is solved for its error δ; its mean moves by δ, its residual becomes zero, and those of
+linked landmarks change: ρ_j ← ρ_j - Ω_ji δ_i. Ω and ξ = Ω μ + ρ do not change.
 """
 
 import jax
@@ -27,7 +27,7 @@ def move_landmarks(
     n = state.alive.shape[0]
     row = state.neighbours.at[slot].get(mode="fill", fill_value=n)
     links = state.links.at[slot].get(mode="fill", fill_value=0)
-    # Who writes to the lists next needs the slots, so waits for this, and needs no copy of all N.
+    # A later write to the lists depends on the slots, so it comes after this without a copy.
     row, links, active = materialize((row, links, state.active))
     change = jnp.einsum("mkij,mi->mkj", links, step).reshape(-1, 2)
     return state._replace(
@@ -62,8 +62,8 @@ def recover_active_means(
 ) -> tuple[SparseState, Bool[Array, ""]]:
     """Robot and active landmarks moved by Ω⁻¹ ρ, and whether that could be solved for.
 
-    Where it could not (`canonical.mean_error`), means and ρ stay as they are. Ω of the state is
-    left alone.
+    Where it could not (`canonical.mean_error`), means and ρ do not change. Ω of the state is not
+    changed.
     """
     error, solved = canonical.mean_error(omega, residual, omega_positive)
     state = with_active_residual(state, jnp.where(solved, 0.0, active_residual(state)))

@@ -85,8 +85,8 @@ def runs_out(
 ) -> Bool[Array, ""]:
     """Whether the scan needs more indices of the active set than are free, minus a reserve.
 
-    Free is an index that is empty, or whose landmark is not linked to the robot, nor measured now;
-    and a relocation must free some.
+    An index is free if it is empty, or if its landmark is not linked to the robot and not measured
+    now; and a relocation must free some.
     """
     measurements, size = matches.shape
     enters = measured.has_slot & ~matches.any(axis=1)
@@ -94,7 +94,7 @@ def runs_out(
     free = ((state.active >= settings.capacity) | ~(linked | in_scan)).sum()
     beyond = size - min(measurements, size)
     reserve = max(min(measurements, beyond), beyond // 2)
-    reserve = min(reserve, settings.capacity - size)  # no more can ever be asked for
+    reserve = min(reserve, settings.capacity - size)  # no more are ever needed
     return (enters.sum() > free - reserve) & (linked & ~in_scan).any()
 
 
@@ -124,7 +124,7 @@ def determines_pose(rows: Float[Array, "MZ 3"], turn: float) -> Bool[Array, ""]:
     factor, positive = linalg.cholesky(unit)
     pivot = jnp.diagonal(factor)
     rank = (pivot**2 > float(jnp.finfo(rows.dtype).eps) ** 0.5).all()
-    # The heading comes last: the square of its pivot is its information, the position unknown.
+    # The heading comes last: the square of its pivot is its marginal information.
     spread = 1.0 / (jnp.where(rank, pivot[2], 1.0) * scale[2])
     determined: Array = there & positive & rank & (spread <= turn)
     return determined

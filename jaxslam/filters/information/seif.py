@@ -51,13 +51,13 @@ def seif(
 
     1. motion update (`canonical.motion_update`), of the robot and the active landmarks;
     2. sparsification (`sparsification.sparsify`): the least recently measured active landmarks
-       lose their links to the robot, as many as the scan needs room for;
+       lose their links to the robot, as many as the scan needs indices for;
     3. measurement update and new landmarks (`canonical`);
     4. mean recovery (`mean_recovery`), one block at a time: the block of robot and active
        landmarks, and `passive` landmarks in rotation.
 
-    With active = capacity it is `eif_slam`. `sparsification` says what is dropped, and where;
-    `SparseState.counts` how much. NIS, gate and, unless `whole`, `estimate` take covariances of
+    With active = capacity it is `eif_slam`. `sparsification` documents what is dropped, and
+    `SparseState.counts` counts it. NIS, gate and, unless `whole`, `estimate` use covariances of
     Markov blankets (`marginals`), which hold all other landmarks at their means: less than the true
     ones, by much in a map that has drifted as a whole. Sparsification is overconfident too, which
     `eseif` is not. Landmarks are points associated by their tags, and the tag of one is its slot.
@@ -74,9 +74,9 @@ def seif(
         passive: landmarks whose means are recovered in rotation each scan, beside the active ones.
         sweeps: rounds of mean recovery a scan: passive landmarks, then the active block.
         conservative: how a full list drops its weakest link, `sparsification.drop_link`. False:
-            overconfidently, Ω stays positive definite. True: claiming less; where a map needs many
-            more links than it may have, Ω does not stay positive definite.
-        whole: `estimate` inverts Ω of all landmarks, O(N³): what the filter believes.
+            overconfidently, Ω stays positive definite. True: with loss of information; where a map
+            needs many more links than it may have, Ω does not stay positive definite.
+        whole: `estimate` inverts Ω of all landmarks, O(N³): the filter's exact marginals.
         gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
         floor: standard deviation [m, rad] added to a singular pose_cov, which has no inverse.
     Raises:
@@ -129,8 +129,8 @@ def sparsify_and_activate(
 ) -> tuple[SparseState, Int[Array, "M"]]:
     """The state with all measured landmarks active, and their indices in the active set.
 
-    Empty indices are given first, then those of the landmarks not measured for longest, which are
-    sparsified and become passive.
+    Empty indices are assigned first, then those of the least recently measured landmarks, which
+    are sparsified and become passive.
     """
     matches = active_matches(state, measured)
     enters = measured.has_slot & ~matches.any(axis=1)

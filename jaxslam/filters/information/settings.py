@@ -50,7 +50,7 @@ class SparseSettings(InformationSettings):
     sweeps: int
     """rounds of mean recovery a scan"""
     conservative: bool
-    """a full list drops a link so that Ω claims less, where it stays positive definite"""
+    """a full list drops a link so that Ω loses information, where it stays positive definite"""
     whole: bool
     """covariances of the estimate are of the whole Ω, not of Markov blankets"""
 
@@ -65,7 +65,7 @@ class SparseSettings(InformationSettings):
 
     @property
     def active_size(self) -> int:
-        """A, the size of the active set."""
+        """The size A of the active set."""
         return min(self.active, self.capacity)
 
     @property

@@ -3,7 +3,7 @@
 Ω of the robot and the A active landmarks is one dense block. A passive landmark has no link to the
 robot; its links to other landmarks are in its list of at most K. A pair of which both are active is
 in the dense block alone, every other pair in the lists of both. So a motion or a scan changes the
-dense block, and no array of N landmarks is read or written but at a few rows.
+dense block, and only a few rows of arrays of N landmarks are read or written.
 """
 
 from typing import NamedTuple
@@ -27,7 +27,7 @@ class ApproximationCounts(NamedTuple):
     dropped_links: Float[Array, ""]
     """Σ |Ω_ij| (Frobenius) of the same"""
     anchored: Int[Array, ""]
-    """how many of them were dropped overconfidently, so that Ω stays positive definite"""
+    """number of them dropped overconfidently, so that Ω stays positive definite"""
     refused: Int[Array, ""]
     """scans refused because Ω of the active block was not positive definite"""
     relocated: Int[Array, ""]

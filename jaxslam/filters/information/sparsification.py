@@ -6,10 +6,10 @@
        Ω̃ = Ω + G Σ⁻¹ Gᵀ - Ω F_x Ω_x⁻¹ F_xᵀ Ω,   G = Ω F_x - Ω F_m0 Ω_m0⁻¹ Ω_m0,x,   Σ = F_xᵀ G.
 
    `seif` does it in every scan that needs room; `eseif` relocates instead (`relocation`), unless
-   wait=False. `ApproximationCounts.cut` and `.cut_nats` say how much was dropped.
-2. Landmark to landmark, `drop_link`: a landmark's list of links holds K; a full list drops its
+   wait=False. `ApproximationCounts.cut` and `.cut_nats` count what was dropped.
+2. Landmark to landmark, `drop_link`: a landmark's list has room for K links; a full list drops its
    weakest link Ω_ij (`link_lists`), and the two diagonal blocks change so that Ω̃ stays positive
-   definite. Both filters do it; `.dropped`, `.dropped_links` and `.anchored` say how often.
+   definite. Both filters do it; `.dropped`, `.dropped_links` and `.anchored` count it.
 """
 
 import jax.numpy as jnp
@@ -97,11 +97,11 @@ def drop_link(
     """Diagonal blocks of Ω, and counts, after a link Ω_ij = B is dropped, where on.
 
     With the least U and V of `psd_completion`:
-    Overconfident: [[U, -B], [-Bᵀ, V]] ⪰ 0 is added, so Ω̃ ⪰ Ω stays positive definite for certain,
-    and claims more than Ω: both landmarks are anchored where they are.
-    Conservative: [[U, B], [Bᵀ, V]] ⪰ 0 is subtracted, so Ω̃ ⪯ Ω claims less. Whether Ω̃ is positive
-    definite cannot be tested at a constant cost, but by the two diagonal blocks: where one of them
-    would lose half of its information in some direction, the link is dropped overconfidently.
+    Overconfident: [[U, -B], [-Bᵀ, V]] ⪰ 0 is added, so Ω̃ ⪰ Ω is certainly positive definite, with
+    spurious information that anchors both landmarks at their means.
+    Conservative: [[U, B], [Bᵀ, V]] ⪰ 0 is subtracted, so Ω̃ ⪯ Ω. Whether Ω̃ is positive definite
+    cannot be tested at a constant cost, so only the two diagonal blocks are tested: where one of
+    them would lose half of its information in some direction, the link is dropped overconfidently.
     """
     u, v = psd_completion(link)
     n = diagonal.shape[0]

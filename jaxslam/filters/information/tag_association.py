@@ -21,7 +21,7 @@ class TagAssociation(NamedTuple):
     repeated: Bool[Array, "M"]
     """its tag occurs earlier in the scan"""
     has_slot: Bool[Array, "M"]
-    """the landmark has a slot, or there is one that a new landmark may take"""
+    """the landmark has a slot, or a slot is free for a new landmark"""
     slot: Int[Array, "M"]
     """this slot; any number where there is none"""
 
@@ -43,7 +43,7 @@ def associate_by_table(tag: Int[Array, "N"], alive: Bool[Array, "N"], scan: Scan
 def associate_by_index(alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
     """Association where a landmark's slot is its tag; measurements without a tag get slot N.
 
-    Of several measurements of one landmark the first counts, the others are repeated.
+    Of several measurements of one landmark the first is used, the others are REPEATED.
     """
     capacity = alive.shape[0]
     tagged = scan.valid & (scan.tag >= 0)

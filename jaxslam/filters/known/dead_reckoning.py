@@ -21,8 +21,8 @@ def dead_reckoning(
 ) -> Filter:
     """The predicted pose alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (16)).
 
-    Every measurement is `Status.UNMATCHED`, and the map stays empty. The sensor only says of what
-    size measurements are; chart and linearize are those of `ekf_slam`, and raise as there.
+    Every measurement is `Status.UNMATCHED`, and the map stays empty. The sensor only gives the size
+    of measurements; chart and linearize are those of `ekf_slam`, with the same errors.
     """
     validation.check_models("dead_reckoning", motion, sensor)
     validation.check_parts("dead_reckoning", chart=chart, linearize=linearize)

@@ -61,18 +61,18 @@ def localization(
     """Extended Kalman filter of the pose in a known map without errors (Williams; the Notes).
 
     The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the pose only, P (3, 3). A step
-    costs what its scan does, but for finding tags among N (0.09 ms a step with 10,000); association
-    other than by tags looks at all landmarks. With a `sensors.suite`, absolute sensors (compass,
-    position fix) correct in the same update.
+    costs O(M), plus the search for tags among N (0.09 ms a step with 10,000); association other
+    than by tags compares all landmarks. With a `sensors.suite`, absolute sensors (compass, position
+    fix) correct in the same update.
 
-    The state is a `slots.Joint` whose landmarks have no parameters. A measurement of no landmark of
-    the map is `Status.UNMATCHED`.
+    The state is a `slots.Joint` whose landmarks have no parameters. A measurement without a
+    landmark in the map is `Status.UNMATCHED`.
 
     Args:
         motion, sensor: as for `ekf_slam`.
         landmarks: (N, L) the map, in the sensor's parameters.
         tags: (N,) int, different; default the row numbers.
-        chart: the error P is of; its pose part. Default `charts.euclidean()`.
+        chart: the error coordinates of P; its pose part. Default `charts.euclidean()`.
         linearize: one without a memory of landmarks (at_estimate, unscented).
         associate, update, gate, iterations: as for `ekf_slam`.
         covariance: "plain" or "joseph", as there.

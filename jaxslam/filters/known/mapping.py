@@ -37,11 +37,11 @@ def mapping(
     """A filter of the map alone, for known poses (Williams): the control *is* the pose.
 
     Given the path, landmarks are independent: each has an EKF of its own, l ← l + C Hᵀ S⁻¹ ν with
-    S = H C Hᵀ + R, and a measurement costs O(1) however large the map is. It is what one particle
-    of `fastslam` does; no joint matrix exists.
+    S = H C Hᵀ + R, and a measurement costs O(1) for any size of the map. This is the map update of
+    one particle of `fastslam`, without a joint covariance.
 
     The state is one particle of a `SlamParticles`. `log._replace(control=poses)` makes a log
-    of recorded poses (T, 3) and scans; `as_prior` makes the map one that `ekf_slam` goes on from.
+    of recorded poses (T, 3) and scans; `as_prior` makes the map the initial state of `ekf_slam`.
 
     Args:
         sensor: of landmarks; Jacobians come from `jax.jacfwd`.
@@ -69,7 +69,7 @@ def mapping(
     def update(state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
         scan = zero_padding(scan)
         association = associate_particle(state, scan, settings)
-        # The pose is known, so that the proposal is where it was; the rest is of use.
+        # The pose is known, so the proposal does not change it; the other results are used.
         proposed, innovations = propose_pose(state, association, scan, settings)
         state, info = update_map(state, association, innovations, scan, settings)
         return state, info._replace(log_likelihood=proposed.log_matched)
@@ -98,7 +98,7 @@ def as_prior(
 ) -> Joint:
     """The initial state of a SLAM filter with this map as an uncorrelated prior.
 
-    `run` begins in it by `dataclasses.replace(filter, init=partial(as_prior, final, filter))`.
+    Used by `run` with `dataclasses.replace(filter, init=partial(as_prior, final, filter))`.
 
     Args:
         state: the final state of `mapping`.
@@ -106,8 +106,8 @@ def as_prior(
         pose, pose_cov: (3,) and (3, 3) where its robot begins.
     Raises:
         ValueError: on other shapes; on a filter whose state is no `slots.Joint` of as many
-            landmarks, holds a root of its covariance, is in another chart, or remembers where it
-            linearized.
+            landmarks, has a root of its covariance, is in another chart, or has a linearizer with
+            memory.
     """
     if np.shape(pose) != (3,) or np.shape(pose_cov) != (3, 3):
         raise ValueError(

@@ -87,7 +87,7 @@ def match(points: PointSets, limits: SearchLimits) -> Match:
 
     Each of a few pairs (a, b) of cluster points, the longest, is compared with all pairs (j, k) of
     the map: with s and r the two distances, (s - r)²/var(s - r) <= χ²(1). Each agreement fixes the
-    frame T, and the rest of the cluster is judged in it: δ_ik = T z_i - m_k, linear in the errors
+    frame T, in which the rest of the cluster is tested: δ_ik = T z_i - m_k, linear in the errors
     of z_a, z_b, z_i, m_j, m_k and m_l, with d² <= χ²(2) and no point twice. The best hypotheses are
     then fitted as a whole, and lose their worst pair until D² <= χ²(2n - 3).
 

@@ -121,7 +121,7 @@ class PairFrame(NamedTuple):
     moved: Float[Array, "M 2"]
     """T z_i"""
     jacobians: Float[Array, "M 2 8"]
-    """of T z_i, through T, by z_a, z_b, m_j and m_k"""
+    """Jacobians of T z_i, through T, by z_a, z_b, m_j and m_k"""
 
 
 def frame_of_pair(points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"]) -> PairFrame:

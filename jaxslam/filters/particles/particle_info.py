@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 
 class ParticleInfo(NamedTuple):
-    """`info.extra["particles"]` of a particle filter; None for fields this filter does not have."""
+    """The record `info.extra["particles"]`; None for fields that the filter does not have."""
 
     ess: Float[Array, "*T"]
     """effective number of particles, 1/Σ w², after the scan and before resampling"""

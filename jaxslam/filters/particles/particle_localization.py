@@ -63,18 +63,18 @@ def particle_localization(
     forget: tuple[float, float] | None = (0.01, 0.1),
     slack: float = 1.0,
 ) -> Filter:
-    """Monte-Carlo localization with a number of particles that adapts, and recovery when lost.
+    """Monte-Carlo localization with an adaptive number of particles, and recovery when lost.
 
     Poses are drawn from the motion with its noise and weighted by the scan, p(z | x, map), the map
     being without error (Dellaert, Fox, Burgard & Thrun 1999; Thrun, Burgard & Fox, "Probabilistic
     Robotics", table 8.2). The state is a `PoseParticles`. Particles are resampled before a motion,
-    if the last scan left ESS = 1/Σ w² below threshold · (particles in use); then so many of the
-    draws are used as the KLD bound asks for the bins that these occupy after the motion (Fox 2001;
-    `resampling.kld`), at most `particles`, of which the others have weight zero. In
-    `info.extra["particles"]`, a `ParticleInfo`, these are `active` and `capped`.
+    if the last scan left ESS = 1/Σ w² below threshold · (particles in use). The number of particles
+    in use is then the KLD bound for the bins that they occupy after the motion (Fox 2001;
+    `resampling.kld`), at most `particles`; the others have weight zero. In
+    `info.extra["particles"]`, a `ParticleInfo`, see `active` and `capped`.
 
-    A kidnapped robot is found again by particles from the whole box (table 8.3). With
-    c the average over the particles, by weight, of exp(-Σ d²/2m) over the m measurements of a scan,
+    A kidnapped robot is found again by particles from the whole box (table 8.3). With c the
+    weighted average over the particles of exp(-Σ d²/2m) over the m measurements of a scan,
 
         slow ← slow + α_slow (c - slow)     fast ← fast + α_fast (c - fast)
 
@@ -83,7 +83,7 @@ def particle_localization(
     does not depend on how many landmarks are in view; the first scan sets both averages; scans
     without a measurement change nothing. slack above 1 injects less (Gutmann & Fox 2002).
 
-    The estimate is that of the weighted particles after a scan, before anything is drawn anew:
+    The estimate is that of the weighted particles after a scan, before resampling:
     `moments.weighted_pose_moments`, a single mean and covariance even if the particles form several
     modes. Where all weights underflow, all in use become equal (`underflow`). A motion
     that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
