@@ -3,6 +3,8 @@
 import importlib
 import inspect
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -68,3 +70,12 @@ def test_every_public_factory_is_in_the_reference():
         for name in getattr(package, "__all__", []):
             if name != "REGISTRY":
                 assert (package.__name__, name) in listed
+
+
+def test_a_dotted_path_in_the_text_is_reached_after_one_import():
+    """In a process of its own: here other tests have imported everything."""
+    text = README.split("## Reference")[0]
+    called = sorted(set(re.findall(r"`[^`]*?\b(jaxslam(?:\.\w+)+)\(", text)))
+    assert called
+    code = "import jaxslam\n" + "\n".join(called)
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

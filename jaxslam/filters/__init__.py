@@ -9,11 +9,15 @@ from jaxslam.filters.information.seif import seif
 from jaxslam.filters.known.dead_reckoning import dead_reckoning
 from jaxslam.filters.known.localization import localization
 from jaxslam.filters.known.mapping import mapping
+from jaxslam.filters.map_management.closing import closing
+from jaxslam.filters.map_management.merging import merging
+from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.filters.multi_robot.team_slam import team_slam
 from jaxslam.filters.particles.fastslam import fastslam
 from jaxslam.filters.particles.particle_localization import particle_localization
 
 __all__ = [
+    "closing",
     "compressed_ekf_slam",
     "dead_reckoning",
     "delayed_slam",
@@ -23,7 +27,9 @@ __all__ = [
     "fastslam",
     "localization",
     "mapping",
+    "merging",
     "particle_localization",
+    "pruning",
     "seif",
     "team_slam",
 ]
