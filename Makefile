@@ -11,7 +11,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DELETE_ON_ERROR:
-.PHONY: consistency test check bench clean
+.PHONY: consistency test check bench docs links clean
 
 ## The main job: is EKF-SLAM honest? 100 simulated runs; results in out/.
 consistency: $(VENV)/.run
@@ -31,6 +31,14 @@ check: $(VENV)/.dev
 bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks $(ARGS)
 
+## The documentation, in docs/_build/html; its code is run, its results kept in .cache/. Warnings are errors.
+docs: $(VENV)/.dev
+	$(BIN)/sphinx-build --builder html --jobs auto --fail-on-warning --keep-going --quiet docs docs/_build/html $(ARGS)
+
+## Whether the documentation's links to other sites are alive; needs the network.
+links: $(VENV)/.dev
+	$(BIN)/sphinx-build --builder linkcheck --jobs auto --quiet docs docs/_build/links $(ARGS)
+
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "jaxslam needs Python >= 3.11 with the venv module"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
@@ -45,4 +53,4 @@ $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) out docs/_build docs/reference/api

@@ -1,0 +1,201 @@
+"""Sphinx extension: writes the pages of the API reference from the package.
+
+A name is public if neither it nor its module begins with an underscore. It is shown under the
+shortest path that reaches it: the package that lists it in `__all__`, else its own module.
+"""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+FOLDER = Path(__file__).parents[1] / "reference" / "api"
+
+INTRODUCED = {
+    "jaxslam": "The driver, the harness and the verifier",
+    "jaxslam.types": "Records of data",
+    "jaxslam.protocols": "Protocols",
+    "jaxslam.motion": "Motion models",
+    "jaxslam.sensors": "Sensors",
+    "jaxslam.filters": "Filters",
+    "jaxslam.charts": "Charts of the error",
+    "jaxslam.linearize": "Where Jacobians are taken",
+    "jaxslam.association": "Data association",
+    "jaxslam.life": "Which landmarks exist",
+    "jaxslam.resampling": "Resampling",
+    "jaxslam.smoothing": "Smoothing and batch estimation",
+    "jaxslam.team": "Several robots",
+    "jaxslam.simulation": "Simulated worlds",
+    "jaxslam.monte_carlo": "Monte-Carlo campaigns",
+    "jaxslam.consistency": "Measures of consistency",
+    "jaxslam.verify": "Verification of Jacobians",
+    "jaxslam.catalog": "The filters of a campaign by name",
+    "jaxslam.datasets": "Data sets",
+    "jaxslam.calibration": "Calibration of odometry",
+    "jaxslam.results": "Reports, figures and files",
+    "jaxslam.math": "Mathematics",
+    "jaxslam.noise": "Noise models",
+    "jaxslam.slots": "The table of landmarks",
+    "jaxslam.derivatives": "Derivatives",
+    "jaxslam.programs": "Compiled programs",
+    "jaxslam.validation": "What is refused",
+}
+"""Title of each page, in the order of the contents; a module that is not listed comes after."""
+
+
+class Name(NamedTuple):
+    """A public name under the path that a reader uses."""
+
+    module: str
+    name: str
+    kind: str
+    """the autodoc directive: function, class, exception or data"""
+
+
+def modules() -> list[ModuleType]:
+    """All public modules of the package but the command line's."""
+    import jaxslam
+
+    found = [jaxslam]
+    for info in pkgutil.walk_packages(jaxslam.__path__, "jaxslam."):
+        parts = info.name.split(".")[1:]
+        if parts[0] != "cli" and not any(part.startswith("_") for part in parts):
+            found.append(importlib.import_module(info.name))
+    return found
+
+
+def public_names() -> dict[str, list[Name]]:
+    """The public names of each module; a name stands once."""
+    walked = modules()
+    listed: dict[int, Name] = {}
+    pages: dict[str, list[Name]] = {module.__name__: [] for module in walked}
+    for module in walked:
+        for name in getattr(module, "__all__", []):
+            value = getattr(module, name)
+            if not inspect.ismodule(value) and id(value) not in listed:
+                listed[id(value)] = Name(module.__name__, name, kind_of(value))
+                pages[module.__name__].append(listed[id(value)])
+    for module in walked:
+        constants = assigned(module)
+        for name, value in vars(module).items():
+            if name.startswith("_") or inspect.ismodule(value) or id(value) in listed:
+                continue
+            kind = kind_of(value)
+            foreign = kind == "data" and inspect.isclass(value)  # `Array`, say, is JAX's
+            own = name in constants if kind == "data" else value.__module__ == module.__name__
+            if own and not foreign:
+                pages[module.__name__].append(Name(module.__name__, name, kind))
+    return pages
+
+
+def kind_of(value: Any) -> str:
+    """The autodoc directive of a value."""
+    if inspect.isclass(value) and value.__module__.startswith("jaxslam"):
+        return "exception" if issubclass(value, BaseException) else "class"
+    is_function = callable(value) and getattr(value, "__module__", "").startswith("jaxslam")
+    return "function" if is_function and hasattr(value, "__name__") else "data"
+
+
+def assigned(module: ModuleType) -> set[str]:
+    """Names of the constants and types that a module itself assigns."""
+    names = set()
+    for statement in ast.parse(inspect.getsource(module)).body:
+        if isinstance(statement, ast.Assign):
+            names |= {target.id for target in statement.targets if isinstance(target, ast.Name)}
+        elif isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            names.add(statement.target.id)
+    return names
+
+
+def page_of(module: str) -> str:
+    """The page that a module stands on: its top-level part."""
+    return ".".join(module.split(".")[:2])
+
+
+def write_pages(app: Any = None) -> None:
+    """Write a page for each top-level module; a page that is as it was is left alone."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    sections: dict[str, list[str]] = {}
+    for module, names in public_names().items():
+        page = page_of(module)
+        if names or module == page:
+            sections.setdefault(page, []).append(section(module, names, top=module == page))
+    order = [*INTRODUCED, *sorted(set(sections) - set(INTRODUCED))]
+    written = set()
+    for page in (page for page in order if page in sections):
+        title = f"{INTRODUCED.get(page, page)}: {page}" if page in INTRODUCED else page
+        text = f"{title}\n{'=' * len(title)}\n\n" + "\n".join(sections[page])
+        target = FOLDER / f"{page}.rst"
+        written.add(target)
+        if not target.exists() or target.read_text(encoding="utf-8") != text:
+            target.write_text(text, encoding="utf-8")
+    for path in set(FOLDER.glob("*.rst")) - written:
+        path.unlink()
+
+
+def section(module: str, names: list[Name], top: bool) -> str:
+    """The text of one module: its docstring, then its names in order."""
+    lines = [] if top else [module, "-" * len(module), ""]
+    lines += [f".. automodule:: {module}", "   :no-members:"]
+    lines += ["   :no-index:", ""] if hidden(module) else [""]
+    for name in names:
+        lines += [f".. auto{name.kind}:: {name.module}::{name.name}"]
+        if name.kind == "data":
+            lines += ["   :no-value:"]
+        lines += [""]
+    return "\n".join(lines)
+
+
+def hidden(module: str) -> bool:
+    """Whether the package has a function of the module's name, as `jaxslam.motion.unicycle` is."""
+    package, _, name = module.rpartition(".")
+    return bool(package) and not inspect.ismodule(getattr(importlib.import_module(package), name))
+
+
+def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Docstrings are plain text with `code` and the sections Args and Raises.
+
+    What reStructuredText would take for markup is escaped. A constant without a docstring of its
+    own has its type's, which is left out.
+    """
+    from sphinx.ext import napoleon  # the suite imports this file without Sphinx
+
+    text = "\n".join(lines)
+    borrowed = (inspect.getdoc(type(obj)), inspect.getdoc(obj) if inspect.isclass(obj) else None)
+    if what in ("data", "attribute") and text.strip() in borrowed:
+        lines.clear()
+        return
+    pieces = re.split(r"(`[^`]*`)", text)
+    for k in range(0, len(pieces), 2):
+        pieces[k] = re.sub(r"([*|\\])", r"\\\1", pieces[k])
+        pieces[k] = re.sub(r"(\w)_(?!\w)", r"\1\\_", pieces[k])
+        pieces[k] = re.sub(r":\n\n(?= )", "::\n\n", pieces[k])  # a diagram
+    for k in range(1, len(pieces), 2):
+        pieces[k] += "\\ " if re.match(r"[\w(]", pieces[k + 1]) else ""
+    plain = "".join(pieces).split("\n")
+    settings = napoleon.Config(napoleon_use_rtype=False)
+    # As of a module: napoleon would take an attribute's text up to a colon for its type.
+    kind = what if what in ("class", "function", "method") else "module"
+    lines[:] = napoleon.GoogleDocstring(plain, settings, app, kind, name, obj).lines()
+
+
+def missing(app: Any, exception: Exception | None) -> None:
+    """After the build: a public name that no page shows is an error."""
+    if exception is not None or app.builder.name != "html":
+        return
+    shown = set(app.env.domaindata["py"]["objects"])
+    wanted = {f"{n.module}.{n.name}" for names in public_names().values() for n in names}
+    if lost := sorted(wanted - shown):
+        raise RuntimeError(f"the reference misses {len(lost)} public names: {', '.join(lost)}")
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Connect to Sphinx."""
+    app.connect("builder-inited", write_pages)
+    app.connect("autodoc-process-docstring", as_markup)
+    app.connect("build-finished", missing)
+    return {"parallel_read_safe": True}

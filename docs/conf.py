@@ -1,0 +1,58 @@
+"""How the documentation is built: `make docs`, with every warning an error."""
+
+import hashlib
+import importlib.metadata
+import os
+import sys
+from pathlib import Path
+
+import jax
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+sys.path.insert(0, str(HERE / "_ext"))
+
+
+project = "jaxslam"
+author = copyright = "The jaxslam authors"
+version = release = importlib.metadata.version("jaxslam")
+
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.mathjax", "myst_nb", "reference"]
+exclude_patterns = ["_build", "_ext"]
+suppress_warnings = ["mystnb.unknown_mime_type"]
+
+html_theme = "furo"
+html_title = "jaxslam"
+html_static_path = ["_static"]
+html_css_files = ["jaxslam.css"]
+pygments_style = "friendly"
+
+# Pages.
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 3
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_execution_show_tb = True
+nb_merge_streams = True
+
+# What a page printed and drew is kept until the page or the package changes.
+sources = hashlib.sha256()
+for path in sorted((ROOT / "jaxslam").rglob("*.py")):
+    sources.update(path.read_bytes())
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(ROOT / ".cache" / f"docs-{sources.hexdigest()[:16]}")
+
+# The kernels that run the pages keep their compiled programs in the checkout.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / f"jax-{jax.__version__}"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+# The reference.
+default_role = "code"
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_default_options = {"members": True, "undoc-members": True}
+python_use_unqualified_type_names = True
+maximum_signature_line_length = 80
