@@ -1,9 +1,9 @@
-"""All benchmarks, one gate: `python -m benchmarks [--quick]`, or `make bench`.
+"""All benchmarks, one gate: `make bench`.
 
-A table of every metric with the range it must lie in; the exit status is 1 if one is missed. Each
-part is also a program of its own: compile, consistency, victoria_park, real_data, speed, gradient,
-association, baselines, bearing, delayed, plaza, team, smoothing, fastslam, plain_particles,
-scaling, comparison, monte_carlo_localization, seif, verdict.
+    python -m benchmarks [--quick] [--only NAME,…] [--record]
+
+A table of every metric with the range it must lie in; the exit status is 1 if one is missed.
+`--record` writes RESULTS.md. Most parts are also a program of their own, with options.
 """
 
 import argparse
@@ -11,7 +11,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -35,10 +37,13 @@ from benchmarks import (
     victoria_park,
 )
 from benchmarks.association.__main__ import measure as measure_association
-from benchmarks.consistency import circle
+from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import Metric, report
+from benchmarks.results import measured
 from benchmarks.speed.__main__ import gated
 from benchmarks.speed.__main__ import measure as measure_speed
+
+FIGURES = Path(__file__).parent / "figures"
 
 
 def command_seconds() -> list[Metric]:
@@ -61,7 +66,10 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "speed": lambda: gated(measure_speed(quick)),
         "gradient": gradient.measure,
         "verdict": lambda: verdict.measure(1000 if quick else 4000),
-        "circle": lambda: circle.measure(200 if quick else 1000)[1],
+        "circle": lambda: circle_published(200 if quick else 1000),
+        "loop": lambda: pictured(loop, maps=10 if quick else 100),
+        "webmap": lambda: pictured(webmap, runs=10 if quick else 100),
+        "stationary": lambda: pictured(stationary, runs=20 if quick else 200),
         "victoria_park": victoria_park.measure,
         "real_data": real_data.measure,
         "association": lambda: measure_association(quick),
@@ -80,23 +88,49 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
     }
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks")
+def pictured(module: Any, **scale: int) -> list[Metric]:
+    """A published experiment: its section is printed, its figure drawn."""
+    section, metrics, figure = module.measure(**scale)
+    print(section, flush=True)
+    figure.savefig(FIGURES / f"{section.name}.png")
+    return metrics
+
+
+def circle_published(runs: int) -> list[Metric]:
+    """UKF-M's published figures beside ours."""
+    section, metrics = circle.measure(runs)
+    print(section, flush=True)
+    return metrics
+
+
+def main(names: Sequence[str] = ()) -> int:
+    """Run the benchmarks of these names, or those that the command line names, or all."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer runs, no campaigns of cloister")
+    parser.add_argument("--only", default="", help="names of benchmarks, separated by commas")
+    parser.add_argument("--record", action="store_true", help="write RESULTS.md")
     options = parser.parse_args()
+    known = parts(options.quick)
+    wanted = [name for name in options.only.split(",") if name] or names or list(known)
+    if unknown := sorted(set(wanted) - set(known)):
+        parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(known)}")
     jax.config.update("jax_enable_x64", True)
     metrics: list[Metric] = []
-    for name, measure in parts(options.quick).items():
+    for name in wanted:
         print(f"\n{name}", flush=True)
         began = time.perf_counter()
-        found = measure()
+        if options.record:
+            command = f"python -m benchmarks --record {'--quick ' * options.quick}--only {name}"
+            found = measured(name, known[name], command)
+        else:
+            found = known[name]()
         # What was measured stays on the screen, whatever becomes of the parts after it.
         if found:
             report(found)
         print(f"{name}: {time.perf_counter() - began:.0f} s", flush=True)
         metrics += found
     print("\nall")
-    return report(metrics)
+    return report(metrics) if metrics else 0
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def measure(maps: int = 100, runs: int = 4, steps: int = 2500, seed: int = 0):
         "turn by 2° (1 σ). At a tenth of every σ, same maps and draws, its mean is "
         f"{calm.mean():.2f} ± {calm.mean(axis=1).std(ddof=1) / np.sqrt(maps):.2g}.\n\n"
         f"The authors' own released program, 50 runs on one map each: {published}.\n\n"
-        "![Pose NEES by map and filter](loop.png)"
+        "![Pose NEES by map and filter](figures/loop.png)"
     )
     middle = {name: float(np.median(nees[name])) for name in NAMES}
     metrics = [

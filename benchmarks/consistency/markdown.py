@@ -9,7 +9,7 @@ class Section(NamedTuple):
     text: str
 
     def __str__(self) -> str:
-        return f"## {self.title} (`{self.name}`)\n\n{self.text}\n"
+        return f"### {self.title} (`{self.name}`)\n\n{self.text}\n"
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:

@@ -50,7 +50,7 @@ def measure(runs: int = 200, seed: int = 0) -> tuple[Section, list[Metric], Figu
         "could claim is 1/√(prior's information + what its own linearized system gains along a "
         "turn of the whole frame).\n\n"
         + table(header, rows)
-        + "\n\n![Heading σ against time](stationary.png)"
+        + "\n\n![Heading σ against time](figures/stationary.png)"
     )
     return Section("stationary", "A robot that does not move", text), metrics, figure(campaign)
 

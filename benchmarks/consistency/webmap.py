@@ -39,7 +39,9 @@ def measure(runs: int = 100, seed: int = 0) -> tuple[Section, list[Metric], Figu
         f"{runs} runs × {campaign.steps} scans ({LOOPS} loops of 340 m), seed {seed}. "
         "The map is ours, in the style of theirs; what is reproduced is the course: the standard "
         "EKF is consistent at first and grows optimistic with the heading's uncertainty, the ideal "
-        "EKF stays consistent.\n\n" + table(header, rows) + "\n\n![NEES against time](webmap.png)"
+        "EKF stays consistent.\n\n"
+        + table(header, rows)
+        + "\n\n![NEES against time](figures/webmap.png)"
     )
     ideal, ekf = (campaign.filters[n].measures["nees_pose"] for n in ("ideal", "ekf"))
     metrics.append(Metric("webmap, ideal EKF, pose NEES", ideal.value, 2.4, 3.6))

@@ -10,13 +10,13 @@ may fall behind it by its tolerance. `--write` records a new one. Leave the mach
 import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
 from pathlib import Path
 
 from benchmarks.gate import Metric, report
+from benchmarks.results import processor
 from benchmarks.speed.campaigns import campaign, processes
 
 BASELINE = Path(__file__).with_name("baseline.json")
@@ -68,19 +68,6 @@ def measure(quick: bool = False, long: bool = False) -> dict[str, float]:
             ratios.append((one + again) / 2 / two)
         found["campaign, two processes on two cores / one on one"] = statistics.median(ratios)
     return found
-
-
-def processor() -> str:
-    """Its name, and which vectors it has."""
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        return platform.processor()
-    lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
-    known = {key.strip(): value.strip() for key, value in lines.items()}
-    flags = known.get("flags", "").split()
-    vectors = [flag for flag in flags if flag.startswith(("avx", "fma", "sse4"))]
-    return f"{known.get('model name', platform.processor())}: {' '.join(vectors)}"
 
 
 def gated(found: dict[str, float]) -> list[Metric]:
