@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import jax
+from jupyter_cache import get_cache
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -41,12 +42,17 @@ for path in sorted((ROOT / "jaxslam").rglob("*.py")):
     sources.update(path.read_bytes())
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / ".cache" / f"docs-{sources.hexdigest()[:16]}")
+get_cache(nb_execution_cache_path).list_cache_records()  # makes it, before several processes do
 
 # The kernels that run the pages keep their compiled programs in the checkout.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / f"jax-{jax.__version__}"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+# `!jaxslam …` in a page is the command of this environment.
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+os.environ["COLUMNS"] = "100"
 
 # The reference.
 default_role = "code"

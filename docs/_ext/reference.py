@@ -165,8 +165,9 @@ def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: lis
     from sphinx.ext import napoleon  # the suite imports this file without Sphinx
 
     text = "\n".join(lines)
-    borrowed = (inspect.getdoc(type(obj)), inspect.getdoc(obj) if inspect.isclass(obj) else None)
-    if what in ("data", "attribute") and text.strip() in borrowed:
+    of = obj if inspect.isclass(obj) else type(obj)
+    borrowed = (inspect.getdoc(of) or "").partition("\n")[0]
+    if what in ("data", "attribute") and text.partition("\n")[0].strip() == borrowed:
         lines.clear()
         return
     pieces = re.split(r"(`[^`]*`)", text)
