@@ -16,10 +16,11 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.validation.numbers import check_covariance
 from jaxslam.verify.differences import on_circle
 from jaxslam.verify.errors import describe_error, line_of
-from jaxslam.verify.functions import Function, periods
+from jaxslam.verify.functions import Function, at_state, periods
 from jaxslam.verify.jacobians import Evaluated
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples
+from jaxslam.verify.singular import CURES, singular_operation
 
 Values: TypeAlias = np.ndarray
 
@@ -219,24 +220,23 @@ def _finite_check(evaluated: Evaluated) -> Check:
         if bad.any():
             i = int(np.argmax(bad))
             state = tuple(a[i] for a in samples.values)
-            where = _line_of_nan(function, state, what)
-            at = ", ".join(
-                f"{argument.name} = ({', '.join(f'{v:.6g}' for v in row)})"
-                for argument, row in zip(function.arguments, state, strict=True)
-            )
+            hand = function.hand if what.startswith("hand") else None
+            call: Callable[..., object] = hand or function.call
+            kind = singular_operation(call, state)
+            if what != "a value" and hand is None:
+                call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
+            where = _line_of_nan(call, state)
+            at = at_state(function, state)
             line = f"{where}: " if where else ""
-            often = f"{int(np.sum(bad))} of {count} states"
-            return Check(name, False, f"{line}{what} is not, {often}; {samples.labels[i]}: {at}")
+            often = f"at {int(np.sum(bad))} of {count} states"
+            cure = (f"The cause is {kind}. {CURES[kind][0]}", *CURES[kind][1:]) if kind else ()
+            detail = f"{line}{what} is not finite, {often}; {samples.labels[i]}: {at}"
+            return Check(name, False, detail, cure)
     return Check(name, True, f"{count} states")
 
 
-def _line_of_nan(function: Function, state: tuple[Values, ...], what: str) -> str:
-    """The user's line at which a NaN or an infinity first appears in the computation of `what`."""
-    call: Callable[..., object] = function.call
-    if what != "a value" and "hand" not in what:
-        call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
-    elif "hand" in what and function.hand is not None:
-        call = function.hand
+def _line_of_nan(call: Callable[..., object], state: tuple[Values, ...]) -> str:
+    """The user's line at which a NaN or an infinity first appears when a function is called."""
     try:  # JAX prints what it found
         with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
             call(*(jnp.asarray(a) for a in state))
