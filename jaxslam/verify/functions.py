@@ -121,10 +121,13 @@ def plain_function(
     parameters = _parameters(call, given)
     if unknown := [key for key in given if key not in parameters]:
         raise ValueError(
-            f"{name}: no parameter {', '.join(unknown)}; it has {', '.join(parameters) or 'none'}"
+            f"{name}: expected arguments of {', '.join(parameters) or 'no parameter'}, got "
+            f"{', '.join(unknown)}"
         )
     if not parameters:
-        raise ValueError(f"{name}: takes no argument to differentiate by")
+        raise ValueError(
+            f"{name}: expected a function with a parameter to differentiate by, got none"
+        )
     named = {p: _entries(name, p, given.get(p, GLOSSARY.get(p))) for p in parameters}
     lengths = {p: None if entries is None else len(entries) for p, entries in named.items()}
     shapes = [np.shape(table) for table in (() if states is None else states)]

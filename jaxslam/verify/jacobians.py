@@ -132,7 +132,13 @@ class _Evaluator:
             return None
         shape = getattr(out, "shape", None)
         if np.issubdtype(getattr(out, "dtype", float), np.complexfloating):
-            self.checks.append(Check(f"{name} returns its shape", False, "returns complex numbers"))
+            self.checks.append(
+                Check(
+                    f"{name} returns its shape",
+                    False,
+                    "returns complex numbers where real ones are expected",
+                )
+            )
             return None
         wanted = f"({len(named)},)" if named else "(m,)"
         if shape is None or len(shape) != 1 or (named and shape != (len(named),)):

@@ -57,7 +57,7 @@ def motion_checks(motion: Motion, samples: Samples) -> Iterator[Check]:
     def heading_error() -> str:
         heading = np.asarray(quick_jit(jax.vmap(motion.step))(pose, u, w))[:, 2]
         worst = float(np.max(np.abs(heading)))
-        return "" if worst <= np.pi else f"a heading of {worst:.6g} rad is returned"
+        return "" if worst <= np.pi else f"it returns a heading of {worst:.6g} rad"
 
     yield from _guarded("the heading is wrapped to (-π, π]", heading_error)
     perturb = motion.perturb
@@ -147,8 +147,9 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
     if gaps[worst] <= _ROUNDING * (1 + np.abs(pose).max()):
         return ""
     return (
-        f"a landmark at ({point[worst][0]:.4g}, {point[worst][1]:.4g}) seen from "
-        f"({', '.join(f'{v:.4g}' for v in pose[worst])}) comes back {gaps[worst]:.3g} off"
+        f"a landmark at ({point[worst][0]:.4g}, {point[worst][1]:.4g}) observed from "
+        f"({', '.join(f'{v:.4g}' for v in pose[worst])}) is returned with an error of "
+        f"{gaps[worst]:.3g}"
     )
 
 
@@ -171,13 +172,13 @@ def _residual_error(
     if np.abs(off).max() > _ROUNDING * (1 + np.abs(z).max()):
         return f"residual(z, ẑ) differs from z - ẑ by {np.abs(off).max():.3g}"
     if np.any(np.abs(plain)[:, circular] > period[circular] / 2 + 1e-12):
-        return "an angle beyond half a turn is returned"
+        return "it returns an angle beyond half a turn"
     for turns in (1, -3):
         whole = np.where(circular, turns * period, 0.0)
         far = np.abs(np.asarray(residual(z + whole, other)) - plain)
         far = np.where(circular, np.minimum(far, np.abs(far - period)), far)
         if far.max() > 1e-8:
-            return "a whole turn more changes it"
+            return "adding whole turns to z changes the residual"
     return ""
 
 
@@ -196,7 +197,7 @@ def _deviation(difference: ArrayLike, circle: Float[np.ndarray, "m"]) -> str:
     """How far a difference is from zero modulo the periods, or "" within rounding."""
     off = on_circle(np.asarray(difference, np.float64), circle)
     worst = float(np.max(np.abs(np.where(np.isnan(off), np.inf, off)), initial=0.0))
-    return "" if worst <= _ROUNDING else f"off by {worst:.3g}, relative to the coordinates"
+    return "" if worst <= _ROUNDING else f"off by {worst:.3g} relative to the coordinates"
 
 
 def _exactly(difference: ArrayLike) -> str:
@@ -253,11 +254,13 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
         state = tuple(jnp.asarray(a[i]) for a in evaluated.samples.values)
         first, second = (np.asarray(function.call(*state), np.float64) for _ in range(2))
         if not np.array_equal(first, second, equal_nan=True):
-            return "two calls with the same arguments differ: it keeps or draws something"
+            return (
+                "two calls with the same arguments differ: it keeps a state or draws random numbers"
+            )
         scale = 1.0 + max(float(np.max(np.abs(np.asarray(a)), initial=0)) for a in (*state, first))
         off = first - evaluated.values[i]
         if bad := _deviation(off / scale, function.periods / scale):
-            return f"under jit and vmap the value is another, {bad}"
+            return f"under jit and vmap the value differs, {bad}"
     return ""
 
 

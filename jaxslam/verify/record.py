@@ -8,6 +8,10 @@ from typing import Any
 
 _SHOWN = 3
 """number of wrong entries of a Jacobian that are printed with their values; others by name only"""
+_COLUMNS = (
+    "float64, float32: largest difference of autodiff and hand-derived Jacobian, relative to the",
+    "row; differences: of these and difference quotients; linearity: median linearity index.",
+)
 
 
 @dataclass(frozen=True)
@@ -173,7 +177,7 @@ class Report:
 
 
 def table(reports: Sequence[Report]) -> str:
-    """The table of reports: a line a model with its largest relative differences and its result."""
+    """The table of reports: a line for each model with its largest differences, and a legend."""
     head = ("", "Jacobians", "float64", "float32", "differences", "checks", "linearity", "")
     lines = [head]
     for report in reports:
@@ -197,7 +201,7 @@ def table(reports: Sequence[Report]) -> str:
         ).rstrip()
         for line in lines
     ]
-    return "\n".join([text[0], "-" * max(map(len, text)), *text[1:]])
+    return "\n".join([text[0], "-" * max(map(len, text)), *text[1:], "", *_COLUMNS])
 
 
 def _wrapped(text: str, indent: int) -> list[str]:

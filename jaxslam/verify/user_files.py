@@ -85,8 +85,8 @@ def load(target: str) -> list[Target]:
         found = [t for t in found if t.name == name]
         if not found and hasattr(module, name):
             raise UnusableFile(
-                f"{path.name}: {name} is neither a Motion nor a Sensor nor a factory"
-                f" of one, and there is no {name}{CLAIMS[0]}"
+                f"{path.name}: expected {name} to be a Motion, a Sensor, a factory of one, or a "
+                f"function with its Jacobian, and there is no {name}{CLAIMS[0]}"
             )
         if not found:
             raise UnusableFile(f"{path.name}: there is no {name}")
@@ -180,7 +180,7 @@ def _target(module: ModuleType, name: str) -> Target | None:
         return None
     claims = [getattr(module, name + end) for end in CLAIMS if hasattr(module, name + end)]
     if len(claims) > 1:
-        raise UnusableFile(f"there are both {name}_jacobian and {name}_jacobians: which is it?")
+        raise UnusableFile(f"expected {name}_jacobian or {name}_jacobians, got both")
     if claims:
         about = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
         return Target(name, value, claims[0], *about)

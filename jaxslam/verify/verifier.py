@@ -96,7 +96,10 @@ def verify_jacobians(
             or count or a tolerance is not positive.
     """
     if not tolerance > 0 or not float32_tolerance > 0:
-        raise ValueError("verify_jacobians: expected tolerances above 0")
+        raise ValueError(
+            f"verify_jacobians: expected tolerances above 0, got {tolerance} and "
+            f"{float32_tolerance}"
+        )
     if count < 2:
         raise ValueError(f"verify_jacobians: expected count >= 2, got {count}")
     if not 0 <= seed < 2**32:
@@ -215,7 +218,7 @@ def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
         elif isinstance(model, Sensor):
             yield from properties.sensor_checks(model, *drawn)
     except (Exception, SystemExit) as error:
-        yield Check("the rest of the checks", False, describe_error(error))
+        yield Check("the remaining checks", False, describe_error(error))
 
 
 def _typical_linearity(model: Model, examined: Examined) -> float | None:

@@ -151,7 +151,7 @@ def test_one_of_them_by_name(verify):
         (GOOD, ":g", "there is no g"),
         (GOOD.replace("f_jacobian", "f_slope"), ":f", "there is no f_jacobian"),
         (UNTOLD, "", "what is the length of its argument 'u'"),
-        (GOOD + "\nf_jacobians = f_jacobian\n", "", "which is it?"),
+        (GOOD + "\nf_jacobians = f_jacobian\n", "", "expected f_jacobian or f_jacobians, got both"),
         (GOOD + "\nf_states = (1.0,)\n", "", "expected states of shapes (S, 3), (S, 1)"),
         (MODELS.replace("return jaxslam.sensors", "return 1 / jaxslam.sensors"), "", "mine.py:9: "),
     ],
