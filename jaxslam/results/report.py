@@ -22,7 +22,7 @@ from jaxslam.types import Estimate
 
 ROWS = (
     ("nees_pose", "pose NEES (x, y, θ)", f"{DOF['pose']}"),
-    ("nees_own", "pose NEES, own error", f"{DOF['pose']}"),
+    ("nees_own", "pose NEES, in its chart", f"{DOF['pose']}"),
     ("nees_position", "position NEES", f"{DOF['position']}"),
     ("nees_heading", "heading NEES", f"{DOF['heading']}"),
     ("nees_landmarks", "landmark NEES", f"{LANDMARK_DOF}"),
@@ -71,8 +71,8 @@ def campaign_table(campaign: Campaign) -> str:
     notes += not_finite(campaign)
     if campaign.dtype == "float32":
         notes.append(
-            "The filters ran in float32; for float64, the command's default, set jax_enable_x64 "
-            "in Python."
+            "The filters ran in float32: for float64, set jax_enable_x64 in Python, or leave out "
+            "--dtype in the command."
         )
     if campaign.published:
         notes.append(f"published: {campaign.source}")

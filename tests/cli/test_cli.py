@@ -200,5 +200,5 @@ def test_the_module_runs_as_a_program_in_float32(tmp_path):
         [sys.executable, "-m", "jaxslam", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert "The filters ran in float32; for float64, the command's default" in done.stdout
+    assert "The filters ran in float32: for float64" in done.stdout
     assert json.loads((tmp_path / "consistency.json").read_text())["dtype"] == "float32"

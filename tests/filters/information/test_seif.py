@@ -361,7 +361,7 @@ def test_gradients_and_batches():
         ({"sweeps": 0}, "sweeps"),
         ({"capacity": 0}, "capacity"),
         ({"floor": -1.0}, "floor"),
-        ({"sensor": sensors.range_bearing_signature(0.01 * np.eye(3))}, "points"),
+        ({"sensor": sensors.range_bearing_signature(0.01 * np.eye(3))}, r"landmarks \(x, y\)"),
     ],
 )
 def test_refusals(changes, message):

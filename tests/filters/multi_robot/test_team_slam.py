@@ -417,5 +417,5 @@ def test_a_scan_with_other_places_is_refused():
     scenario, log_of = drawn(2)
     log = log_of(0)
     short = log._replace(scan=jax.tree.map(lambda leaf: leaf[:, :10], log.scan))
-    with pytest.raises(ValueError, match="expected 14 places"):
+    with pytest.raises(ValueError, match="expected 14 measurement slots"):
         go(crew_slam(2, True), scenario, short)
