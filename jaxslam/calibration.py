@@ -98,16 +98,22 @@ def calibrate(
         jacobian, (w, dof) = jax.device_get(programs.call(step, (), jnp.asarray(p)))
         jacobian, w, dof = np.asarray(jacobian, np.float64), np.asarray(w, np.float64), int(dof)
         if not dof:
-            raise ValueError(f"calibrate: no measurement is fused at {p}")
+            raise ValueError(
+                f"calibrate: expected fused measurements, got none at parameters {p}: start "
+                "closer, or with a larger gate"
+            )
         if not (np.isfinite(jacobian).all() and np.isfinite(w).all()):
             raise ValueError(
-                f"calibrate: the innovations or their derivatives are not finite at {p}"
+                f"calibrate: the innovations or their derivatives are not finite at parameters {p}"
             )
         # Columns of unit length: whether parameters can be distinguished does not depend on units.
         length = np.linalg.norm(jacobian, axis=0)
         left, values, right = np.linalg.svd(jacobian / np.where(length > 0, length, 1.0), False)
         if values[-1] <= len(p) * np.sqrt(np.finfo(np.float64).eps) * values[0]:
-            raise ValueError(f"calibrate: the innovations do not distinguish the parameters at {p}")
+            raise ValueError(
+                f"calibrate: the log does not determine all parameters at {p}: fix one, or use a "
+                "log with more motion"
+            )
         inverse = right.T / values / length[:, None]
         cov = inverse @ inverse.T
         move = -inverse @ (left.T @ w)

@@ -57,7 +57,7 @@ def check_team(
         if not isinstance(robot, Robot):
             raise ValueError(f"{name}: expected a team.Robot, got {robot!r}")
     if robots[0].start is not None:
-        raise ValueError(f"{name}: robot 0 has no start of its own, the run's is its start")
+        raise ValueError(f"{name}: expected no start of robot 0: it begins at the pose of the run")
     made = tuple(range(landmarks, landmarks + len(robots))) if tags is None else tuple(tags)
     if len(made) != len(robots) or len(set(made)) != len(made):
         raise ValueError(f"{name}: expected {len(robots)} different tags of robots, got {made}")

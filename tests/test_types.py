@@ -41,18 +41,18 @@ BAD_VALUES = {
     "control inf": (changed("control", (3, 0), np.inf), r"log.control is not finite \(row 3\)"),
     "z nan": (
         changed("z", (1, 2, 0), np.nan),
-        r"log.scan.z: a valid measurement is not finite \(row 1, place 2\)",
+        r"log.scan.z: a valid measurement is not finite \(row 1, slot 2\)",
     ),
     "z inf": (
         changed("z", (0, 0, 1), -np.inf),
-        r"log.scan.z: a valid measurement is not finite \(row 0, place 0\)",
+        r"log.scan.z: a valid measurement is not finite \(row 0, slot 0\)",
     ),
-    "tag -2": (changed("tag", (3, 1), -2), r"log.scan.tag: a tag is below -1 \(row 3, place 1\)"),
+    "tag -2": (changed("tag", (3, 1), -2), r"log.scan.tag: a tag is below -1 \(row 3, slot 1\)"),
     "tag 2**32": (
         good_log()._replace(
             scan=good_log().scan._replace(tag=good_log().scan.tag.astype(np.int64) + 2**32)
         ),
-        r"log.scan.tag: a tag is beyond int32 \(row 0, place 0\)",
+        r"log.scan.tag: a tag is beyond int32 \(row 0, slot 0\)",
     ),
     "repeated": (
         changed("tag", 2, [5, 6, 5]),

@@ -237,9 +237,9 @@ def test_localization_is_named_by_its_own_name():
 
 
 def test_a_compressed_filter_refuses_to_merge():
-    with pytest.raises(ValueError, match=r"^compressed_ekf_slam: does not take make_room"):
+    with pytest.raises(ValueError, match=r"^compressed_ekf_slam: make_room is not supported"):
         FACTORIES["compressed_ekf_slam"](MOVE, SEES, make_room=life.recency())
-    with pytest.raises(ValueError, match=r"^merging: two landmarks of compressed_ekf_slam"):
+    with pytest.raises(ValueError, match=r"^merging: landmarks of compressed_ekf_slam"):
         merging.merging(FACTORIES["compressed_ekf_slam"](MOVE, SEES), 1.0)
 
 
@@ -282,11 +282,11 @@ def run_from(pose, pose_cov=WORLD.pose_cov):
         ),
         (
             lambda: jaxslam.monte_carlo(WORLD, {"ekf": EKF}, 2, KEY, devices=99),
-            r"devices as of jax.local_devices\(\), got 99",
+            r"devices as from jax.local_devices\(\), got 99",
         ),
         (
             lambda: jaxslam.monte_carlo(WORLD, {"ekf": EKF}, 2, KEY, keep="kk"),
-            r"^monte_carlo: expected keep as of jaxslam.store.create\(folder\).*got 'kk'",
+            r"^monte_carlo: expected keep as from jaxslam.store.create\(folder\).*got 'kk'",
         ),
         (
             lambda: jaxslam.verify_jacobians(3),

@@ -26,7 +26,9 @@ def right_invariant(rays: bool = False) -> Chart:
 
     def retract(pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark) -> tuple[Pose, Landmark]:
         if landmark.shape != (size,):
-            raise ValueError(f"{name}: expected a landmark ({size},), got {landmark.shape}")
+            raise ValueError(
+                f"{name}: expected a landmark of shape ({size},), got {landmark.shape}"
+            )
         moved = se2.exp(dx)
         shift = se2.exp(jnp.concatenate([dl[:2], dx[2:]]))
         point = se2.from_frame(shift, landmark[:2])

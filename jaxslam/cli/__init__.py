@@ -56,13 +56,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The parser of the command line; `options.command` is the function to call."""
-    parser = argparse.ArgumentParser(prog="jaxslam", description="2-D landmark SLAM in JAX.")
+    parser = argparse.ArgumentParser(
+        prog="jaxslam",
+        description="2-D landmark SLAM in JAX.",
+        epilog="jaxslam COMMAND --help describes the options of a command.",
+    )
     parser.add_argument("--version", action="version", version=_versions())
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_consistency(
         commands.add_parser(
             "consistency",
-            help="is a filter consistent? a Monte-Carlo campaign",
+            help="test filters for consistency in a Monte-Carlo campaign",
             description="Run filters over the same simulated worlds and compare their errors with "
             "the covariances they claim. Prints a table and writes JSON, CSV and figures.",
         )
@@ -70,21 +74,18 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(
         commands.add_parser(
             "run",
-            help="EKF-SLAM on a data set",
-            description="Run EKF-SLAM on recorded data; writes trajectory, map, summary and a "
-            "picture.",
-            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+            help="run EKF-SLAM on a recorded data set",
+            description="Run EKF-SLAM on recorded data. Prints a summary and writes trajectory, "
+            "map, summary and a figure.",
         )
     )
     _add_verify(
         commands.add_parser(
             "verify",
-            help="is a Jacobian right? of every model, or of your own file",
-            description="Compare Jacobians by forward and reverse autodiff, by hand and by "
-            "differences. Without a file: every motion model and sensor of jaxslam. Exit status 1 "
-            "if anything fails, 2 if the file cannot be used. Prints a table or report, writes "
-            "JSON.",
-            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+            help="verify the Jacobians of every model, or of your own file",
+            description="Compare hand-derived Jacobians with forward and reverse autodiff and "
+            "with difference quotients. Prints a table, or a report on your file, and writes JSON. "
+            "The exit status is 1 if anything fails, 2 if the file cannot be used.",
         )
     )
     return parser
@@ -110,13 +111,13 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
         "--bound",
         action=argparse.BooleanOptionalAction,
         default=argparse.SUPPRESS,
-        help="also compute the Cramér-Rao bound given each true trajectory (default: no)",
+        help="also compute the Cramér-Rao bound conditional on each true trajectory (default: no)",
     )
     campaign.add_argument(
         "--dtype",
         default=argparse.SUPPRESS,
         choices=["float32", "float64"],
-        help="(default: float64)",
+        help="floating-point type of the filters (default: float64)",
     )
     parser.add_argument(
         "--out", metavar="DIR", help=f"folder for results (default: {OUT}; with --resume, its own)"
@@ -133,20 +134,20 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
     earlier.add_argument(
         "--again",
         action="store_true",
-        help="replace it only if it is finished and had the same options",
+        help="as --overwrite, but only of a finished campaign with the same options",
     )
     parser.add_argument(
         "--block",
         type=int,
-        help="number of runs computed together on each device (a CPU has one device a core); "
-        "decides how much memory is used (default: 16 on a CPU, else by the memory)",
+        help="number of runs computed together on each device (each core of a CPU is one); memory "
+        "grows with it (default: 16 on a CPU, elsewhere by the memory of the device)",
     )
     parser.add_argument(
         "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'
     )
     cache.add_options(parser)
     others = parser.add_argument_group(
-        "several processes", "the same command for each process, with another --process-id"
+        "several processes", "run the same command in each, with its own --process-id"
     )
     others.add_argument(
         "--coordinator",
@@ -165,17 +166,28 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam run`."""
     parser.add_argument("--dataset", required=True, help=f"one of: {', '.join(READERS)}")
     parser.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
-    parser.add_argument("--robot", type=int, help="number of the robot, where there are several")
+    parser.add_argument(
+        "--robot",
+        type=int,
+        help="number of the robot, where there are several (default: the first)",
+    )
     parser.add_argument(
         "--check-every",
         type=int,
         metavar="K",
-        help="check after every K steps that the covariance is positive definite; 0: never; None: "
-        "at 20 steps spread over the log",
+        help="check after every K steps that the covariance is positive definite; 0: never "
+        "(default: at 20 steps spread over the log)",
     )
     cache.add_options(parser)
-    parser.add_argument("--dtype", default="float64", choices=["float32", "float64"])
-    parser.add_argument("--out", metavar="DIR", default=str(OUT), help="folder for results")
+    parser.add_argument(
+        "--dtype",
+        default="float64",
+        choices=["float32", "float64"],
+        help="floating-point type of the filter (default: float64)",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", default=str(OUT), help=f"folder for results (default: {OUT})"
+    )
     parser.set_defaults(command=run_dataset)
 
 
@@ -185,11 +197,18 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
         "target",
         metavar="FILE.py[:NAME]",
         nargs="?",
-        help="a file that defines a Motion, a Sensor, or a function f and its f_jacobian",
+        help="a file that defines a Motion, a Sensor, a factory of one, or a function f and its "
+        "f_jacobian; NAME: only that one (default: every model of jaxslam)",
     )
-    parser.add_argument("--states", type=int, default=24, help="number of random states")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random states")
-    parser.add_argument("--out", metavar="DIR", default=str(OUT), help="folder for results")
+    parser.add_argument(
+        "--states", type=int, default=24, help="number of random states (default: 24)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the random states (default: 0)"
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", default=str(OUT), help=f"folder for results (default: {OUT})"
+    )
     cache.add_options(parser)
     parser.set_defaults(command=verify_models, dtype="float64")
 

@@ -100,7 +100,7 @@ def program_cache(asked: Path | None, none: bool = False, bound: int = BOUND) ->
             pass
     except (OSError, RuntimeError) as error:
         where = whole or "the user's cache folder"
-        warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); going on without")
+        warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); continuing without")
         with jax_settings(jax_compilation_cache_dir=None):
             yield
         return
@@ -188,7 +188,7 @@ def _one_warning(folder: Path, ours: bool) -> Iterator[None]:
         if once.acquire(blocking=False):
             what = "is damaged" if match[1] == "reading" else "cannot be written"
             reason = " ".join(str(message)[match.end() :].split())[:200]
-            warn(f"a compiled program in {folder} {what} ({reason}); going on without it")
+            warn(f"a compiled program in {folder} {what} ({reason}); continuing without it")
 
     with warnings.catch_warnings():
         warnings.filterwarnings("always", message=_CACHE_WARNING.pattern)

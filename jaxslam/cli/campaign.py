@@ -71,7 +71,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     scenario = _scenario(asked["scenario"], asked["steps"])
     filters = _filters(asked["filters"], scenario)
     if not 0 <= asked["seed"] < 2**32:
-        raise ValueError(f"expected a seed between 0 and 2³²-1, got {asked['seed']}")
+        raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {asked['seed']}")
     check_count("runs", asked["runs"])
     if options.block is not None:
         check_count("block", options.block)
@@ -111,7 +111,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
                 shutil.rmtree(keep.folder, ignore_errors=True)
             raise
         print(report.campaign_table(stop.campaign))
-        print(f"\njaxslam: interrupted, {stop}; --resume {out} goes on", file=sys.stderr)
+        print(f"\njaxslam: interrupted, {stop}; --resume {out} continues it", file=sys.stderr)
         return INTERRUPTED
     for sentence in keep.set_aside:
         print(f"jaxslam: {sentence}", file=sys.stderr)
@@ -135,7 +135,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     print("\nwrote " + ", ".join(str(path) for path in write_files(out, files)))
     print(
         f"results after {took:.1f} s"
-        + f"; once every program was there, the runs took {ran:.1f} s of them" * (ran > 0)
+        + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
     )
     return 0
 
@@ -167,7 +167,7 @@ def _filters(asked: str, scenario: Scenario) -> dict[str, Candidate]:
             f"--filters: expected names of filters with commas between them, or all, got {asked!r}"
         )
     if len(set(names)) < len(names):
-        raise ValueError(f"expected each filter once, got {asked!r}")
+        raise ValueError(f"--filters: expected each filter once, got {asked!r}")
     return {name: _filter(name, scenario) for name in names}
 
 

@@ -50,10 +50,13 @@ def check_same_campaign(
     folder = options.resume
     if options.out is not None and options.out.resolve() != folder.resolve():
         raise ValueError(
-            f"--resume {folder} writes its results there: expected no --out, got {options.out}"
+            f"--resume: its results go to {folder}: expected no --out, got {options.out}"
         )
     if "asked" not in there.settings:
-        raise ValueError(f"{folder} holds a campaign that no command began")
+        raise ValueError(
+            f"--resume: {folder} holds a campaign that was begun from Python; continue it there, "
+            "with monte_carlo(keep=jaxslam.store.resume(folder))"
+        )
     told = there.settings["asked"]
     differences = [
         f"--{name} is {_as_option(told[name])} there, {_as_option(value)} here"
@@ -61,7 +64,7 @@ def check_same_campaign(
         if name in told and told[name] != value
     ]
     if differences:
-        raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
+        raise ValueError(f"--resume: {folder} holds another campaign: {'; '.join(differences)}")
 
 
 def open_store(
@@ -88,9 +91,14 @@ def _remove_old_blocks(
     folder = out / BLOCKS
     if not (folder / store.MANIFEST).exists():
         if folder.exists() and any(folder.iterdir()):
-            raise ValueError(f"{folder} holds files that are no campaign's; choose another --out")
+            raise ValueError(
+                f"--out: {folder} holds files that are no campaign's: choose another folder"
+            )
         if (out / RESULT).exists() and not options.overwrite:
-            raise ValueError(f"{out} holds the results of a campaign: --overwrite gives them up")
+            raise ValueError(
+                f"--out: {out} holds the results of a campaign: add --overwrite to replace them, "
+                "or choose another folder"
+            )
         return
     store.read_manifest(folder)  # raises where the folder is not a campaign's
     if not options.overwrite:
@@ -99,13 +107,13 @@ def _remove_old_blocks(
         left = bool(missing(there.spans(), whole, max(whole, 1)))
         if left and done:
             raise ValueError(
-                f"{out} holds an unfinished campaign, with {done} of {whole} runs done: --resume "
-                f"{out} goes on with it, --overwrite gives it up; or choose another --out"
+                f"--out: {out} holds an unfinished campaign, with {done} of {whole} runs done: "
+                f"--resume {out} continues it, --overwrite replaces it; or choose another folder"
             )
         same = options.again and (there.settings, whole) == (settings, runs)
         if done and not same:
             raise ValueError(
-                f"{out} holds a finished campaign of {done} runs: --overwrite gives it up, "
-                f"--resume {out} prints it, or extends it to more --runs; or choose another --out"
+                f"--out: {out} holds a finished campaign of {done} runs: --resume {out} prints it, "
+                "or extends it to more --runs, --overwrite replaces it; or choose another folder"
             )
     shutil.rmtree(folder)

@@ -60,8 +60,8 @@ class CompileClock:
     def __str__(self) -> str:
         made = f"{self.programs} programs" if self.programs != 1 else "1 program"
         return (
-            f"{self.seconds:.1f} s in all, {self.compiling:.1f} s of them to make {made}: "
-            f"{self.programs - self.cached} compiled, {self.cached} loaded from the cache"
+            f"{self.seconds:.1f} s in all, {self.compiling:.1f} s of them to compile or load "
+            f"{made}: {self.programs - self.cached} compiled, {self.cached} loaded from the cache"
         )
 
     def _took(self, event: str, duration_secs: float, **_: str | int) -> None:

@@ -25,7 +25,7 @@ from jaxslam.types import Status
 def run_dataset(options: argparse.Namespace, command: str) -> int:
     """Run EKF-SLAM over the data set, print and write its results; returns the exit status."""
     if options.check_every is not None and options.check_every < 0:
-        raise ValueError(f"run: expected --check-every of at least 0, got {options.check_every}")
+        raise ValueError(f"--check-every: expected at least 0, got {options.check_every}")
     data = pick("dataset", options.dataset, READERS)(options.path, options.robot)
     check_writable(options.out)
     ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
@@ -96,9 +96,9 @@ def positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
 def _definiteness(result: PiecewiseRun) -> str:
     """A phrase: at how many of the checked steps P was positive definite, and where not."""
     if not result.checked:
-        return "not looked at"
+        return "not checked"
     failed = [step for step, good in zip(result.checked, result.passed, strict=True) if not good]
-    count = f"at {sum(result.passed)} of {len(result.passed)} steps looked at"
+    count = f"at {sum(result.passed)} of {len(result.passed)} checked steps"
     if not failed:
         return count
     more = ", …" if len(failed) > 5 else ""

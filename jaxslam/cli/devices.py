@@ -19,7 +19,7 @@ def prepare(options: argparse.Namespace) -> None:
     asked = options.devices
     count = cores() if asked in ("all", "cpu") else int(asked) if asked.isdecimal() else None
     if count is not None and count < 1:
-        raise ValueError(f"expected at least 1 device, got {asked}")
+        raise ValueError(f"--devices: expected at least 1, got {asked}")
     if count is not None:
         with contextlib.suppress(RuntimeError):  # JAX is already in use, as in a notebook
             jax.config.update("jax_num_cpu_devices", min(count, cores()))
@@ -34,17 +34,20 @@ def join(options: argparse.Namespace) -> None:
     address, count, mine = options.coordinator, options.processes, options.process_id
     if address is None:
         if count is not None or mine is not None:
-            raise ValueError("--processes and --process-id need --coordinator HOST:PORT")
+            raise ValueError(
+                "--processes, --process-id: expected --coordinator HOST:PORT with them, got none"
+            )
         return
     if address == "auto":  # JAX reads the variables of SLURM, Kubernetes, Open MPI
         jax.distributed.initialize(initialization_timeout=options.timeout)
         return
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal():
-        raise ValueError(f"expected --coordinator HOST:PORT, got {address!r}")
+        raise ValueError(f"--coordinator: expected HOST:PORT or auto, got {address!r}")
     if count is None or mine is None or count < 1 or not 0 <= mine < count:
         raise ValueError(
-            f"expected --processes P >= 1 and --process-id I in 0 to P-1, got {count} and {mine}"
+            f"--processes, --process-id: expected P >= 1 and I from 0 to P-1, got {count} and "
+            f"{mine}"
         )
     if mine > 0:
         _await(host, int(port), options.timeout)
@@ -52,8 +55,8 @@ def join(options: argparse.Namespace) -> None:
         jax.distributed.initialize(address, count, mine, initialization_timeout=options.timeout)
     except jax.errors.JaxRuntimeError as error:
         raise ValueError(
-            f"not all of the {count} processes met at {address} within {options.timeout} s "
-            f"({str(error).splitlines()[0]})"
+            f"--coordinator: not all of the {count} processes connected to {address} within "
+            f"{options.timeout} s; raise --timeout ({str(error).splitlines()[0]})"
         ) from error
 
 
@@ -75,7 +78,7 @@ def chosen(asked: str) -> list[jax.Device]:
     except RuntimeError as error:
         known = sorted({device.platform for device in jax.local_devices()} | {"cpu"})
         raise ValueError(
-            f"no device {asked!r} here; known: all, {', '.join(known)}, or a number"
+            f"--devices: expected all, a number, or one of {', '.join(known)}, got {asked!r}"
         ) from error
 
 
@@ -95,6 +98,7 @@ def _await(host: str, port: int, timeout: int) -> None:
         except OSError as error:
             if time.monotonic() >= end:
                 raise ValueError(
-                    f"no coordinator at {host}:{port} within {timeout} s ({error})"
+                    f"--coordinator: no process 0 at {host}:{port} within {timeout} s: start it, "
+                    f"or raise --timeout ({error})"
                 ) from error
             time.sleep(0.2)

@@ -68,7 +68,7 @@ class ProgramFolder:
             return content
         with contextlib.suppress(OSError):
             path.unlink()
-        cache.warn(f"a compiled program in {self._folder} is damaged; going on without it")
+        cache.warn(f"a compiled program in {self._folder} is damaged; continuing without it")
         return None
 
     def put(self, name: str, content: bytes) -> None:

@@ -75,13 +75,15 @@ def posterior_bound(
             measurement noise that is singular.
     """
     if scenario.draw is not None or scenario.spurious is not None:
-        raise ValueError("posterior_bound: expected the world of one robot, nothing spurious")
+        raise ValueError(
+            "posterior_bound: expected a scenario of one robot without spurious measurements"
+        )
     if np.ndim(truth.pose) != 3 or np.shape(log.control)[:2] != np.shape(truth.pose)[:2]:
         raise ValueError("posterior_bound: expected truth and log with a leading axis over runs")
     count, total = truth.pose.shape[:2]
     at = snapshot_steps(total) if steps is None else np.asarray(steps, int)
     if at.size == 0 or at.min() < 0 or at.max() >= total:
-        raise ValueError(f"posterior_bound: expected steps within 0 and {total - 1}, got {steps}")
+        raise ValueError(f"posterior_bound: expected steps from 0 to {total - 1}, got {steps}")
     runs = jax.device_get(jax.jit(jax.vmap(partial(jacobians_at_truth, scenario)))(truth, log))
     start = np.asarray(jax.jit(root_psd)(jnp.asarray(scenario.pose_cov, truth.pose.dtype)))
     by_p: Any = 0.0
@@ -254,7 +256,9 @@ def _whitened(sensor: SensorJacobians) -> list[np.ndarray]:
     try:
         factor = np.linalg.cholesky(noise)
     except np.linalg.LinAlgError:
-        raise ValueError("posterior_bound: a measurement noise is not positive definite") from None
+        raise ValueError(
+            "posterior_bound: a covariance of measurement noise is not positive definite"
+        ) from None
     return [np.where(there, np.linalg.solve(factor, by), 0.0) for by in sensor[:2]]
 
 

@@ -95,15 +95,13 @@ def judge(
 
 
 def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
-    """A sentence on what a campaign that rejects nothing would have noticed; "" where nothing."""
+    """A phrase on what the campaign rejects with probability `POWER`; "" where nothing."""
     parts = []
     for name, (low, high) in noticed.items():
-        above, below = f"from a {TESTS[name]} of {high:.3g} on", f"below {low:.3g}"
-        if high < np.inf:
-            parts.append(above + f" (or {below})" * bool(low > 0))
-        elif low > 0:
-            parts.append(f"{below} of {TESTS[name]}")
-    return f"would have been noticed {', '.join(parts)}" if parts else ""
+        beyond = [f"above {high:.3g}"] * bool(high < np.inf) + [f"below {low:.3g}"] * bool(low > 0)
+        if beyond:
+            parts.append(f"a {TESTS[name]} {' or '.join(beyond)}")
+    return f"{POWER:.0%} power to reject {', '.join(parts)}" if parts else ""
 
 
 def _side(found: Spread, low: float, high: float) -> int:
@@ -157,8 +155,9 @@ def _doubts(per_run: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> tup
     free = free[np.isfinite(free)]
     if free.size and free.mean() < 3:
         out.append(
-            f"unobservable directions {free.mean():.3g} instead of 3: unless a sensor measures the "
-            "robot in the frame of the map, the filter takes for known what nothing has told it"
+            f"unobservable directions {free.mean():.3g} instead of 3: the filter gained "
+            "information on the pose of the map as a whole, which only a sensor of absolute pose "
+            "or position gives"
         )
     return tuple(out)
 

@@ -42,7 +42,7 @@ def bonn(
         measurement_cov: (2, 2) covariance of (range, bearing), or a function of z.
     Raises:
         ValueError: `path:line: reason` on a malformed line, a landmark that is not in `world.dat`
-            or is seen twice in a step, or a SENSOR line before the first ODOMETRY.
+            or is measured twice in a step, or a SENSOR line before the first ODOMETRY.
     """
     names, landmarks = _read_world(TextFile(Path(folder) / "world.dat"))
     tag_of = {name: tag for tag, name in enumerate(names)}
@@ -66,7 +66,7 @@ def bonn(
             if name not in tag_of:
                 raise file.error(line, f"landmark {name} is not in world.dat")
             if name in in_step:
-                raise file.error(line, f"landmark {name} is seen twice in a step")
+                raise file.error(line, f"landmark {name} is measured twice in a step")
             in_step.add(name)
             if distance < 0:
                 dropped["negative ranges"] += 1

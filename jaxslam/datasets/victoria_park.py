@@ -141,7 +141,7 @@ def _check_landmark_lines(
         if j in poses:
             raise file.error(line, f"{j} is a pose, not a landmark")
         if (i, j) in seen:
-            raise file.error(line, f"landmark {j} is seen twice from pose {i}")
+            raise file.error(line, f"landmark {j} is measured twice from pose {i}")
         seen.add((i, j))
 
 

@@ -23,9 +23,9 @@ def chi2_tail(x: ArrayLike, dof: ArrayLike) -> jax.Array:
 def chi2_quantile(p: float, dof: float) -> float:
     """The x with P(χ²_dof <= x) = p. Raises ValueError unless 0 < p < 1 and dof > 0."""
     if not 0 < p < 1:
-        raise ValueError(f"expected a probability between 0 and 1, got {p}")
+        raise ValueError(f"chi2_quantile: expected a probability between 0 and 1, got {p}")
     if not dof > 0:
-        raise ValueError(f"expected positive degrees of freedom, got {dof}")
+        raise ValueError(f"chi2_quantile: expected dof above 0, got {dof}")
     return float(chi2_quantiles(p, np.asarray(dof)))
 
 
@@ -41,7 +41,7 @@ def sigma_gate(n_sigma: float) -> float:
     (Solà B.3.1, see ERRATA). For a gate by probability use `chi2_quantile(0.99, dof)`.
     """
     if not n_sigma > 0:
-        raise ValueError(f"expected a positive number of sigmas, got {n_sigma}")
+        raise ValueError(f"sigma_gate: expected n_sigma above 0, got {n_sigma}")
     return float(n_sigma) ** 2
 
 
@@ -51,7 +51,7 @@ def chi2_band(dof: float, runs: int, level: float = 0.95) -> tuple[float, float]
     [χ²_{runs·dof}((1-level)/2), χ²_{runs·dof}((1+level)/2)]/runs; around dof.
     """
     if runs < 1:
-        raise ValueError(f"expected at least one run, got {runs}")
+        raise ValueError(f"chi2_band: expected at least one run, got {runs}")
     tail = (1 - level) / 2
     total = dof * runs
     return chi2_quantile(tail, total) / runs, chi2_quantile(1 - tail, total) / runs
@@ -64,7 +64,7 @@ def truncated_chi2_mean(share: float, dof: float) -> float:
     has dropped that share. Raises ValueError unless 0 <= share < 1 and dof > 0.
     """
     if not 0 <= share < 1:
-        raise ValueError(f"expected a share in [0, 1), got {share}")
+        raise ValueError(f"truncated_chi2_mean: expected a share in [0, 1), got {share}")
     if share == 0:
         return 1.0
     gate = chi2_quantile(1 - share, dof)
@@ -82,5 +82,5 @@ def t_quantile(p: float, dof: float) -> float:
 def normal_quantile(p: float) -> float:
     """The x with P(N(0, 1) <= x) = p. Raises ValueError unless 0 < p < 1."""
     if not 0 < p < 1:
-        raise ValueError(f"expected a probability between 0 and 1, got {p}")
+        raise ValueError(f"normal_quantile: expected a probability between 0 and 1, got {p}")
     return float(scipy.special.ndtri(p))

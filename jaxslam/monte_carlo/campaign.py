@@ -194,21 +194,21 @@ def _check(
     check_record("monte_carlo", "scenario", scenario, Scenario)
     check_key("monte_carlo", key)
     if not isinstance(filters, Mapping) or not filters:
-        raise ValueError("monte_carlo: expected filters by name, at least one")
+        raise ValueError("monte_carlo: expected filters as {name: filter}, at least one")
     for name, candidate in filters.items():
         check_fits(name, candidate, scenario)
     check_noise(scenario)
     if devices is not None and not isinstance(devices, Sequence):
         raise ValueError(
-            f"monte_carlo: expected devices as of jax.local_devices(), got {devices!r}"
+            f"monte_carlo: expected devices as from jax.local_devices(), got {devices!r}"
         )
     if devices is not None and not devices:
-        raise ValueError("monte_carlo: expected at least one device")
+        raise ValueError("monte_carlo: expected at least one device, got none")
     if keep is not None and not all(
         callable(getattr(keep, name, None)) for name in ("claim", "save", "blocks")
     ):
         raise ValueError(
-            "monte_carlo: expected keep as of jaxslam.store.create(folder) or .resume(folder), "
+            "monte_carlo: expected keep as from jaxslam.store.create(folder) or .resume(folder), "
             f"got {keep!r}"
         )
 
@@ -261,12 +261,12 @@ class _Work:
                     raise
                 if plan.block == 1:
                     raise MemoryError(
-                        "monte_carlo: out of memory with one run a device (block=1); fewer steps, "
-                        "landmarks or filters at a time may fit"
+                        "monte_carlo: out of memory with one run on each device (block=1): use "
+                        "fewer steps, landmarks or filters at a time"
                     ) from error
                 half = plan.block // 2
                 warnings.warn(
-                    f"monte_carlo: out of memory with block={plan.block}; going on with "
+                    f"monte_carlo: out of memory with block={plan.block}; continuing with "
                     f"block={half}",
                     stacklevel=3,
                 )
@@ -343,9 +343,9 @@ def _qualified(found: dict[str, Summary], scenario: Scenario) -> dict[str, Summa
             one,
             doubts=(
                 *one.doubts,
-                f"the sensor gives {exact} without noise, so innovation covariances were singular: "
-                f"{dropped[name]:,} measurements were dropped for it and others weighed by "
-                "rounding alone; a small noise makes the figures mean something",
+                f"the sensor has {exact} without noise, so innovation covariances were singular: "
+                f"{dropped[name]:,} measurements were dropped and others weighted by rounding "
+                "errors; give the sensor a small noise",
             ),
         )
         if dropped[name]
@@ -359,8 +359,8 @@ def _add_kept(tallies: dict[str, Tally], keep: Keep, runs: int) -> None:
     for first, count, arrays in keep.blocks():
         if first + count > runs:  # sums over a block cannot be taken apart
             raise ValueError(
-                f"monte_carlo: runs up to {first + count} are kept: expected at least as many "
-                f"runs, got {runs}"
+                f"monte_carlo: keep holds {first + count} runs: expected at least as many, got "
+                f"{runs}"
             )
         _add(tallies, first, count, _by_filter(arrays, tallies))
 

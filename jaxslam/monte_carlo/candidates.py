@@ -147,14 +147,17 @@ def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
     """Raise ValueError unless a candidate takes what the scenario's log has."""
     if not isinstance(candidate, Filter):
         if not callable(candidate):
-            raise ValueError(f"monte_carlo: {name} is neither a filter nor a function of the truth")
+            raise ValueError(
+                f"monte_carlo: expected {name} to be a Filter or a function of the truth, got "
+                f"{type(candidate).__name__}"
+            )
         check_called(name, candidate)
         try:
             inspect.signature(candidate).bind(None)
         except TypeError:
             raise ValueError(
-                f"monte_carlo: {name} does not take the truth alone; an estimator of (log, key), "
-                "as of smoothing.smooth, is given as lambda truth: estimator"
+                f"monte_carlo: expected {name} to be a function of the truth alone; an estimator "
+                "of (log, key), as from smoothing.smooth, is given as lambda truth: estimator"
             ) from None
         return
     for what, has, needs in (

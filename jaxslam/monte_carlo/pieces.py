@@ -11,7 +11,7 @@ def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tupl
     done: (first, runs) of what is, in any order; may overlap and reach beyond.
     """
     if block < 1:
-        raise ValueError(f"block = {block}, expected >= 1")
+        raise ValueError(f"block: expected an integer >= 1, got {block}")
     gaps, at = [], 0
     for first, count in [*sorted(done), (runs, 0)]:
         gaps.append((at, min(first, runs)))

@@ -17,8 +17,8 @@ def share(pieces: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     count = jax.process_count()
     if count > 1 and len(set(_everyones(repr(list(pieces)).encode()))) > 1:
         raise ValueError(
-            "monte_carlo: the processes do not see the same blocks; keep them in a folder that all "
-            "share"
+            "monte_carlo: the processes see different blocks: expected keep in a folder that all "
+            "of them share"
         )
     return list(pieces[jax.process_index() :: count])
 

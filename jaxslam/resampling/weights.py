@@ -24,7 +24,9 @@ def normalized(
     Raises ValueError unless log_weights has shape (P,), P at least 1.
     """
     if jnp.ndim(log_weights) != 1 or jnp.shape(log_weights)[0] == 0:
-        raise ValueError(f"expected log-weights of shape (P,), got {jnp.shape(log_weights)}")
+        raise ValueError(
+            f"normalized: expected log-weights of shape (P,), got {jnp.shape(log_weights)}"
+        )
     there = jnp.isfinite(log_weights)
     some = there.any()
     highest = jnp.where(some, jnp.max(jnp.where(there, log_weights, -jnp.inf)), 0.0)

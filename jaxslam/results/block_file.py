@@ -46,7 +46,7 @@ def write_block(
     """
     first, runs = operator.index(first), operator.index(runs)
     if first < 0 or runs < 1:
-        raise ValueError(f"a block of {runs} runs from run {first}: expected >= 1 and >= 0")
+        raise ValueError(f"block: expected runs >= 1 and first >= 0, got {runs} and {first}")
     entries = {name: np.asarray(array) for name, array in arrays.items()}
     for name, array in entries.items():
         if not name.isprintable() or name in ("", _ABOUT) or re.search(r"\\|\.npy$", name):
@@ -84,9 +84,9 @@ def read_block(path: Path, campaign: str) -> Block:
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: an npz, but not a block of a campaign") from error
     if checksum != _checksum(about, arrays):
-        raise ValueError(f"{path}: its content does not fit its checksum")
+        raise ValueError(f"{path}: its content does not match its checksum")
     if settings != campaign:
-        raise ValueError(f"{path}: of another campaign, or made with other settings")
+        raise ValueError(f"{path}: belongs to another campaign, or to other settings")
     if (named := runs_of_name(path)) != (first, first + runs):
         names = f"names runs {named[0]} to {named[1]}" if named else "names no runs"
         raise ValueError(f"{path}: {names}, holds {first} to {first + runs}")

@@ -22,7 +22,7 @@ from jaxslam.types import Estimate
 
 ROWS = (
     ("nees_pose", "pose NEES (x, y, θ)", f"{DOF['pose']}"),
-    ("nees_own", "pose NEES, own error", f"{DOF['pose']}"),
+    ("nees_own", "pose NEES, in its chart", f"{DOF['pose']}"),
     ("nees_position", "position NEES", f"{DOF['position']}"),
     ("nees_heading", "heading NEES", f"{DOF['heading']}"),
     ("nees_landmarks", "landmark NEES", f"{LANDMARK_DOF}"),
@@ -40,7 +40,7 @@ ROWS = (
     ("recall", "associations: recall", "1"),
     ("false_landmarks", "false landmarks", "0"),
     ("unobservable", "unobservable directions", "3"),
-    ("rotation_information", "learnt of a turn [1/rad²]", "0"),
+    ("rotation_information", "rotation information [1/rad²]", "0"),
     ("log_likelihood", "log-likelihood", ""),
 )
 """Rows of the table: key of the measure, label, and the value of a consistent filter."""
@@ -58,17 +58,21 @@ def campaign_table(campaign: Campaign) -> str:
     text = "\n\n".join(_columns(campaign, part) for part in parts)
     title = f"{campaign.scenario}: {campaign.runs} runs × {campaign.steps} steps, {campaign.dtype}"
     notes = [
-        f"NEES is not divided by its dof, which is the honest value. ± or [ends]: {LEVEL:.0%}",
-        "interval over the runs. Verdict: whether pose NEES = 3 and NIS / dof = 1 lie in intervals",
-        f"that an honest filter's miss in {1 - LEVEL:.0%} of campaigns; above: optimistic, below:",
-        "pessimistic, and which spoke; consistent: not rejected. divergent: final position error "
-        f"over {campaign.divergence_limit:.3g} m, 5 σ of the ideal EKF.",
+        "honest: the average of a consistent filter; NEES is not divided by its dof.",
+        f"± or [low, high]: {LEVEL:.0%} interval over the runs.",
+        "verdict: optimistic where the interval of pose NEES or of NIS / dof lies above the honest",
+        "value (covariances too small), pessimistic where it lies below, with the rejecting test.",
+        "consistent: neither test rejects, which is no proof; of honest filters "
+        f"{1 - LEVEL:.0%} are rejected.",
+        f"divergent: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the ideal "
+        "EKF.",
     ]
     notes += qualified(campaign)
     notes += not_finite(campaign)
     if campaign.dtype == "float32":
         notes.append(
-            "In float32: the command's default is float64 (from Python, jax_enable_x64 first)."
+            "The filters ran in float32: for float64, set jax_enable_x64 in Python, or leave out "
+            "--dtype in the command."
         )
     if campaign.published:
         notes.append(f"published: {campaign.source}")
@@ -97,7 +101,7 @@ def not_finite(campaign: Campaign) -> list[str]:
         if lost:
             shown = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
             out.append(
-                f"{name} was not finite in {len(lost)} of {campaign.runs} runs, which its figures "
+                f"{name} was not finite in {len(lost)} of {campaign.runs} runs, which its measures "
                 f"leave out: {shown}"
             )
     return out

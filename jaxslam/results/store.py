@@ -101,7 +101,7 @@ class Store:
             try:
                 if named and named[0] < end:
                     raise ValueError(
-                        f"{path}: has runs of the block before it, which ends at {end}"
+                        f"{path}: repeats runs of the block before it, which ends at {end}"
                     )
                 block = self.load(path)
             except FileNotFoundError:
@@ -124,7 +124,7 @@ class Store:
             name, number = f"{path.name}.bad{number}", number + 1
         with contextlib.suppress(FileNotFoundError):
             path.rename(path.parent / name)
-        self.set_aside.append(f"{reason}; not counted, kept as {name}")
+        self.set_aside.append(f"{reason}; not used, renamed to {name}")
 
 
 def create(
@@ -146,8 +146,8 @@ def create(
     folder, own = _folder(folder), _as_stored(settings or {})
     if (folder / MANIFEST).exists():
         raise ValueError(
-            f"{folder} holds a campaign of which {Store(folder, {}).done()} runs are done: resume "
-            "it, or name another folder"
+            f"store.create: {folder} holds a campaign with {Store(folder, {}).done()} runs done: "
+            "store.resume continues it; or choose another folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
     _write_manifest(folder, own, {}, runs)
@@ -173,7 +173,9 @@ def resume(
     folder = _folder(folder)
     manifest, path = read_manifest(folder), folder / MANIFEST
     if manifest["format"] != FORMAT:
-        raise ValueError(f"{path}: of format {manifest['format']}, expected {FORMAT}")
+        raise ValueError(
+            f"{path}: expected format {FORMAT}, got {manifest['format']}: begin a new campaign"
+        )
     own, campaign = manifest.get("settings"), manifest.get("campaign")
     if (
         not isinstance(own, dict)
@@ -187,7 +189,7 @@ def resume(
     if runs is None:
         return kept
     if (end := max((first + count for first, count in kept.spans()), default=0)) > runs:
-        raise ValueError(f"{folder} has runs up to {end}: expected at least as many, got {runs}")
+        raise ValueError(f"{folder} holds {end} runs: expected at least as many, got {runs}")
     return replace(kept, runs=runs)
 
 
@@ -200,7 +202,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ValueError(f"{path} is not there: no campaign to resume") from error
+        raise ValueError(f"no campaign to resume: there is no {path}") from error
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}") from error
     except (ValueError, RecursionError) as error:
@@ -215,7 +217,9 @@ def _folder(folder: str | os.PathLike[str]) -> Path:
     try:
         return Path(folder)
     except TypeError:
-        raise ValueError(f"expected a folder, as a path or a string, got {folder!r}") from None
+        raise ValueError(
+            f"store: expected a folder, as a path or a string, got {folder!r}"
+        ) from None
 
 
 def _write_manifest(

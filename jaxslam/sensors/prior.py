@@ -27,10 +27,10 @@ def prior(name: str, free: FreeLike, size: int) -> Free:
     if mean.shape != (size,):
         raise ValueError(f"{name}: expected a prior mean of shape ({size},), got {mean.shape}")
     if is_concrete(mean) and not (_is_real(mean) and np.all(np.isfinite(mean))):
-        raise ValueError(f"{name}: the mean of the prior is not finite")
+        raise ValueError(f"{name}: expected a finite prior mean, got {mean}")
     check_covariance(f"{name}: prior", cov, size)
     if is_concrete(cov) and not np.linalg.eigvalsh(np.asarray(cov, np.float64))[0] > 0:
-        raise ValueError(f"{name}: the prior's variance must be positive")
+        raise ValueError(f"{name}: expected a positive definite prior covariance")
     return Free(mean, cov)
 
 

@@ -34,7 +34,7 @@ class Part:
 
     def __post_init__(self) -> None:
         if not isinstance(self.sensor, Sensor) or isinstance(self.sensor, Suite):
-            raise ValueError(f"suite: expected one sensor a part, got {self.sensor!r}")
+            raise ValueError(f"suite: expected one Sensor in each Part, got {self.sensor!r}")
         check_count(f"suite: places of {self.sensor.name}", self.places)
         check_count(f"suite: every of {self.sensor.name}", self.every)
         if type(self.start) is not int or self.start < 0:
@@ -43,7 +43,8 @@ class Part:
             raise ValueError(f'suite: expected sees "landmarks" or "robots", got {self.sees!r}')
         if not self.sensor.landmark and self.places != 1:
             raise ValueError(
-                f"suite: the absolute sensor {self.sensor.name} has one place, not {self.places}"
+                f"suite: expected places=1 of the absolute sensor {self.sensor.name}, got "
+                f"{self.places}"
             )
 
     @property
@@ -93,13 +94,13 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
     for sensor in grounded[1:]:
         if sensor.landmark != first.landmark or len(sensor.landmark) != 2:
             raise ValueError(
-                f"suite: the sensors {first.name} and {sensor.name} do not share landmarks (x, y): "
-                f"{first.landmark} and {sensor.landmark}"
+                f"suite: expected sensors that share landmarks (x, y), got {first.landmark} of "
+                f"{first.name} and {sensor.landmark} of {sensor.name}"
             )
     size = max(len(part.sensor.measurements) for part in made)
 
     def not_one(*_: Any) -> NoReturn:
-        raise ValueError("suite: several sensors have no measurement in common; ask its parts")
+        raise ValueError("suite: a suite has no model of its own: call those of suite.parts")
 
     return Suite(
         name=" + ".join(part.sensor.name for part in made),
@@ -128,7 +129,10 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
     Raises ValueError unless the scan has as many slots as the sensors together.
     """
     if sum(places) != scan.tag.shape[0]:
-        raise ValueError(f"expected places {tuple(places)} of a scan, got {scan.tag.shape[0]}")
+        raise ValueError(
+            f"suite: expected {sum(places)} measurement slots in a scan, {tuple(places)} by "
+            f"sensor, got {scan.tag.shape[0]}"
+        )
     ends = list(itertools.accumulate(places))
     return [
         jax.tree.map(lambda leaf, first=end - count, end=end: leaf[first:end], scan)

@@ -43,7 +43,9 @@ class Spurious:
             raise ValueError(f"Spurious: expected clutter of at least 0, got {self.clutter}")
         needs_reach = self.clutter > 0 or not is_concrete(self.outliers) or self.outliers > 0
         if not np.isfinite(self.reach) or self.reach < 0 or (self.reach == 0 and needs_reach):
-            raise ValueError(f"Spurious: false measurements need a reach above 0, got {self.reach}")
+            raise ValueError(
+                f"Spurious: expected a reach above 0 with false measurements, got {self.reach}"
+            )
 
     @property
     def places(self) -> int:

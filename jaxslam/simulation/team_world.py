@@ -54,14 +54,17 @@ def team_world(
     own_tags = check_team("team_world", robots, tags, count)
     clash = [tag for tag in own_tags if tag < count]
     if clash:
-        raise ValueError(f"team_world: the tag {clash[0]} is a landmark's")
+        raise ValueError(
+            f"team_world: expected tags of robots from {count} on, after the landmarks', got "
+            f"{clash[0]}"
+        )
     if any(robot.start is None for robot in robots[1:]):
-        raise ValueError("team_world: every robot but robot 0 needs a start")
+        raise ValueError("team_world: expected a start of every robot but robot 0")
     if type(report) is not int or not 0 <= report < len(robots):
-        raise ValueError(f"team_world: there is no robot {report!r} to report")
+        raise ValueError(f"team_world: expected report from 0 to {len(robots) - 1}, got {report!r}")
     for what in ("places", "spurious", "noise_on", "draw"):
         if what in options:
-            raise ValueError(f"team_world: does not take {what}")
+            raise ValueError(f"team_world: {what} is not supported")
     return Scenario(
         name=name,
         motion=motion_of(robots, report),

@@ -78,14 +78,19 @@ class Scenario:
         _check_table(f"{self.name}: pose", np.reshape(self.pose, (1, -1)), 3)
         check_covariance(f"{self.name}: pose_cov", self.pose_cov, 3)
         if self.noise_on not in ("robot", "odometry"):
-            raise ValueError(f'{self.name}: noise_on must be "robot" or "odometry"')
+            raise ValueError(
+                f'{self.name}: expected noise_on "robot" or "odometry", got {self.noise_on!r}'
+            )
         if self.noise_on == "odometry" and self.motion.perturb is None:
-            raise ValueError(f"{self.name}: noise on the odometry needs a motion with `perturb`")
+            raise ValueError(
+                f"{self.name}: expected a motion with `perturb` for noise on the odometry"
+            )
         if self.places is not None and self.places < 1:
             raise ValueError(f"{self.name}: expected places >= 1, got {self.places}")
         if isinstance(self.sensor, Suite) and (self.places or self.spurious) is not None:
             raise ValueError(
-                f"{self.name}: the sensors of a suite have places of their own, nothing spurious"
+                f"{self.name}: expected neither places nor spurious with a suite: each Part has "
+                "its own places"
             )
 
     @property

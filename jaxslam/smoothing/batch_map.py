@@ -111,8 +111,8 @@ def batch_map(
     )
     if sensor.free.mean.shape[0] > 0:
         raise ValueError(
-            f"batch_map: expected a sensor that sees all of a landmark, and {sensor.name} leaves "
-            f"{sensor.free.mean.shape[0]} of its parameters free"
+            f"batch_map: expected a sensor that measures all of a landmark, got {sensor.name}, "
+            f"which leaves {sensor.free.mean.shape[0]} of its parameters free"
         )
 
     def solve(log: Log, key: Array) -> Trace:

@@ -62,13 +62,13 @@ def forward_filter(
     validation.check_parts(name, associate=associate)
     if isinstance(sensor, Suite) or sensor.reduced is not None:
         raise ValueError(
-            f"{name}: expected one sensor of landmarks that stay what they are, not a suite or "
-            f"landmarks that turn into points, got {sensor.name}"
+            f"{name}: expected one sensor of landmarks, not a suite or landmarks that are "
+            f"converted to points, got {sensor.name}"
         )
     if len(sensor.landmark) > len(sensor.measurements) + sensor.free.mean.shape[0]:
         raise ValueError(
-            f"{name}: the landmarks of {sensor.name} hold more than what it measures and has a "
-            "prior of; to a smoother the rest would be exact"
+            f"{name}: expected landmarks that measurement and prior determine, got "
+            f"{sensor.landmark} of {sensor.name}"
         )
     ekf = ekf_slam(
         motion, sensor, capacity, associate=associate, update="joint", gate=gate, births=births

@@ -39,8 +39,9 @@ def check_log(
     _expect(f"{name}: log.scan.valid", valid, (steps, places), np.bool_)
     if parts and places != sum(parts):
         raise ValueError(
-            f"{name}: log.scan: expected {sum(parts)} places, {' + '.join(map(str, parts))} of the "
-            f"sensors, got {places}: log.scan.z of shape {np.shape(z)}"
+            f"{name}: log.scan: expected {sum(parts)} measurement slots, "
+            f"{' + '.join(map(str, parts))} of the sensors, got {places}: log.scan.z of shape "
+            f"{np.shape(z)}"
         )
     if not is_concrete(log):
         return
@@ -75,5 +76,5 @@ def _expect(name: str, value: Any, shape: tuple[int | str, ...], kind: type) -> 
 def _refuse(name: str, bad: np.ndarray, why: str) -> None:
     """Raise ValueError if an entry of `bad` is set, by row or by row and measurement slot."""
     if bad.any():
-        at = zip(("row", "place"), np.argwhere(bad)[0], strict=False)
+        at = zip(("row", "slot"), np.argwhere(bad)[0], strict=False)
         raise ValueError(f"{name}: {why} ({', '.join(f'{what} {i}' for what, i in at)})")

@@ -43,7 +43,7 @@ def check_key(name: str, key: Any) -> None:
             raise ValueError(f"{name}: expected one PRNG key, got keys of shape {shape}")
     elif dtype != np.uint32 or shape is None or len(shape) != 1:
         shown = repr(key) if dtype is None else f"an array of {dtype} of shape {shape}"
-        raise ValueError(f"{name}: expected a PRNG key, as of jax.random.key(0), got {shown}")
+        raise ValueError(f"{name}: expected a PRNG key, as jax.random.key(0), got {shown}")
 
 
 def check_gate(name: str, gate: Any) -> None:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.verify.jacobians import Evaluated, Evaluation
 from jaxslam.verify.record import Finding, WrongEntry
-from jaxslam.verify.samples import Samples
+from jaxslam.verify.samples import NOMINAL, Samples
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 """Jacobians (S, m, n)."""
@@ -19,7 +19,6 @@ _CONVERGED = 1e-3
 """largest relative error of a quotient that counts as converged"""
 _NOTHING = 1e-9
 """absolute error at which it counts as converged in any case: a row may be zero everywhere"""
-_NOMINAL = ("random", "given")
 
 
 def compare_methods(
@@ -149,7 +148,7 @@ def _finding(
             dissent=_dissent(values, room, near),
         )
 
-    nominal = np.array([label in _NOMINAL for label in samples.labels])
+    nominal = np.array([label in NOMINAL for label in samples.labels])
     entries = []
     for i, j in np.argwhere(often):
         # Shown at the worst state, preferably a random or given one.

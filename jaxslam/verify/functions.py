@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import jax
 import numpy as np
@@ -11,9 +10,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.protocols import Motion, Sensor
-
-Claim: TypeAlias = Callable[..., ArrayLike | Sequence[ArrayLike | None]]
-"""A hand-derived Jacobian: arguments -> one array, or one array or None for each argument."""
+from jaxslam.verify.claims import Claim
+from jaxslam.verify.lengths import LONGEST, MOST_UNKNOWN, Deduced, deduce_lengths
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
 POINT = ("x [m]", "y [m]")
@@ -26,7 +24,8 @@ GLOSSARY = {
 }
 """Default entries of an argument by its name."""
 
-_PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
+PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
+"""A whole turn by its unit."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +36,8 @@ class Argument:
     entries: tuple[str, ...]
     scale: float = 1.0
     """factor of its random values; noise is small"""
+    deduced: bool = False
+    """whether its length is known from shapes alone, so that its entries have no names"""
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,18 @@ class Function:
         return periods(self.outputs)
 
 
+def at_state(function: Function, state: Sequence[ArrayLike]) -> str:
+    """The arguments at a state as text, as in "pose = (1, 2, 0.5), u = (0, 1)"."""
+    pairs = zip(function.arguments, state, strict=True)
+    return ", ".join(
+        f"{argument.name} = ({', '.join(f'{v:.6g}' for v in np.asarray(row))})"
+        for argument, row in pairs
+    )
+
+
 def periods(names: Sequence[str]) -> Float[np.ndarray, "m"]:
     """The periods of quantities by their units: 2π of [rad], 360 of [deg], inf of all else."""
-    return np.array([_PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
+    return np.array([PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
 
 
 def motion_functions(motion: Motion) -> tuple[Function]:
@@ -95,10 +105,12 @@ def plain_function(
     arguments: Mapping[str, Sequence[str] | int] | None = None,
     outputs: Sequence[str] | None = None,
     name: str | None = None,
+    states: Sequence[ArrayLike] | None = None,
 ) -> Function:
     """A function of vectors, whose arguments are known by the names of its parameters.
 
-    Raises ValueError where the size of an argument is neither given nor follows from its name.
+    Lengths that are neither given nor follow from a parameter's name are those of the states, or
+    deduced by `deduce_lengths`. Raises ValueError where the length of an argument is undetermined.
     """
     name = name or str(getattr(call, "__name__", type(call).__name__))
     if arguments is not None and not isinstance(arguments, Mapping):
@@ -106,34 +118,82 @@ def plain_function(
     if isinstance(outputs, str):
         raise ValueError(f"{name}: expected its outputs as a tuple of names, got {outputs!r}")
     given = dict(arguments or {})
-    if given and not _has_signature(call):
-        parameters = list(given)
-    else:
-        parameters = [
-            p.name
-            for p in inspect.signature(call).parameters.values()
-            if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-        ]
+    parameters = _parameters(call, given)
     if unknown := [key for key in given if key not in parameters]:
         raise ValueError(
-            f"{name}: no parameter {', '.join(unknown)}; it has {', '.join(parameters) or 'none'}"
+            f"{name}: expected arguments of {', '.join(parameters) or 'no parameter'}, got "
+            f"{', '.join(unknown)}"
         )
     if not parameters:
-        raise ValueError(f"{name}: takes no argument to differentiate by")
-    named = []
-    for parameter in parameters:
-        entries = given.get(parameter, GLOSSARY.get(parameter))
-        if entries is None:
-            raise ValueError(
-                f"{name}: how long is its argument {parameter!r}? Say so with arguments="
-                f'{{"{parameter}": ("v [m/s]", …)}}, or in a file with {name}_arguments = …'
-            )
-        if isinstance(entries, int):
-            entries = tuple(f"{parameter}[{k}]" for k in range(entries))
-        if isinstance(entries, str) or not all(isinstance(entry, str) for entry in entries):
-            raise ValueError(f"{name}: {parameter}: expected a tuple of names, got {entries!r}")
-        named.append(Argument(parameter, tuple(entries)))
-    return Function(name, call, tuple(named), tuple(outputs or ()), jacobian)
+        raise ValueError(
+            f"{name}: expected a function with a parameter to differentiate by, got none"
+        )
+    named = {p: _entries(name, p, given.get(p, GLOSSARY.get(p))) for p in parameters}
+    lengths = {p: None if entries is None else len(entries) for p, entries in named.items()}
+    shapes = [np.shape(table) for table in (() if states is None else states)]
+    if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
+        pairs = zip(parameters, shapes, strict=True)
+        lengths |= {p: shape[1] for p, shape in pairs if lengths[p] is None}
+    if None in lengths.values():
+        deduced = deduce_lengths(call, jacobian, lengths, len(outputs) if outputs else None)
+        lengths |= deduced.lengths
+        if missing := [p for p, length in lengths.items() if length is None]:
+            raise ValueError(_undetermined(name, missing, jacobian is not None, deduced))
+    arguments_of = tuple(
+        Argument(p, _numbered(p, lengths[p] or 0), deduced=True)
+        if entries is None
+        else Argument(p, entries)
+        for p, entries in named.items()
+    )
+    return Function(name, call, arguments_of, tuple(outputs or ()), jacobian)
+
+
+def _parameters(call: Callable[..., object], given: dict[str, Sequence[str] | int]) -> list[str]:
+    """The names of a function's required parameters, or those given where Python has none."""
+    if given and not _has_signature(call):
+        return list(given)
+    return [
+        p.name
+        for p in inspect.signature(call).parameters.values()
+        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+    ]
+
+
+def _entries(
+    name: str, parameter: str, entries: Sequence[str] | int | None
+) -> tuple[str, ...] | None:
+    """The names of an argument's entries, or None where they are unknown."""
+    if entries is None:
+        return None
+    if isinstance(entries, int):
+        return _numbered(parameter, entries)
+    if isinstance(entries, str) or not all(isinstance(entry, str) for entry in entries):
+        raise ValueError(f"{name}: {parameter}: expected a tuple of names, got {entries!r}")
+    return tuple(entries)
+
+
+def _numbered(parameter: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{parameter}[{k}]" for k in range(count))
+
+
+def _undetermined(name: str, missing: list[str], claimed: bool, deduced: Deduced) -> str:
+    """The message that the lengths of some arguments are needed, and how they are given."""
+    both = f"{name} and its Jacobian accept" if claimed else f"{name} accepts"
+    why = f"{both} more than one"
+    if deduced.error:
+        why = f"{name} fails with 1 to {LONGEST} entries ({deduced.error})"
+    elif len(missing) > MOST_UNKNOWN:
+        why = f"at most {MOST_UNKNOWN} are deduced"
+    which = ", ".join(map(repr, missing))
+    return (
+        f"{name}: what is the length of its argument {which}? {why}. Name the entries, each with "
+        f"its unit: {name}_arguments = {example_line(missing)} in the file, or arguments= in Python"
+    )
+
+
+def example_line(parameters: Sequence[str]) -> str:
+    """What a user may write for `arguments`, as if each argument were a speed and a turn rate."""
+    return "{" + ", ".join(f'"{p}": ("v [m/s]", "omega [rad/s]")' for p in parameters) + "}"
 
 
 def _has_signature(call: Callable[..., object]) -> bool:

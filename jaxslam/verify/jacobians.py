@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -12,9 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.math.xla import quick_jit
+from jaxslam.verify.claims import as_claim, split_claim
 from jaxslam.verify.differences import Batch, Quotient, complex_step, quotients
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.functions import Function, periods
+from jaxslam.verify.jumps import Jump, find_jumps
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples
 
@@ -54,6 +55,8 @@ class Evaluated(NamedTuple):
     """in float64; None if the function cannot be called"""
     by_argument: tuple[Evaluation, ...]
     checks: tuple[Check, ...]
+    jumps: tuple[Jump, ...] = ()
+    """of outputs that are not named as angles"""
 
 
 def evaluate(function: Function, samples: Samples) -> Evaluated:
@@ -96,7 +99,12 @@ class _Evaluator:
                 )
             )
         return Evaluated(
-            self.function, self.samples, values, tuple(evaluations), tuple(self.checks)
+            self.function,
+            self.samples,
+            values,
+            tuple(evaluations),
+            tuple(self.checks),
+            self._jumps(),
         )
 
     @cached_property
@@ -124,7 +132,13 @@ class _Evaluator:
             return None
         shape = getattr(out, "shape", None)
         if np.issubdtype(getattr(out, "dtype", float), np.complexfloating):
-            self.checks.append(Check(f"{name} returns its shape", False, "returns complex numbers"))
+            self.checks.append(
+                Check(
+                    f"{name} returns its shape",
+                    False,
+                    "returns complex numbers where real ones are expected",
+                )
+            )
             return None
         wanted = f"({len(named)},)" if named else "(m,)"
         if shape is None or len(shape) != 1 or (named and shape != (len(named),)):
@@ -175,7 +189,7 @@ class _Evaluator:
         claim = self.function.hand
 
         def hand(*arguments: Any) -> Any:
-            return _as_claim(claim(*arguments))
+            return as_claim(claim(*arguments))
 
         name = f"the Jacobian claimed for {self.function.name}"
         try:
@@ -201,27 +215,14 @@ class _Evaluator:
 
     def _split(self, claim: Any) -> list[Any]:
         """A claimed Jacobian split by argument; raises ValueError on a wrong shape."""
-        rows = len(self.function.outputs)
-        if not isinstance(claim, tuple | list):
-            shape = np.shape(claim)
-            total = sum(self.sizes)
-            if shape[-2:] == (rows, total) and len(self.sizes) > 1:
-                ends = np.cumsum(self.sizes)[:-1]
-                edges = [0, *ends.tolist(), total]
-                if isinstance(claim, jax.ShapeDtypeStruct):
-                    return [jax.ShapeDtypeStruct((rows, n), claim.dtype) for n in self.sizes]
-                return [claim[..., a:b] for a, b in pairwise(edges)]
-            claim = (claim, *(None for _ in self.over[1:]))
-        if len(claim) != len(self.sizes):
-            raise ValueError(
-                f"returns {len(claim)} Jacobians where the function has {len(self.sizes)} arguments"
-            )
-        for part, size, argument in zip(claim, self.sizes, self.function.arguments, strict=True):
-            if part is not None and np.shape(part)[-2:] != (rows, size):
-                raise ValueError(
-                    f"has shape {np.shape(part)[-2:]} by {argument.name}; expected ({rows}, {size})"
-                )
-        return list(claim)
+        names = [argument.name for argument in self.function.arguments]
+        return split_claim(claim, len(self.function.outputs), names, self.sizes)
+
+    def _jumps(self) -> tuple[Jump, ...]:
+        """Jumps by a whole turn; none are sought in a function that is called state by state."""
+        if not self.traceable:
+            return ()
+        return find_jumps(self.values, self.samples, self.function.periods)
 
     def _quotient(self, which: int) -> tuple[Quotient, str]:
         """The Jacobian by differences or, where possible, by the complex step; and which it is."""
@@ -262,16 +263,6 @@ def _of_argument(methods: dict[str, list[Values | None]], k: int) -> dict[str, V
     """The Jacobians by argument k, by each method that has one."""
     parts = {name: jacobians[k] for name, jacobians in methods.items()}
     return {name: part for name, part in parts.items() if part is not None}
-
-
-def _as_claim(claim: Any) -> Any:
-    """A claimed Jacobian as one array or a tuple of arrays; a list of rows is one array."""
-    if claim is None:
-        raise ValueError("returns None: is a `return` missing?")
-    if isinstance(claim, list):
-        nested = all(isinstance(row, list | tuple) for row in claim)
-        return jnp.asarray(claim) if nested else tuple(claim)
-    return claim
 
 
 def _worst_gap(methods: dict[str, Values], reference: dict[str, Values]) -> np.ndarray:

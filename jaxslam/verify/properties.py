@@ -16,10 +16,11 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.validation.numbers import check_covariance
 from jaxslam.verify.differences import on_circle
 from jaxslam.verify.errors import describe_error, line_of
-from jaxslam.verify.functions import Function, periods
+from jaxslam.verify.functions import Function, at_state, periods
 from jaxslam.verify.jacobians import Evaluated
 from jaxslam.verify.record import Check
 from jaxslam.verify.samples import Samples
+from jaxslam.verify.singular import CURES, singular_operation
 
 Values: TypeAlias = np.ndarray
 
@@ -56,7 +57,7 @@ def motion_checks(motion: Motion, samples: Samples) -> Iterator[Check]:
     def heading_error() -> str:
         heading = np.asarray(quick_jit(jax.vmap(motion.step))(pose, u, w))[:, 2]
         worst = float(np.max(np.abs(heading)))
-        return "" if worst <= np.pi else f"a heading of {worst:.6g} rad is returned"
+        return "" if worst <= np.pi else f"it returns a heading of {worst:.6g} rad"
 
     yield from _guarded("the heading is wrapped to (-π, π]", heading_error)
     perturb = motion.perturb
@@ -146,8 +147,9 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
     if gaps[worst] <= _ROUNDING * (1 + np.abs(pose).max()):
         return ""
     return (
-        f"a landmark at ({point[worst][0]:.4g}, {point[worst][1]:.4g}) seen from "
-        f"({', '.join(f'{v:.4g}' for v in pose[worst])}) comes back {gaps[worst]:.3g} off"
+        f"a landmark at ({point[worst][0]:.4g}, {point[worst][1]:.4g}) observed from "
+        f"({', '.join(f'{v:.4g}' for v in pose[worst])}) is returned with an error of "
+        f"{gaps[worst]:.3g}"
     )
 
 
@@ -170,13 +172,13 @@ def _residual_error(
     if np.abs(off).max() > _ROUNDING * (1 + np.abs(z).max()):
         return f"residual(z, ẑ) differs from z - ẑ by {np.abs(off).max():.3g}"
     if np.any(np.abs(plain)[:, circular] > period[circular] / 2 + 1e-12):
-        return "an angle beyond half a turn is returned"
+        return "it returns an angle beyond half a turn"
     for turns in (1, -3):
         whole = np.where(circular, turns * period, 0.0)
         far = np.abs(np.asarray(residual(z + whole, other)) - plain)
         far = np.where(circular, np.minimum(far, np.abs(far - period)), far)
         if far.max() > 1e-8:
-            return "a whole turn more changes it"
+            return "adding whole turns to z changes the residual"
     return ""
 
 
@@ -195,7 +197,7 @@ def _deviation(difference: ArrayLike, circle: Float[np.ndarray, "m"]) -> str:
     """How far a difference is from zero modulo the periods, or "" within rounding."""
     off = on_circle(np.asarray(difference, np.float64), circle)
     worst = float(np.max(np.abs(np.where(np.isnan(off), np.inf, off)), initial=0.0))
-    return "" if worst <= _ROUNDING else f"off by {worst:.3g}, relative to the coordinates"
+    return "" if worst <= _ROUNDING else f"off by {worst:.3g} relative to the coordinates"
 
 
 def _exactly(difference: ArrayLike) -> str:
@@ -219,24 +221,23 @@ def _finite_check(evaluated: Evaluated) -> Check:
         if bad.any():
             i = int(np.argmax(bad))
             state = tuple(a[i] for a in samples.values)
-            where = _line_of_nan(function, state, what)
-            at = ", ".join(
-                f"{argument.name} = ({', '.join(f'{v:.6g}' for v in row)})"
-                for argument, row in zip(function.arguments, state, strict=True)
-            )
+            hand = function.hand if what.startswith("hand") else None
+            call: Callable[..., object] = hand or function.call
+            kind = singular_operation(call, state)
+            if what != "a value" and hand is None:
+                call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
+            where = _line_of_nan(call, state)
+            at = at_state(function, state)
             line = f"{where}: " if where else ""
-            often = f"{int(np.sum(bad))} of {count} states"
-            return Check(name, False, f"{line}{what} is not, {often}; {samples.labels[i]}: {at}")
+            often = f"at {int(np.sum(bad))} of {count} states"
+            cure = (f"The cause is {kind}. {CURES[kind][0]}", *CURES[kind][1:]) if kind else ()
+            detail = f"{line}{what} is not finite, {often}; {samples.labels[i]}: {at}"
+            return Check(name, False, detail, cure)
     return Check(name, True, f"{count} states")
 
 
-def _line_of_nan(function: Function, state: tuple[Values, ...], what: str) -> str:
-    """The user's line at which a NaN or an infinity first appears in the computation of `what`."""
-    call: Callable[..., object] = function.call
-    if what != "a value" and "hand" not in what:
-        call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
-    elif "hand" in what and function.hand is not None:
-        call = function.hand
+def _line_of_nan(call: Callable[..., object], state: tuple[Values, ...]) -> str:
+    """The user's line at which a NaN or an infinity first appears when a function is called."""
     try:  # JAX prints what it found
         with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
             call(*(jnp.asarray(a) for a in state))
@@ -253,11 +254,13 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
         state = tuple(jnp.asarray(a[i]) for a in evaluated.samples.values)
         first, second = (np.asarray(function.call(*state), np.float64) for _ in range(2))
         if not np.array_equal(first, second, equal_nan=True):
-            return "two calls with the same arguments differ: it keeps or draws something"
+            return (
+                "two calls with the same arguments differ: it keeps a state or draws random numbers"
+            )
         scale = 1.0 + max(float(np.max(np.abs(np.asarray(a)), initial=0)) for a in (*state, first))
         off = first - evaluated.values[i]
         if bad := _deviation(off / scale, function.periods / scale):
-            return f"under jit and vmap the value is another, {bad}"
+            return f"under jit and vmap the value differs, {bad}"
     return ""
 
 

@@ -8,6 +8,10 @@ from typing import Any
 
 _SHOWN = 3
 """number of wrong entries of a Jacobian that are printed with their values; others by name only"""
+_COLUMNS = (
+    "float64, float32: largest difference of autodiff and hand-derived Jacobian, relative to the",
+    "row; differences: of these and difference quotients; linearity: median linearity index.",
+)
 
 
 @dataclass(frozen=True)
@@ -101,11 +105,15 @@ class Check:
     name: str
     passed: bool
     detail: str = ""
+    cure: tuple[str, ...] = ()
+    """of a singular place, what to do: a sentence, then lines of code"""
 
     def lines(self) -> Iterator[str]:
-        """The check as a line of text."""
+        """The check as a line of text, and those of its cure."""
         detail = f": {self.detail}" if self.detail else ""
         yield f"{'ok  ' if self.passed else 'FAIL'}  {self.name}{detail}"
+        for number, line in enumerate(self.cure):
+            yield from _wrapped(line, 6) if number == 0 else [f"        {line}"]
 
 
 @dataclass(frozen=True)
@@ -120,6 +128,7 @@ class Report:
     """of a model, the median of `linearity_index` over the random states, for standard deviations
     of 0.1 (0.05 of [rad] and [1/m])"""
     notes: tuple[str, ...] = field(default=())
+    """what the user should know although it is no failure"""
 
     @property
     def passed(self) -> bool:
@@ -144,8 +153,9 @@ class Report:
                 lines += [f"  {line}" for line in check.lines()]
         held = "; ".join(check.name for check in self.checks if check.passed)
         if held:
-            lines += textwrap.wrap(f"  ok    {held}", 100, subsequent_indent=" " * 8)
-        lines += [f"  note  {note}" for note in self.notes]
+            lines += _wrapped(f"ok    {held}", 2)
+        for note in self.notes:
+            lines += _wrapped(f"note  {note}", 2)
         if self.linearity is not None:
             lines.append(f"  linearity index {self.linearity:.3g}, median (3 σ of 0.1 m, 0.05 rad)")
         return "\n".join(lines)
@@ -167,7 +177,7 @@ class Report:
 
 
 def table(reports: Sequence[Report]) -> str:
-    """The table of reports: a line a model with its largest relative differences and its result."""
+    """The table of reports: a line for each model with its largest differences, and a legend."""
     head = ("", "Jacobians", "float64", "float32", "differences", "checks", "linearity", "")
     lines = [head]
     for report in reports:
@@ -191,7 +201,13 @@ def table(reports: Sequence[Report]) -> str:
         ).rstrip()
         for line in lines
     ]
-    return "\n".join([text[0], "-" * max(map(len, text)), *text[1:]])
+    return "\n".join([text[0], "-" * max(map(len, text)), *text[1:], "", *_COLUMNS])
+
+
+def _wrapped(text: str, indent: int) -> list[str]:
+    """A sentence in lines of at most 100 characters."""
+    others = " " * max(indent, 6)
+    return textwrap.wrap(text, 100, initial_indent=" " * indent, subsequent_indent=others)
 
 
 def _worst(values: Sequence[float | None]) -> str:

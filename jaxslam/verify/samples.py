@@ -20,6 +20,8 @@ OUT_OF_SIGHT = 16.0
 """Distance from the robot to a far landmark, along each axis [m]."""
 NEAR = 2.0**-10
 """Distance from the robot to a close landmark [m]; a power of two is exact in float32, too."""
+NOMINAL = ("random", "given")
+"""Labels of the states that are not chosen to be difficult."""
 _SEAM = 1e-9
 
 # One coordinate at a time takes these values while the others are random. Between 0.499 and 0.501

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import Check, Report, build
+from jaxslam.verify.claims import Claim
 from jaxslam.verify.errors import describe_error, is_user_file
-from jaxslam.verify.functions import Claim
 from jaxslam.verify.verifier import Model
 
 CLAIMS = ("_jacobian", "_jacobians")
@@ -72,8 +72,8 @@ def load(target: str) -> list[Target]:
 
     These are objects of the types `Motion` and `Sensor`; factories annotated to return one, whose
     only required parameter is a noise covariance; and functions f with a function f_jacobian (or
-    f_jacobians), whose sizes may be given as f_arguments = {"pose": ("x [m]", …), …} and
-    f_outputs = ("range [m]", …), and their states as f_states = (array (S, n), …).
+    f_jacobians), whose entries may be named as f_arguments = {"pose": ("x [m]", …), …} and
+    f_outputs = ("range [m]", …), and their states given as f_states = (array (S, n), …).
 
     Raises:
         UnusableFile: with the line, if the file is missing, does not import, or defines none.
@@ -85,8 +85,8 @@ def load(target: str) -> list[Target]:
         found = [t for t in found if t.name == name]
         if not found and hasattr(module, name):
             raise UnusableFile(
-                f"{path.name}: {name} is neither a Motion nor a Sensor nor a factory"
-                f" of one, and there is no {name}{CLAIMS[0]}"
+                f"{path.name}: expected {name} to be a Motion, a Sensor, a factory of one, or a "
+                f"function with its Jacobian, and there is no {name}{CLAIMS[0]}"
             )
         if not found:
             raise UnusableFile(f"{path.name}: there is no {name}")
@@ -118,7 +118,7 @@ def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
             reports.append(Report(one.name, "function", checks=(check,)))
     if len(unusable) == len(targets):
         raise UnusableFile("; ".join(unusable))
-    return [dataclasses.replace(reports[0], notes=notes), *reports[1:]]
+    return [dataclasses.replace(reports[0], notes=(*notes, *reports[0].notes)), *reports[1:]]
 
 
 def _verified(target: Target, verify_one: Callable[..., Report]) -> Report:
@@ -180,7 +180,7 @@ def _target(module: ModuleType, name: str) -> Target | None:
         return None
     claims = [getattr(module, name + end) for end in CLAIMS if hasattr(module, name + end)]
     if len(claims) > 1:
-        raise UnusableFile(f"there are both {name}_jacobian and {name}_jacobians: which is it?")
+        raise UnusableFile(f"expected {name}_jacobian or {name}_jacobians, got both")
     if claims:
         about = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
         return Target(name, value, claims[0], *about)

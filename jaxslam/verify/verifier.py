@@ -14,11 +14,13 @@ from numpy.typing import ArrayLike
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties, samples
+from jaxslam.verify.claims import Claim
 from jaxslam.verify.comparison import compare_methods
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.functions import (
-    Claim,
     Function,
+    at_state,
+    example_line,
     motion_functions,
     plain_function,
     sensor_functions,
@@ -75,8 +77,12 @@ def verify_jacobians(
             first argument, or by all of them side by side. Models bring their own.
         arguments: of a function, the names of the entries of its arguments with units, as in
             {"pose": ("x [m]", "y [m]", "theta [rad]")}, or only their number. Parameters called
-            pose, frame, landmark, l or point need not be given.
-        outputs: of a function, the names of its outputs with units; [rad] is modulo 2π.
+            pose, frame, landmark, l or point need not be given; others need not where `states`
+            are given, or where one length alone fits the function and the shapes of its claimed
+            Jacobian (`lengths.deduce_lengths`). A note says what was deduced.
+        outputs: of a function, the names of its outputs with units; [rad] is modulo 2π. An output
+            without a unit that jumps by 2π is noted; that is no failure, since its derivative is
+            right on both sides, and only its author knows whether it is an angle.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
             sensor those of `observe`.
         name: of a function, its name in the report; default: its own.
@@ -84,13 +90,16 @@ def verify_jacobians(
         seed: seed of the random states.
         tolerance, float32_tolerance: largest relative difference between autodiff and hand.
     Returns:
-        A `Report`: `passed`, `findings`, `checks`, `as_dict()`, and text when printed.
+        A `Report`: `passed`, `findings`, `checks`, `notes`, `as_dict()`, and text when printed.
     Raises:
-        ValueError: if the arguments of a function have no known size, states have the wrong shape,
+        ValueError: if the length of an argument is not determined, states have the wrong shape,
             or count or a tolerance is not positive.
     """
     if not tolerance > 0 or not float32_tolerance > 0:
-        raise ValueError("verify_jacobians: expected tolerances above 0")
+        raise ValueError(
+            f"verify_jacobians: expected tolerances above 0, got {tolerance} and "
+            f"{float32_tolerance}"
+        )
     if count < 2:
         raise ValueError(f"verify_jacobians: expected count >= 2, got {count}")
     if not 0 <= seed < 2**32:
@@ -108,7 +117,8 @@ def verify_jacobians(
         kind, name = "motion" if isinstance(model, Motion) else "sensor", model.name
         functions = functions_of(model)
     else:
-        functions = (plain_function(model, jacobian, arguments, outputs, name),)
+        with _float64():
+            functions = (plain_function(model, jacobian, arguments, outputs, name, states),)
         kind, name = "function", functions[0].name
     given = None if states is None else _given_samples(functions[0], states)
     examined = examine(model, functions, given, count, seed)
@@ -120,7 +130,32 @@ def verify_jacobians(
         ]
     with _float64():
         linearity = _typical_linearity(model, examined)
-    return Report(name, kind, tuple(findings), examined.checks, linearity)
+    notes = tuple(note for one in examined.evaluated for note in notes_of(one, kind))
+    return Report(name, kind, tuple(findings), examined.checks, linearity, notes)
+
+
+def notes_of(evaluated: Evaluated, kind: str) -> Iterator[str]:
+    """What a user should know although nothing is wrong: lengths deduced, angles not named."""
+    function = evaluated.function
+    for argument in function.arguments:
+        if argument.deduced:
+            count = len(argument.entries)
+            entries = "1 entry" if count == 1 else f"{count} entries"
+            yield (
+                f"{argument.name}: {entries}, deduced from shapes. Name them with their units, "
+                f"as {function.name}_arguments = {example_line([argument.name])} in the file or "
+                "arguments= in Python, and difficult values are tried too"
+            )
+    for jump in evaluated.jumps if kind != "motion" else ():
+        output, turn = function.outputs[jump.output], "2π" if jump.unit == "[rad]" else "360"
+        field, then = "outputs", "it is then compared on the circle"
+        if kind == "sensor":
+            field = "landmark" if function.name == "invert" else "measurements"
+            then += ", and the residual is checked for wrapping"
+        yield (
+            f"{output} jumps by {turn} at {at_state(function, jump.state)}. If it is an angle, end "
+            f'its name in {field} with {jump.unit}, as in "bearing {jump.unit}": {then}'
+        )
 
 
 class Examined(NamedTuple):
@@ -183,7 +218,7 @@ def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
         elif isinstance(model, Sensor):
             yield from properties.sensor_checks(model, *drawn)
     except (Exception, SystemExit) as error:
-        yield Check("the rest of the checks", False, describe_error(error))
+        yield Check("the remaining checks", False, describe_error(error))
 
 
 def _typical_linearity(model: Model, examined: Examined) -> float | None:

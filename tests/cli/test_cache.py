@@ -115,7 +115,7 @@ def test_a_folder_that_cannot_be_is_said_and_done_without(tmp_path, capsys, monk
         one_program()
     (line,) = warned(capsys)
     assert f"cannot be kept in {asked} (" in line
-    assert "going on without" in line
+    assert "continuing without" in line
 
     def homeless():
         raise RuntimeError("Could not determine home directory.")
@@ -236,4 +236,4 @@ def test_commands_keep_programs_unless_told_not_to(
     said = capsys.readouterr()
     assert len(entries(tmp_path)) == kept
     assert len(said.err.splitlines()) == lines
-    assert "s of them to make 1 program: 1 compiled, 0 loaded from the cache" in said.out
+    assert "s of them to compile or load 1 program: 1 compiled, 0 loaded from the cache" in said.out

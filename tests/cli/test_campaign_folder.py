@@ -102,7 +102,7 @@ def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys, refused):
     fresh = tmp_path / "fresh"
     assert cli.main([*asked, "--runs", "5", "--out", str(fresh)]) == 0
     assert extended == results(fresh)
-    refused([*again, "--runs", "4"], "has runs up to 5: expected at least as many, got 4")
+    refused([*again, "--runs", "4"], "holds 5 runs: expected at least as many, got 4")
     assert store.resume(out / "blocks").runs == 5
 
 
@@ -140,7 +140,7 @@ def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, r
     mine = out / "blocks" / "mine"
     mine.write_text("of this campaign")
     for other in ([], ["--runs", "4", "--again"], ["--seed", "1", "--again"]):
-        holds = f"{out} holds a finished campaign of 3 runs: --overwrite gives it up"
+        holds = f"{out} holds a finished campaign of 3 runs: --resume {out} prints it"
         refused([*asked, *other], holds, f"--resume {out}", "--out")
     assert mine.exists() and len(begun) == 1
     for accepted in ("--again", "--overwrite"):
@@ -150,14 +150,14 @@ def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, r
     # Results without their blocks are results all the same.
     cli.campaign.shutil.rmtree(out / "blocks")
     (out / "consistency.json").write_text("{}")
-    refused([*asked, "--again"], f"{out} holds the results of a campaign: --overwrite")
+    refused([*asked, "--again"], f"{out} holds the results of a campaign: add --overwrite")
     assert cli.main([*asked, "--overwrite"]) == 130
     refused([*asked, "--overwrite", "--resume", out], "not allowed with")
 
 
 def test_a_campaign_begun_from_python_is_not_the_commands_to_resume(tmp_path, refused):
     store.create(tmp_path / "blocks")
-    refused(["consistency", "--resume", tmp_path], "a campaign that no command began")
+    refused(["consistency", "--resume", tmp_path], "a campaign that was begun from Python")
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, refused):

@@ -29,10 +29,10 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
     wrote, results, last = printed.splitlines()[-3:]
     assert wrote.startswith(f"wrote {out / 'report.html'}, ")
     assert re.fullmatch(
-        r"results after .* s; once every program was there, the runs took .* s of them", results
+        r"results after .* s, .* s of them for the runs once all programs were compiled", results
     )
     assert re.fullmatch(
-        r".* s in all, .* s of them to make \d+ programs: \d+ compiled, \d+ loaded from the cache",
+        r".* s in all, .* s of them to compile or load \d+ programs: \d+ compiled, \d+ loaded from the cache",
         last,
     )
     names = {path.name for path in out.iterdir()}
@@ -112,16 +112,16 @@ def test_a_first_result_does_not_wait_for_what_draws():
         (["--block", "-1"], "block"),
         (["--seed", "-1"], "seed"),
         (["--dtype", "float16"], "invalid choice"),
-        (["--devices", "0"], "at least 1 device"),
+        (["--devices", "0"], "--devices: expected at least 1"),
         (["--devices", "99"], "--devices: expected at most 4, as many as there are here (each a"),
         (["--filters", ""], "--filters: expected names of filters with commas between them"),
         (["--filters", "ekf,"], "or all, got 'ekf,'"),
         (["--cache", ""], "--cache: expected a folder, got ''"),
         (["--resume", " "], "--resume: expected a folder, got ' '"),
-        (["--devices", "abacus"], "no device 'abacus' here; known: all, cpu"),
-        (["--processes", "2"], "need --coordinator"),
-        (["--coordinator", "here"], "expected --coordinator HOST:PORT"),
-        (["--coordinator", "127.0.0.1:9", "--processes", "2"], "--process-id I"),
+        (["--devices", "abacus"], "--devices: expected all, a number, or one of cpu"),
+        (["--processes", "2"], "expected --coordinator HOST:PORT with them"),
+        (["--coordinator", "here"], "--coordinator: expected HOST:PORT or auto"),
+        (["--coordinator", "127.0.0.1:9", "--processes", "2"], "I from 0 to P-1"),
         (
             [
                 "--coordinator",
@@ -133,7 +133,7 @@ def test_a_first_result_does_not_wait_for_what_draws():
                 "--timeout",
                 "1",
             ],
-            "no coordinator at 127.0.0.1:9 within 1 s",
+            "no process 0 at 127.0.0.1:9 within 1 s",
         ),
     ],
 )
@@ -200,5 +200,5 @@ def test_the_module_runs_as_a_program_in_float32(tmp_path):
         [sys.executable, "-m", "jaxslam", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert "In float32: the command's default is float64" in done.stdout
+    assert "The filters ran in float32: for float64" in done.stdout
     assert json.loads((tmp_path / "consistency.json").read_text())["dtype"] == "float32"

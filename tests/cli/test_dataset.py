@@ -67,8 +67,8 @@ def test_a_covariance_is_judged_on_the_host():
 def test_the_command_says_in_how_many_steps_it_looked(tmp_path, capsys, refused):
     run = ["run", "--dataset", "bonn", str(write_bonn(tmp_path / "bonn")), "--out"]
     assert cli.main([*run, str(tmp_path / "a"), "--check-every", "2"]) == 0
-    assert "at 2 of 2 steps looked at" in capsys.readouterr().out
-    message = "expected --check-every of at least 0"
+    assert "at 2 of 2 checked steps" in capsys.readouterr().out
+    message = "--check-every: expected at least 0"
     refused([*run, tmp_path / "b", "--check-every", "-1"], message)
     assert not (tmp_path / "b").exists()
     assert jax.config.jax_enable_x64

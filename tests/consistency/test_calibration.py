@@ -136,10 +136,10 @@ def test_what_is_empty_does_not_count_and_a_number_will_do():
         (plain, [], {}, "start"),
         (plain, 1.0, {"iterations": 0}, "iterations"),
         (plain, 1.0, {"tolerance": 0.0}, "tolerance"),
-        (lambda p: plain(p[0], status=3), 1.0, {}, "no measurement is fused"),
+        (lambda p: plain(p[0], status=3), 1.0, {}, "expected fused measurements"),
         (lambda p: plain(jnp.log(p[0])), -1.0, {}, "not finite"),
-        (lambda p: plain(p[0] + p[1]), [1.0, 2.0], {}, "distinguish"),
-        (lambda p: plain(p[0] * 0), 1.0, {}, "distinguish"),
+        (lambda p: plain(p[0] + p[1]), [1.0, 2.0], {}, "does not determine"),
+        (lambda p: plain(p[0] * 0), 1.0, {}, "does not determine"),
     ],
 )
 def test_refusals(info, start, options, message):

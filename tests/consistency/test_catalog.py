@@ -333,7 +333,10 @@ def test_variants_for_points_refuse_other_landmarks(name):
         ({"linearize": linearize.first_estimate(), "chart": charts.right_invariant()}, "Euclidean"),
         ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
         ({"covariance": "root"}, 'or "joseph" or "square_root", got \'root\''),
-        ({"covariance": "square_root", "chart": charts.robocentric()}, "motion apart"),
+        (
+            {"covariance": "square_root", "chart": charts.robocentric()},
+            "with the chart robocentric",
+        ),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(options, why):

@@ -34,7 +34,7 @@ def test_bonn_by_hand(tmp_path):
         ("SENSOR 2 0.5 1", "SENSOR 2 -inf 1", 7, "range is not a finite number: '-inf'"),
         ("SENSOR 2 0.5 1", "SENSOR 2.5 0.5 1", 7, "id is not a whole number"),
         ("SENSOR 2 0.5 1", "SENSOR 3 0.5 1", 7, "landmark 3 is not in world.dat"),
-        ("SENSOR 2 0.5 1", "SENSOR 4 0.5 1", 8, "landmark 4 is seen twice in a step"),
+        ("SENSOR 2 0.5 1", "SENSOR 4 0.5 1", 8, "landmark 4 is measured twice in a step"),
         ("SENSOR 4 -0.25 1\n", "SENSOR 4", 8, "got 1"),
         ("ODOMETRY 0.1 2 -0.3\n", "", 1, "SENSOR before the first ODOMETRY"),
         (None, "", 1, "no ODOMETRY line"),

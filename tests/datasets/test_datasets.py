@@ -59,7 +59,7 @@ def test_readers_by_name(tmp_path):
     assert datasets.READERS["mrclam"](both, None).name == "mrclam robot 1"
     assert datasets.READERS["mrclam"](both, 2).name == "mrclam robot 2"
     for name, path in (("victoria_park", file), ("bonn", both)):
-        with pytest.raises(ValueError, match="no robot 1"):
+        with pytest.raises(ValueError, match="robot: expected none"):
             datasets.READERS[name](path, 1)
     for name, path in (("victoria_park", file), ("bonn", both), ("mrclam", both)):
         data = datasets.READERS[name](path, None)

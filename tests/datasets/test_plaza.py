@@ -120,6 +120,6 @@ def test_the_odometry_leads_along_the_ground_truth(plaza1):
     off = plaza1.log.scan.z[rows, places, 0] - distance
     assert abs(off.mean()) < 0.05
     assert 0.4 < off.std() < 0.6
-    with pytest.raises(ValueError, match="no robot 2"):
+    with pytest.raises(ValueError, match="robot: expected none"):
         READERS["plaza"]("nowhere", 2)
     assert jaxslam.datasets.plaza is datasets.plaza

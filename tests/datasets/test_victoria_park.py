@@ -82,7 +82,7 @@ def test_victoria_scan_at_the_first_pose_gets_a_row_without_motion_or_noise(tmp_
         ("LANDMARK 4 5", "LANDMARK 3 5", 5, "no odometry leads to pose 3"),
         ("LANDMARK 4 5", "LANDMARK 4 2", 5, "2 is a pose"),
         ("LANDMARK 4 5", "LANDMARK 4 -5", 5, "j is not a whole number"),
-        ("LANDMARK 4 5", "LANDMARK 4 7", 7, "landmark 7 is seen twice from pose 4"),
+        ("LANDMARK 4 5", "LANDMARK 4 7", 7, "landmark 7 is measured twice from pose 4"),
         ("3 4 0.4 0.1 0.3\n", "3 4 0.4", 7, "got 5"),
         (None, "", 1, "no ODOMETRY line"),
         (None, f"ODOMETRY 0 1 0 0 0 {COV}\n", 1, "no LANDMARK line"),

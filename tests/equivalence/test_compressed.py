@@ -144,12 +144,15 @@ def test_gradients_pass_through_a_change_of_area():
     ("options", "message"),
     [
         ({"area": 0}, "area"),
-        ({"area": 4, "watch": True}, "does not take watch"),
+        ({"area": 4, "watch": True}, "watch is not supported"),
         ({"area": 4, "covariance": "square_root"}, "got 'square_root'"),
         ({"area": 4, "chart": charts.right_invariant()}, "right_invariant"),
         ({"area": 4, "linearize": linearize.first_estimate()}, "first_estimate"),
-        ({"area": 4, "sensor": sensors.compass(np.eye(1))}, "compass has no landmarks"),
-        ({"area": PLACES - 1}, f"{PLACES} places, the area {PLACES - 1}"),
+        ({"area": 4, "sensor": sensors.compass(np.eye(1))}, "a sensor of landmarks, got compass"),
+        (
+            {"area": PLACES - 1},
+            f"area >= {PLACES}, the measurement slots of a scan, got {PLACES - 1}",
+        ),
     ],
 )
 def test_refusals(options, message):

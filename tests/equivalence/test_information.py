@@ -157,7 +157,7 @@ def test_gradients_and_batches():
         ({"capacity": 0}, "capacity"),
         ({"gate": 0.0}, "gate above 0"),
         ({"floor": 0.0}, "floor above 0"),
-        ({"sensor": sensors.compass([[1e-4]])}, "no landmarks"),
+        ({"sensor": sensors.compass([[1e-4]])}, "a sensor of landmarks"),
     ],
 )
 def test_refusals(changes, message):

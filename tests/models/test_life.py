@@ -229,7 +229,9 @@ def test_what_is_no_manager_is_refused():
     plain, manager = ekf_slam(MOTION, SENSOR, 3), life.existence(always)
     with pytest.raises(ValueError, match="pruning: expected life to be a Life"):
         pruning(plain, life.existence)
-    with pytest.raises(ValueError, match=r"pruning: the state of eif_slam is no slots.Joint"):
+    with pytest.raises(
+        ValueError, match=r"pruning: expected a filter whose state is a slots.Joint.* got eif_slam"
+    ):
         pruning(eif_slam(MOTION, SENSOR, 3), manager).init(np.zeros(3), np.eye(3))
     for wrong in (life.existence, manager):
         with pytest.raises(ValueError, match="ekf_slam: expected make_room to be a Life that"):
@@ -244,7 +246,7 @@ def test_making_room_takes_a_filter_and_a_manager_that_know_of_each_other():
     )
     scan = jax.tree.map(lambda leaf: leaf[0], log_of([[0, 1]]).scan)
     for filter, message in (
-        (forgetful, "ekf_slam: make_room=existence goes by the memory that pruning keeps"),
+        (forgetful, "ekf_slam: make_room=existence needs the record that pruning keeps"),
         (pruning(ignorant, manager), "pruning: existence makes room in a full map"),
     ):
         state = filter.init(np.zeros(3), np.eye(3))

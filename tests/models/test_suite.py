@@ -208,7 +208,7 @@ def test_a_scan_with_other_places_is_refused():
     scenario = world()
     _, log = drawn(scenario)
     short = log._replace(scan=jax.tree.map(lambda leaf: leaf[:, :10], log.scan))
-    with pytest.raises(ValueError, match="expected 11 places"):
+    with pytest.raises(ValueError, match="expected 11 measurement slots"):
         go(scenario, short)
     twice = log.scan._replace(tag=jnp.zeros_like(log.scan.tag))
     ekf = ekf_slam(scenario.motion, scenario.sensor, 6)
@@ -231,20 +231,23 @@ def signature():
         (lambda: suite(Part(EYES, 1, every=0)), "every of range_bearing"),
         (lambda: suite(Part(EYES, 1, start=-1)), "a start of at least 0"),
         (lambda: suite(Part(EYES, 1, sees="birds")), 'sees "landmarks"'),
-        (lambda: suite((COMPASS, 2)), "the absolute sensor compass has one place"),
-        (lambda: suite((suite((EYES, 1)), 1)), "expected one sensor a part"),
-        (lambda: suite((EYES, 1), (signature(), 1)), "do not share landmarks"),
-        (lambda: world(places=3), "places of their own"),
-        (lambda: world(spurious=Spurious()), "places of their own"),
+        (lambda: suite((COMPASS, 2)), "expected places=1 of the absolute sensor compass, got 2"),
+        (lambda: suite((suite((EYES, 1)), 1)), "expected one Sensor in each Part"),
+        (lambda: suite((EYES, 1), (signature(), 1)), "expected sensors that share landmarks"),
+        (lambda: world(places=3), "each Part has its own places"),
+        (lambda: world(spurious=Spurious()), "each Part has its own places"),
         (
             lambda: ekf_slam(ring().motion, world().sensor, 6, linearize=linearize.observability()),
-            "has an absolute sensor",
+            "does not support absolute sensors",
         ),
         (
             lambda: filters.compressed_ekf_slam(ring().motion, world().sensor, 6, area=3),
             "not a suite",
         ),
-        (lambda: suite((EYES, 1)).observe(jnp.zeros(3), jnp.zeros(2)), "no measurement in common"),
+        (
+            lambda: suite((EYES, 1)).observe(jnp.zeros(3), jnp.zeros(2)),
+            "a suite has no model of its own",
+        ),
     ],
 )
 def test_bad_input(make, message):

@@ -50,7 +50,7 @@ def test_what_would_not_come_back_is_refused(made):
         with pytest.raises(ValueError, match="block"):
             made.save(0, arrays, 1)
     for first, runs in ((-1, 1), (0, 0)):
-        with pytest.raises(ValueError, match="expected >= 1"):
+        with pytest.raises(ValueError, match="expected runs >= 1"):
             made.save(first, {}, runs)
     assert files(made) == ["manifest.json"]
 

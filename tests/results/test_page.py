@@ -151,7 +151,7 @@ def test_filters_verdicts_and_measures_stand_in_the_table(read):
     assert row(read, "position RMSE [m]")[2] == "1.20 ± 0.10published 1.25"
     assert row(read, "over conditional bound")[1:3] == ["1", "1"]
     assert row(read, "unobservable directions")[2] == "3 ± 0"
-    assert row(read, "learnt of a turn [1/rad²]")[2] == "(3.0 ± 1.0)·10−26"
+    assert row(read, "rotation information [1/rad²]")[2] == "(3.0 ± 1.0)·10−26"
     assert row(read, "log-likelihood")[2] == "−12,346 ± 100"
     assert row(read, "not finite")[2:] == ["0", "2", "0"]
     assert row(read, "finite runs")[2:] == ["30", "28", "30"]

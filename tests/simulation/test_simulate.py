@@ -303,8 +303,8 @@ BAD = {
     "pose nan": ({"pose": (0.0, 0.0, np.nan)}, "pose: expected finite"),
     "cov shape": ({"pose_cov": np.eye(2)}, "pose_cov: expected a covariance"),
     "cov negative": ({"pose_cov": -np.eye(3)}, "pose_cov: .*positive semi-definite"),
-    "noise_on": ({"noise_on": "map"}, "noise_on must be"),
-    "no perturb": ({"motion": BLIND, "noise_on": "odometry"}, "needs a motion with `perturb`"),
+    "noise_on": ({"noise_on": "map"}, "expected noise_on"),
+    "no perturb": ({"motion": BLIND, "noise_on": "odometry"}, "expected a motion with `perturb`"),
     "places 0": ({"places": 0}, "places >= 1"),
     "places -2": ({"places": -2}, "places >= 1"),
 }

@@ -541,7 +541,7 @@ RAYS = sensors.bearing_inverse_depth(np.eye(1), min_distance=1.0)
     ("change", "message"),
     [
         ({"sensor": sensors.suite((ring(5).sensor, 2))}, "suite"),
-        ({"sensor": RAYS}, "would be exact"),
+        ({"sensor": RAYS}, "measurement and prior determine"),
         ({"capacity": 0}, "capacity"),
         ({"gate": -1.0}, "gate"),
         ({"pose": (0.0, 0.0)}, "pose"),

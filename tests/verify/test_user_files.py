@@ -54,6 +54,20 @@ f_arguments = {"u": ("forward [m]",)}
 f_outputs = ("x [m]", "y [m]")
 """
 
+UNTOLD = """
+import numpy as np
+
+def f(pose, u):
+    return u
+
+def f_jacobian(pose, u):
+    return None, np.eye(len(u))
+"""
+
+
+def test_a_length_that_the_claim_tells_need_not_be_given(verify):
+    verify.says(GOOD.replace("f_arguments", "g_arguments"), 0, "u: 1 entry, deduced from shapes")
+
 
 def test_a_right_claim_passes(verify):
     status, out, err, content = verify(GOOD)
@@ -89,7 +103,8 @@ def test_williams_and_the_notes_are_caught(verify):
     usual = [e for e in by_pose if e["label"] == "random"]
     assert {(e["row"], e["column"]) for e in usual} == slips
     assert {tuple(e["dissent"]) for e in usual} == {("hand",)}
-    assert "notes_velocity.py:19: a value is not, " in out  # v/ω at ω = 0
+    assert "notes_velocity.py:19: a value is not finite, " in out  # v/ω at ω = 0
+    assert "The cause is a division by 0." in out
     assert "prints" in out  # the check that it prints nothing was made, and passed
     assert "FAIL  prints" not in out
 
@@ -135,8 +150,8 @@ def test_one_of_them_by_name(verify):
         ("", "", "mine.py: defines nothing to verify"),
         (GOOD, ":g", "there is no g"),
         (GOOD.replace("f_jacobian", "f_slope"), ":f", "there is no f_jacobian"),
-        (GOOD.replace("f_arguments", "g_arguments"), "", "how long is its argument 'u'"),
-        (GOOD + "\nf_jacobians = f_jacobian\n", "", "which is it?"),
+        (UNTOLD, "", "what is the length of its argument 'u'"),
+        (GOOD + "\nf_jacobians = f_jacobian\n", "", "expected f_jacobian or f_jacobians, got both"),
         (GOOD + "\nf_states = (1.0,)\n", "", "expected states of shapes (S, 3), (S, 1)"),
         (MODELS.replace("return jaxslam.sensors", "return 1 / jaxslam.sensors"), "", "mine.py:9: "),
     ],

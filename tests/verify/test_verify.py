@@ -262,9 +262,15 @@ def test_the_report_is_json_and_text():
 @pytest.mark.parametrize(
     ("call", "why"),
     [
-        (lambda: verify_jacobians(lambda speed: speed), "how long is its argument 'speed'"),
-        (lambda: verify_jacobians(observe, arguments={"landmarks": 2}), "no parameter landmarks"),
-        (lambda: verify_jacobians(lambda: jnp.ones(2)), "takes no argument"),
+        (
+            lambda: verify_jacobians(lambda speed: speed),
+            "what is the length of its argument 'speed'",
+        ),
+        (
+            lambda: verify_jacobians(observe, arguments={"landmarks": 2}),
+            "expected arguments of pose, landmark, got landmarks",
+        ),
+        (lambda: verify_jacobians(lambda: jnp.ones(2)), "a parameter to differentiate by"),
         (lambda: verify_jacobians(observe, count=1), "count >= 2"),
         (lambda: verify_jacobians(observe, tolerance=0.0), "above 0"),
         (lambda: verify_jacobians(observe, states=[np.zeros((4, 3))]), "expected states of shapes"),

@@ -67,7 +67,10 @@ class Hypotheses:
         _check_positive(self, "spread", "same")
         _check_not_negative(self, "decay")
         if self.distance not in get_args(Distance):
-            raise ValueError(f"Hypotheses: unknown distance {self.distance!r}")
+            raise ValueError(
+                f"Hypotheses: expected distance {' or '.join(get_args(Distance))}, got "
+                f"{self.distance!r}"
+            )
 
     @property
     def same_below(self) -> float:
@@ -176,4 +179,4 @@ def _check_not_negative(record: Any, *fields: str) -> None:
         value = getattr(record, field)
         if is_concrete(value) and not value >= 0:
             name = type(record).__name__
-            raise ValueError(f"{name}: expected {field} not below 0, got {value}")
+            raise ValueError(f"{name}: expected {field} of at least 0, got {value}")

@@ -70,25 +70,25 @@ def compressed_ekf_slam(
     check_count("compressed_ekf_slam: area", area)
     for name in ("associate", "watch", "make_room"):
         if options.get(name):
-            raise ValueError(f"compressed_ekf_slam: does not take {name}")
+            raise ValueError(f"compressed_ekf_slam: {name} is not supported")
     check_covariance_form(
         "compressed_ekf_slam", options.get("covariance", "plain"), ("plain", "joseph")
     )
     if sensor.reduced is not None:
         raise ValueError(
-            f"compressed_ekf_slam: the landmarks of {sensor.name} become points, which is not "
-            "for this filter"
+            f"compressed_ekf_slam: the landmarks of {sensor.name} are converted to points, which "
+            "is not supported"
         )
     whole = ekf_slam(motion, sensor, capacity, **options)
     size, own = len(sensor.landmark), min(area, capacity)
     if size == 0:
-        raise ValueError(f"compressed_ekf_slam: the sensor {sensor.name} has no landmarks")
+        raise ValueError(f"compressed_ekf_slam: expected a sensor of landmarks, got {sensor.name}")
     if whole.places:
         raise ValueError("compressed_ekf_slam: expected one sensor, not a suite")
     if whole.chart.basis is not None:
         raise ValueError(
-            f"compressed_ekf_slam: in the chart {whole.chart.name} a motion changes what is known "
-            "of every landmark; it needs the chart euclidean"
+            f"compressed_ekf_slam: expected the chart euclidean, got {whole.chart.name}, in which "
+            "a motion changes the covariance of every landmark"
         )
     local = ekf_slam(motion, sensor, own + _more(own, size), **options)
     most = options.get("births")
@@ -98,7 +98,8 @@ def compressed_ekf_slam(
         if jax.tree.leaves(joint.lin):
             linearizer = options["linearize"].name
             raise ValueError(
-                f"compressed_ekf_slam: the linearizer {linearizer} remembers where landmarks were"
+                f"compressed_ekf_slam: the linearizer {linearizer} keeps former estimates, which "
+                "is not supported"
             )
         return opened(joint, own)
 
@@ -108,7 +109,8 @@ def compressed_ekf_slam(
     def update(state: Compressed, scan: Scan, key: jax.Array) -> tuple[Compressed, Info]:
         if len(scan.tag) > area:
             raise ValueError(
-                f"compressed_ekf_slam: a scan has {len(scan.tag)} places, the area {area}"
+                f"compressed_ekf_slam: expected area >= {len(scan.tag)}, the measurement slots of "
+                f"a scan, got {area}"
             )
         joint = state.whole
         tagged = scan.valid & (scan.tag >= 0)

@@ -114,8 +114,8 @@ def ekf_slam(
     def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
         if make_room is not None and joint.life is None:
             raise ValueError(
-                f"ekf_slam: make_room={make_room.name} goes by the memory that pruning keeps: "
-                "pruning(ekf_slam(…, make_room=life), life)"
+                f"ekf_slam: make_room={make_room.name} needs the record that pruning keeps: "
+                "expected pruning(ekf_slam(…, make_room=life), life)"
             )
         joint, info, evicted = update_by_scan(joint, scan, turns)
         if make_room is not None:

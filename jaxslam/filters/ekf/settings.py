@@ -79,7 +79,10 @@ def check_covariance_form(filter: str, covariance: str, forms: tuple[str, ...]) 
 def check_iterations(filter: str, linearize: Linearizer, iterations: int) -> None:
     """Raise ValueError on several iterations with a linearizer that does not iterate."""
     if iterations > 1 and not linearize.iterates:
-        raise ValueError(f"{filter}: the linearizer {linearize.name} does not iterate")
+        raise ValueError(
+            f"{filter}: expected iterations=1 with the linearizer {linearize.name}, which does not "
+            f"iterate, got {iterations}"
+        )
 
 
 def check_chart(sensor: Sensor, chart: Chart) -> None:
@@ -113,21 +116,22 @@ def check_settings(settings: EkfSettings) -> None:
         )
     if linearize.euclidean and isinstance(sensor, Suite) and any(p.absolute for p in sensor.parts):
         raise ValueError(
-            f"ekf_slam: the linearizer {linearize.name} is for landmarks alone, and the suite "
-            f"{sensor.name} has an absolute sensor"
+            f"ekf_slam: the linearizer {linearize.name} does not support absolute sensors, "
+            f"and the suite {sensor.name} has one"
         )
     check_iterations("ekf_slam", linearize, settings.iterations)
     if sensor.reduced is not None and chart.basis is not None:
         ground = jnp.zeros(len(sensor.landmark))
         if chart.basis(jnp.zeros(3), ground).landmark is not None:
             raise ValueError(
-                f"ekf_slam: the landmarks of {sensor.name} become points, for which those of the "
-                f"chart {chart.name} must not turn with the robot"
+                f"ekf_slam: the landmarks of {sensor.name} are converted to points, which the "
+                f"chart {chart.name} does not support, since its errors of landmarks turn with the "
+                "robot"
             )
     if chart.motion_apart and settings.square_root:
         raise ValueError(
-            f"ekf_slam: the chart {chart.name} keeps the last motion apart, which has no square "
-            "root here"
+            f'ekf_slam: expected covariance "plain" or "joseph" with the chart {chart.name}, got '
+            '"square_root"'
         )
 
 
@@ -135,6 +139,6 @@ def check_make_room(make_room: Life | None) -> None:
     """Raise ValueError unless `life` is a `Life` with `make_room`."""
     if make_room is not None and (not isinstance(make_room, Life) or make_room.make_room is None):
         raise ValueError(
-            "ekf_slam: expected make_room to be a Life that makes room, as of "
+            "ekf_slam: expected make_room to be a Life that makes room, as from "
             f"life.existence(…, replace=True), got {make_room!r}"
         )

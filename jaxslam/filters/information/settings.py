@@ -32,9 +32,12 @@ class InformationSettings:
         if isinstance(sensor, Suite):
             raise ValueError(f"{name}: expected one sensor, not a suite")
         if len(sensor.landmark) == 0:
-            raise ValueError(f"{name}: the sensor {sensor.name} has no landmarks")
+            raise ValueError(f"{name}: expected a sensor of landmarks, got {sensor.name}")
         if sensor.reduced is not None:
-            raise ValueError(f"{name}: the landmarks of {sensor.name} become points")
+            raise ValueError(
+                f"{name}: the landmarks of {sensor.name} are converted to points, which is not "
+                "supported"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +63,8 @@ class SparseSettings(InformationSettings):
             check_count(f"{self.name}: {option}", getattr(self, option))
         if len(self.sensor.landmark) != 2:
             raise ValueError(
-                f"{self.name}: the landmarks of {self.sensor.name} are not points (x, y)"
+                f"{self.name}: expected landmarks (x, y), got {self.sensor.landmark} of "
+                f"{self.sensor.name}"
             )
 
     @property

@@ -56,7 +56,8 @@ def check_scan_size(settings: SparseSettings, scan: Scan) -> None:
     size = scan.tag.shape[0]
     if size > settings.active:
         raise ValueError(
-            f"{settings.name}: a scan has {size} places, the active set holds {settings.active}"
+            f"{settings.name}: expected active >= {size}, the measurement slots of a scan, got "
+            f"{settings.active}"
         )
 
 

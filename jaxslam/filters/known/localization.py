@@ -89,7 +89,10 @@ def localization(
     check_options("localization", capacity, update, gate, iterations, None)
     check_covariance_form("localization", covariance, ("plain", "joseph"))
     if linearize.own_landmarks:
-        raise ValueError(f"localization: the linearizer {linearize.name} is for maps with errors")
+        raise ValueError(
+            f"localization: the linearizer {linearize.name} is for estimated maps, not for a known "
+            "one"
+        )
     check_iterations("localization", linearize, iterations)
     settings = EkfSettings(
         sensor=sensor,
@@ -196,7 +199,9 @@ def _without_landmark(sensor: Sensor) -> Sensor:
 def _of_pose(chart: Chart) -> Chart:
     """The chart restricted to the pose, for landmarks without parameters."""
     if chart.motion_apart:
-        raise ValueError(f"localization: the chart {chart.name} composes a map with the motion")
+        raise ValueError(
+            f"localization: the chart {chart.name} is for estimated maps, not for a known one"
+        )
     whole_basis = chart.basis
     size = 2 if chart.landmark_size is None else chart.landmark_size
 
@@ -237,7 +242,7 @@ def checked_map(
             f"{name}: expected landmarks of shape (at least 1, {size}), got {np.shape(landmarks)}"
         )
     if not np.issubdtype(jnp.result_type(landmarks), np.number) or jnp.iscomplexobj(landmarks):
-        raise ValueError(f"{name}: the map is not of real numbers")
+        raise ValueError(f"{name}: expected a map of real numbers")
     if is_concrete(landmarks) and not np.isfinite(np.asarray(landmarks)).all():
         raise ValueError(f"{name}: the map is not finite")
     count = np.shape(landmarks)[0]

@@ -119,13 +119,14 @@ def as_prior(
     joint = filter.init(jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind))
     if not isinstance(joint, Joint) or joint.landmarks.shape != (capacity, size):
         raise ValueError(
-            f"as_prior: the state of {filter.name} has no {capacity} landmarks of {size} numbers"
+            f"as_prior: expected a filter of {capacity} landmarks with {size} parameters each, got "
+            f"{filter.name}"
         )
     plain = filter.chart.basis is None and not filter.chart.motion_apart
     if not plain or filter.square_root or jax.tree.leaves(joint.lin):
         raise ValueError(
-            "as_prior: expected a filter in the Euclidean chart, with a covariance and Jacobians "
-            "at the estimate"
+            "as_prior: expected a filter in the Euclidean chart with a covariance, not its square "
+            "root, and with Jacobians at the estimate"
         )
     blocks = jnp.where(state.alive[:, None, None], state.covs, jnp.eye(size, dtype=kind)[None])
     rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]

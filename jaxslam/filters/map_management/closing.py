@@ -59,7 +59,10 @@ def closing(
     if not (reach is None or reach > 0) or not spread > 0:
         raise ValueError(f"closing: expected a reach and a spread above 0, got {reach}, {spread}")
     if filter.square_root:
-        raise ValueError(f"closing: the state of {filter.name} holds a root of its covariance")
+        raise ValueError(
+            f"closing: expected a filter that keeps its covariance, got {filter.name}, which keeps "
+            "the square root of it"
+        )
     chart, gate = filter.chart, chi2_quantile(0.99, 2)
 
     def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:

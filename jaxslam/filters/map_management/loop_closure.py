@@ -92,7 +92,10 @@ def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
     """Raise ValueError unless landmarks are points and their times are kept (`life.recency`)."""
     check_points(caller, joint, chart)
     if not isinstance(joint.life, Recency):
-        raise ValueError(f"{caller}: expected a filter with times, pruning(…, life.recency())")
+        raise ValueError(
+            f"{caller}: expected a filter that keeps times of landmarks, as pruning(…, "
+            "life.recency())"
+        )
 
 
 def close_loop(joint: Joint, chart: Chart, **options: Any) -> tuple[Joint, Closing]:

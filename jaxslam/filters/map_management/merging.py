@@ -52,8 +52,8 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
         raise ValueError(f"merging: expected 0 < probability < 1, got {probability}")
     if len(filter.landmark) < 2 or "rho [1/m]" in filter.landmark:
         raise ValueError(
-            f"merging: two landmarks of {filter.name} with parameters {filter.landmark} are not "
-            "one where their parameters agree, so they cannot be merged"
+            f"merging: landmarks of {filter.name} with parameters {filter.landmark} cannot be "
+            "merged: equal parameters do not mean equal positions"
         )
     gate = chi2_quantile(probability, len(filter.landmark))
 

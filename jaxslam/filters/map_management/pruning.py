@@ -40,8 +40,8 @@ def pruning(filter: Filter, life: Life) -> Filter:
         joint, info = validation.state_and_info(f"pruning: {filter.name}", joint, scan, found)
         if life.make_room is not None and "pruning" not in (info.extra or {}):
             raise ValueError(
-                f"pruning: {life.name} makes room in a full map, which {filter.name} has to know: "
-                "pruning(ekf_slam(…, make_room=life), life)"
+                f"pruning: {life.name} makes room in a full map, and {filter.name} does not ask it "
+                "to: expected pruning(ekf_slam(…, make_room=life), life)"
             )
         memory, dead = life.after(joint, info, lambda: filter.estimate(joint))
         joint = joint._replace(life=memory)

@@ -45,7 +45,7 @@ def seen_points(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[
     open (K > 0).
     """
     if len(sensor.landmark) == 0 or np.shape(sensor.free.mean)[0] > 0:
-        raise ValueError(f"seen_points: one measurement of {sensor.name} is not a point")
+        raise ValueError(f"seen_points: expected a sensor that measures points, got {sensor.name}")
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
     origin, rest = jnp.zeros(3, z.dtype), jnp.zeros(0, z.dtype)
 
@@ -238,9 +238,9 @@ def check_points(caller: str, joint: Joint, chart: Chart) -> None:
     """Raise ValueError unless landmarks are points and the state keeps no earlier poses."""
     if joint.landmarks.shape[1] != 2:
         raise ValueError(
-            f"{caller}: expected landmarks (x, y), got {joint.landmarks.shape[1]} each"
+            f"{caller}: expected landmarks (x, y), got {joint.landmarks.shape[1]} parameters each"
         )
     if chart.motion_apart:
-        raise ValueError(f"{caller}: the chart {chart.name} keeps the last motion apart")
+        raise ValueError(f"{caller}: the chart {chart.name} is not supported")
     if jax.tree.leaves(joint.lin):
-        raise ValueError(f"{caller}: a linearizer with a memory of former poses cannot forget them")
+        raise ValueError(f"{caller}: a linearizer that keeps former estimates is not supported")

@@ -9,5 +9,8 @@ from jaxslam.slots import Joint
 def joint_of(manager: str, filter: Filter, state: Any) -> Joint:
     """The filter's state; ValueError, which names the manager, unless it is a `slots.Joint`."""
     if not isinstance(state, Joint):
-        raise ValueError(f"{manager}: the state of {filter.name} is no slots.Joint")
+        raise ValueError(
+            f"{manager}: expected a filter whose state is a slots.Joint, as from ekf_slam, got "
+            f"{filter.name}"
+        )
     return state

@@ -63,7 +63,7 @@ def check_options(
         if value is not None:
             check_count(f"team_slam: {name}", value)
     if type(report) is not int or not 0 <= report < len(robots):
-        raise ValueError(f"team_slam: there is no robot {report!r} to report")
+        raise ValueError(f"team_slam: expected report from 0 to {len(robots) - 1}, got {report!r}")
     if chart is not None and chart.basis is not None:
         raise ValueError(f"team_slam: expected the chart euclidean, got {chart.name}")
     if update not in ("sequential", "joint"):
@@ -77,13 +77,14 @@ def check_sensors(robots: Sequence[Robot]) -> None:
         for part in robot.sensors.parts:
             if len(part.sensor.landmark) not in (0, 2):
                 raise ValueError(
-                    f"team_slam: the landmarks of {part.sensor.name} are not points (x, y)"
+                    f"team_slam: expected landmarks (x, y), got {part.sensor.landmark} of "
+                    f"{part.sensor.name}"
                 )
         able = any(measures_points(part.sensor) for part in robot.sensors.parts)
         if b > 0 and robot.start is None and not able:
             raise ValueError(
-                f"team_slam: robot {b} has no start, and no sensor that tells both distance and "
-                "direction to find it by"
+                f"team_slam: robot {b} needs a start, or a sensor that measures both range and "
+                "bearing to find it by"
             )
 
 

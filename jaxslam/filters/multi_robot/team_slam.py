@@ -122,7 +122,8 @@ def team_slam(
     def update_map(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
         if scan.tag.shape[0] != place_ends[-1]:
             raise ValueError(
-                f"team_slam: expected {place_ends[-1]} places of a scan, got {scan.tag.shape[0]}"
+                f"team_slam: expected {place_ends[-1]} measurement slots in a scan, got "
+                f"{scan.tag.shape[0]}"
             )
         scans = split_scan(scan, settings.places)
         infos: dict[int, Info] = {}

@@ -120,12 +120,14 @@ def particle_map_settings(
     if births is not None:
         validation.check_count(f"{name}: births", births)
     if life is not None and not isinstance(life, Life):
-        raise ValueError(f"{name}: expected life to be a Life, as of life.existence, got {life!r}")
+        raise ValueError(
+            f"{name}: expected life to be a Life, as from life.existence, got {life!r}"
+        )
     validation.check_gate(name, gate)
     if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
         raise ValueError(
-            f"{name}: expected one sensor of landmarks that stay what they are, not a suite, an "
-            f"absolute sensor or landmarks that turn into points, got {sensor.name}"
+            f"{name}: expected one sensor of landmarks, not a suite, an absolute sensor or "
+            f"landmarks that are converted to points, got {sensor.name}"
         )
     return ParticleMapSettings(sensor, associate or known_association(), gate, births, life)
 
@@ -178,7 +180,7 @@ def checked_box(box: ArrayLike | None, start: str) -> np.ndarray | None:
         raise ValueError(f'{name}: expected start "gaussian" or "uniform", got {start!r}')
     if box is None:
         if start == "uniform":
-            raise ValueError(f"{name}: a uniform start needs a box")
+            raise ValueError(f"{name}: expected a box with a uniform start, got none")
         return None
     limits = np.asarray(box, np.float64)
     if limits.shape != (2, 2) or not np.isfinite(limits).all() or not (limits[1] > limits[0]).all():

@@ -21,14 +21,14 @@ def ellipse(
     """
     cov = np.asarray(cov, np.float64)
     if cov.shape != (2, 2) or not np.all(np.isfinite(cov)):
-        raise ValueError(f"expected a finite 2×2 covariance, got {cov}")
+        raise ValueError(f"ellipse: expected a finite 2×2 covariance, got {cov}")
     a, b, c = cov[0, 0], cov[1, 0], cov[1, 1]
     tolerance = 1e-6 * max(abs(a), abs(c))
     first = np.sqrt(max(a, 0.0))
     below = b / first if first > 0 else 0.0
     rest = c - below**2
     if a < -tolerance or rest < -tolerance or (first == 0 and abs(b) > tolerance):
-        raise ValueError(f"expected a positive semi-definite covariance, got {cov}")
+        raise ValueError(f"ellipse: expected a positive semi-definite covariance, got {cov}")
     factor = np.array([[first, 0.0], [below, np.sqrt(max(rest, 0.0))]])
     around = np.linspace(0.0, 2 * np.pi, points + 1)
     circle = np.stack([np.cos(around), np.sin(around)], axis=1)

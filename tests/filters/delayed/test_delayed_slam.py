@@ -569,16 +569,16 @@ def test_bad_arguments_are_refused(options, message):
     ("record", "options", "message"),
     [
         (StoredMeasurements, {"capacity": 0}, "capacity"),
-        (StoredMeasurements, {"spacing": -0.1}, "expected spacing not below 0"),
+        (StoredMeasurements, {"spacing": -0.1}, "expected spacing of at least 0"),
         (Hypotheses, {"capacity": 0}, "capacity"),
         (Hypotheses, {"patience": 0.5}, "patience"),
-        (Hypotheses, {"decay": -1}, "expected decay not below 0"),
+        (Hypotheses, {"decay": -1}, "expected decay of at least 0"),
         (Hypotheses, {"spread": np.nan}, "expected spread above 0"),
         (Hypotheses, {"same": 0}, "expected same above 0"),
-        (Hypotheses, {"distance": "euclid"}, "unknown distance 'euclid'"),
+        (Hypotheses, {"distance": "euclid"}, "expected distance .*, got 'euclid'"),
         (Promotion, {"per_scan": 1.5}, "per_scan"),
         (Promotion, {"persistence": 0}, "expected persistence above 0"),
-        (Promotion, {"lead": -1}, "expected lead not below 0"),
+        (Promotion, {"lead": -1}, "expected lead of at least 0"),
     ],
 )
 def test_bad_settings_are_refused_where_they_are_made(record, options, message):

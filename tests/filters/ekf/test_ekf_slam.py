@@ -406,7 +406,7 @@ BAD_RUNS = {
     "z nan": (
         spoiled("z", (2, 1, 1), np.nan),
         {},
-        r"valid measurement is not finite \(row 2, place 1\)",
+        r"valid measurement is not finite \(row 2, slot 1\)",
     ),
     "tags repeat": (spoiled("tag", (0, 1), 0), {}, r"tag repeats within the scan \(row 0\)"),
     "pose shape": (good_log(), {"pose": np.zeros(2)}, r"pose \(x, y, θ\) of shape \(3,\)"),

@@ -361,7 +361,7 @@ def test_gradients_and_batches():
         ({"sweeps": 0}, "sweeps"),
         ({"capacity": 0}, "capacity"),
         ({"floor": -1.0}, "floor"),
-        ({"sensor": sensors.range_bearing_signature(0.01 * np.eye(3))}, "points"),
+        ({"sensor": sensors.range_bearing_signature(0.01 * np.eye(3))}, r"landmarks \(x, y\)"),
     ],
 )
 def test_refusals(changes, message):
@@ -374,5 +374,7 @@ def test_refusals(changes, message):
 def test_an_area_smaller_than_a_scan_is_refused():
     scene, log = world()
     f = filters.seif(scene.motion, scene.sensor, COUNT, active=7, links=10)
-    with pytest.raises(ValueError, match="8 places, the active set holds 7"):
+    with pytest.raises(
+        ValueError, match="expected active >= 8, the measurement slots of a scan, got 7"
+    ):
         run(f, log, scene.pose, P0, KEY)

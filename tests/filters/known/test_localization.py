@@ -231,8 +231,8 @@ BAD = {
     "nan": ({"landmarks": np.full((2, 2), np.nan)}, "not finite"),
     "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
     "negative tag": ({"tags": [-1, 0, 1, 2, 3, 4]}, "different tags"),
-    "chart": ({"chart": charts.robocentric()}, "composes a map"),
-    "linearizer": ({"linearize": linearize.first_estimate()}, "for maps with errors"),
+    "chart": ({"chart": charts.robocentric()}, "is for estimated maps"),
+    "linearizer": ({"linearize": linearize.first_estimate()}, "is for estimated maps"),
     "iterated": ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
     "update": ({"update": "whole"}, "sequential"),
 }

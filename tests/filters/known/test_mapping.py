@@ -121,7 +121,7 @@ def test_refusals():
     with pytest.raises(ValueError, match=r"pose \(3,\)"):
         as_prior(final, ekf_slam(ring(3).motion, sensor, 2), jnp.zeros(2), jnp.eye(3))
     for options, message in (
-        ({"capacity": 3}, "no 2 landmarks"),
+        ({"capacity": 3}, "a filter of 2 landmarks"),
         ({"chart": charts.right_invariant()}, "Euclidean"),
         ({"chart": charts.robocentric()}, "Euclidean"),
         ({"covariance": "square_root"}, "covariance"),

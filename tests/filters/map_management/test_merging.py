@@ -236,7 +236,9 @@ def test_refusals_of_merging():
         with pytest.raises(ValueError, match="cannot be merged"):
             merging(ekf_slam(MOTION, sensor, 3), 0.5)
     other = dataclasses.replace(plain, init=lambda pose, pose_cov: pose)
-    with pytest.raises(ValueError, match=r"merging: the state of ekf_slam is no slots.Joint"):
+    with pytest.raises(
+        ValueError, match=r"merging: expected a filter whose state is a slots.Joint"
+    ):
         merging(other, 0.5).init(np.zeros(3), np.eye(3))
 
 

@@ -54,7 +54,7 @@ def test_closing_takes_times():
         closing(ekf_slam(*models, 4)),
         MANAGERS["pruning"](closing(ekf_slam(*models, 4))),
     ):
-        with pytest.raises(ValueError, match=r"closing: expected a filter with times"):
+        with pytest.raises(ValueError, match=r"closing: expected a filter that keeps times"):
             filter.init(np.zeros(3), np.eye(3))
 
 

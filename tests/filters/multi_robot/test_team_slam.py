@@ -389,23 +389,23 @@ def signs():
     [
         (lambda: team_slam([], 3), "at least one robot"),
         (lambda: team_slam([ring()], 3), "expected a team.Robot"),
-        (lambda: team_slam(crew(2)[::-1], 3), "robot 0 has no start of its own"),
+        (lambda: team_slam(crew(2)[::-1], 3), "expected no start of robot 0"),
         (lambda: team_slam(crew(2), 3, tags=(7, 7)), "2 different tags"),
         (lambda: team_slam(crew(2), 3, tags=(7,)), "2 different tags"),
         (lambda: team_slam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
         (lambda: team_slam(crew(2), 0), "capacity"),
-        (lambda: team_slam(crew(2), 3, report=2), "no robot 2 to report"),
+        (lambda: team_slam(crew(2), 3, report=2), "expected report from 0 to"),
         (lambda: team_slam(crew(2), 3, chart=charts.right_invariant()), "chart euclidean"),
         (lambda: team_slam(crew(2), 3, gate=0.0), "gate above 0"),
         (lambda: team_slam(crew(2), 3, update="at once"), "expected update"),
-        (lambda: team_slam([signs()], 3), "are not points"),
-        (lambda: team_slam([crew(1)[0], compass_only()], 3), "robot 1 has no start"),
+        (lambda: team_slam([signs()], 3), "expected landmarks \\(x, y\\)"),
+        (lambda: team_slam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
         (lambda: team.Robot(motion.increment(Q), ring().sensor), "a motion and a sensors.suite"),
         (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
-        (lambda: world(crew(2), tags=(3, 9)), "the tag 3 is a landmark's"),
-        (lambda: world(unknown(crew(2))), "needs a start"),
-        (lambda: world(crew(2), report=2), "no robot 2 to report"),
-        (lambda: world(crew(2), places=2), "does not take places"),
+        (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
+        (lambda: world(unknown(crew(2))), "expected a start of every robot"),
+        (lambda: world(crew(2), report=2), "expected report from 0 to"),
+        (lambda: world(crew(2), places=2), "places is not supported"),
     ],
 )
 def test_bad_input(make, message):
@@ -417,5 +417,5 @@ def test_a_scan_with_other_places_is_refused():
     scenario, log_of = drawn(2)
     log = log_of(0)
     short = log._replace(scan=jax.tree.map(lambda leaf: leaf[:, :10], log.scan))
-    with pytest.raises(ValueError, match="expected 14 places"):
+    with pytest.raises(ValueError, match="expected 14 measurement slots"):
         go(crew_slam(2, True), scenario, short)

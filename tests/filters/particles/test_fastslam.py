@@ -484,7 +484,7 @@ def test_a_campaign_counts_resamplings():
         ({"sensor": sensors.compass(np.eye(1))}, "not a suite"),
         (
             {"sensor": sensors.bearing_inverse_depth(np.eye(1), min_distance=1.0, to_point=0.1)},
-            "turn into points",
+            "converted to points",
         ),
     ],
 )

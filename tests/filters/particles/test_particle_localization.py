@@ -336,7 +336,7 @@ BAD = {
     "map": ({"landmarks": np.zeros((3, 3))}, "particle_localization: expected landmarks of shape"),
     "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
     "start": ({"start": "anywhere"}, 'start "gaussian" or "uniform"'),
-    "no box": ({"start": "uniform"}, "needs a box"),
+    "no box": ({"start": "uniform"}, "expected a box"),
     "box": ({"box": [[0, 0, 0], [1, 1, 1]]}, r"a box of shape \(2, 2\)"),
     "inside out": ({"box": [[1, 1], [0, 2]]}, "a box of"),
     "threshold": ({"threshold": 1.5}, "threshold from 0 to 1"),
