@@ -13,7 +13,7 @@ from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.intervals import LEVEL, Measure, interval, positive_interval
 from jaxslam.consistency.nees import DOF
 from jaxslam.consistency.score import DROPS, EVENTS, KEPT
-from jaxslam.consistency.tally import Tally
+from jaxslam.consistency.tally import SHOTS, Tally
 from jaxslam.consistency.verdict import judge
 from jaxslam.math.stats import chi2_quantile, chi2_quantiles, normal_quantile
 
@@ -110,7 +110,10 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
     per_run = tally.measures()
     shot = credibility(*tally.snapshots())
     if shot is not None:
-        per_run |= {"noncredibility": shot[0], "inclination": shot[1]}
+        looked_at = np.flatnonzero(finite & (tally.numbers() < SHOTS))
+        for name, values in zip(("noncredibility", "inclination"), shot, strict=True):
+            per_run[name] = np.full(len(finite), np.nan)
+            per_run[name][looked_at] = values
     measures: dict[str, Measure] = {}
     for name, values in per_run.items():
         bounded = name.startswith(POSITIVE)
