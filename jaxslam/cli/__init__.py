@@ -99,7 +99,7 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
     for name, text in {
         "scenario": f"one of: {', '.join(SCENARIOS)}; or FILE.py:NAME, a Scenario or a function "
         "that returns one",
-        "filters": f'"all", or some of: {",".join(ALL)}, and FILE.py:NAME, a Filter or a function '
+        "filters": f'"all", or some of: {", ".join(ALL)}; and FILE.py:NAME, a Filter or a function '
         "of the scenario that returns one; comma-separated",
         "runs": "number of simulated trajectories",
         "steps": "number of steps of each trajectory; default: the scenario's own",

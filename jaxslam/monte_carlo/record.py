@@ -47,9 +47,9 @@ class Campaign:
     fold_in(key, i)"""
 
     def __repr__(self) -> str:
-        verdicts = ", ".join(f"{name} {s.verdict}" for name, s in self.filters.items())
+        verdicts = ", ".join(f"{name}={s.verdict}" for name, s in self.filters.items())
         size = f"{self.runs} runs × {self.steps} steps, {self.dtype}"
-        text = f"Campaign({self.scenario}, {size}: {verdicts})"
+        text = f"Campaign({self.scenario}, {size}, {verdicts})"
         return textwrap.fill(text, 100, subsequent_indent="    ", break_long_words=False)
 
     def __str__(self) -> str:

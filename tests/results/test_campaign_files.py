@@ -51,7 +51,7 @@ def test_printed_it_is_the_table_and_in_a_line_its_verdicts(found):
     assert str(found) == report.campaign_table(found)
     size = f"{RUNS} runs × {STEPS} steps, float32"
     assert " ".join(repr(found).split()) == (
-        f"Campaign(world {EVIL}, {size}: good consistent, other optimistic)"
+        f"Campaign(world {EVIL}, {size}, good=consistent, other=optimistic)"
     )
     many = dataclasses.replace(found, filters={f"f{i}": found.filters["good"] for i in range(20)})
     assert max(map(len, repr(many).splitlines())) <= 100

@@ -18,7 +18,7 @@ code { font: .86em/1.5 ui-monospace, "SF Mono", Menlo, Consolas, "DejaVu Sans Mo
 .verdicts { display: grid; grid-template-columns: repeat(auto-fill, minmax(19rem, 1fr));
   gap: .6rem; margin: 0; padding: 0; list-style: none; }
 .verdicts li { display: grid; grid-template-columns: 1fr auto; gap: .1rem .8rem;
-  align-items: center; padding: .6rem .8rem; background: var(--card);
+  align-items: center; align-content: start; padding: .6rem .8rem; background: var(--card);
   border: 1px solid var(--line); border-radius: .5rem; }
 .name { font-weight: 600; overflow-wrap: anywhere; }
 .why { grid-column: 1 / -1; color: var(--soft); font-size: .86rem;
@@ -98,6 +98,6 @@ FRAGMENT_CSS = (
   summary { cursor: pointer; }
 """
     + _PARTS
-    + "}"
+    + "figure { margin: 1rem 0; } }"
 )
 """Rules nested below one class, with light colours alone: figures are light, too."""
