@@ -25,11 +25,13 @@ COUNTS = tuple(status.name.lower() for status in (*KEPT, *DROPS)) + (
 )
 """The sums that are reported as counts."""
 
+_IN_REPR = ("nees_pose", "nis_per_dof", "rmse_position")
+
 POSITIVE = ("nees", "nis", "square", "noncredibility")
 """How the names of measures begin that cannot be negative."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Summary:
     """The consistency of one filter over the runs of a campaign."""
 
@@ -77,6 +79,11 @@ class Summary:
     what "consistent" says, which means not rejected"""
     doubts: tuple[str, ...] = ()
     """sentences that qualify the verdict: most measurements dropped, directions lost"""
+
+    def __repr__(self) -> str:
+        there = (name for name in _IN_REPR if name in self.measures)
+        shown = (f"{name}={self.measures[name].value:.4g}" for name in there)
+        return f"Summary({', '.join([self.verdict, *shown, *self.doubts])})"
 
 
 def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Summary:

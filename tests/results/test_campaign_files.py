@@ -53,6 +53,7 @@ def test_printed_it_is_the_table_and_in_a_line_its_verdicts(found):
     assert " ".join(repr(found).split()) == (
         f"Campaign(world {EVIL}, {size}, good=consistent, other=optimistic)"
     )
+    assert repr(found.filters["good"]) == "Summary(consistent, nees_pose=3.041, rmse_position=1.2)"
     many = dataclasses.replace(found, filters={f"f{i}": found.filters["good"] for i in range(20)})
     assert max(map(len, repr(many).splitlines())) <= 100
 
