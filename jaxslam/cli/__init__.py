@@ -18,6 +18,7 @@ from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
 from jaxslam.datasets import READERS
+from jaxslam.results.campaign_files import FORMATS
 from jaxslam.simulation.scenarios import SCENARIOS
 
 __all__ = ["main"]
@@ -97,8 +98,10 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
         "campaign", "kept in the folder of results; --resume reads them there"
     )
     for name, text in {
-        "scenario": f"one of: {', '.join(SCENARIOS)}",
-        "filters": f'"all", or some of: {",".join(ALL)}; comma-separated',
+        "scenario": f"one of: {', '.join(SCENARIOS)}; or FILE.py:NAME, a Scenario or a function "
+        "that returns one",
+        "filters": f'"all", or some of: {", ".join(ALL)}; and FILE.py:NAME, a Filter or a function '
+        "of the scenario that returns one; comma-separated",
         "runs": "number of simulated trajectories",
         "steps": "number of steps of each trajectory; default: the scenario's own",
         "seed": "seed of the random numbers",
@@ -121,6 +124,13 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out", metavar="DIR", help=f"folder for results (default: {OUT}; with --resume, its own)"
+    )
+    parser.add_argument(
+        "--figures",
+        default="png",
+        metavar="FORMATS",
+        help=f"formats of the files of figures, of {','.join(FORMATS)}; comma-separated (default: "
+        "png; the page always has its own)",
     )
     earlier = parser.add_mutually_exclusive_group()
     earlier.add_argument(

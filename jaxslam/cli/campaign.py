@@ -4,50 +4,36 @@ import argparse
 import shutil
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 
-from jaxslam.catalog import ALL
 from jaxslam.cli import devices, library
 from jaxslam.cli.campaign_folder import (
     BLOCKS,
-    RESULT,
     TIMES,
     check_same_campaign,
     earlier_results,
     open_store,
 )
-from jaxslam.cli.common import INTERRUPTED, Progress, pick
-from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
-from jaxslam.monte_carlo.candidates import rounded
-from jaxslam.protocols import Candidate, Filter
-from jaxslam.results import report, store
-from jaxslam.results.files import check_writable, versions, write_files
-from jaxslam.run import run
-from jaxslam.simulation.scenarios import SCENARIOS
+from jaxslam.cli.common import INTERRUPTED
+from jaxslam.cli.user_objects import UserObjects
+from jaxslam.monte_carlo import Interrupted, Library, monte_carlo
+from jaxslam.monte_carlo.candidates import estimator_of, rounded
+from jaxslam.monte_carlo.fingerprint import fingerprint
+from jaxslam.protocols import Candidate
+from jaxslam.results import campaign_files, store
+from jaxslam.results.files import check_writable
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Truth
 from jaxslam.validation.numbers import check_count
 
-if TYPE_CHECKING:  # Matplotlib is slow to load
-    from jaxslam.results.plot import Figure
-
 OUT = Path("out")
 """Default folder of results."""
-
-FILES = (
-    "report.html",
-    RESULT,
-    "consistency.csv",
-    *(f"{name}.png" for name in ("nees", "bound", "cost", "coverage", "whiteness", "gained")),
-    *("errors.png", "map.png"),
-)
-"""The files that a campaign writes."""
 
 DEFAULTS: dict[str, Any] = {
     "scenario": "circle",
@@ -68,33 +54,33 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
     devices.join(options)
-    scenario = _scenario(asked["scenario"], asked["steps"])
-    filters = _filters(asked["filters"], scenario)
+    formats = campaign_files.check_formats("--figures", options.figures.split(","))
+    files = UserObjects()
+    scenario = files.scenario(asked["scenario"], asked["steps"])
+    filters = files.filters(asked["filters"], scenario)
     if not 0 <= asked["seed"] < 2**32:
         raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {asked['seed']}")
     check_count("runs", asked["runs"])
     if options.block is not None:
         check_count("block", options.block)
     check_writable(out)
-    here = devices.chosen(options.devices)
+    here, key = devices.chosen(options.devices), jax.random.key(asked["seed"])
+    identity, programs = _identity(asked, files, scenario, filters, key, here[0].platform)
     keep = open_store(options, out, asked, block)
-    identity = library.identity(asked, here[0].platform)
     earlier = earlier_results(out, keep)
-    written = earlier is not None and all((out / name).exists() for name in FILES)
+    names = campaign_files.file_names(formats)
+    written = earlier is not None and all((out / name).exists() for name in names)
     if not written:
         # Matplotlib is loaded while filters run. Not in a daemon thread: such a thread crashes in
         # compiled code when the interpreter exits.
         threading.Thread(target=_prepare_drawing).start()
     try:
-        with (
-            Progress(f"{scenario.name}, {len(filters)} filter(s)") as progress,
-            library.program_folder(identity) as kept,
-        ):
+        with files.located_errors(), programs as kept:
             campaign = monte_carlo(
                 scenario,
                 filters,
                 asked["runs"],
-                jax.random.key(asked["seed"]),
+                key,
                 block=options.block,
                 devices=here,
                 bound=asked["bound"],
@@ -102,16 +88,14 @@ def consistency(options: argparse.Namespace, command: str) -> int:
                 keep=keep,
                 identity=identity,
                 library=kept,
-                progress=progress,
-                glimpse=progress.glimpse,
             )
     except Interrupted as stop:
         if stop.campaign is None:
             if not keep.spans():  # other processes may have saved some
                 shutil.rmtree(keep.folder, ignore_errors=True)
             raise
-        print(report.campaign_table(stop.campaign))
-        print(f"\njaxslam: interrupted, {stop}; --resume {out} continues it", file=sys.stderr)
+            print(stop.campaign)
+            print(f"\njaxslam: interrupted, {stop}; --resume {out} continues it", file=sys.stderr)
         return INTERRUPTED
     for sentence in keep.set_aside:
         print(f"jaxslam: {sentence}", file=sys.stderr)
@@ -124,15 +108,19 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         campaign, command = replace(campaign, **times), earlier["command"]
     else:
         written = False
-    print(report.campaign_table(campaign))
+    print(campaign)
     if written:
         print(
             f"\n{out} holds this campaign, finished: nothing was run and nothing written; "
             f"--runs above {campaign.runs} extends it"
         )
         return 0
-    files = _campaign_files(campaign, scenario, asked["seed"], asked["bound"], command)
-    print("\nwrote " + ", ".join(str(path) for path in write_files(out, files)))
+    name = campaign_files.filter_of_run_zero(campaign)
+    if name not in campaign.first:
+        first = _run_zero(scenario, filters[name], key, campaign.dtype)
+        campaign = replace(campaign, first={name: first})
+    paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"])
+    print("\nwrote " + ", ".join(map(str, paths)))
     print(
         f"results after {took:.1f} s"
         + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
@@ -157,18 +145,26 @@ def _asked(options: argparse.Namespace) -> tuple[dict[str, Any], int | None]:
     return DEFAULTS | asked, block
 
 
-def _filters(asked: str, scenario: Scenario) -> dict[str, Candidate]:
-    """The filters of a comma-separated list, or all, by name."""
-    names = [name.strip() for name in asked.split(",")]
-    if names == ["all"]:
-        names = list(ALL)
-    if "" in names:
-        raise ValueError(
-            f"--filters: expected names of filters with commas between them, or all, got {asked!r}"
-        )
-    if len(set(names)) < len(names):
-        raise ValueError(f"--filters: expected each filter once, got {asked!r}")
-    return {name: _filter(name, scenario) for name in names}
+def _identity(
+    asked: Mapping[str, Any],
+    files: UserObjects,
+    scenario: Scenario,
+    filters: Mapping[str, Candidate],
+    key: jax.Array,
+    platform: str,
+) -> tuple[dict[str, str], AbstractContextManager[Library | None]]:
+    """What tells the campaign from others, and its compiled programs in the cache folder.
+
+    By the names and the source of the package, without a trace. What comes from a user's file may
+    depend on anything, as other files: it is told by what it computes (`fingerprint`), which takes
+    a trace, and its programs are found in JAX's own cache, by their text.
+    """
+    if not files.used:
+        identity = library.identity(asked, platform)
+        return identity, library.program_folder(identity)
+    with files.located_errors():
+        found = fingerprint(scenario, filters, key, platform, asked["bound"], asked["dtype"])
+    return found, nullcontext()
 
 
 def _prepare_drawing() -> None:
@@ -178,77 +174,12 @@ def _prepare_drawing() -> None:
     plot.warm_up()
 
 
-def _campaign_files(
-    campaign: Campaign, scenario: Scenario, seed: int, bound: bool, command: str
-) -> dict[str, str | Callable[[Path], object]]:
-    """The files of a campaign; errors and map are of run 0 of the first filter with a map."""
-    from jaxslam.results import page, plot  # matplotlib is slow to load
-
-    mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
-    name = next(iter(mapping or campaign.filters))
-
-    truth, estimate = campaign.first.get(name) or _run_zero(campaign, scenario, name, seed)
-    title = f"{scenario.name}, {name}, run 0 of seed {seed}"
-    figures = {
-        "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
-        "bound": (
-            "RMSE, and the conditional Cramér-Rao bound" if bound else "RMSE",
-            plot.bound_figure(campaign),
-        ),
-        "cost": ("Error and NEES against the time of a step", plot.cost_figure(campaign)),
-        "coverage": ("Coverage of the ellipsoids", plot.coverage_figure(campaign)),
-        "whiteness": ("Autocorrelation of innovations", plot.whiteness_figure(campaign)),
-        "gained": ("Information wrongly gained of a turn", plot.gained_figure(campaign)),
-        "errors": (f"Errors: {title}", plot.errors_figure(estimate, truth, title=title)),
-        "map": (f"Map: {title}", plot.map_figure(estimate, truth=truth, title=title)),
-    }
-    draw = cache(plot.png)
-
-    def saved(figure: "Figure") -> Callable[[Path], object]:
-        return lambda path: path.write_bytes(draw(figure))
-
-    return {
-        "report.html": page.page(
-            campaign,
-            report.ROWS,
-            command,
-            seed,
-            versions(),
-            dict(figures.values()),
-            draw,
-        ),
-        RESULT: report.as_json(campaign, command, seed),
-        "consistency.csv": report.as_csv(campaign),
-    } | {f"{name}.png": saved(figure) for name, (_, figure) in figures.items()}
-
-
 def _run_zero(
-    campaign: Campaign, scenario: Scenario, name: str, seed: int
+    scenario: Scenario, candidate: Candidate, key: jax.Array, dtype: str
 ) -> tuple[Truth, Estimate]:
     """Run 0 of a filter, computed again where another process or an earlier command computed it."""
-    key = jax.random.fold_in(jax.random.key(seed), 0)
-    key_world, key_filter = jax.random.split(key)
-    truth, log = rounded(simulate(scenario, key_world), campaign.dtype)
-    candidate = ALL[name](scenario)
-    method = candidate if isinstance(candidate, Filter) else candidate(truth)
-    assert isinstance(method, Filter)
-    trace = run(method, log, scenario.pose, scenario.pose_cov, key_filter)
-    found: tuple[Truth, Estimate] = jax.device_get((truth, trace.estimate))
+    key_world, key_filter = jax.random.split(jax.random.fold_in(key, 0))
+    truth, log = rounded(simulate(scenario, key_world), dtype)
+    method, _ = estimator_of(candidate, truth, scenario)
+    found: tuple[Truth, Estimate] = jax.device_get((truth, method(log, key_filter).estimate))
     return found
-
-
-def _scenario(name: str, steps: int | None) -> Scenario:
-    """A scenario by name, with its own number of steps unless given."""
-    make = pick("scenario", name, SCENARIOS)
-    return make() if steps is None else make(steps)
-
-
-def _filter(name: str, scenario: Scenario) -> Candidate:
-    """A filter of the catalog; raises ValueError with its name if it cannot run the scenario."""
-    make = pick("filter", name, ALL)
-    try:
-        return make(scenario, watch=True)
-    except ValueError as error:
-        raise ValueError(
-            f"filter {name!r} cannot run scenario {scenario.name!r}: {error}"
-        ) from error

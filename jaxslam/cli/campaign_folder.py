@@ -12,19 +12,17 @@ import jax
 from jaxslam.cli import devices
 from jaxslam.monte_carlo import missing
 from jaxslam.results import store
+from jaxslam.results.campaign_files import RESULT
 
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
-
-RESULT = "consistency.json"
-"""The file of results that a finished campaign is recognized by."""
 
 TIMES = ("seconds", "compile_seconds", "step_seconds")
 """Entries of the results that are measured while the campaign runs."""
 
 
 def earlier_results(out: Path, keep: store.Store) -> dict[str, Any] | None:
-    """The results of a finished campaign in a folder; None without results or where runs miss."""
+    """The results of a finished campaign in a folder; None without them or where runs miss."""
     assert keep.runs is not None
     if missing(keep.spans(), keep.runs, keep.runs):
         return None

@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.cli.common import Progress, pick
+from jaxslam.cli.common import pick
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.math import se2
+from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
 from jaxslam.results.files import check_writable, json_text, versions, write_files
 from jaxslam.types import Status

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 from jaxslam import motion, sensors, verify
-from jaxslam.cli.common import Progress
+from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, json_text, versions, write_files
 from jaxslam.verify import user_files
 

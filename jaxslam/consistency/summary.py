@@ -13,7 +13,7 @@ from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.intervals import LEVEL, Measure, interval, positive_interval
 from jaxslam.consistency.nees import DOF
 from jaxslam.consistency.score import DROPS, EVENTS, KEPT
-from jaxslam.consistency.tally import Tally
+from jaxslam.consistency.tally import SHOTS, Tally
 from jaxslam.consistency.verdict import judge
 from jaxslam.math.stats import chi2_quantile, chi2_quantiles, normal_quantile
 
@@ -25,11 +25,13 @@ COUNTS = tuple(status.name.lower() for status in (*KEPT, *DROPS)) + (
 )
 """The sums that are reported as counts."""
 
+_IN_REPR = ("nees_pose", "nis_per_dof", "rmse_position")
+
 POSITIVE = ("nees", "nis", "square", "noncredibility")
 """How the names of measures begin that cannot be negative."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Summary:
     """The consistency of one filter over the runs of a campaign."""
 
@@ -78,6 +80,11 @@ class Summary:
     doubts: tuple[str, ...] = ()
     """sentences that qualify the verdict: most measurements dropped, directions lost"""
 
+    def __repr__(self) -> str:
+        there = (name for name in _IN_REPR if name in self.measures)
+        shown = (f"{name}={self.measures[name].value:.4g}" for name in there)
+        return f"Summary({', '.join([self.verdict, *shown, *self.doubts])})"
+
 
 def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Summary:
     """The averages, bands and verdict of one filter, from its tally (host numbers, float64).
@@ -110,7 +117,10 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
     per_run = tally.measures()
     shot = credibility(*tally.snapshots())
     if shot is not None:
-        per_run |= {"noncredibility": shot[0], "inclination": shot[1]}
+        looked_at = np.flatnonzero(finite & (tally.numbers() < SHOTS))
+        for name, values in zip(("noncredibility", "inclination"), shot, strict=True):
+            per_run[name] = np.full(len(finite), np.nan)
+            per_run[name][looked_at] = values
     measures: dict[str, Measure] = {}
     for name, values in per_run.items():
         bounded = name.startswith(POSITIVE)

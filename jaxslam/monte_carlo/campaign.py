@@ -6,12 +6,13 @@ there are and whatever was interrupted; otherwise to rounding. Only scores are k
 memory is that of the blocks in flight however many runs there are.
 """
 
+import contextlib
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import jax
 import numpy as np
@@ -32,47 +33,14 @@ from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.pieces import cores, missing
 from jaxslam.monte_carlo.plan import Plan, Promises
 from jaxslam.monte_carlo.programs import compile_programs
+from jaxslam.monte_carlo.progress import Progress
+from jaxslam.monte_carlo.record import Campaign, Interrupted
 from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Estimate, Truth
 from jaxslam.validation import check_record
 from jaxslam.validation.numbers import check_count, check_key
-
-
-@dataclass(frozen=True)
-class Campaign:
-    """The result: the scenario, what was run, and a `Summary` for each filter by name."""
-
-    scenario: str
-    source: str
-    published: dict[str, dict[str, float]]
-    steps: int
-    runs: int
-    dtype: str
-    divergence_limit: float
-    """[m] a run is divergent when its final position error exceeds it: 5 σ of the ideal spread,
-    σ² = tr P of the position at the end of an EKF with Jacobians at the truth, in run 0."""
-    filters: dict[str, Summary]
-    seconds: float
-    """wall time, compilation included."""
-    compile_seconds: float
-    """wall time until the last program was there; blocks begun meanwhile ran beside. 0 where
-    nothing was left to run."""
-    step_seconds: dict[str, float]
-    """Wall time of a step of one run on one device, by filter: the median over the blocks that this
-    process computed while nothing was being compiled (where there are none, over all), several of
-    which are at work at once; without filters of which it was none."""
-    first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict, repr=False)
-    """Run 0 by filter, host arrays; of those that this process did not run there is none."""
-
-
-class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, once the blocks at work are finished; `campaign` is of the runs done, if any."""
-
-    def __init__(self, campaign: Campaign | None, runs: int) -> None:
-        super().__init__(f"{campaign.runs if campaign else 0} of {runs} runs done")
-        self.campaign = campaign
 
 
 class Keep(Protocol):
@@ -100,7 +68,7 @@ def monte_carlo(
     bound: bool = False,
     dtype: DTypeLike | None = None,
     keep: Keep | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | Literal[False] | None = None,
     glimpse: Glimpse | None = None,
     library: Library | None = None,
     identity: Mapping[str, str] | None = None,
@@ -128,10 +96,12 @@ def monte_carlo(
         keep: blocks are saved there as they finish, and those found there are not run again. It
             holds one campaign: what must agree (key, scenario, models, filters, precision,
             versions) is told by `fingerprint`. More runs than it has extend it.
-        progress: called with (runs done, runs) of this process after each block.
+        progress: called with (runs done, runs) of this process after each block. Default a bar with
+            rate and remaining time, on a terminal and in a notebook alone; False: none.
         glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
             block of each filter has run, while the others may still be compiled. A campaign of no
-            more than `workers` blocks is compiled in full first: its steps are timed.
+            more than `workers` blocks is compiled in full first: its steps are timed. Default a
+            line on the terminal, with the default `progress`.
         library: compiled programs are taken from there, without a trace, and put there. The caller
             answers for it: its programs are of this scenario and these filters, by name.
         identity: what `keep` is told instead of the fingerprint, where the caller knows without a
@@ -146,7 +116,7 @@ def monte_carlo(
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """
-    _check(scenario, filters, runs, key, block, workers, devices, keep)
+    _check(scenario, filters, runs, key, block, workers, devices, keep, progress)
     began, runs = time.perf_counter(), int(runs)
     devices = jax.local_devices() if devices is None else list(devices)
     dtype = check_dtype(dtype)
@@ -161,9 +131,10 @@ def monte_carlo(
     size = int(block or fitting_block(scenario, filters, devices[0]))
     plan = Plan(scenario, filters, key, devices, size, bound, dtype, library)
     todo = share(missing(tallies[BOUND].pieces(), runs, plan.wide))
-    work = _Work(workers, keep, progress, glimpse, {name: Tally() for name in names})
+    work = _Work(workers, keep, progress or None, glimpse, {name: Tally() for name in names})
     try:
-        work.in_blocks_that_fit(plan, todo)
+        with _shown(work, plan, progress is None):
+            work.in_blocks_that_fit(plan, todo)
         interrupted = False
     except KeyboardInterrupt:
         interrupted = True
@@ -186,6 +157,7 @@ def _check(
     workers: int | None,
     devices: Sequence[jax.Device] | None,
     keep: Keep | None,
+    progress: object,
 ) -> None:
     """Raise ValueError on arguments that `monte_carlo` does not take."""
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
@@ -211,6 +183,11 @@ def _check(
             "monte_carlo: expected keep as from jaxslam.store.create(folder) or .resume(folder), "
             f"got {keep!r}"
         )
+    if not (progress is None or progress is False or callable(progress)):
+        raise ValueError(
+            "monte_carlo: expected progress as a function of (runs done, runs), or False for none, "
+            f"got {progress!r}"
+        )
 
 
 def _summed_up(plan: Plan, tallies: dict[str, Tally], work: "_Work", seconds: float) -> Campaign:
@@ -234,6 +211,7 @@ def _summed_up(plan: Plan, tallies: dict[str, Tally], work: "_Work", seconds: fl
         compile_seconds=work.compile_seconds,
         step_seconds={name: seconds / steps for name, seconds in work.run_seconds.items()},
         first=work.first,
+        run_numbers=tallies[BOUND].numbers(),
     )
 
 
@@ -330,6 +308,20 @@ class _Work:
         self.first |= runner.first
         if stop is not None:
             raise stop
+
+
+@contextlib.contextmanager
+def _shown(work: _Work, plan: Plan, wanted: bool) -> Iterator[None]:
+    """A block in which, if wanted, a bar of progress tells of the work where it can be seen."""
+    count = len(plan.filters)
+    bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None
+    if bar is None or not bar.shown:
+        yield
+        return
+    work.progress = bar
+    work.glimpse = work.glimpse or bar.glimpse
+    with bar:
+        yield
 
 
 def _qualified(found: dict[str, Summary], scenario: Scenario) -> dict[str, Summary]:

@@ -1,5 +1,6 @@
 """Files of results: JSON and CSV as text, and files that are written completely or not at all."""
 
+import contextlib
 import csv
 import io
 import json
@@ -54,20 +55,28 @@ def check_writable(folder: Path) -> None:
 def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], object]]) -> list[Path]:
     """Write all files or, after any error or interrupt, none; returns their paths.
 
-    They are written to a hidden folder in the target and moved into place when all are complete.
+    They are written to a hidden folder in the target and moved into place when all are complete. A
+    folder that was created for nothing is removed again.
 
     Args:
         folder: the target, which is created if needed.
         files: by name, the text, or a function that writes the file at a path.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as hidden:
-        for name, content in files.items():
-            target = Path(hidden) / name
-            if callable(content):
-                content(target)
-            else:
-                target.write_text(content, encoding="utf-8")
-        for name in files:
-            os.replace(Path(hidden) / name, folder / name)
+    created = [each for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as hidden:
+            for name, content in files.items():
+                target = Path(hidden) / name
+                if callable(content):
+                    content(target)
+                else:
+                    target.write_text(content, encoding="utf-8")
+            for name in files:
+                os.replace(Path(hidden) / name, folder / name)
+    except BaseException:
+        for each in created:
+            with contextlib.suppress(OSError):  # not empty, or never created
+                each.rmdir()
+        raise
     return [folder / name for name in files]

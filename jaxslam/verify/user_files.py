@@ -78,8 +78,8 @@ def load(target: str) -> list[Target]:
     Raises:
         UnusableFile: with the line, if the file is missing, does not import, or defines none.
     """
-    path, name = _split(target)
-    module = _import(path)
+    path, name = split_target(target)
+    module = import_file(path)
     found = [t for key in vars(module) if (t := _target(module, key)) is not None]
     if name:
         found = [t for t in found if t.name == name]
@@ -137,8 +137,11 @@ def _verified(target: Target, verify_one: Callable[..., Report]) -> Report:
     return dataclasses.replace(report, model=target.name, checks=(*report.checks, quiet))
 
 
-def _split(target: str) -> tuple[Path, str]:
-    """The file and the name, or "", of FILE.py or FILE.py:NAME."""
+def split_target(target: str) -> tuple[Path, str]:
+    """The file and the name, or "", of FILE.py or FILE.py:NAME.
+
+    Raises UnusableFile where that is no Python file, and where it is not there.
+    """
     file, colon, name = target.rpartition(":")
     if not colon or not file.endswith(".py"):
         file, name = target, ""
@@ -150,7 +153,7 @@ def _split(target: str) -> tuple[Path, str]:
     return path, name
 
 
-def _import(path: Path) -> ModuleType:
+def import_file(path: Path) -> ModuleType:
     """The module of a file; raises UnusableFile where it cannot be imported."""
     name = f"_jaxslam_user_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path.resolve())

@@ -13,8 +13,7 @@ QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
 
 def test_an_interrupt_exits_with_130_and_writes_nothing(tmp_path, capsys, monkeypatch):
-    def interrupted(*arguments, progress, **options):
-        progress(1, 3)
+    def interrupted(*arguments, **options):
         raise Interrupted(None, 3)
 
     monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)

@@ -7,15 +7,13 @@ import sys
 from types import SimpleNamespace
 
 import jax
-import numpy as np
 import pytest
 from worlds import three_parameters
 
 from jaxslam import catalog, cli
-from jaxslam.cli import common, devices
-from jaxslam.consistency import Measure
+from jaxslam.cli import devices
 from jaxslam.monte_carlo import Interrupted
-from jaxslam.results import files
+from jaxslam.results import campaign_files, files
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
@@ -36,7 +34,7 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
         last,
     )
     names = {path.name for path in out.iterdir()}
-    assert names == {"blocks", *cli.campaign.FILES}
+    assert names == {"blocks", *campaign_files.file_names(["png"])}
     assert names == {
         "blocks",
         "report.html",
@@ -49,41 +47,6 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
     assert (found["runs"], found["steps"], found["seed"]) == (3, 8, 4)
     assert list(found["filters"]) == ["ekf", "ideal"]
     assert found["command"].startswith("jaxslam consistency --scenario circle")
-
-
-def test_on_a_terminal_a_line_tells_of_each_filter_as_soon_as_it_can(capsys, monkeypatch):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with common.Progress("circle") as progress:
-        progress.glimpse("ekf", 64, Measure(5.814, 4.712, 7.214))
-        progress.glimpse("one", 1, Measure(2.0, 0.0, np.inf))
-        progress.glimpse("none", 64, None)
-        progress(64, 100)
-    shown = capsys.readouterr().err
-    lines = [line.rpartition("\x1b[K")[2] for line in shown.split("\n")]
-    assert lines[:2] == [
-        "ekf: pose NEES 5.81 (4.71 to 7.21) over a first block of 64 runs; honest is 3",
-        "one: pose NEES 2 over a first run; honest is 3",
-    ]
-    assert "64/100 runs" in shown
-    assert "none" not in shown
-
-
-def test_a_bar_tells_how_fast_it_goes_and_how_long_that_takes(capsys, monkeypatch):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    clock = iter([100.0, 130.0, 131.0, 132.0, 150.0])
-    monkeypatch.setattr(common.time, "perf_counter", lambda: next(clock))
-    with common.Progress("circle") as progress:
-        for done in (64, 64, 128, 140):
-            progress(done, 10_000)
-    first, same, second, third = (
-        line for line in capsys.readouterr().err.split("\x1b[K") if "/10,000" in line
-    )
-    assert first.endswith("64/10,000 runs, 30 s\r")
-    assert same.endswith("64/10,000 runs, 31 s\r")  # no rate of nothing
-    assert second.endswith("128/10,000 runs, 32 s, 32 a second, 5 min 8 s left\r")
-    assert third.endswith("140/10,000 runs, 50 s, 3.8 a second, 43 min 15 s left\r")
-    assert common._duration(59.6) == "1 min 0 s"
-    assert common._duration(7322) == "2 h 2 min"
 
 
 def test_the_version_is_told(capsys):
@@ -114,7 +77,7 @@ def test_a_first_result_does_not_wait_for_what_draws():
         (["--dtype", "float16"], "invalid choice"),
         (["--devices", "0"], "--devices: expected at least 1"),
         (["--devices", "99"], "--devices: expected at most 4, as many as there are here (each a"),
-        (["--filters", ""], "--filters: expected names of filters with commas between them"),
+        (["--filters", ""], "--filters: expected names of filters, or FILE.py:NAME, with commas"),
         (["--filters", "ekf,"], "or all, got 'ekf,'"),
         (["--cache", ""], "--cache: expected a folder, got ''"),
         (["--resume", " "], "--resume: expected a folder, got ' '"),

@@ -212,4 +212,4 @@ def test_neighbours_can_be_imported_and_nothing_stays_behind(verify, tmp_path):
 
 
 def test_a_path_with_a_name_is_split():
-    assert user_files._split(str(EXAMPLES / "notes_velocity.py") + ":move")[1] == "move"
+    assert user_files.split_target(str(EXAMPLES / "notes_velocity.py") + ":move")[1] == "move"

@@ -11,6 +11,7 @@ from jaxslam.results.plot.campaign import (
     gained_figure,
     whiteness_figure,
 )
+from jaxslam.results.plot.formats import encode
 from jaxslam.results.plot.nees import nees_figure
 from jaxslam.results.plot.single import ellipse, errors_figure, map_figure
 from jaxslam.results.plot.style import COLORS, Figure, describe, png, warm_up
@@ -23,6 +24,7 @@ __all__ = [
     "coverage_figure",
     "describe",
     "ellipse",
+    "encode",
     "errors_figure",
     "gained_figure",
     "map_figure",

@@ -1,0 +1,137 @@
+"""The scenario and the filters of a campaign: by name, or from a user's own file.
+
+In place of a name, FILE.py:NAME takes NAME from a Python file: a `Scenario` or a function that
+returns one, a `Filter` or a function of the scenario that returns one.
+"""
+
+import contextlib
+import inspect
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from jaxslam.catalog import ALL
+from jaxslam.cli.common import pick
+from jaxslam.monte_carlo.candidates import check_fits, check_noise
+from jaxslam.protocols import Candidate, Filter
+from jaxslam.simulation.scenarios import SCENARIOS
+from jaxslam.simulation.worlds import Scenario
+from jaxslam.verify.errors import describe_error
+from jaxslam.verify.user_files import import_file, split_target
+
+
+class UserObjects:
+    """The objects of a user's files; each file is executed once."""
+
+    def __init__(self) -> None:
+        self._modules: dict[Path, ModuleType] = {}
+
+    @property
+    def used(self) -> bool:
+        """Whether anything came from a file."""
+        return bool(self._modules)
+
+    def scenario(self, asked: str, steps: int | None) -> Scenario:
+        """A scenario, by name or from a file; steps: None for its own number of them.
+
+        Raises ValueError where there is none, and where a `Scenario` is to have other steps.
+        """
+        arguments = () if steps is None else (steps,)
+        if not _in_file(asked):
+            return pick("scenario", asked, SCENARIOS)(*arguments)
+        _, made = self._find("--scenario", asked)
+        if isinstance(made, Scenario) and steps is not None:
+            raise ValueError(
+                f"--steps: {asked} is a Scenario, which has {made.steps}; "
+                "expected a function of the number of steps"
+            )
+        if not isinstance(made, Scenario) and callable(made):
+            made = self._call(asked, made, *arguments)
+        if not isinstance(made, Scenario):
+            raise ValueError(f"{asked}: expected a Scenario, or a function that returns one")
+        check_noise(made)
+        return made
+
+    def filters(self, asked: str, scenario: Scenario) -> dict[str, Candidate]:
+        """The filters of a comma-separated list, or all of the catalog, by name.
+
+        Raises ValueError where there is none, and with its name if one cannot run the scenario.
+        """
+        entries = [entry.strip() for entry in asked.split(",")]
+        if entries == ["all"]:
+            entries = list(ALL)
+        if "" in entries:
+            raise ValueError(
+                "--filters: expected names of filters, or FILE.py:NAME, with commas between them, "
+                f"or all, got {asked!r}"
+            )
+        found: dict[str, Candidate] = {}
+        for entry in entries:
+            name, candidate = (self._own if _in_file(entry) else _of_catalog)(entry, scenario)
+            if name in found:
+                raise ValueError(f"--filters: expected each name once, got {name} twice")
+            found[name] = candidate
+        return found
+
+    @contextlib.contextmanager
+    def located_errors(self) -> Iterator[None]:
+        """A block whose errors in a user's file become a ValueError that begins with the line."""
+        try:
+            yield
+        except Exception as error:
+            frames = traceback.extract_tb(error.__traceback__)
+            if not any(Path(frame.filename) in self._modules for frame in frames):
+                raise
+            raise ValueError(describe_error(error)) from error
+
+    def _find(self, option: str, asked: str) -> tuple[str, Any]:
+        """The name and the object of FILE.py:NAME."""
+        path, name = split_target(asked)
+        if not name:
+            raise ValueError(f"{option}: expected FILE.py:NAME, got {asked}")
+        path = path.resolve()
+        if path not in self._modules:
+            self._modules[path] = import_file(path)
+        if not hasattr(self._modules[path], name):
+            raise ValueError(f"{path.name}: there is no {name}")
+        return name, getattr(self._modules[path], name)
+
+    def _own(self, asked: str, scenario: Scenario) -> tuple[str, Candidate]:
+        """The name of a user's filter, and the filter for the scenario."""
+        name, made = self._find("--filters", asked)
+        if not isinstance(made, Filter) and callable(made):
+            made = self._call(asked, made, scenario)
+        if not isinstance(made, Filter) and not callable(made):
+            raise ValueError(
+                f"{asked}: expected a Filter, or a function of the scenario that returns one"
+            )
+        check_fits(name, made, scenario)
+        return name, made
+
+    def _call(self, asked: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """What a user's function returns."""
+        given = "one argument" if arguments else "no argument"
+        try:
+            inspect.signature(function).bind(*arguments)
+        except TypeError as error:
+            raise ValueError(f"{asked} is called with {given}: {error}") from error
+        with self.located_errors():
+            return function(*arguments)
+
+
+def _in_file(asked: str) -> bool:
+    """Whether an object is asked for by its file."""
+    return ":" in asked or asked.endswith(".py")
+
+
+def _of_catalog(name: str, scenario: Scenario) -> tuple[str, Candidate]:
+    """The name and a filter of the catalog; raises ValueError if it cannot run the scenario."""
+    make = pick("filter", name, ALL)
+    try:
+        return name, make(scenario, watch=True)
+    except ValueError as error:
+        raise ValueError(
+            f"filter {name!r} cannot run scenario {scenario.name!r}: {error}"
+        ) from error

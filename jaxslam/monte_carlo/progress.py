@@ -1,0 +1,93 @@
+"""A progress bar, drawn on a terminal or in a notebook, and nowhere else."""
+
+import sys
+import time
+from collections.abc import Callable
+
+from jaxslam.consistency import DOF, Measure
+
+
+class Progress:
+    """A progress bar on a terminal's standard error or below a notebook's cell, gone at the end.
+
+    Where there is neither, as in a pipe, nothing is written and `shown` is false.
+    """
+
+    def __init__(self, what: str, unit: str = "runs") -> None:
+        self._what, self._unit = what, unit
+        self._began = time.perf_counter()
+        self._terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._cell = None if self._terminal else _notebook_cell()
+        self._first: tuple[float, int] | None = None
+
+    @property
+    def shown(self) -> bool:
+        """Whether anybody can see it."""
+        return self._terminal or self._cell is not None
+
+    def __enter__(self) -> "Progress":
+        self.say("compiling …")
+        return self
+
+    def say(self, what: str) -> None:
+        """Show a word on the current stage of the work."""
+        self._draw(f"{self._what}: {what}")
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show how much is done and, from the second call on, the rate and the remaining time.
+
+        The rate is measured from the first call, so it excludes compilation.
+        """
+        now = time.perf_counter()
+        filled = round(30 * done / total)
+        bar = "█" * filled + "░" * (30 - filled)
+        line = f"{self._what}: {bar} {done:,}/{total:,} {self._unit}, {now - self._began:.0f} s"
+        if self._first is None:
+            self._first = now, done
+        elif done > self._first[1] and now > self._first[0]:
+            rate = (done - self._first[1]) / (now - self._first[0])
+            line += f", {_rate(rate)} a second, {_duration((total - done) / rate)} left"
+        self._draw(line)
+
+    def glimpse(self, name: str, runs: int, nees: Measure | None) -> None:
+        """Print a line with the pose NEES of a filter's first block, while others are compiled."""
+        if self._terminal and nees is not None:
+            one = runs == 1
+            shown = f"{nees.value:.3g}" + ("" if one else f" ({nees.low:.3g} to {nees.high:.3g})")
+            of = "run" if one else f"block of {runs} runs"
+            self._draw(f"{name}: pose NEES {shown} over a first {of}; honest is {DOF['pose']}\n")
+            self.say("compiling …")
+
+    def __exit__(self, *_: object) -> None:
+        self._draw("")
+
+    def _draw(self, line: str) -> None:
+        """Show a line in place of the last one."""
+        if self._terminal:
+            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+        elif self._cell is not None:
+            self._cell(line)
+
+
+def _notebook_cell() -> Callable[[str], object] | None:
+    """What replaces a line of output below the running cell of a notebook; None elsewhere."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    if ipython is None or not hasattr(shell, "kernel"):
+        return None
+    handle = ipython.display.display({"text/plain": ""}, raw=True, display_id=True)
+    return lambda line: handle.update({"text/plain": line}, raw=True)
+
+
+def _rate(rate: float) -> str:
+    return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+
+
+def _duration(seconds: float) -> str:
+    """A duration as text: 42 s, 3 min 5 s or 2 h 10 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600:,} h {whole % 3600 // 60} min"

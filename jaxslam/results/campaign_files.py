@@ -1,0 +1,135 @@
+"""The report of a campaign: its files, written whole or not at all, and its part of a notebook."""
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jaxslam.monte_carlo import Campaign
+from jaxslam.results import report
+from jaxslam.results.files import versions, write_files
+
+if TYPE_CHECKING:  # Matplotlib is slow to load
+    from jaxslam.results.plot import Figure
+
+PAGE, RESULT, CURVES = "report.html", "consistency.json", "consistency.csv"
+"""The page; the verdicts, measures and counts; the averages of every step."""
+
+FORMATS = ("png", "pdf", "svg")
+"""Formats of the files of figures."""
+
+FIGURES = ("nees", "bound", "cost", "coverage", "whiteness", "gained", "errors", "map")
+"""The figures, by the names of their files; the last two are of run 0 of one filter."""
+
+_IN_NOTEBOOK = ("nees", "bound")
+
+
+def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list[str]:
+    """The names of the files of a campaign's report, with figures of these formats."""
+    kinds = list(formats)
+    return [PAGE, RESULT, CURVES, *(f"{name}.{kind}" for name in figures for kind in kinds)]
+
+
+def check_formats(caller: str, asked: str | Iterable[str]) -> tuple[str, ...]:
+    """The formats that were asked for, each once; raises ValueError that names another one."""
+    kinds = tuple(dict.fromkeys([asked] if isinstance(asked, str) else asked))
+    for kind in kinds:
+        if kind not in FORMATS:
+            raise ValueError(f"{caller}: expected formats of {', '.join(FORMATS)}, got {kind!r}")
+    return kinds
+
+
+def filter_of_run_zero(campaign: Campaign) -> str:
+    """The filter whose run 0 is shown: the first with a map, or else the first."""
+    mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
+    return next(iter(mapping or campaign.filters))
+
+
+def save(
+    campaign: Campaign,
+    folder: str | Path,
+    figures: str | Iterable[str] = ("png",),
+    overwrite: bool = False,
+    command: str = "",
+    seed: int | None = None,
+) -> list[Path]:
+    """Write the files of a campaign's report, and return their paths; see `Campaign.save`.
+
+    Args:
+        command, seed: those of the campaign, for the page and the JSON; "" and None where it has
+            none.
+    """
+    formats, folder = check_formats("Campaign.save", figures), Path(folder)
+    drawings = _drawings(campaign, seed)
+    there = [name for name in file_names(formats, drawings) if (folder / name).exists()]
+    if there and not overwrite:
+        raise ValueError(
+            f"Campaign.save: {folder / there[0]} exists: overwrite=True replaces it, or choose "
+            "another folder"
+        )
+    from jaxslam.results import page, plot  # matplotlib is slow to load
+
+    drawn = {name: (caption, make()) for name, (caption, make) in drawings.items()}
+    encode = cache(plot.encode)
+
+    def saved(figure: "Figure", kind: str) -> Callable[[Path], object]:
+        return lambda path: path.write_bytes(encode(figure, kind))
+
+    files: dict[str, str | Callable[[Path], object]] = {
+        PAGE: page.page(
+            campaign,
+            report.ROWS,
+            command,
+            seed,
+            versions(),
+            dict(drawn.values()),
+            lambda figure: encode(figure, "png"),
+        ),
+        RESULT: report.as_json(campaign, command, seed),
+        CURVES: report.as_csv(campaign),
+    }
+    for name, (_, figure) in drawn.items():
+        files |= {f"{name}.{kind}": saved(figure, kind) for kind in formats}
+    return write_files(folder, files)
+
+
+def notebook(campaign: Campaign) -> str:
+    """The campaign as a fragment of HTML: verdicts, NEES and RMSE over the steps, all measures."""
+    from jaxslam.results import page, plot  # matplotlib is slow to load
+
+    drawings = _drawings(campaign, None)
+    shown = [drawings[name] for name in _IN_NOTEBOOK]
+    figures = {caption: make() for caption, make in shown}
+    return page.fragment(campaign, report.ROWS, figures, partial(plot.png, dpi=110))
+
+
+def _drawings(
+    campaign: Campaign, seed: int | None
+) -> Mapping[str, tuple[str, Callable[[], "Figure"]]]:
+    """The caption of each figure, and a function that draws it, by name."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    bound = any("bound_position" in found.curves for found in campaign.filters.values())
+    found = {
+        "nees": ("NEES against time, with its 95 % band", partial(plot.nees_figure, campaign)),
+        "bound": (
+            "RMSE, and the conditional Cramér-Rao bound" if bound else "RMSE",
+            partial(plot.bound_figure, campaign),
+        ),
+        "cost": (
+            "Error and NEES against the time of a step",
+            partial(plot.cost_figure, campaign),
+        ),
+        "coverage": ("Coverage of the ellipsoids", partial(plot.coverage_figure, campaign)),
+        "whiteness": ("Autocorrelation of innovations", partial(plot.whiteness_figure, campaign)),
+        "gained": ("Information wrongly gained of a turn", partial(plot.gained_figure, campaign)),
+    }
+    name = filter_of_run_zero(campaign)
+    if name in campaign.first:
+        truth, estimate = campaign.first[name]
+        of_seed = "" if seed is None else f" of seed {seed}"
+        title = f"{campaign.scenario}, {name}, run 0{of_seed}"
+        one = partial(plot.errors_figure, estimate, truth, title=title)
+        other = partial(plot.map_figure, estimate, truth=truth, title=title)
+        found |= {"errors": (f"Errors: {title}", one), "map": (f"Map: {title}", other)}
+    return found

@@ -1,0 +1,165 @@
+"""What a campaign shows and writes of itself: the table, a line, a notebook's fragment, files, rows.
+
+The campaign's numbers are made up; nothing is compiled but for the errors of run 0.
+"""
+
+import dataclasses
+import json
+import sys
+import types
+
+import numpy as np
+import pytest
+from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
+
+from jaxslam import plot, report
+from jaxslam.consistency import Measure
+from jaxslam.results import campaign_files
+from jaxslam.types import Estimate, Truth
+
+FIGURES = {*campaign_files.FIGURES}
+
+
+def run_zero():
+    """The truth and the estimate of a run of `STEPS` steps with two landmarks."""
+    pose = np.cumsum(np.full((STEPS, 3), 0.1), axis=0)
+    truth = Truth(pose, np.ones((2, 2)), np.zeros(STEPS, int), np.zeros(3))
+    covs = np.tile(0.01 * np.eye(3), (STEPS, 1, 1))
+    points, alive = np.ones((STEPS, 2, 2)), np.ones((STEPS, 2), bool)
+    tags = np.tile(np.arange(2), (STEPS, 1))
+    return truth, Estimate(
+        pose + 0.01, covs, points, np.tile(covs[:, None, :2, :2], (1, 2, 1, 1)), alive, tags
+    )
+
+
+@pytest.fixture(scope="module")
+def found():
+    per_run = {"nees_pose": np.arange(3.0), "square_position": np.ones(3)}
+    good = dataclasses.replace(summary("consistent", GOOD), per_run=per_run)
+    mapping = summary("optimistic", {"rmse_landmarks": Measure(1.0, 0.9, 1.1)})
+    other = dataclasses.replace(
+        mapping, per_run={"nees_pose": np.array([5.0, np.nan, 7.0])}, not_finite_runs=[4]
+    )
+    return dataclasses.replace(
+        campaign(good=good, other=other),
+        first={"other": run_zero()},
+        run_numbers=np.array([0, 4, 5]),
+    )
+
+
+def test_printed_it_is_the_table_and_in_a_line_its_verdicts(found):
+    assert str(found) == report.campaign_table(found)
+    size = f"{RUNS} runs × {STEPS} steps, float32"
+    assert " ".join(repr(found).split()) == (
+        f"Campaign(world {EVIL}, {size}, good=consistent, other=optimistic)"
+    )
+    assert repr(found.filters["good"]) == "Summary(consistent, nees_pose=3.041, rmse_position=1.2)"
+    many = dataclasses.replace(found, filters={f"f{i}": found.filters["good"] for i in range(20)})
+    assert max(map(len, repr(many).splitlines())) <= 100
+
+
+def test_a_notebook_shows_verdicts_figures_and_measures_and_little_weighs(found):
+    text = found._repr_html_()
+    read = Reader(text)
+    assert read.open == []
+    assert not {"script", "html", "body", "link"} & set(read.tags)
+    assert "<script" not in text
+    assert "✓ consistent" in "".join(read.words)
+    assert "▲ optimistic" in "".join(read.words)
+    assert read.tags.count("img") == 2
+    assert [row[0] for row in read.rows if row[0].startswith("pose NEES")]
+    assert len(text) < 400_000
+    style = text.partition("<style>")[2].partition("</style>")[0].strip()
+    assert style.startswith(".jaxslam {") and style.endswith("}")
+    assert style.count("{") == style.count("}")
+
+
+def test_the_report_is_written_as_the_command_writes_it(found, tmp_path):
+    out = tmp_path / "deep" / "out"
+    paths = found.save(str(out), figures=("png", "pdf", "svg"))
+    names = {path.name for path in out.iterdir()}
+    assert (
+        names
+        == {path.name for path in paths}
+        == {*campaign_files.file_names(("png", "pdf", "svg"))}
+    )
+    assert {path.stem for path in out.glob("*.pdf")} == FIGURES
+    heads = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
+    for kind, head in heads.items():
+        assert all(path.read_bytes().startswith(head) for path in out.glob(f"*.{kind}"))
+    assert json.loads((out / "consistency.json").read_text())["seed"] is None
+    page = Reader((out / "report.html").read_text())
+    assert page.open == [] and page.tags.count("img") == len(FIGURES)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures are made, and not drawn."""
+    monkeypatch.setattr(plot, "encode", lambda figure, kind: kind.encode())
+
+
+def test_files_are_those_asked_for_and_without_run_0_its_figures_are_left_out(
+    found, tmp_path, undrawn
+):
+    only = found.save(tmp_path / "bare", figures=())
+    assert [path.name for path in only] == ["report.html", "consistency.json", "consistency.csv"]
+    elsewhere = dataclasses.replace(found, first={})
+    kept = {path.stem for path in elsewhere.save(tmp_path / "no run 0", "svg")}
+    assert FIGURES - kept == {"errors", "map"}
+
+
+def test_what_exists_is_not_overwritten_unasked_and_nothing_half_written_stays(
+    found, tmp_path, undrawn, monkeypatch
+):
+    mine = tmp_path / "consistency.csv"
+    mine.write_text("mine")
+    with pytest.raises(
+        ValueError, match=r"^Campaign.save: .*consistency.csv exists: overwrite=True"
+    ):
+        found.save(tmp_path, figures=())
+    assert [path.name for path in tmp_path.iterdir()] == [mine.name]
+    assert mine.read_text() == "mine"
+    found.save(tmp_path, figures=(), overwrite=True)
+    assert mine.read_text() != "mine"
+    with pytest.raises(ValueError, match="expected formats of png, pdf, svg, got 'gif'"):
+        found.save(tmp_path / "new", figures=("png", "gif"))
+
+    def broken(figure, kind):
+        if kind == "svg":  # the page's own are there
+            raise KeyboardInterrupt
+        return b""
+
+    monkeypatch.setattr(plot, "encode", broken)
+    with pytest.raises(KeyboardInterrupt):
+        found.save(tmp_path / "new" / "er", figures=("svg",))
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_figure_is_the_same_bytes_each_time(found):
+    for kind in ("pdf", "svg"):
+        first, again = (plot.encode(plot.nees_figure(found), kind) for _ in range(2))
+        assert first == again
+
+
+def test_a_data_frame_has_a_row_for_each_run_of_each_filter(found, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=dict))
+    columns = found.to_dataframe()
+    assert list(columns) == ["filter", "run", "finite", "nees_pose", "square_position"]
+    assert list(columns["filter"]) == ["good"] * 3 + ["other"] * 3
+    assert list(columns["run"]) == [0, 4, 5] * 2
+    assert list(columns["finite"]) == [True] * 4 + [False, True]
+    np.testing.assert_array_equal(columns["nees_pose"], [0, 1, 2, 5, np.nan, 7])
+    np.testing.assert_array_equal(columns["square_position"], [1] * 3 + [np.nan] * 3)
+
+
+def test_pandas_takes_it(found):
+    pandas = pytest.importorskip("pandas")
+    frame = found.to_dataframe()
+    assert isinstance(frame, pandas.DataFrame)
+    assert frame.groupby("filter").nees_pose.mean().to_dict() == {"good": 1.0, "other": 6.0}
+
+
+def test_without_pandas_a_line_says_so(found, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="to_dataframe needs pandas, which is not inst"):
+        found.to_dataframe()
