@@ -52,7 +52,7 @@ os.environ.setdefault("JAX_ENABLE_X64", "1")
 
 # `!jaxslam …` in a page is the command of this environment.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-os.environ["COLUMNS"] = "100"
+os.environ |= {"COLUMNS": "100", "TERM": "dumb"}  # no bar of progress
 
 # The reference.
 default_role = "code"

@@ -1,5 +1,6 @@
 """A progress bar, drawn on a terminal or in a notebook, and nowhere else."""
 
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -16,7 +17,8 @@ class Progress:
     def __init__(self, what: str, unit: str = "runs") -> None:
         self._what, self._unit = what, unit
         self._began = time.perf_counter()
-        self._terminal = sys.stderr is not None and sys.stderr.isatty()
+        there = sys.stderr is not None and sys.stderr.isatty()
+        self._terminal = there and os.environ.get("TERM") != "dumb"
         self._cell = None if self._terminal else _notebook_cell()
         self._first: tuple[float, int] | None = None
 
