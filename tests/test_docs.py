@@ -94,7 +94,23 @@ def test_the_reference_misses_no_public_name():
 def test_a_dotted_path_in_the_text_is_reached_after_one_import():
     """In a process of its own: here other tests have imported everything."""
     text = "\n".join(PAGES.values())
-    named = sorted(set(re.findall(r"`(jaxslam(?:\.\w+)+)(?:\(.*?\))?`", text)))
+    named = sorted(set(re.findall(r"(?<!\})`(jaxslam(?:\.\w+)+)(?:\(.*?\))?`", text)))
     assert named
     code = "import jaxslam\n" + "\n".join(named)
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_a_link_into_the_reference_leads_somewhere():
+    """Sphinx says nothing of a name that it does not know."""
+    shown = {f"{n.module}.{n.name}" for names in reference().public_names().values() for n in names}
+    modules = {module.__name__ for module in reference().modules()}
+    lost = []
+    for page, text in PAGES.items():
+        for target in re.findall(r"\{py:\w+\}`(?:[^`<]*<)?~?([\w.]+)>?`", text):
+            owner, _, field = target.rpartition(".")
+            if target not in shown | modules and owner not in shown:
+                lost.append((page, target))
+            elif owner in shown and target not in shown:
+                module, _, name = owner.rpartition(".")
+                assert field in dir(getattr(sys.modules[module], name)), (page, target)
+    assert lost == []
