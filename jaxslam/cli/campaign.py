@@ -181,14 +181,18 @@ def _prepare_drawing() -> None:
 def _campaign_files(
     campaign: Campaign, scenario: Scenario, seed: int, bound: bool, command: str
 ) -> dict[str, str | Callable[[Path], object]]:
-    """The files of a campaign; errors and map are of run 0 of the first filter with a map."""
+    """The files of a campaign; errors and maps are those of run 0.
+
+    Where this process did not run it, it is run again for the first filter with a map.
+    """
     from jaxslam.results import page, plot  # matplotlib is slow to load
 
-    mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
-    name = next(iter(mapping or campaign.filters))
-
-    truth, estimate = campaign.first.get(name) or _run_zero(campaign, scenario, name, seed)
-    title = f"{scenario.name}, {name}, run 0 of seed {seed}"
+    title = f"{scenario.name}, run 0 of seed {seed}"
+    if not campaign.first:
+        mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
+        name = next(iter(mapping or campaign.filters))
+        first = {name: _run_zero(campaign, scenario, name, seed)}
+        campaign, title = replace(campaign, first=first), f"{title}, {name}"
     figures = {
         "nees": ("NEES against time, with its 95 % band", plot.nees_figure(campaign)),
         "bound": (
@@ -199,8 +203,8 @@ def _campaign_files(
         "coverage": ("Coverage of the ellipsoids", plot.coverage_figure(campaign)),
         "whiteness": ("Autocorrelation of innovations", plot.whiteness_figure(campaign)),
         "gained": ("Information wrongly gained of a turn", plot.gained_figure(campaign)),
-        "errors": (f"Errors: {title}", plot.errors_figure(estimate, truth, title=title)),
-        "map": (f"Map: {title}", plot.map_figure(estimate, truth=truth, title=title)),
+        "errors": (f"Errors: {title}", plot.run_errors_figure(campaign, title=title)),
+        "map": (f"Maps: {title}", plot.run_map_figure(campaign, title=title)),
     }
     draw = cache(plot.png)
 

@@ -65,6 +65,14 @@ img { display: block; max-width: 100%; height: auto; padding: .6rem; background:
 figcaption { max-width: 46rem; margin-top: .5rem; color: var(--soft); font-size: .9rem; }
 figcaption strong { color: var(--ink); }
 @page broad { size: landscape; margin: 10mm; }
+@media screen and (max-width: 40rem) { body { padding: 1.25rem .75rem 2.5rem; }
+  h1 { font-size: 1.4rem; } .scroll { margin: 0 -.75rem; } table { font-size: .74rem; }
+  th, td { padding: .3rem .35rem; white-space: normal; } td { min-width: 4.7rem; }
+  td.honest { min-width: 0; }
+  th:first-child { width: 5.6rem; min-width: 5.6rem; padding-left: .75rem; }
+  tr th.sub { padding-left: 1.2rem; } td .badge { padding: .05rem .3rem; font-size: .9em; }
+  .verdicts, dl { grid-template-columns: 1fr; } dd { margin-bottom: .4rem; }
+  img { padding: .2rem; } }
 @media print { :root { color-scheme: light; --ink: #000; --soft: #444; --line: #ccc; --back: #fff;
     --card: #fff; --accent: #000; --good: #0a6b47; --over: #9c3b00; --under: #22508f;
     --bad: #a3123a; --none: #4d5566; --good-bg: #fff; --over-bg: #fff; --under-bg: #fff;
