@@ -115,8 +115,8 @@ def consistency(options: argparse.Namespace, command: str) -> int:
             f"--runs above {campaign.runs} extends it"
         )
         return 0
-    name = campaign_files.filter_of_run_zero(campaign)
-    if name not in campaign.first:
+    if not campaign.first:
+        name = campaign_files.filter_of_run_zero(campaign)
         first = _run_zero(scenario, filters[name], key, campaign.dtype)
         campaign = replace(campaign, first={name: first})
     paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"])

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxslam.cli.common import pick
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.consistency import align_map
-from jaxslam.datasets import READERS
+from jaxslam.datasets import READERS, Dataset
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.math import se2
 from jaxslam.monte_carlo.progress import Progress
@@ -64,20 +64,26 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
-    surveyed = None
+    surveyed: dict[str, Any] = {}
     if data.landmarks is not None and summary["landmarks"]:
         frame, summary["map RMSE after alignment [m]"] = align_map(last, data.landmarks)
-        into_map = jax.vmap(se2.to_frame, (None, 0))
-        surveyed = np.asarray(into_map(jnp.asarray(frame), jnp.asarray(data.landmarks)))
+        surveyed = {"true_points": _in_frame(frame, data.landmarks), "names": data.tags}
+        if data.true_path is not None:
+            surveyed["true_path"] = _in_frame(frame, data.true_path[:, :2])
     from jaxslam.results import plot  # matplotlib is slow to load
 
-    at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive")}
-    figure = plot.map_figure(result.path._replace(**at_end), true_points=surveyed, title=data.name)
+    at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive", "tag")}
+    figure = plot.map_figure(
+        result.path._replace(**at_end),
+        dead_reckoning=_dead_reckoning(data),
+        title=data.name,
+        **surveyed,
+    )
     files: dict[str, str | Callable[[Path], object]] = {
         "trajectory.csv": report.trajectory_csv(data.time, result.path),
         "map.csv": report.map_csv(last, data.tags),
         "summary.json": json_text(summary | {"versions": versions()}),
-        "map.png": figure.savefig,
+        "map.png": lambda path: path.write_bytes(plot.png(figure)),
     }
     for name, value in summary.items():
         print(f"{name:30} {_shown(value)}")
@@ -92,6 +98,26 @@ def positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
         return bool(np.isfinite(np.linalg.cholesky(cov)).all())
     except np.linalg.LinAlgError:
         return False
+
+
+def _in_frame(
+    frame: Float[np.ndarray, "3"], points: Float[np.ndarray, "N 2"]
+) -> Float[np.ndarray, "N 2"]:
+    """Points in the coordinates of a frame."""
+    into = jax.vmap(se2.to_frame, (None, 0))
+    return np.asarray(into(jnp.asarray(frame), jnp.asarray(points)))
+
+
+def _dead_reckoning(data: Dataset) -> Float[np.ndarray, "T 3"]:
+    """The path by the controls alone, without noise."""
+    nominal = jnp.zeros(len(data.motion.noises))
+
+    def step(pose: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pose = data.motion.step(pose, control, nominal)
+        return pose, pose
+
+    drive = jax.jit(lambda pose, controls: jax.lax.scan(step, pose, controls)[1])
+    return np.asarray(drive(jnp.asarray(data.pose), jnp.asarray(data.log.control)))
 
 
 def _definiteness(result: PiecewiseRun) -> str:

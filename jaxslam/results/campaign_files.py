@@ -19,7 +19,7 @@ FORMATS = ("png", "pdf", "svg")
 """Formats of the files of figures."""
 
 FIGURES = ("nees", "bound", "cost", "coverage", "whiteness", "gained", "errors", "map")
-"""The figures, by the names of their files; the last two are of run 0 of one filter."""
+"""The figures, by the names of their files; the last two are of run 0."""
 
 _IN_NOTEBOOK = ("nees", "bound")
 
@@ -40,7 +40,7 @@ def check_formats(caller: str, asked: str | Iterable[str]) -> tuple[str, ...]:
 
 
 def filter_of_run_zero(campaign: Campaign) -> str:
-    """The filter whose run 0 is shown: the first with a map, or else the first."""
+    """The filter whose run 0 is shown where none is kept: the first with a map, else the first."""
     mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
     return next(iter(mapping or campaign.filters))
 
@@ -124,12 +124,12 @@ def _drawings(
         "whiteness": ("Autocorrelation of innovations", partial(plot.whiteness_figure, campaign)),
         "gained": ("Information wrongly gained of a turn", partial(plot.gained_figure, campaign)),
     }
-    name = filter_of_run_zero(campaign)
-    if name in campaign.first:
-        truth, estimate = campaign.first[name]
-        of_seed = "" if seed is None else f" of seed {seed}"
-        title = f"{campaign.scenario}, {name}, run 0{of_seed}"
-        one = partial(plot.errors_figure, estimate, truth, title=title)
-        other = partial(plot.map_figure, estimate, truth=truth, title=title)
-        found |= {"errors": (f"Errors: {title}", one), "map": (f"Map: {title}", other)}
+    if campaign.first:
+        title = f"{campaign.scenario}, run 0" + ("" if seed is None else f" of seed {seed}")
+        if len(campaign.first) == 1 < len(campaign.filters):
+            title += f", {next(iter(campaign.first))}"
+        found |= {
+            "errors": (f"Errors: {title}", partial(plot.run_errors_figure, campaign, title=title)),
+            "map": (f"Maps: {title}", partial(plot.run_map_figure, campaign, title=title)),
+        }
     return found

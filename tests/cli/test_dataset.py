@@ -8,6 +8,7 @@ import pytest
 
 from jaxslam import cli
 from jaxslam.cli.dataset import positive_definite
+from jaxslam.results import plot
 
 
 def write_bonn(folder):
@@ -18,8 +19,13 @@ def write_bonn(folder):
     return folder
 
 
-def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys):
+def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
+    drawn = {}
+    draw = plot.map_figure
+    monkeypatch.setattr(
+        plot, "map_figure", lambda *a, **more: drawn.update(more) or draw(*a, **more)
+    )
     data = write_bonn(tmp_path / "bonn")
     assert cli.main(["run", "--dataset", "bonn", str(data), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
@@ -39,6 +45,10 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["map RMSE after alignment [m]"] < 1.0
     assert summary["status"]["born"] == 2
+    assert tuple(drawn["names"]) == (1, 2) and np.shape(drawn["true_points"]) == (2, 2)
+    headings = 0.1 * np.arange(3)
+    path = 0.1 * np.cumsum([np.cos(headings), np.sin(headings)], axis=1)
+    np.testing.assert_allclose(drawn["dead_reckoning"][:, :2], path.T, atol=1e-12)
 
 
 @pytest.mark.parametrize(

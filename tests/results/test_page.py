@@ -197,3 +197,9 @@ def test_figures_are_embedded_with_captions_and_alternative_text(read):
         if (tag, name) == ("img", "src"):
             png = base64.b64decode(value.split(",")[1], validate=True)
             assert png.startswith(b"\x89PNG\r\n")
+
+
+def test_a_narrow_screen_has_rules_of_its_own(text):
+    narrow = text.split("(max-width: 40rem)")[1].split("@media")[0]
+    assert "white-space: normal" in narrow  # numbers wrap, so that several filters are seen
+    assert "figure { overflow-x: auto; }" in narrow  # figures keep a size that can be read

@@ -1,149 +1,80 @@
-"""Ellipses are contours of Mahalanobis distance; figures carry labels, units and equal aspect."""
+"""Figures of campaigns: what is drawn, what sets a scale, and that nothing overlaps."""
 
 import dataclasses
+from itertools import pairwise
 
-import jax.numpy as jnp
+import drawn
 import numpy as np
 import pytest
-import worlds
 
-from jaxslam import plot, run, simulate
-from jaxslam.consistency import LAGS, LEVELS
-from jaxslam.results.plot.style import logarithmic, panels_of
+from jaxslam import plot
+from jaxslam.catalog import ALL, KINDS
+from jaxslam.consistency import DOF, LAGS, LEVELS
+from jaxslam.results.plot.layout import kinds_of
+from jaxslam.results.plot.scale import BEYOND, set_positive
+from jaxslam.results.plot.style import COLORS, TEXT, curves_of, look, panels_of
 
-WORLD = worlds.ring()
-
-
-@pytest.mark.parametrize("n_sigma", [1.0, 3.0])
-@pytest.mark.parametrize("points", [4, 33])
-def test_an_ellipse_is_a_contour_of_mahalanobis_distance(n_sigma, points):
-    cov = np.array([[2.0, -0.9], [-0.9, 0.5]])
-    contour = plot.ellipse(np.array([3.0, -1.0]), cov, n_sigma, points)
-    assert contour.shape == (points + 1, 2)
-    np.testing.assert_allclose(contour[0], contour[-1], atol=1e-12)
-    d = contour - [3.0, -1.0]
-    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", d, np.linalg.inv(cov), d), n_sigma**2)
-
-
-def test_a_singular_covariance_gives_a_segment_and_a_point():
-    line = plot.ellipse(np.zeros(2), np.array([[1.0, 2.0], [2.0, 4.0]]), 1.0)
-    np.testing.assert_allclose(line[:, 1], 2 * line[:, 0], atol=1e-7)
-    np.testing.assert_allclose(np.abs(line[:, 0]).max(), 1.0, rtol=1e-2)
-    flat = plot.ellipse(np.zeros(2), np.diag([0.0, 4.0]), 1.0)
-    np.testing.assert_allclose(np.abs(flat[:, 1]).max(), 2.0)
-    np.testing.assert_allclose(plot.ellipse(np.ones(2), np.zeros((2, 2))), 1.0)
-
-
-@pytest.mark.parametrize(
-    "cov",
-    [np.diag([1.0, -1.0]), np.array([[1.0, 2.0], [2.0, 1.0]]), np.eye(3), np.full((2, 2), np.nan)],
-)
-def test_an_ellipse_of_no_covariance_is_refused(cov):
-    with pytest.raises(ValueError, match="covariance"):
-        plot.ellipse(np.zeros(2), cov)
-
-
-@pytest.fixture(scope="module")
-def drive():
-    truth, log = simulate(WORLD, worlds.key())
-    return truth, run(worlds.ekf(WORLD), log, WORLD.pose, WORLD.pose_cov, worlds.key())
-
-
-def test_a_map_has_equal_aspect_units_and_a_legend(drive, tmp_path):
-    truth, trace = drive
-    figure = plot.map_figure(trace.estimate, truth=truth, title="ring")
-    (axes,) = figure.axes
-    assert axes.get_aspect() == 1.0
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
-    named = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert {"true path", "estimated path", "true landmarks", "3 σ ellipses"} <= set(named)
-    assert len(named) == len(set(named))
-    figure.savefig(tmp_path / "map.png")
-    assert (tmp_path / "map.png").stat().st_size > 10_000
-
-
-def test_a_map_without_any_landmark_can_be_drawn(drive):
-    _, trace = drive
-    nothing = trace.estimate._replace(alive=jnp.zeros_like(trace.estimate.alive))
-    plot.map_figure(nothing).savefig("/dev/null", format="png")
-
-
-def test_errors_are_drawn_within_their_claimed_bounds(drive):
-    truth, trace = drive
-    figure = plot.errors_figure(trace.estimate, truth)
-    assert ylabels(figure) == ["x error [m]", "y error [m]", "heading error [°]"]
-    drawn = figure.axes[1].lines[0].get_ydata()
-    np.testing.assert_allclose(drawn, truth.pose[:, 1] - trace.estimate.pose[:, 1])
-
-
-@pytest.fixture(scope="module")
-def campaign():
-    """A filter and another like it; the first as if it had been watched."""
-    found = worlds.campaign(WORLD, {"a": worlds.ekf(WORLD)}, 4)
-    a = found.filters["a"]
-    watched = {"rotation_information": np.linspace(0.0, 9.0, WORLD.steps)}
-    b = dataclasses.replace(
-        a,
-        verdict="pessimistic",
-        curves={key: 1.1 * curve for key, curve in a.curves.items()},
-        coverage={block: share**2 for block, share in a.coverage.items()},
-        autocorrelation=a.autocorrelation / 2,
-    )
-    a = dataclasses.replace(a, curves=a.curves | watched)
-    (one,) = found.step_seconds.values()
-    return dataclasses.replace(
-        found, filters={"a": a, "b": b}, step_seconds={"a": one, "b": 20 * one}
-    )
-
-
-DOF = {"pose": 3, "position": 2, "heading": 1}
-
-CAMPAIGN_FIGURES = (
+FIVE = ("dead_reckoning", "ekf", "fej", "right_invariant", "fastslam1")
+OVER_STEPS = (
     plot.nees_figure,
     plot.bound_figure,
-    plot.cost_figure,
     plot.coverage_figure,
     plot.whiteness_figure,
     plot.gained_figure,
 )
+FIGURES = (*OVER_STEPS, plot.cost_figure, plot.run_errors_figure, plot.run_map_figure)
 
 
-def many(campaign, names):
-    summaries = list(campaign.filters.values())
-    filters = {name: summaries[i % 2] for i, name in enumerate(names)}
-    times = list(campaign.step_seconds.values())
-    step_seconds = {name: times[i % 2] for i, name in enumerate(names)}
-    return dataclasses.replace(campaign, filters=filters, step_seconds=step_seconds)
+@pytest.fixture(scope="module")
+def five():
+    return drawn.campaign(FIVE)
+
+
+@pytest.fixture(scope="module")
+def every():
+    return drawn.campaign(ALL)
 
 
 def line(axes, label):
-    (found,) = [drawn for drawn in axes.lines if drawn.get_label() == label]
+    (found,) = [each for each in curves_of(axes) if each.get_label().split(" (")[0] == label]
     return found
 
 
-def ylabels(figure):
-    return [axes.get_ylabel() for axes in figure.axes]
+def beyond(axes):
+    return [each for each in axes.lines if each.get_gid() == BEYOND]
+
+
+def panels(figure):
+    return [axes for axes in figure.axes if axes.axison]
 
 
 def named(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_nees_is_drawn_with_its_band(campaign):
-    figure = plot.nees_figure(campaign)
-    assert ylabels(figure) == [f"{block} NEES (dof {dof})" for block, dof in DOF.items()]
-    verdicts = [summary.verdict for summary in campaign.filters.values()]
-    assert named(figure) == ["95 % band", f"a ({verdicts[0]})", f"b ({verdicts[1]})"]
-    curves, most = (campaign.filters[name].curves for name in "ba")
-    for axes, block in zip(figure.axes, DOF, strict=True):
-        drawn = line(axes, f"b ({verdicts[1]})").get_ydata()
-        np.testing.assert_array_equal(drawn, curves[f"nees_{block}"])
-        (band,) = axes.collections
-        heights = band.get_paths()[0].vertices[:, 1]
-        assert heights.max() == np.nanmax(most[f"nees_{block}_high"])
-        assert heights.min() == np.nanmin(most[f"nees_{block}_low"])
-    (axes,) = plot.nees_figure(campaign, blocks=("heading",)).axes
-    assert axes.get_ylabel() == "heading NEES (dof 1)"
+def title(figure):
+    return figure.legends[0].get_title().get_text().replace("\n", " ")
+
+
+def kinds(figure, columns):
+    """[(kind, its panels, the names in its legend)]."""
+    grid = np.array(figure.axes).reshape(-1, columns + 1)
+    return [
+        (
+            row[0].get_ylabel().replace("\n", " "),
+            row[:-1],
+            [text.get_text().split(" (")[0] for text in row[-1].get_legend().texts],
+        )
+        for row in grid
+    ]
+
+
+def test_filters_are_told_apart_by_colour_and_without():
+    thirty = [look(i) for i in range(30)]
+    assert len({(each["color"], each["ls"]) for each in thirty}) == 30
+    assert {each["color"] for each in thirty} <= set(COLORS)
+    for five in (thirty[:5], thirty[5:10]):
+        assert len({each["ls"] for each in five}) == len({each["marker"] for each in five}) == 5
 
 
 @pytest.mark.parametrize(
@@ -151,10 +82,10 @@ def test_nees_is_drawn_with_its_band(campaign):
 )
 def test_an_ordinate_is_logarithmic_beyond_a_decade_and_has_numbers(low, high, scale):
     _, (axes,) = panels_of(5.0, 3.0, 1)
-    axes.plot([0, 1], [low, high])
-    logarithmic(axes)
+    set_positive(axes, low, high)
     assert axes.get_yscale() == scale
     bottom, top = axes.get_ylim()
+    assert bottom < low < high < top
     shown = []
     for axis in (axes.yaxis.major, axes.yaxis.minor):
         ticks = [tick for tick in axis.locator() if bottom <= tick <= top]
@@ -162,110 +93,236 @@ def test_an_ordinate_is_logarithmic_beyond_a_decade_and_has_numbers(low, high, s
     assert len(shown) >= 2
 
 
-def test_errors_are_drawn_above_the_bound(campaign):
-    figure = plot.bound_figure(campaign)
-    assert ylabels(figure) == ["position RMSE [m]", "heading RMSE [°]"]
-    assert named(figure) == ["a", "b", "conditional Cramér-Rao bound"]
-    for axes, key in zip(figure.axes, ("position", "heading_deg"), strict=True):
-        bound = line(axes, "conditional Cramér-Rao bound")
+def test_every_filter_of_the_family_has_one_kind():
+    every = [name for names in KINDS.values() for name in names]
+    assert sorted(every) == sorted(ALL) and max(map(len, KINDS.values())) <= 5
+
+
+def test_kinds_keep_their_order_and_others_come_last_in_fives():
+    names = [*(f"mine{i}" for i in range(7)), "fastslam2", "ukf", "ekf"]
+    assert kinds_of(names) == [
+        ("Kalman filter", ["ekf"]),
+        ("unscented", ["ukf"]),
+        ("particles", ["fastslam2"]),
+        ("others", [f"mine{i}" for i in range(5)]),
+        ("others", ["mine5", "mine6"]),
+    ]
+
+
+@pytest.mark.parametrize(("draw", "columns"), list(zip(OVER_STEPS, (3, 2, 3, 1, 1), strict=True)))
+def test_twenty_filters_are_drawn_by_kind(every, draw, columns):
+    rows = kinds(draw(every), columns)
+    there = {kind: list(names) for kind, names in KINDS.items()}
+    if draw is plot.gained_figure:
+        watched = [n for n, s in every.filters.items() if "rotation_information" in s.curves]
+        there = dict(kinds_of(watched))
+    assert [kind for kind, *_ in rows] == list(there)
+    for kind, axes, names in rows:
+        assert [name.split(":")[0] for name in names] == there[kind]
+        assert all(len(curves_of(each)) == len(names) for each in axes)
+
+
+def test_nees_is_drawn_with_its_band_and_verdicts(five):
+    figure = plot.nees_figure(five)
+    assert [axes.get_ylabel() for axes in figure.axes] == [
+        f"{block} NEES (dof {dof})" for block, dof in DOF.items()
+    ]
+    assert named(figure)[:3] == ["95 % band", "dead_reckoning (consistent)", "ekf (optimistic)"]
+    for axes, block in zip(figure.axes, DOF, strict=True):
         np.testing.assert_array_equal(
-            bound.get_ydata(), campaign.filters["a"].curves[f"bound_{key}"]
+            line(axes, "ekf").get_ydata(), five.filters["ekf"].curves[f"nees_{block}"]
         )
-        assert bound.get_linewidth() > line(axes, "a").get_linewidth()
-        assert axes.get_yscale() == "linear"
-        assert axes.get_ylim()[0] == 0
-    there = campaign.filters["a"]
-    key = "rmse_position"
-    far = dataclasses.replace(there, curves=there.curves | {key: 100 * there.curves[key]})
-    figure = plot.bound_figure(dataclasses.replace(campaign, filters={"a": there, "far": far}))
-    assert [axes.get_yscale() for axes in figure.axes] == ["log", "linear"]
-    bare = {name: curve for name, curve in there.curves.items() if not name.startswith("bound")}
-    alone = dataclasses.replace(campaign, filters={"a": dataclasses.replace(there, curves=bare)})
-    assert named(plot.bound_figure(alone)) == ["a"]
+    (axes,) = plot.nees_figure(five, blocks=("heading",)).axes
+    assert axes.get_ylabel() == "heading NEES (dof 1)"
 
 
-def test_coverage_is_drawn_about_the_diagonal(campaign):
-    figure = plot.coverage_figure(campaign)
+@pytest.mark.parametrize("names", [FIVE, tuple(ALL)])
+def test_the_band_is_seen_whatever_a_degenerate_covariance_gives(names):
+    figure = plot.nees_figure(drawn.campaign(names))
+    shown = panels(figure)
+    extreme = [
+        axes for axes in shown if any(c.get_label()[:9] == "fastslam1" for c in curves_of(axes))
+    ]
+    for at, axes in enumerate(shown):
+        dof = list(DOF.values())[at % 3]
+        (band,) = axes.collections
+        heights = band.get_paths()[0].vertices[:, 1]
+        low, high = axes.get_ylim()
+        np.testing.assert_allclose([heights.min(), heights.max()], [0.7 * dof, 1.3 * dof])
+        assert low < heights.min() and heights.max() < high <= 150 * dof
+        assert np.log(heights.max() / heights.min()) > 0.06 * np.log(high / low)
+        if axes in extreme:
+            curve = line(axes, "fastslam1")
+            assert curve.get_ydata().max() > 1e26
+            marks = [mark for mark in beyond(axes) if mark.get_color() == curve.get_color()]
+            x = np.concatenate([mark.get_xdata() for mark in marks])
+            assert len(x) and (curve.get_ydata()[x.astype(int) - 1] > high).all()
+            assert axes.get_title("right").startswith("▲ to $")
+    assert len(extreme) == 3
+
+
+def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
+    figure = plot.bound_figure(five)
+    assert named(figure)[-1] == "conditional Cramér-Rao bound"
+    for axes, unit in zip(figure.axes, (1, 2), strict=True):
+        others = max(line(axes, name).get_ydata().max() for name in FIVE[1:])
+        assert axes.get_ylim() == pytest.approx((0.0, 1.06 * others))
+        reckoned = line(axes, "dead_reckoning")
+        assert reckoned.get_ydata().max() == 40 * unit
+        (marks,) = beyond(axes)
+        assert marks.get_color() == reckoned.get_color()
+        assert axes.get_title("right") == f"▲ to {40 * unit}"
+    # Alone, it does; and so does a filter that is merely worse than another.
+    alone = plot.bound_figure(drawn.campaign(["dead_reckoning"])).axes[0]
+    assert alone.get_ylim()[1] > 40 and not beyond(alone)
+    pair = drawn.campaign(["localization", "ekf"])
+    assert not beyond(plot.bound_figure(pair).axes[0])
+    bare = {name: c for name, c in five.filters["ekf"].curves.items() if name[:5] != "bound"}
+    without = dataclasses.replace(five.filters["ekf"], curves=bare)
+    assert named(plot.bound_figure(drawn.campaign("a", filters={"a": without}))) == ["a"]
+
+
+def test_coverage_is_drawn_about_the_diagonal(five):
+    figure = plot.coverage_figure(five)
     for axes, (block, dof) in zip(figure.axes, DOF.items(), strict=True):
-        assert axes.get_title() == f"{block} (dof {dof})"
+        assert axes.get_title("left") == f"{block} (dof {dof})"
         assert axes.get_box_aspect() == 1
-        np.testing.assert_array_equal(*line(axes, "honest").get_data())
-        np.testing.assert_array_equal(line(axes, "a").get_xdata(), LEVELS)
-        drawn = line(axes, "a").get_ydata()
-        np.testing.assert_array_equal(drawn, campaign.filters["a"].coverage[block])
+        np.testing.assert_array_equal(*axes.lines[0].get_data())
+        np.testing.assert_array_equal(line(axes, "ekf").get_xdata(), LEVELS)
+        share = line(axes, "ekf").get_ydata()
+        np.testing.assert_array_equal(share, five.filters["ekf"].coverage[block])
 
 
-def test_whiteness_is_drawn_lag_by_lag_about_zero(campaign):
-    figure = plot.whiteness_figure(campaign)
+def test_whiteness_is_drawn_about_zero_and_says_who_has_no_innovations(five):
+    figure = plot.whiteness_figure(five)
     (axes,) = figure.axes
-    drawn = line(axes, "b")
-    np.testing.assert_array_equal(drawn.get_xdata(), np.arange(1, LAGS + 1))
-    np.testing.assert_array_equal(drawn.get_ydata(), campaign.filters["b"].autocorrelation)
+    for name in FIVE[1:]:
+        curve = line(axes, name)
+        np.testing.assert_allclose(curve.get_xdata(), np.arange(1, LAGS + 1), atol=0.25)
+        np.testing.assert_array_equal(curve.get_ydata(), five.filters[name].autocorrelation)
     assert axes.get_ylim()[0] == -axes.get_ylim()[1]
-    assert axes.get_xlabel() == "lag [steps]"
+    assert "dead_reckoning: no innovations" in named(figure)
+    assert "dead_reckoning" not in named(figure)
+    assert len(line(axes, "dead_reckoning: no innovations").get_xdata()) == 0
 
 
-def test_cost_is_drawn_against_error_and_nees(campaign):
-    top, bottom = plot.cost_figure(campaign).axes
-    for name, summary in campaign.filters.items():
+def test_points_of_cost_stay_off_the_frame(five):
+    top, bottom = plot.cost_figure(five).axes
+    for name, summary in five.filters.items():
         for axes, key in ((top, "rmse_position"), (bottom, "nees_pose")):
-            (x,), (y,) = line(axes, name).get_data()
-            assert x == pytest.approx(1e6 * campaign.step_seconds[name])
-            assert y == pytest.approx(summary.measures[key].value)
+            point = line(axes, name).get_xydata()
+            (expected,) = [[1e6 * five.step_seconds[name], summary.measures[key].value]]
+            np.testing.assert_allclose(point, [expected])
+            x, y = axes.transAxes.inverted().transform(axes.transData.transform(point))[0]
+            assert 0.05 < x < 0.95
+            assert 0.05 < y < 0.95 or (name, key) == ("fastslam1", "nees_pose")
+    assert bottom.get_title("right") == r"▲ to $3\cdot 10^{27}$"
+    assert bottom.get_ylim()[1] < 1e3
     assert bottom.get_xlabel() == "time of a step [µs]"
     # A campaign that only read its blocks has timed nothing.
-    untimed = plot.cost_figure(dataclasses.replace(campaign, step_seconds={}))
+    untimed = plot.cost_figure(dataclasses.replace(five, step_seconds={}))
     assert "no filter was timed" in [text.get_text() for text in untimed.axes[0].texts]
+    assert "ekf: not timed" in named(untimed)
     untimed.canvas.draw()
 
 
-def test_information_gained_is_drawn_for_watched_filters_and_zeros_are_nothing(campaign):
-    there = campaign.filters["a"]
-    gained = np.array([0.0, -1e-20, 1e-30, 1e-3, np.nan, *np.linspace(1, 50, WORLD.steps - 5)])
-    filters = {
-        name: dataclasses.replace(there, curves=there.curves | {"rotation_information": values})
-        for name, values in (("learns", gained), ("honest", np.zeros(WORLD.steps)))
-    } | {"b": campaign.filters["b"]}
-    figure = plot.gained_figure(dataclasses.replace(campaign, filters=filters))
+def test_many_filters_are_listed_by_cost(every):
+    figure = plot.cost_figure(every)
+    times, errors, nees = figure.axes[:3]
+    listed = [text.get_text() for text in times.get_yticklabels()]
+    assert listed == [name for _, names in kinds_of(list(ALL)) for name in names]
+    for axes in (times, errors):
+        left, right = axes.get_xlim()
+        points = [each for each in axes.lines if each.get_marker() != "None"]
+        assert len(points) == len(ALL)
+        assert all(left < each.get_xdata()[0] < right for each in points)
+    assert nees.get_xlim()[1] < 1e3
+    assert r"$3\cdot 10^{27}$" in [text.get_text() for text in nees.texts]
+    untimed = plot.cost_figure(dataclasses.replace(every, step_seconds={}))
+    assert untimed.axes[0].get_xlabel() == "no filter was timed"
+    untimed.canvas.draw()
+
+
+def test_information_gained_is_drawn_for_watched_filters_and_zeros_below_the_axis():
+    gained = np.array([0.0, -1e-20, 1e-30, 1e-3, np.nan, *np.linspace(1, 50, drawn.STEPS - 5)])
+    found = drawn.campaign(["learns", "honest", "dead_reckoning"])
+    for name, values in (("learns", gained), ("honest", np.zeros(drawn.STEPS))):
+        found.filters[name].curves["rotation_information"] = values
+    figure = plot.gained_figure(found)
     assert named(figure) == ["learns", "honest"]
+    assert title(figure).endswith("Not watched: dead_reckoning")
     (axes,) = figure.axes
-    drawn = line(axes, "learns").get_ydata()
-    np.testing.assert_array_equal(drawn[3:], gained[3:])
+    learns, honest = (line(axes, name).get_ydata() for name in ("learns", "honest"))
+    np.testing.assert_array_equal(learns[3:], gained[3:])
     assert axes.get_yscale() == "log"
     low, high = axes.get_ylim()
-    honest = line(axes, "honest").get_ydata()
-    assert np.all((drawn[:3] > low) & (drawn[:3] < 1e-6))
+    assert np.all((learns[:3] > low) & (learns[:3] < 1e-6))
     assert np.all((honest > low) & (honest < 1e-6))
-    assert not np.isclose(honest[0], drawn[0], rtol=0.2)  # each in its own lane
+    assert not np.isclose(honest[0], learns[0], rtol=0.2)  # each at a height of its own
     assert high > 50
-    assert "nothing" in [label.get_text() for label in axes.get_yticklabels()]
-    nobody = dataclasses.replace(campaign, filters={"b": campaign.filters["b"]})
-    (axes,) = plot.gained_figure(nobody).axes
-    assert [text.get_text() for text in axes.texts] == ["no filter was watched"]
+    nobody = plot.gained_figure(drawn.campaign(["dead_reckoning"]))
+    assert [text.get_text() for text in nobody.axes[0].texts] == ["no filter was watched"]
 
 
-@pytest.mark.parametrize("draw", CAMPAIGN_FIGURES[1:])  # tests/test_nees_figure.py has the first
-def test_twelve_filters_can_be_told_apart_and_nothing_overlaps(campaign, draw):
-    figure = draw(many(campaign, [f"filter_number_{i}" for i in range(12)]))
-    plot.png(figure, 60)
-    lines = [drawn for drawn in figure.axes[0].lines if drawn.get_label().startswith("filter")]
-    looks = [(drawn.get_color(), drawn.get_linestyle()) for drawn in lines]
-    assert len(looks) == len(set(looks)) == (6 if draw is plot.gained_figure else 12)
-    page = figure.bbox
+@pytest.mark.parametrize("names", [("ekf", "fej"), tuple(ALL)])
+def test_labels_of_information_gained_do_not_crowd(names):
+    figure = plot.gained_figure(drawn.campaign(names))
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    low, high = axes.get_ylim()
+    labels = zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
+    boxes = [text.get_window_extent() for at, text in labels if low <= at <= high]
+    assert len(boxes) >= 3
+    boxes.sort(key=lambda box: box.y0)
+    assert all(below.y1 < above.y0 for below, above in pairwise(boxes))
+    assert axes.get_yticklabels()[0].get_text() == "$< 10^{-6}$"
+
+
+@pytest.mark.parametrize("draw", FIGURES)
+@pytest.mark.parametrize("width", [plot.PAGE, plot.COLUMN])
+def test_five_filters_fit_a_page_and_a_column_in_letters_of_one_size(five, draw, width):
+    figure = draw(five, width=width)
+    figure.draw_without_rendering()
+    assert figure.get_figwidth() == width
     (legend,) = figure.legends
-    box = legend.get_window_extent()
-    assert box.x0 >= page.x0
-    assert box.x1 <= page.x1
+    page, box = figure.bbox, legend.get_window_extent()
+    assert page.x0 <= box.x0 and box.x1 <= page.x1 + 1
+    shown = panels(figure)
+    for axes in shown:
+        extent = axes.get_tightbbox()
+        assert page.x0 - 1 <= extent.x0 and extent.x1 <= page.x1 + 2
+        assert page.y0 - 1 <= extent.y0 and extent.y1 <= box.y0 + 1
+        assert {text.get_size() for text in axes.get_xticklabels()} <= {TEXT}
+    _apart(shown)
+
+
+@pytest.mark.parametrize("draw", FIGURES)
+def test_twenty_filters_can_be_read_and_nothing_overlaps(every, draw):
+    rows = draw is plot.run_errors_figure  # three panels a filter: slow to lay out, and all alike
+    figure = draw(drawn.campaign(list(ALL)[:7]) if rows else every)
+    figure.draw_without_rendering()
+    page = figure.bbox
     for axes in figure.axes:
-        drawn = axes.get_tightbbox()
-        assert drawn.y1 <= box.y0 + 1
-        assert drawn.y0 >= page.y0 - 1
-        assert drawn.x1 <= page.x1 + 1
+        extent = axes.get_tightbbox()
+        assert page.x0 - 1 <= extent.x0 and extent.x1 <= page.x1 + 2
+        assert page.y0 - 1 <= extent.y0 and extent.y1 <= page.y1 + 1
+    _apart(panels(figure))
 
 
-@pytest.mark.parametrize("draw", CAMPAIGN_FIGURES)
-def test_filters_without_a_number_and_single_steps_can_be_drawn(campaign, draw):
-    there = campaign.filters["a"]
+def _apart(shown):
+    boxes = [axes.get_window_extent() for axes in shown]
+    for i, a in enumerate(boxes):
+        assert a.width > 30 and a.height > 30
+        assert not any(a.shrunk(0.98, 0.98).overlaps(b.shrunk(0.98, 0.98)) for b in boxes[i + 1 :])
+    labels = [axes.yaxis.label.get_window_extent() for axes in shown if axes.get_ylabel()]
+    for i, a in enumerate(labels):
+        assert not any(a.overlaps(b) for b in labels[i + 1 :])
+
+
+@pytest.mark.parametrize("draw", [*OVER_STEPS, plot.cost_figure])
+@pytest.mark.parametrize("count", [1, 6])
+def test_filters_without_a_number_and_single_steps_can_be_drawn(draw, count):
+    there = drawn.summary("ekf")
     lost = dataclasses.replace(
         there,
         curves={name: np.full_like(curve, np.nan) for name, curve in there.curves.items()},
@@ -275,24 +332,23 @@ def test_filters_without_a_number_and_single_steps_can_be_drawn(campaign, draw):
         measures={},
     )
     once = dataclasses.replace(there, curves={n: curve[2:3] for n, curve in there.curves.items()})
+    more = {f"mine{i}": there for i in range(count - 1)}
     for steps, filters in (
-        (WORLD.steps, {"$lost_": lost}),
-        (WORLD.steps, {"_a$": lost, "b": there}),
-        (1, {"a": once}),
+        (drawn.STEPS, {"$lost_": lost}),
+        (drawn.STEPS, {"_a$": lost} | more),
+        (1, {f"a{i}": once for i in range(count)}),
     ):
         times = dict.fromkeys(filters, 1e-4)
-        tiny = dataclasses.replace(campaign, steps=steps, filters=filters, step_seconds=times)
-        figure = draw(tiny)
+        found = drawn.campaign([], steps, filters=filters, step_seconds=times)
+        figure = draw(found)
         assert plot.png(figure, 40).startswith(b"\x89PNG")
-        said = plot.describe(figure)
-        for name in filters:
-            assert name in said
+        if not (draw is plot.cost_figure and len(filters) > 5):  # there they are tick labels
+            assert all(name in plot.describe(figure) for name in filters)
 
 
-def test_a_figure_is_described_in_words(campaign, drive):
-    said = plot.describe(plot.coverage_figure(campaign))
+def test_a_figure_is_described_in_words(five):
+    said = plot.describe(plot.coverage_figure(five))
     assert "share of truth within" in said
-    assert "against probability p of the ellipsoid" in said
-    assert "Drawn: honest, a, b." in said
-    truth, trace = drive
-    assert "true path" in plot.describe(plot.map_figure(trace.estimate, truth=truth))
+    assert "against probability p" in said
+    assert "Drawn: honest, dead_reckoning, ekf, fej," in said
+    assert "true path" in plot.describe(plot.run_map_figure(five))

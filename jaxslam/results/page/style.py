@@ -76,6 +76,18 @@ dl { display: grid; grid-template-columns: max-content 1fr; gap: .35rem 1.1rem; 
 dt { color: var(--soft); }
 dd { margin: 0; overflow-wrap: anywhere; }
 @page broad { size: landscape; margin: 10mm; }
+@media screen { img { width: min(100%, 54rem); } .verdicts li { align-content: start; } }
+@media screen and (min-width: 72rem) { .scroll { position: relative; left: 50%; width: fit-content;
+  min-width: 100%; max-width: 96vw; transform: translateX(-50%); } }
+@media screen and (max-width: 40rem) { body { padding: 1.25rem .75rem 2.5rem; }
+  h1 { font-size: 1.4rem; } .scroll { margin: 0 -.75rem; } table { font-size: .7rem; }
+  th, td { padding: .3rem .25rem; white-space: normal; } td { min-width: 3.9rem; }
+  td.honest { min-width: 0; font-size: .62rem; }
+  th:first-child { width: 5.2rem; min-width: 5.2rem; padding-left: .6rem; }
+  tr th.sub { padding-left: 1.2rem; }
+  td .badge { padding: 0 .2rem; font-size: .9em; border-radius: .3rem; white-space: normal; }
+  .verdicts, dl { grid-template-columns: 1fr; } dd { margin-bottom: .4rem; }
+  figure { overflow-x: auto; } img { width: 36rem; max-width: none; padding: .2rem; } }
 @media print { :root { color-scheme: light; --ink: #000; --soft: #444; --line: #ccc; --back: #fff;
     --card: #fff; --accent: #000; --good: #0a6b47; --over: #9c3b00; --under: #22508f;
     --bad: #a3123a; --none: #4d5566; --good-bg: #fff; --over-bg: #fff; --under-bg: #fff;

@@ -1,23 +1,27 @@
-"""Figures of maps, errors and campaigns.
+"""Figures of maps, errors and campaigns, all in one style (`plot.style`).
 
 Only this package draws. Figures are made without pyplot, so there is no global state and no window;
-`figure.savefig(path)` saves one.
+`figure.savefig(path)` saves one. They are as wide as a page; `width=plot.COLUMN` makes one for a
+column of a paper, with letters of the same size.
 """
 
 from jaxslam.results.plot.campaign import (
     bound_figure,
-    cost_figure,
     coverage_figure,
     gained_figure,
     whiteness_figure,
 )
+from jaxslam.results.plot.cost import cost_figure
 from jaxslam.results.plot.formats import encode
+from jaxslam.results.plot.maps import ellipse, map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
-from jaxslam.results.plot.single import ellipse, errors_figure, map_figure
-from jaxslam.results.plot.style import COLORS, Figure, describe, png, warm_up
+from jaxslam.results.plot.single import errors_figure, run_errors_figure
+from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, png, warm_up
 
 __all__ = [
     "COLORS",
+    "COLUMN",
+    "PAGE",
     "Figure",
     "bound_figure",
     "cost_figure",
@@ -30,6 +34,8 @@ __all__ = [
     "map_figure",
     "nees_figure",
     "png",
+    "run_errors_figure",
+    "run_map_figure",
     "warm_up",
     "whiteness_figure",
 ]

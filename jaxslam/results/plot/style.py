@@ -1,26 +1,55 @@
-"""Parts of every figure: colours, panels, curves, captions and axes."""
+"""The one style of all figures: sizes, colours, lines, marks, legends, and files."""
 
 import io
-from typing import Any
+import textwrap
+from collections.abc import Sequence
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # re-exported: only this package imports Matplotlib
 
-from jaxslam.monte_carlo import Campaign
+Share: TypeAlias = bool | Literal["none", "all", "row", "col"]
+
+PAGE, COLUMN = 7.16, 3.5
+"""Widths [in] of the text and of a column of a two-column paper."""
+
+TEXT, TITLE = 8.0, 9.0
+"""Sizes of letters [pt] in a figure of any width."""
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
 """A palette for colour-blind readers (Okabe & Ito)."""
 
-INK = "#333333"
+INK, FAINT, SHADE, RULE = "#333333", "#777777", "#bdbdbd", "#dddddd"
+"""Colours of what is no filter's: lines and text, dead reckoning, bands, the grid."""
 
 _HUES = 6
-_DASHES = ("-", (0, (4, 1.6)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
-_MARKS = ("o", "s", "^", "D")
-"""Six colours are used in turn, then again with other dashes and markers."""
+_DASHES = ("-", (0, (5, 1.4)), (0, (1.4, 1.1)), (0, (6, 1.3, 1.4, 1.3)), (0, (9, 2)))
+_MARKS = ("o", "s", "^", "D", "v")
+
+CURVE = "curve"
+"""`gid` of the lines of filters."""
+
+_FEW = 12
+"""A curve of so many values has a mark at each."""
 
 
-def png(figure: Figure, dpi: float = 180) -> bytes:
+def look(i: int) -> dict[str, Any]:
+    """Options of the line of filter number i: colour, dashes and mark, each another.
+
+    Thirty differ in colour and dashes; five differ in dashes and marks alone, without colour.
+    """
+    return {
+        "color": COLORS[i % _HUES],
+        "ls": _DASHES[i % len(_DASHES)],
+        "marker": _MARKS[i % len(_MARKS)],
+        "mec": "white",
+        "mew": 0.4,
+    }
+
+
+def png(figure: Figure, dpi: float = 200) -> bytes:
     """The figure as a PNG file with dpi dots an inch."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=dpi)
@@ -36,55 +65,102 @@ def warm_up() -> None:
 
 def describe(figure: Figure) -> str:
     """A sentence that describes the figure, for readers who cannot see it."""
-    panels = [" ".join(filter(None, (a.get_title(), a.get_ylabel()))) for a in figure.axes]
+    panels = [
+        " ".join(filter(None, (a.get_title(), a.get_title("left"), a.get_ylabel())))
+        for a in figure.axes
+    ]
     across = next(filter(None, (a.get_xlabel() for a in figure.axes)), "")
     legends = [*figure.legends, *filter(None, (a.get_legend() for a in figure.axes))]
     named = [text.get_text() for legend in legends for text in legend.get_texts()]
-    said = f"{'; '.join(filter(None, panels))} against {across}"
+    said = f"{'; '.join(filter(None, panels))} against {across}".replace("\n", " ")
     return (f"{said}. Drawn: {', '.join(named)}." if named else f"{said}.").replace(r"\$", "$")
 
 
 def panels_of(
-    width: float, height: float, rows: int, columns: int = 1
+    width: float,
+    height: float,
+    rows: int,
+    columns: int = 1,
+    *,
+    share: tuple[Share, Share] = (True, False),
+    widths: Sequence[float] | None = None,
+    heights: Sequence[float] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """An empty figure, width by height inches, and its panels row by row."""
+    """An empty figure, width by height inches, and its panels row by row.
+
+    share: whether panels share abscissae and ordinates, as Matplotlib says it. widths, heights:
+    ratios of columns and rows.
+    """
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
-    grid = figure.subplots(rows, columns, sharex=True, sharey=columns > 1, squeeze=False)
+    grid = figure.subplots(
+        rows,
+        columns,
+        sharex=share[0],
+        sharey=share[1],
+        squeeze=False,
+        width_ratios=widths,
+        height_ratios=heights,
+    )
     for axes in grid.flat:
         axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="#dddddd", lw=0.5)
+        axes.spines[["bottom", "left"]].set_linewidth(0.8)
+        axes.grid(color=RULE, lw=0.5)
         axes.set_axisbelow(True)
+        axes.tick_params(which="both", labelsize=TEXT, width=0.8)
+        axes.tick_params(length=3)
+        for text in (axes.xaxis.label, axes.yaxis.label):
+            text.set_size(TEXT)
     return figure, list(grid.flat)
 
 
+def ordinate(axes: Axes, text: str, height: float) -> None:
+    """Label the ordinate; in two lines if the panel is too low for one, height [in]."""
+    if len(text) * 4.5 > 0.9 * 72 * height:
+        text = text.replace(" (", "\n(").replace(" [", "\n[")
+    axes.set_ylabel(text)
+
+
+def titled(axes: Axes, text: str) -> None:
+    """Write the title of a panel above its left end."""
+    axes.set_title(text, loc="left", fontsize=TEXT)
+
+
 def curve(
-    axes: Axes,
-    i: int,
-    x: np.ndarray,
-    y: np.ndarray,
-    label: str,
-    *,
-    mark: float = 0.0,
-    width: float = 1.2,
+    axes: Axes, i: int, x: np.ndarray, y: np.ndarray, label: str, *, absent: str = "no values"
 ) -> None:
-    """Draw the curve of filter number i; width and size of marks in points, mark 0 for none."""
-    dashes = _DASHES[i // _HUES % len(_DASHES)]
-    marks: dict[str, Any] = {"marker": _MARKS[i // _HUES % len(_MARKS)], "ms": mark or 3.0}
+    """Draw the curve of filter number i with marks, in other places than those of its neighbours.
+
+    A curve without a finite value has an entry in the legend that says so: absent.
+    """
+    label, finite = plain(label), np.isfinite(x) & np.isfinite(y)
+    if not finite.any():
+        axes.plot([], [], ls="none", label=f"{label}: {absent}", gid=CURVE)
+        return
+    every: Any = None
+    if finite.sum() > _FEW:
+        apart = max(len(y) // 6, 1)
+        every = (int(apart * (0.1 + 0.4 * i % 1)), apart)
     axes.plot(
         x,
         y,
-        color=COLORS[i % _HUES],
-        ls=dashes,
-        lw=width,
-        label=plain(label),
+        lw=1.1,
+        ms=3.6,
+        markevery=every,
+        label=label,
+        gid=CURVE,
         zorder=3 + 0.01 * i,
-        **(marks if mark else lone_mark(y)),
+        **look(i),
     )
 
 
-def lone_mark(y: np.ndarray) -> dict[str, Any]:
-    """Options that draw a marker where a curve has a single finite value, and so no line."""
-    return {"marker": "o", "ms": 3.0} if np.isfinite(y).sum() == 1 else {}
+def curves_of(axes: Axes) -> list[Any]:
+    """The lines that `curve` has drawn."""
+    return [line for line in axes.lines if line.get_gid() == CURVE]
+
+
+def band(axes: Axes, x: np.ndarray, low: np.ndarray, high: np.ndarray, label: str) -> None:
+    """Shade what lies between two curves."""
+    axes.fill_between(x, low, high, color=SHADE, alpha=0.6, lw=0, label=label, zorder=1)
 
 
 def plain(name: str) -> str:
@@ -93,62 +169,51 @@ def plain(name: str) -> str:
     return f" {name}" if name.startswith("_") else name
 
 
-def logarithmic(axes: Axes) -> None:
-    """Make the ordinate logarithmic where positive values span more than a decade.
+def wrapped(name: str) -> str:
+    """A long name in several lines, broken at underscores."""
+    words = plain(name).replace("_", "_ ")
+    return "\n".join(
+        line.replace("_ ", "_") for line in textwrap.wrap(words, 12, break_long_words=False)
+    )
 
-    Numbers are plain; minor ticks have numbers where there are few decades.
+
+def caption(figure: Figure, title: str, handles: Sequence[Artist] | None = None) -> None:
+    """Add title and legend above the panels; the figure grows with their lines.
+
+    handles: default all with a label of the first panel.
     """
-    if not np.isfinite(axes.dataLim.minposy):
-        return  # Matplotlib raises without positive values
-    low, high = axes.get_ylim()
-    if 0 < high < 10 * low:
-        return
-    axes.set_yscale("log", nonpositive="mask")
-    low, high = axes.get_ylim()
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(few_digits if high < 100 * low else "")
-
-
-def few_digits(x: float, _: float) -> str:
-    """The label of a minor tick on a logarithmic axis: 2 and 5 of each decade have one."""
-    return f"{x:g}" if f"{x:.0e}"[0] in "25" else ""
-
-
-def caption(figure: Figure, title: str) -> None:
-    """Add title and legend above the panels; the figure grows with the rows of the legend."""
-    handles, labels = figure.axes[0].get_legend_handles_labels()
+    handles = figure.axes[0].get_legend_handles_labels()[0] if handles is None else handles
+    labels = [str(handle.get_label()) for handle in handles]
     width = 72 * figure.get_figwidth()
     columns = 1
     for more in range(2, min(len(labels), 6) + 1):
         parts = np.array_split(np.array([len(label) for label in labels]), more)
-        if sum(4.4 * part.max() + 40 for part in parts) < width:
+        if sum(4.3 * part.max() + 36 for part in parts) < width:
             columns = more
-    figure.set_figheight(figure.get_figheight() + 0.17 * (-(-len(labels) // columns) - 1))
-    legend = figure.legend(
+    lines = textwrap.wrap(title, int(width / 4.9))
+    more_lines = -(-len(labels) // columns) - 1 + max(len(lines) - 1, 0)
+    figure.set_figheight(figure.get_figheight() + 0.16 * more_lines)
+    figure.legend(
         handles,
         labels,
         loc="outside upper left",
-        title=title or None,
+        title="\n".join(lines) or None,
         alignment="left",
         frameon=False,
         ncols=columns,
-        fontsize=8,
-        title_fontsize=10.5,
-        columnspacing=1.4,
-        handlelength=2.4,
+        fontsize=TEXT,
+        title_fontsize=TITLE,
+        columnspacing=1.2,
+        handlelength=2.6,
+        borderpad=0.2,
+        labelspacing=0.3,
     )
-    for line in legend.get_lines():
-        line.set_linewidth(1.6)
 
 
-def head(campaign: Campaign) -> str:
-    """The name of a campaign's scenario, for a title."""
-    return plain(campaign.scenario)
-
-
-def runs_of(campaign: Campaign) -> str:
-    """The number of runs of a campaign in words."""
-    return f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
+def every_handle(panels: Sequence[Axes]) -> list[Artist]:
+    """What the legend of some panels shows: the last of those with the same label."""
+    found = [handle for axes in panels for handle in axes.get_legend_handles_labels()[0]]
+    return list({handle.get_label(): handle for handle in found}.values())
 
 
 def span(steps: int) -> tuple[float, float]:

@@ -1,0 +1,145 @@
+"""Figures of what a filter gives against what a step of it takes."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxslam.consistency import DOF, Measure
+from jaxslam.monte_carlo import Campaign
+from jaxslam.results.plot.layout import TOGETHER, head, kinds_of, runs_of
+from jaxslam.results.plot.scale import mark_beyond, power, set_positive
+from jaxslam.results.plot.style import (
+    INK,
+    PAGE,
+    TEXT,
+    caption,
+    curve,
+    look,
+    ordinate,
+    panels_of,
+    plain,
+)
+
+_ERROR, _NEES = "rmse_position", "nees_pose"
+
+_LABELS = {_ERROR: "position RMSE [m]", _NEES: f"pose NEES (dof {DOF['pose']})"}
+
+_NONE = Measure(np.nan, np.nan, np.nan)
+
+_CAP = 100.0
+"""The scale of the NEES ends at so many times dof."""
+
+
+def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
+    """Position error and pose NEES of every filter against the time of a step.
+
+    More than five filters are listed, a row each, with their intervals, and columns of time, error
+    and NEES. A NEES over 100 times dof is marked at the edge. Filters that were not timed are named
+    only. width [in].
+    """
+    times = {name: 1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters}
+    if len(times) > TOGETHER:
+        return _listed(campaign, times, max(width, PAGE))
+    figure, panels = panels_of(width, 0.4 * width + 1.4, 2)
+    for axes, (key, named) in zip(panels, _LABELS.items(), strict=True):
+        for i, (name, summary) in enumerate(campaign.filters.items()):
+            y = summary.measures[key].value if key in summary.measures else np.nan
+            x = times[name]
+            absent = "no value" if np.isfinite(x) else "not timed"
+            curve(axes, i, np.array([x]), np.array([y]), name, absent=absent)
+            axes.lines[-1].set(markersize=7.0, linestyle="none")
+        ordinate(axes, named, 0.2 * width + 0.3)
+        _scale(axes, _values(campaign, key), "y")
+    panels[-1].axhline(DOF["pose"], color=INK, lw=0.8, zorder=1.5)
+    panels[-1].set_xlabel("time of a step [µs]")
+    if np.isfinite(list(times.values())).any():
+        _scale(panels[-1], np.array(list(times.values())), "x")
+        for axes in panels:
+            mark_beyond(axes)
+    else:
+        said = "no filter was timed"
+        panels[0].text(0.5, 0.5, said, transform=panels[0].transAxes, ha="center", fontsize=TEXT)
+    caption(figure, _title(campaign))
+    return figure
+
+
+def _listed(campaign: Campaign, times: dict[str, float], width: float) -> Figure:
+    """The figure with a row for each filter, by kind."""
+    groups = kinds_of(list(times))
+    rows = len(times) + len(groups) - 1  # an empty one between two kinds
+    figure, panels = panels_of(width, 0.145 * rows + 0.9, 1, 3, share=(False, True))
+    for axes in panels:
+        axes.grid(axis="y", visible=False)
+        axes.tick_params(axis="y", length=0)
+    _scale(panels[0], np.array(list(times.values())), "x")
+    for axes, key in zip(panels[1:], _LABELS, strict=True):
+        _scale(axes, _values(campaign, key), "x")
+    names, heights, middle, at = [], [], [], 0
+    for _, members in groups:
+        middle.append(at + (len(members) - 1) / 2)
+        for i, name in enumerate(members):
+            measures = campaign.filters[name].measures
+            _point(panels[0], i, at, name, Measure(times[name], np.nan, np.nan))
+            for axes, key in zip(panels[1:], _LABELS, strict=True):
+                _point(axes, i, at, name, measures.get(key, _NONE))
+            names.append(plain(name))
+            heights.append(at)
+            at += 1
+        at += 1
+    panels[0].set_yticks(heights, names)
+    panels[0].set_ylim(at - 1.4, -0.6)
+    kinds = panels[-1].secondary_yaxis("right")
+    kinds.set_yticks(middle, [kind.replace(" ", "\n") for kind, _ in groups])
+    kinds.tick_params(labelsize=TEXT, length=0, pad=8)
+    kinds.spines["right"].set_visible(False)
+    timed = np.isfinite(list(times.values())).any()
+    panels[0].set_xlabel("time of a step [µs]" if timed else "no filter was timed")
+    for axes, named in zip(panels[1:], _LABELS.values(), strict=True):
+        axes.set_xlabel(named)
+    panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5)
+    caption(figure, f"{_title(campaign)}; lines: 95 % intervals", [])
+    return figure
+
+
+def _point(axes: Axes, i: int, at: float, name: str, measure: Measure) -> None:
+    """Draw a measure with its interval at a height; beyond the scale a triangle with its value."""
+    value, low, high = measure
+    if not np.isfinite(value):
+        return
+    left, right = axes.get_xlim()
+    style = look(i)
+    if value > right:
+        axes.plot(right, at, ">", color=style["color"], mec=INK, mew=0.4, ms=5.0, clip_on=False)
+        axes.annotate(
+            power(value),
+            (right, at),
+            (-6, 0),
+            textcoords="offset points",
+            ha="right",
+            va="center",
+            fontsize=7,
+            color=INK,
+        )
+        return
+    if np.isfinite(low):
+        axes.plot([max(low, left), min(high, right)], [at, at], color=style["color"], lw=1.0)
+    axes.plot(value, at, color=style["color"], marker=style["marker"], ms=5.0, label=plain(name))
+
+
+def _values(campaign: Campaign, key: str) -> np.ndarray:
+    """A measure of each filter, at most a hundred times dof if it is the NEES."""
+    found = [s.measures[key].value for s in campaign.filters.values() if key in s.measures]
+    if key == _NEES:
+        return np.minimum([*found, DOF["pose"]], _CAP * DOF["pose"])
+    return np.array(found)
+
+
+def _scale(axes: Axes, values: np.ndarray, which: str) -> None:
+    """Set an axis for some values, none of them on the frame."""
+    there = values[np.isfinite(values) & (values > 0)]
+    if there.size:
+        set_positive(axes, there.min(), there.max(), which, margin=0.12, linear=3.0)
+
+
+def _title(campaign: Campaign) -> str:
+    return f"{head(campaign)}: error and NEES against the time of a step, {runs_of(campaign)}"

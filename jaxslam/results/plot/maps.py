@@ -1,0 +1,241 @@
+"""Figures of maps: paths, landmarks with covariance ellipses, the truth or a survey."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.markers import MarkerStyle
+from matplotlib.path import Path
+from matplotlib.transforms import Affine2D
+
+from jaxslam.monte_carlo import Campaign
+from jaxslam.results.plot.style import (
+    COLORS,
+    FAINT,
+    INK,
+    PAGE,
+    SHADE,
+    caption,
+    every_handle,
+    panels_of,
+    plain,
+    titled,
+)
+from jaxslam.types import Estimate, Truth
+
+_ARROW = Path([(1.2, 0.0), (-0.6, 0.6), (-0.25, 0.0), (-0.6, -0.6), (1.2, 0.0)])
+
+_NEAR = 1.5
+"""Dead reckoning is shown in full if it enlarges the map by at most this factor."""
+
+_UPRIGHT = 15
+"""largest number of landmarks whose names stand side by side"""
+
+
+def ellipse(
+    mean: np.ndarray, cov: np.ndarray, n_sigma: float = 3.0, points: int = 64
+) -> np.ndarray:
+    """The closed contour (points + 1, 2) of Mahalanobis distance n_sigma, Solà (84).
+
+    mean + n L (cos α, sin α) with P = L Lᵀ. n_sigma sets the size and points the smoothness. A
+    positive semi-definite P gives a segment or a point. Raises ValueError if P is not 2×2, not
+    finite or indefinite.
+    """
+    cov = np.asarray(cov, np.float64)
+    if cov.shape != (2, 2) or not np.all(np.isfinite(cov)):
+        raise ValueError(f"ellipse: expected a finite 2×2 covariance, got {cov}")
+    a, b, c = cov[0, 0], cov[1, 0], cov[1, 1]
+    tolerance = 1e-6 * max(abs(a), abs(c))
+    first = np.sqrt(max(a, 0.0))
+    below = b / first if first > 0 else 0.0
+    rest = c - below**2
+    if a < -tolerance or rest < -tolerance or (first == 0 and abs(b) > tolerance):
+        raise ValueError(f"ellipse: expected a positive semi-definite covariance, got {cov}")
+    factor = np.array([[first, 0.0], [below, np.sqrt(max(rest, 0.0))]])
+    around = np.linspace(0.0, 2 * np.pi, points + 1)
+    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
+    return np.asarray(np.asarray(mean) + n_sigma * circle @ factor.T)
+
+
+def map_figure(
+    estimate: Estimate,
+    *,
+    truth: Truth | None = None,
+    true_points: np.ndarray | None = None,
+    true_path: np.ndarray | None = None,
+    dead_reckoning: np.ndarray | None = None,
+    names: Sequence[object] | None = None,
+    n_sigma: float = 3.0,
+    title: str = "",
+    width: float = 6.0,
+) -> Figure:
+    """The estimated path and final map with n-σ ellipses, and the truth if it is known.
+
+    Args:
+        estimate: with leading T, as in `Trace.estimate`.
+        truth: of a simulated world; or, drawn without alignment,
+        true_points: (N, 2) landmarks [m], in the order of tags where names is given, and
+        true_path: (T, 2 or 3) poses.
+        dead_reckoning: (T, 2 or 3) poses; what is far from the rest of the map is not shown.
+        names: of the landmarks, by tag. A panel below shows the distance of each landmark of the
+            map from its point in true_points, with what its covariance claims in that direction,
+            and lines join the two.
+        n_sigma: size of ellipses and claims. width: [in].
+
+    Raises ValueError if names are given without true_points.
+    """
+    if names is not None and true_points is None:
+        raise ValueError("map_figure: names are those of true_points, which are missing")
+    if truth is not None:
+        true_path, true_points = np.asarray(truth.pose), np.asarray(truth.landmarks)[:, :2]
+    heights, tall = ((1.0,), width) if names is None else ((1.0, 0.2), 1.25 * width)
+    figure, panels = panels_of(width, tall, len(heights), share=(False, False), heights=heights)
+    axes = panels[0]
+    shown = _draw_truth(axes, true_path, true_points, "true" if names is None else "surveyed")
+    shown += _draw_estimate(axes, estimate, n_sigma)
+    if dead_reckoning is not None:
+        path = np.asarray(dead_reckoning)[:, :2]
+        axes.plot(*path.T, color=FAINT, lw=1.0, ls=(0, (1, 1.2)), label="dead reckoning", zorder=2)
+        shown += [path] if _size([*shown, path]) < _NEAR * _size(shown) else []
+    _limits(axes, shown)
+    if names is not None:
+        _draw_residuals(axes, panels[1], estimate, np.asarray(true_points), names, n_sigma)
+        figure.align_ylabels()
+    caption(figure, title, every_handle(panels))
+    return figure
+
+
+def run_map_figure(
+    campaign: Campaign, *, n_sigma: float = 3.0, title: str = "", width: float = PAGE
+) -> Figure:
+    """Path and final map of run 0 of every filter of `Campaign.first`, with the truth.
+
+    The panels show the true map and its surroundings; estimates may leave them. Raises ValueError
+    if the campaign has no run 0.
+    """
+    if not campaign.first:
+        raise ValueError("run_map_figure: the campaign holds no run 0 (Campaign.first is empty)")
+    if len(campaign.first) == 1:
+        ((truth, estimate),) = campaign.first.values()
+        return map_figure(estimate, truth=truth, n_sigma=n_sigma, title=title, width=width)
+    columns = min(len(campaign.first), 3 if len(campaign.first) <= 9 else 4)
+    if width < 5:
+        columns = 2
+    rows = -(-len(campaign.first) // columns)
+    side = width / columns
+    figure, panels = panels_of(width, side * rows + 0.7, rows, columns, share=(True, True))
+    for axes, (name, (truth, estimate)) in zip(panels, campaign.first.items(), strict=False):
+        shown = _draw_truth(axes, np.asarray(truth.pose), np.asarray(truth.landmarks)[:, :2])
+        _draw_estimate(axes, estimate, n_sigma)
+        _limits(axes, shown)
+        titled(axes, plain(name))
+    for axes in panels[len(campaign.first) :]:
+        axes.set_axis_off()
+    for i, axes in enumerate(panels):
+        axes.set_xlabel("x [m]" if i >= len(panels) - columns else "")
+        axes.set_ylabel("y [m]" if i % columns == 0 else "")
+    caption(figure, title, every_handle(panels))
+    return figure
+
+
+def _draw_truth(
+    axes: Axes, path: np.ndarray | None, points: np.ndarray | None, kind: str = "true"
+) -> list[np.ndarray]:
+    """Draw the true path and landmarks; returns what was drawn."""
+    shown = []
+    if path is not None:
+        shown.append(np.asarray(path)[:, :2])
+        axes.plot(*shown[-1].T, color=INK, lw=1.0, ls=(0, (4, 2)), label="true path", zorder=3.5)
+    if points is not None:
+        shown.append(np.asarray(points))
+        label = f"{kind} landmarks"
+        axes.plot(*shown[-1].T, "x", color=INK, ms=5, mew=1.0, label=label, zorder=4)
+    return shown
+
+
+def _draw_estimate(axes: Axes, estimate: Estimate, n_sigma: float) -> list[np.ndarray]:
+    """Draw the estimated path with its ends, and the final map; returns what was drawn.
+
+    Covariances that have no ellipse are counted above the panel.
+    """
+    pose = np.asarray(estimate.pose)
+    alive = np.asarray(estimate.alive[-1])
+    points = np.asarray(estimate.points[-1])[alive]
+    covs = np.asarray(estimate.point_covs[-1])[alive]
+    axes.plot(*pose[:, :2].T, color=COLORS[0], lw=1.3, label="estimated path", zorder=3)
+    axes.plot(*points.T, ".", color=COLORS[1], ms=4.5, label="estimated landmarks", zorder=5)
+    last = pose[-1, :2], np.asarray(estimate.pose_cov[-1])[:2, :2], COLORS[0], "_"
+    label, refused = f"{n_sigma:g} σ ellipses", 0
+    for mean, cov, color, named in [
+        last,
+        *((point, cov, COLORS[1], label) for point, cov in zip(points, covs, strict=True)),
+    ]:
+        try:
+            contour = ellipse(mean, cov, n_sigma)
+        except ValueError:
+            refused += 1
+            continue
+        axes.plot(*contour.T, color=color, lw=0.9, label=named, zorder=3)
+    if refused:
+        axes.set_title(f"{refused} without ellipse", loc="right", fontsize=7, color=INK)
+    ends: dict[str, Any] = {"ls": "none", "color": INK, "zorder": 6}
+    axes.plot(*pose[0, :2], marker="o", mfc="white", mew=1.2, ms=5, label="start", **ends)
+    turned = MarkerStyle(_ARROW, transform=Affine2D().rotate(np.nan_to_num(pose[-1, 2])))
+    axes.plot(*pose[-1, :2], marker=turned, mec="white", mew=0.6, ms=12, label="end", **ends)
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    return [pose[:, :2], points]
+
+
+def _draw_residuals(
+    over: Axes,
+    axes: Axes,
+    estimate: Estimate,
+    survey: np.ndarray,
+    names: Sequence[object],
+    n_sigma: float,
+) -> None:
+    """Draw what parts each landmark from its surveyed point: lines over the map, and lengths."""
+    tag = np.asarray(estimate.tag[-1])
+    mine = np.flatnonzero(np.asarray(estimate.alive[-1]) & (tag >= 0))
+    mine = mine[np.argsort(tag[mine])]
+    points, targets = np.asarray(estimate.points[-1])[mine], survey[tag[mine]]
+    label = "residual"
+    for ends in zip(points, targets, strict=True):
+        over.plot(*np.array(ends).T, color=COLORS[2], lw=1.2, label=label, zorder=4.5)
+    error = points - targets
+    far = np.hypot(*error.T)
+    along = error / np.where(far > 0, far, 1.0)[:, None]
+    covs = np.asarray(estimate.point_covs[-1])[mine]
+    claim = n_sigma * np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", along, covs, along), 0.0))
+    at = np.arange(len(mine))
+    claimed = f"{n_sigma:g} σ claimed in its direction"
+    axes.bar(at, claim, 0.7, color=SHADE, label=claimed)
+    axes.plot(at, far, "D", color=COLORS[2], ms=4.5, mec="white", mew=0.4, label=label)
+    axes.set_xticks(at, [str(names[tag[i]]) for i in mine])
+    if len(mine) > _UPRIGHT:
+        axes.tick_params(axis="x", rotation=90)
+    axes.grid(axis="x", visible=False)
+    axes.set(xlabel="landmark", ylabel="residual [m]")
+    axes.set_ylim(bottom=0.0)
+
+
+def _size(clouds: Sequence[np.ndarray]) -> float:
+    """The larger side of the bounding box of some points, or 1 if it is 0."""
+    return float(np.nanmax(np.ptp(_finite(clouds), axis=0))) or 1.0
+
+
+def _finite(clouds: Sequence[np.ndarray]) -> np.ndarray:
+    """The finite ones of some points, the origin if there is none."""
+    every = np.concatenate(clouds)
+    every = every[np.isfinite(every).all(axis=1)]
+    return every if len(every) else np.zeros((1, 2))
+
+
+def _limits(axes: Axes, clouds: Sequence[np.ndarray]) -> None:
+    """Set the limits of a square panel about some points, with a margin."""
+    every = _finite(clouds)
+    middle = (every.min(axis=0) + every.max(axis=0)) / 2
+    half = 0.56 * _size(clouds)
+    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
