@@ -25,11 +25,14 @@ PAGES = {
 def commands():
     """(page, command line) of every `jaxslam …` that a page shows."""
     for page, text in PAGES.items():
-        for block in re.findall(r"^```(?:console)?\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
-            for line in re.findall(r"^(?:\$ )?(jaxslam .*)$", block, re.MULTILINE):
-                yield page, line
-        for line in re.findall(r"^!(jaxslam .*)$", text, re.MULTILINE):
-            yield page, line
+        for kind, block in re.findall(r"^```([^\n]*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
+            start = r"^!" if kind.startswith("{code-cell}") else r"^(?:\$ )?"
+            if kind in ("", "console") or start == "^!":
+                block = block.replace("\\\n", "")
+                yield from (
+                    (page, line)
+                    for line in re.findall(rf"{start}(jaxslam .*)$", block, re.MULTILINE)
+                )
 
 
 @pytest.mark.parametrize(("page", "line"), list(commands()))

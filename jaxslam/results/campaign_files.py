@@ -122,7 +122,10 @@ def _drawings(
         ),
         "coverage": ("Coverage of the ellipsoids", partial(plot.coverage_figure, campaign)),
         "whiteness": ("Autocorrelation of innovations", partial(plot.whiteness_figure, campaign)),
-        "gained": ("Information wrongly gained of a turn", partial(plot.gained_figure, campaign)),
+        "gained": (
+            "Information gained about a rotation of the whole frame",
+            partial(plot.gained_figure, campaign),
+        ),
     }
     if campaign.first:
         title = f"{campaign.scenario}, run 0" + ("" if seed is None else f" of seed {seed}")

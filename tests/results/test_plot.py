@@ -352,3 +352,8 @@ def test_a_figure_is_described_in_words(five):
     assert "against probability p" in said
     assert "Drawn: honest, dead_reckoning, ekf, fej," in said
     assert "true path" in plot.describe(plot.run_map_figure(five))
+
+
+def test_a_notebook_shows_a_figure_as_it_is():
+    figure, _ = panels_of(1.0, 1.0, 1)
+    assert figure._repr_png_().startswith(b"\x89PNG")

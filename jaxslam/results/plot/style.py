@@ -76,6 +76,14 @@ def describe(figure: Figure) -> str:
     return (f"{said}. Drawn: {', '.join(named)}." if named else f"{said}.").replace(r"\$", "$")
 
 
+class ShownFigure(Figure):
+    """A figure that a notebook shows as it is, whether or not pyplot was imported."""
+
+    def _repr_png_(self) -> bytes:
+        """The figure as a PNG file, for the screen."""
+        return png(self, dpi=110)
+
+
 def panels_of(
     width: float,
     height: float,
@@ -91,7 +99,7 @@ def panels_of(
     share: whether panels share abscissae and ordinates, as Matplotlib says it. widths, heights:
     ratios of columns and rows.
     """
-    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+    figure = ShownFigure(figsize=(width, height), dpi=150, layout="constrained")
     grid = figure.subplots(
         rows,
         columns,
