@@ -122,11 +122,10 @@ def localization(
         return joint._replace(alive=jnp.ones(capacity, bool), tag=jnp.asarray(names))
 
     def predict(joint: Joint, u: Array, key: Array) -> Joint:
-        return propagate(joint, u, motion, settings)
+        return propagate(joint, u, motion, settings)[0]
 
     def update_pose(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        joint, info, _ = update_by_scan(joint, scan, turns)
-        return joint, info
+        return update_by_scan(joint, scan, turns)[:2]
 
     def estimate(joint: Joint) -> Estimate:
         cov = joint.cov

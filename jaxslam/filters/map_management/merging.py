@@ -1,6 +1,5 @@
 """Duplicate landmarks: found by a joint chi-square test, and merged by an exact constraint."""
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -9,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots, validation
 from jaxslam.filters.ekf.coordinates import retracted
-from jaxslam.filters.map_management.wrapping import joint_of
+from jaxslam.filters.map_management.wrapping import joint_of, managed
 from jaxslam.filters.reporting import with_extra
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import gaussian_terms
@@ -62,9 +61,7 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
         capacity = joint.alive.shape[0]
         return joint._replace(co_observed=jnp.zeros((capacity, capacity), bool))
 
-    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        found = filter.update(joint, scan, key)
-        joint, info = validation.state_and_info(f"merging: {filter.name}", joint, scan, found)
+    def manage(joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
         together = co_observed(joint, info, filter.places)
         joint = joint._replace(co_observed=together)
         kept, freed, distance = closest_pair(
@@ -79,8 +76,7 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
         pair = jnp.where(same, jnp.stack([kept, freed]), -1).astype(jnp.int32)
         return joint, with_extra(info, "merging", Merged(pair))
 
-    name = f"merging {filter.name}"
-    return dataclasses.replace(filter, name=name, init=init, update=update)
+    return managed("merging", filter, init, manage)
 
 
 def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[Array, "N N"]:

@@ -203,7 +203,7 @@ def initial_state(
 
 def moved(joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings) -> Joint:
     """The state after the prediction of one robot, if it is in the map."""
-    after = propagate(
+    after, _ = propagate(
         seen_from(joint, robot, settings), u, settings.robots[robot].motion, settings.ekf
     )
     after = seen_from_first(after, robot, joint, settings)
@@ -246,7 +246,7 @@ def corrected(joint: Joint, robot: int, scan: Scan, settings: TeamSettings) -> t
     others = jnp.where(jnp.arange(len(there)) == robot, False, there)
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~there[robot]
     own = scan._replace(valid=scan.valid & ~unknown)
-    after, info, _ = update_by_scan(seen_from(joint, robot, settings), own, settings.turns[robot])
+    after, info = update_by_scan(seen_from(joint, robot, settings), own, settings.turns[robot])[:2]
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))
     return seen_from_first(after, robot, joint, settings), info
