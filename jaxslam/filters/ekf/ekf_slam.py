@@ -16,8 +16,8 @@ from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
     Update,
+    check_ekf_options,
     check_make_room,
-    check_options,
     check_settings,
 )
 from jaxslam.filters.reporting import with_extra, with_removed
@@ -85,7 +85,7 @@ def ekf_slam(
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
-    check_options("ekf_slam", capacity, update, gate, iterations, births, covariance)
+    check_ekf_options("ekf_slam", capacity, update, gate, iterations, births, covariance)
     settings = EkfSettings(
         sensor=sensor,
         chart=chart or euclidean(),

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxslam.filters.ekf.linear_system import Transition
 from jaxslam.filters.ekf.predict import in_charts, moved_cov
-from jaxslam.linearize.first_order import turned
+from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Chart
@@ -56,7 +56,7 @@ def moved_anew(
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
     still = jnp.eye(3, dtype=pose.dtype)
-    moved = in_charts(turned(still, change[:2]), before, after, joint.alive)
+    moved = in_charts(with_lever_arm(still, change[:2]), before, after, joint.alive)
     composed = joint._replace(pose=pose, last=joint.last._replace(frame=frame))
     h = (lever_by(moved, frame) - moved.times(lever)).T
     cov_last = moved.times(joint.last.cov.T).T

@@ -13,7 +13,7 @@ from jaxslam.filters.ekf.linear_system import Transition
 from jaxslam.filters.ekf.predict import in_charts, moved_cov
 from jaxslam.filters.ekf.robocentric_motion import lever_by, lever_of_motion, out_of
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.linearize.first_order import turned
+from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.xla import materialize, no_inline
@@ -76,7 +76,7 @@ def composition_of(state: MapAndMotion, chart: Chart) -> Composition:
     pose = materialize(jnp.concatenate([pose[:2], wrap(pose[2:])]))
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before, after = over_map(rest.pose, rest.landmarks), over_map(pose, rest.landmarks)
-    by_pose = turned(jnp.eye(3, dtype=pose.dtype), change[:2])
+    by_pose = with_lever_arm(jnp.eye(3, dtype=pose.dtype), change[:2])
     moved = in_charts(by_pose, before, after, rest.alive)
     return Composition(pose, moved, lever_by(moved, frame))
 

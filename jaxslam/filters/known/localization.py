@@ -18,8 +18,8 @@ from jaxslam.filters.ekf.settings import (
     EkfSettings,
     Update,
     check_covariance_form,
+    check_ekf_options,
     check_iterations,
-    check_options,
 )
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
@@ -86,7 +86,7 @@ def localization(
     capacity = points.shape[0]
     chart = _of_pose(chart or euclidean())
     linearize = linearize or at_estimate()
-    check_options("localization", capacity, update, gate, iterations, None)
+    check_ekf_options("localization", capacity, update, gate, iterations, None)
     check_covariance_form("localization", covariance, ("plain", "joseph"))
     if linearize.own_landmarks:
         raise ValueError(f"localization: the linearizer {linearize.name} is for maps with errors")

@@ -70,7 +70,9 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
         same = distance <= gate
         joint = change_where(
             same,
-            lambda joint: merge(joint, filter.chart, kept, freed, square_root=filter.square_root),
+            lambda joint: merge_landmarks(
+                joint, filter.chart, kept, freed, square_root=filter.square_root
+            ),
             joint,
         )
         pair = jnp.where(same, jnp.stack([kept, freed]), -1).astype(jnp.int32)
@@ -108,7 +110,8 @@ def closest_pair(
 
     d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), including the correlation of the two: for
     landmarks with large covariances but a certain difference d² is large. i = j = 0 and d² infinite
-    where no pair is within reach [m] of another and allowed (N, N). square_root: as in `merge`.
+    where no pair is within reach [m] of another and allowed (N, N). square_root: as in
+    `merge_landmarks`.
 
     Raises ValueError on a reach not above 0, or allowed of another shape.
     """
@@ -149,7 +152,9 @@ def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Floa
     return jnp.where(terms.positive, terms.distance, jnp.inf)
 
 
-def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False) -> Joint:
+def merge_landmarks(
+    joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False
+) -> Joint:
     """The map conditioned on equal landmarks in slots i and j, of which slot i is kept.
 
     The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with
