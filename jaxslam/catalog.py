@@ -17,6 +17,7 @@ from jaxslam.charts.left_invariant import left_invariant
 from jaxslam.charts.right_invariant import right_invariant
 from jaxslam.charts.robocentric import robocentric
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.observability import monitored
 from jaxslam.filters.information.eif_slam import eif_slam
 from jaxslam.filters.information.eseif import eseif
 from jaxslam.filters.information.seif import seif
@@ -33,12 +34,16 @@ from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Info, Scan, Truth
 
 
-def variant(scenario: Scenario, **options: Any) -> Filter:
-    """EKF-SLAM with the scenario's options, which these arguments of `filters.ekf_slam` replace."""
+def variant(scenario: Scenario, *, watch: bool = False, **options: Any) -> Filter:
+    """EKF-SLAM with the scenario's options, which these arguments of `filters.ekf_slam` replace.
+
+    watch: with an observability monitor (`filters.monitored`).
+    """
     capacity = int(np.shape(scenario.landmarks)[0])
-    return ekf_slam(
+    filter = ekf_slam(
         scenario.motion, scenario.sensor, capacity, **(scenario.filter_options | options)
     )
+    return monitored(filter) if watch else filter
 
 
 def ideal(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
@@ -172,8 +177,8 @@ FILTERS: dict[str, Callable[..., Candidate]] = {
     ),
     "square_root": lambda world, **more: variant(world, covariance="square_root", **more),
 }
-"""By name; each takes a scenario, and further options of `ekf_slam`, and returns what `monte_carlo`
-runs on it."""
+"""By name; each takes a scenario, further options of `ekf_slam`, and `watch` of `variant`, and
+returns what `monte_carlo` runs on it."""
 
 BASELINES: dict[str, Callable[..., Candidate]] = {
     "dead_reckoning": without_measurements,

@@ -29,8 +29,6 @@ class Joint(NamedTuple):
     """-1 where dead"""
     lin: Any
     """the linearizer's memory"""
-    watch: Any = None
-    """a `Watch` of the directions that should stay unobservable, where one is kept"""
     last: Any = None
     """the `Last` motion, in a chart with `motion_apart`"""
     life: Any = None
@@ -53,24 +51,6 @@ class Last(NamedTuple):
     """covariance of δ"""
 
 
-class Watch(NamedTuple):
-    """The three directions that should stay unobservable, propagated by the linearized system.
-
-    A direction n starts at the robot and is propagated by the transition matrices and by the
-    Jacobians of new landmarks. It is unobservable as long as H n = 0 for all later measurements;
-    these directions span the unobservable subspace.
-    """
-
-    directions: Float[Array, "D 3"]
-    """in the filter's chart; rows of the robot begin as the unit matrix"""
-    information: Float[Array, "3 3"]
-    """Σ (H n)ᵀ R⁻¹ (H n) of all corrections"""
-    scale: Float[Array, "3"]
-    """Σ of the same with absolute values, the scale of rounding errors"""
-    turn: Float[Array, "3"]
-    """the combination of directions that rotates robot and map about the origin by 1 rad"""
-
-
 def empty(
     pose: Float[Array, "3"],
     pose_cov: Float[Array, "3 3"],
@@ -79,21 +59,12 @@ def empty(
     lin: Any = (),
     *,
     square_root: bool = False,
-    turn: jax.Array | None = None,
     motion_apart: bool = False,
 ) -> Joint:
-    """The initial state: a robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero.
-
-    turn: (3,) error of the pose in a rotation of robot and map about the origin, in the filter's
-    chart; where given, a `Watch` is kept.
-    """
+    """The initial state: a robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero."""
     size = 3 + capacity * landmark_size
     if square_root:
         pose_cov = cholesky(pose_cov)[0]
-    watch: Any = None
-    if turn is not None:
-        information = jnp.zeros((3, 3), pose.dtype)
-        watch = Watch(jnp.eye(size, 3, dtype=pose.dtype), information, information[0], turn)
     return Joint(
         pose=pose,
         landmarks=jnp.zeros((capacity, landmark_size), pose.dtype),
@@ -101,7 +72,6 @@ def empty(
         alive=jnp.zeros(capacity, bool),
         tag=jnp.full(capacity, -1, jnp.int32),
         lin=lin,
-        watch=watch,
         last=Last(pose[2], jnp.zeros((3, size), pose.dtype), 0 * pose_cov)
         if motion_apart
         else None,
@@ -221,16 +191,11 @@ def scatter(
         cross = materialize(jnp.pad(cross, [(3, 0), (0, 0)]))
         cov = cov + (cross + cross.T)
         cov = _add_blocks(cov, own)
-    watch = joint.watch
-    if watch:
-        grown = watch.directions.at[3:].add(gain @ watch.directions[:3])
-        watch = watch._replace(directions=grown)
     return joint._replace(
         landmarks=joint.landmarks + of_slots(landmarks),
         cov=cov,
         alive=joint.alive | born,
         tag=jnp.where(born, tag[place], joint.tag).astype(jnp.int32),
-        watch=watch,
     )
 
 
@@ -263,16 +228,11 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
         cov = triangular_root(jnp.concatenate(wide, axis=1))
     else:
         cov = jnp.where(keep[:, None] & keep[None, :], joint.cov, eye)
-    watch = joint.watch
-    if watch:
-        left = jnp.where(keep[:, None], watch.directions, 0.0)
-        watch = watch._replace(directions=left)
     return joint._replace(
         landmarks=jnp.where(dead[:, None], 0.0, joint.landmarks),
         cov=cov,
         alive=joint.alive & ~dead,
         tag=jnp.where(dead, -1, joint.tag),
-        watch=watch,
         reduced=jax.tree.map(lambda was: was & ~dead, joint.reduced),
         co_observed=jax.tree.map(
             lambda was: was & ~dead[:, None] & ~dead[None, :], joint.co_observed

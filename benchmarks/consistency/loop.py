@@ -132,7 +132,7 @@ def campaign(names, maps: int, runs: int, steps: int, seed: int, noise=1.0, bloc
             here.pose,
             here.pose_cov,
             key_filter,
-            probe=lambda joint: joint.watch.information,
+            probe=lambda state: state.monitor.information,
         )
         own = own_error_of(filter.chart, here.sensor, trace, truth)
         scores = score(trace, truth, here.sensor, own)

@@ -13,7 +13,7 @@ from jaxslam import derivatives
 from jaxslam.consistency.score import snapshot_steps
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.linearize.at_truth import at_truth
-from jaxslam.linearize.first_order import turned
+from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math.linalg import root_psd
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
@@ -154,7 +154,7 @@ def jacobians_at_truth(scenario: Scenario, truth: Truth, log: Log) -> RunJacobia
         by_pose, by_noise = derivatives.motion_jacobians(motion, old, u)
         ahead = motion.step(old, u, still)
         root = root_psd(motion.noise_cov(old, u))
-        return turned(by_pose, new[:2] - ahead[:2]), by_noise @ root
+        return with_lever_arm(by_pose, new[:2] - ahead[:2]), by_noise @ root
 
     by_pose, by_noise = jax.vmap(moved)(old, truth.pose, log.control)
     sensor = scenario.sensor

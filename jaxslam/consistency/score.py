@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.consistency.nees import DOF, Nees, block_nees, pose_error
 from jaxslam.consistency.statistics import Statistics
+from jaxslam.filters.ekf.observability import Monitor, Monitored
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.slots import Watch
 from jaxslam.types import Info, Status, Trace, Truth
 
 LANDMARK_DOF = 2
@@ -108,9 +108,9 @@ def score(
     }
     measures: dict[str, tuple[Any, Any]] = dict(found.associations)
     sums: dict[str, np.ndarray] = {}
-    watch = monitor_of(trace.final)
-    if watch is not None:
-        gained, dimensions = _null_space(watch, trace.probe)
+    monitor = monitor_of(trace.final)
+    if monitor is not None:
+        gained, dimensions = _null_space(monitor, trace.probe)
         curves["rotation_information"] = gained
         measures["rotation_information"] = gained[:, -1], 1
         measures["unobservable"] = dimensions, 1
@@ -189,13 +189,13 @@ def _covered(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
     return out
 
 
-def monitor_of(state: Any) -> Watch | None:
-    """The observability monitor that a filter keeps in its state; None where it keeps none."""
-    return getattr(state, "watch", None) or None
+def monitor_of(state: Any) -> Monitor | None:
+    """The observability monitor in the state of a `monitored` filter; None in another state."""
+    return state.monitor if isinstance(state, Monitored) else None
 
 
 def _null_space(
-    watch: Watch, information: Float[np.ndarray, "R T 3 3"]
+    monitor: Monitor, information: Float[np.ndarray, "R T 3 3"]
 ) -> tuple[Float[np.ndarray, "R T"], Int[np.ndarray, "R"]]:
     """Information gained along a turn of the whole frame by each step, and the dimension of the
     unobservable subspace of the filter's linearized system.
@@ -204,9 +204,9 @@ def _null_space(
     same sum of squares with absolute values.
     """
     eps = float(np.finfo(information.dtype).eps)
-    scale = np.sqrt(np.where(watch.scale > 0, watch.scale, 1.0).astype(np.float64))
-    unit = watch.information / scale[:, :, None] / scale[:, None, :]
+    scale = np.sqrt(np.where(monitor.scale > 0, monitor.scale, 1.0).astype(np.float64))
+    unit = monitor.information / scale[:, :, None] / scale[:, None, :]
     regular = np.isfinite(unit).all(axis=(1, 2))
     size = np.linalg.eigvalsh(np.where(regular[:, None, None], unit, 0.0))
-    gained = np.einsum("rtij,ri,rj->rt", information.astype(np.float64), watch.turn, watch.turn)
+    gained = np.einsum("rtij,ri,rj->rt", information.astype(np.float64), monitor.turn, monitor.turn)
     return gained, (size < eps**0.75).sum(axis=1)

@@ -3,6 +3,7 @@
 from jaxslam.filters.delayed.delayed_slam import delayed_slam
 from jaxslam.filters.ekf.compressed_ekf_slam import compressed_ekf_slam
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.observability import monitored
 from jaxslam.filters.information.eif_slam import eif_slam
 from jaxslam.filters.information.eseif import eseif
 from jaxslam.filters.information.seif import seif
@@ -28,6 +29,7 @@ __all__ = [
     "localization",
     "mapping",
     "merging",
+    "monitored",
     "particle_localization",
     "pruning",
     "seif",

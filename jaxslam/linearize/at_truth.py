@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.linearize import first_order
-from jaxslam.linearize.first_order import turned
+from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.types import Truth
 
@@ -28,7 +28,7 @@ def at_truth(truth: Truth) -> Linearizer:
         old, new = path[here.joint.lin], path[here.joint.lin + 1]
         moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, old)
         ahead = motion.step(old, u, jnp.zeros(len(motion.noises), old.dtype))
-        return moved, turned(by_pose, new[:2] - ahead[:2]), noise, here.joint.lin + 1
+        return moved, with_lever_arm(by_pose, new[:2] - ahead[:2]), noise, here.joint.lin + 1
 
     def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
         true_landmark = truth.landmarks[jnp.maximum(here.joint.tag[here.slot], 0)]

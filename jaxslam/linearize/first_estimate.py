@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.linearize import first_order
-from jaxslam.linearize.first_order import turned
+from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 
@@ -42,7 +42,7 @@ def first_estimate() -> Linearizer:
     def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, First]:
         first = here.joint.lin
         moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
-        by_pose = turned(by_pose, here.pose[:2] - first.pose[:2])
+        by_pose = with_lever_arm(by_pose, here.pose[:2] - first.pose[:2])
         return moved, by_pose, noise, first._replace(pose=moved)
 
     def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
@@ -51,7 +51,7 @@ def first_estimate() -> Linearizer:
 
     def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
         landmark, by_pose, own = first_order.invert_at(sensor, here.pose, z, here.pose, z)
-        return landmark, turned(by_pose, here.pose[:2] - here.joint.lin.pose[:2]), own
+        return landmark, with_lever_arm(by_pose, here.pose[:2] - here.joint.lin.pose[:2]), own
 
     def born(joint: Joint, born: Array) -> First:
         landmarks = jnp.where(born[:, None], joint.landmarks, joint.lin.landmarks)

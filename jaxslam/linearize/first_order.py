@@ -43,6 +43,6 @@ def invert_at(
     return sensor.invert(pose, z, mean), by_pose, own
 
 
-def turned(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> Float[Array, "L 3"]:
+def with_lever_arm(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> Float[Array, "L 3"]:
     """The derivative of a point by the pose (·, 3), with an offset (2,) added to the lever arm."""
     return by_pose.at[:2, 2].add(jnp.stack([-offset[1], offset[0]]))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.linearize import first_order
-from jaxslam.linearize.first_order import turned
+from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 
@@ -47,7 +47,7 @@ def observability() -> Linearizer:
         arms = jnp.where(joint.alive[:, None], arms, 0.0)
         shift = arms.sum(axis=0) / (1 + joint.alive.sum())
         robot = old.robot + moved[:2] - joint.pose[:2] - shift
-        return moved, turned(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
+        return moved, with_lever_arm(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
 
     def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
         own = here.joint.lin

@@ -3,17 +3,17 @@
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
 from jaxslam.consistency import Measure, Score, condense, mean_pose_nees, positive_interval, score
 from jaxslam.consistency.tally import condensed_sums
+from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.monte_carlo.limit import divergence_limit, first_run
 from jaxslam.monte_carlo.plan import Plan, Promises, run_numbers
 from jaxslam.monte_carlo.programs import FilterResults, World
-from jaxslam.slots import Watch
 from jaxslam.types import Estimate, Info, Trace, Truth
 
 BOUND = "bound"
@@ -22,12 +22,6 @@ BOUND = "bound"
 
 Glimpse = Callable[[str, int, Measure | None], Any]
 """(filter, runs, their mean pose NEES)."""
-
-
-class FinalMonitor(NamedTuple):
-    """Of a filter's final state, what a score looks at."""
-
-    watch: Watch | None
 
 
 class BlockRunner:
@@ -150,7 +144,7 @@ def _on_host(results: FilterResults) -> Trace:
     found: tuple[Estimate, Info, Any] = jax.tree.map(
         lambda leaf: np.swapaxes(leaf, 0, 1), jax.device_get(by_time)
     )
-    watch = results.watch
-    if watch is not None:
-        watch = jax.device_get(watch._replace(directions=absent))
-    return Trace(found[0], found[1], FinalMonitor(watch), found[2])
+    final: Monitored | None = None
+    if results.monitor is not None:
+        final = Monitored(None, jax.device_get(results.monitor._replace(directions=absent)))
+    return Trace(found[0], found[1], final, found[2])

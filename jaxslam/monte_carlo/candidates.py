@@ -188,15 +188,15 @@ def check_called(name: str, candidate: Callable[..., Any]) -> None:
 def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tuple[Estimator, Chart]:
     """The estimator that a candidate is, and the chart of its errors.
 
-    Its probe is what the filter's observability monitor has gained, where it keeps one.
+    Its probe is the information in the filter's observability monitor, where it has one.
     """
     method = candidate if isinstance(candidate, Filter) else candidate(truth)
     if not isinstance(method, Filter):
         return method, euclidean()
 
     def gained(state: Any) -> jax.Array | None:
-        watch = monitor_of(state)
-        return None if watch is None else watch.information
+        monitor = monitor_of(state)
+        return None if monitor is None else monitor.information
 
     def drive(log: Log, key: jax.Array) -> Trace:
         return run(method, log, scenario.pose, scenario.pose_cov, key, probe=gained)

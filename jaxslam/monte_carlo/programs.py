@@ -36,13 +36,13 @@ from jaxslam.consistency import (
     own_error_of,
     statistics,
 )
+from jaxslam.filters.ekf.observability import Monitor
 from jaxslam.monte_carlo.blockwise import Axes, Blockwise, Program
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.monte_carlo.limit import divergence_limit
 from jaxslam.monte_carlo.plan import Plan, Promises, run_numbers
 from jaxslam.protocols import Candidate, Sensor
 from jaxslam.simulation.worlds import Scenario, simulate
-from jaxslam.slots import Watch
 from jaxslam.types import Estimate, Info, Log, Trace, Truth
 
 World = tuple[Truth, Log]
@@ -57,8 +57,8 @@ class FilterResults(NamedTuple):
     """(T, B, …)"""
     own_error: Float[Array, "T B 3"]
     """the pose error in the filter's own coordinates"""
-    watch: Watch | None
-    """(B, …) its observability monitor at the end, where it keeps one"""
+    monitor: Monitor | None
+    """(B, …) its observability monitor at the end, where it has one"""
     information: Float[Array, "T B 3 3"] | None
     """what that monitor had gained after each step"""
 
@@ -202,9 +202,9 @@ def drive_filter(
         method, chart = estimator_of(candidate, truth, scenario)
         trace = method(log, _keys(key, i)[1])
         own = own_error_of(chart, scenario.sensor, trace, truth)
-        watch = monitor_of(trace.final)
-        information = None if watch is None else trace.probe
-        return FilterResults(trace.estimate, trace.info, own, watch, information)
+        monitor = monitor_of(trace.final)
+        information = None if monitor is None else trace.probe
+        return FilterResults(trace.estimate, trace.info, own, monitor, information)
 
     results: FilterResults = jax.vmap(one, out_axes=_RUN_AXES)(which, *world)
     return results

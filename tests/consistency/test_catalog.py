@@ -94,9 +94,9 @@ def still():
     )
 
 
-def drive_watched(drawn, name, gate=1e6, **options):
+def drive_monitored(drawn, name, gate=1e6, **options):
     """`drive`, with what it was told of a turn of everything; the gate rejects nothing."""
-    return drive(drawn, name, watch_of, gate=gate, watch=True, **options)
+    return drive(drawn, name, monitor_of, gate=gate, watch=True, **options)
 
 
 @cache
@@ -105,14 +105,14 @@ def around_and_still(name):
     of what was compiled are wrong."""
     moving, standing = around(), still()
     programs.clear()
-    first = drive_watched(moving, name)
+    first = drive_monitored(moving, name)
     with worlds.compilations() as count:
-        second = drive_watched(standing, name, gate=2e6)
+        second = drive_monitored(standing, name, gate=2e6)
         return first, second, count(), wrong_layouts()
 
 
-def watch_of(state):
-    return getattr(state, "watch", ())
+def monitor_of(state):
+    return getattr(state, "monitor", ())
 
 
 @pytest.mark.parametrize("name", catalog.ALL)
@@ -128,8 +128,8 @@ def test_with_points_close_together_it_is_the_ekf_of_the_same_chart(chart):
     """Slopes are then derivatives; what stays is the mean's second order, which is of size P."""
     calm = around(noise=0.01)
     options = {"chart": charts.REGISTRY[chart]()}
-    first = drive_watched(calm, "ekf", **options)
-    fitted = drive_watched(calm, "ekf", linearize=linearize.unscented(1e-3), **options)
+    first = drive_monitored(calm, "ekf", **options)
+    fitted = drive_monitored(calm, "ekf", linearize=linearize.unscented(1e-3), **options)
     np.testing.assert_allclose(fitted.estimate.pose, first.estimate.pose, atol=2e-3)
     np.testing.assert_allclose(
         fitted.estimate.pose_cov, first.estimate.pose_cov, rtol=0.02, atol=1e-7
@@ -144,11 +144,11 @@ def test_with_points_close_together_it_is_the_ekf_of_the_same_chart(chart):
 def test_cures_keep_three_directions_unobservable_and_the_others_two(name):
     """Huang et al. 2010: the standard EKF's linearized system has rank deficit 2 instead of 3."""
     trace = around_and_still(name)[0]
-    watch = trace.final.watch
-    scale = np.sqrt(np.asarray(watch.scale))
-    size = np.linalg.eigvalsh(np.asarray(watch.information) / scale / scale[:, None])
+    monitor = trace.final.monitor
+    scale = np.sqrt(np.asarray(monitor.scale))
+    size = np.linalg.eigvalsh(np.asarray(monitor.information) / scale / scale[:, None])
     assert np.all(size[:2] < 1e-15)  # translations
-    turn = np.einsum("tij,i,j->t", np.asarray(trace.probe.information), watch.turn, watch.turn)
+    turn = np.einsum("tij,i,j->t", np.asarray(trace.probe.information), monitor.turn, monitor.turn)
     assert np.all(np.diff(turn) >= 0)
     if name in CURES:
         assert size[2] < 1e-15
@@ -179,7 +179,7 @@ def test_the_others_do_and_are_mistaken(name):
 
 def test_first_estimates_stay_where_they_were():
     trace = around_and_still("fej")[0]
-    first = trace.final.lin.landmarks
+    first = trace.final.state.lin.landmarks
     alive = np.asarray(trace.estimate.alive)
     for slot in np.flatnonzero(alive[-1]):
         born = int(np.argmax(alive[:, slot]))

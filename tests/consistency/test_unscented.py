@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_catalog import around, drive_watched
+from test_catalog import around, drive_monitored
 
 from jaxslam import linearize
 from jaxslam.linearize.unscented import by_variables, regress
@@ -60,8 +60,8 @@ def test_a_pose_known_exactly_and_both_dtypes(dtype):
     world, truth, log = around(noise=0.01)
     log = jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, log)
     drawn = dataclasses.replace(world, pose_cov=np.zeros((3, 3))), truth, log
-    trace = drive_watched(drawn, "ukf")
-    usual = drive_watched(drawn, "ekf")
+    trace = drive_monitored(drawn, "ukf")
+    usual = drive_monitored(drawn, "ekf")
     assert trace.estimate.pose.dtype == dtype
     assert np.isfinite(trace.estimate.pose_cov).all()
     np.testing.assert_allclose(trace.estimate.pose, usual.estimate.pose, atol=5e-3)

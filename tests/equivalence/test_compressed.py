@@ -144,7 +144,6 @@ def test_gradients_pass_through_a_change_of_area():
     ("options", "message"),
     [
         ({"area": 0}, "area"),
-        ({"area": 4, "watch": True}, "watch is not supported"),
         ({"area": 4, "covariance": "square_root"}, "got 'square_root'"),
         ({"area": 4, "chart": charts.right_invariant()}, "right_invariant"),
         ({"area": 4, "linearize": linearize.first_estimate()}, "first_estimate"),

@@ -19,8 +19,9 @@ def augment(
     slot: Int[Array, "m"],
     granted: Bool[Array, "m"],
     settings: EkfSettings,
-) -> Joint:
-    """The joint with new landmarks of measurements z (m, Z) in free slots (m,), where granted (m,).
+) -> tuple[Joint, Float[Array, "m L 3"]]:
+    """The joint with new landmarks of measurements z (m, Z) in free slots (m,), where granted (m,);
+    and the derivatives G_R of their errors by that of the pose.
 
     L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
     with the prior's term of (44); several in one scan are correlated through the robot.
@@ -45,4 +46,4 @@ def augment(
         joint, slot, granted, landmark, by_pose, own, tag, square_root=square_root
     )
     new = jnp.zeros_like(joint.alive).at[slot].max(granted)
-    return joint._replace(lin=settings.linearize.born(joint, new))
+    return joint._replace(lin=settings.linearize.born(joint, new)), by_pose

@@ -59,7 +59,7 @@ def compressed_ekf_slam(
     Args:
         area: number K of landmarks in the area; at least the measurement slots of a scan.
         options: those of `ekf_slam` in the Euclidean chart, with a linearizer without memory
-            (at_estimate, unscented), except associate, watch, make_room and the covariance
+            (at_estimate, unscented), except associate, make_room and the covariance
             "square_root".
     Raises:
         ValueError: as `ekf_slam`; on an area below 1, an option that is not for this filter; and,
@@ -68,7 +68,7 @@ def compressed_ekf_slam(
     validation.check_models("compressed_ekf_slam", motion, sensor)
     check_count("compressed_ekf_slam: capacity", capacity)
     check_count("compressed_ekf_slam: area", area)
-    for name in ("associate", "watch", "make_room"):
+    for name in ("associate", "make_room"):
         if options.get(name):
             raise ValueError(f"compressed_ekf_slam: {name} is not supported")
     check_covariance_form(

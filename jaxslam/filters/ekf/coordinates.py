@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.filters.ekf.predict import Transition, moved_cov
+from jaxslam.filters.ekf.linear_system import Transition
+from jaxslam.filters.ekf.predict import moved_cov
 from jaxslam.filters.ekf.to_points import seen_as
 from jaxslam.math import linalg
 from jaxslam.protocols import Chart, Sensor

@@ -9,14 +9,15 @@ from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf import to_points
 from jaxslam.filters.ekf.coordinates import estimate_of
+from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import turns_of, update_by_scan
 from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
     Update,
+    check_ekf_options,
     check_make_room,
-    check_options,
     check_settings,
 )
 from jaxslam.filters.reporting import with_extra, with_removed
@@ -41,7 +42,6 @@ def ekf_slam(
     iterations: int = 1,
     covariance: Covariance = "plain",
     births: int | None = None,
-    watch: bool = False,
     make_room: Life | None = None,
 ) -> Filter:
     """Extended Kalman filter SLAM in a map of fixed capacity (Solà 2).
@@ -74,7 +74,6 @@ def ekf_slam(
         make_room: a `Life` that removes landmarks from a full map before new ones enter it; only
             for filters wrapped as `map_management.pruning(filter, make_room)`, which keeps its
             memory. Default: none is removed.
-        watch: keep a `slots.Watch` in the state, which campaigns report.
     Raises:
         ValueError: on models, charts, linearizers or associations of another type or size
             (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
@@ -86,7 +85,7 @@ def ekf_slam(
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
-    check_options("ekf_slam", capacity, update, gate, iterations, births, covariance)
+    check_ekf_options("ekf_slam", capacity, update, gate, iterations, births, covariance)
     settings = EkfSettings(
         sensor=sensor,
         chart=chart or euclidean(),
@@ -106,35 +105,38 @@ def ekf_slam(
     places = sensor.places if isinstance(sensor, Suite) else ()
 
     def init(pose: jax.Array, pose_cov: jax.Array) -> Joint:
-        return initial_state(pose, pose_cov, capacity, settings, watch=watch)
+        return initial_state(pose, pose_cov, capacity, settings)
 
-    def predict(joint: Joint, u: jax.Array, key: jax.Array) -> Joint:
-        return propagate(joint, u, motion, settings)
+    def predict(joint: Joint, u: jax.Array, key: jax.Array) -> tuple[Joint, LinearSystem]:
+        joint, moved = propagate(joint, u, motion, settings)
+        return joint, (moved,)
 
-    def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info]:
+    def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info, LinearSystem]:
         if make_room is not None and joint.life is None:
             raise ValueError(
                 f"ekf_slam: make_room={make_room.name} needs the record that pruning keeps: "
                 "expected pruning(ekf_slam(…, make_room=life), life)"
             )
-        joint, info, evicted = update_by_scan(joint, scan, turns)
+        joint, info, evicted, system = update_by_scan(joint, scan, turns)
         if make_room is not None:
             info = with_removed(info, evicted)
         if sensor.reduced is not None:
-            joint, which = to_points.reduced_where_ready(joint, sensor, square_root)
+            joint, which, reduced = to_points.reduced_where_ready(joint, sensor, square_root)
             info = with_extra(info, "points", to_points.ToPoints(which))
-        return joint, info
+            system = (*system, reduced)
+        return joint, info, system
 
     def estimate(joint: Joint) -> Estimate:
         return estimate_of(joint, sensor, chart, square_root=square_root)
 
+    steps = LinearizedSteps(predict, update_map)
     return Filter(
         name="ekf_slam",
         control_size=len(motion.controls),
         measurement_size=len(sensor.measurements),
         init=init,
-        predict=predict,
-        update=update_map,
+        predict=steps.predict,
+        update=steps.update,
         estimate=estimate,
         chart=chart,
         places=places,
@@ -148,17 +150,14 @@ def initial_state(
     pose_cov: Float[Array, "3 3"],
     capacity: int,
     settings: EkfSettings,
-    *,
-    watch: bool = False,
 ) -> Joint:
     """The initial state: a robot with covariance pose_cov in map coordinates, and no landmark."""
     sensor, chart = settings.sensor, settings.chart
     size_l = len(sensor.landmark)
     ground = jnp.zeros((capacity, size_l), pose.dtype)
-    turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
     if chart.basis is not None:
         undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
-        pose_cov, turn = undo @ pose_cov @ undo.T, undo @ turn
+        pose_cov = undo @ pose_cov @ undo.T
     joint = slots.empty(
         pose,
         pose_cov,
@@ -166,7 +165,6 @@ def initial_state(
         size_l,
         settings.linearize.init(pose, ground),
         square_root=settings.square_root,
-        turn=turn if watch else None,
         motion_apart=chart.motion_apart,
     )
     if sensor.reduced is not None:

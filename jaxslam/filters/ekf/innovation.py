@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
+from jaxslam.filters.ekf.linear_system import Transition, basis_of_each
 from jaxslam.filters.ekf.predicted_measurements import in_chart, projected_cov
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.to_points import at_slot
@@ -33,6 +34,13 @@ class Correction(NamedTuple):
     """passed the gate"""
     positive: Bool[Array, "m"]
     """its innovation covariance is positive definite"""
+    jacobian: Float[Array, "m Z 3+L"]
+    """H by coordinates, against the prior"""
+    basis: Float[Array, "m 3+L 3+L"] | None
+    """the coordinates by the errors in the chart; None says identity"""
+    moved: Transition | None = None
+    """of the errors where the map was composed with the corrected last motion: once after all
+    measurements, or (m, …) after each"""
 
 
 class View(NamedTuple):
@@ -65,12 +73,8 @@ class Innovation(NamedTuple):
     """H X of a square-root filter, else H P"""
     noise: Float[Array, "m Z Z"]
     """R with the linearizer's addition"""
-    own_noise: Float[Array, "m Z Z"]
-    """R"""
     jacobians: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
     """H by the errors of pose and landmark"""
-    seen: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
-    """the same by coordinates, at the prior"""
     fuse: Bool[Array, "m"]
     """known, inside the gate, and with a positive definite S_ii"""
     correction: Correction
@@ -157,13 +161,14 @@ def innovate(
         first = gated is None
         if gated is None:
             gated = _gate(nu, marginal, inverse, definite, known, settings.gate)
-            seen = model.seen
         hp = hp.reshape(m * size_z, -1)
         factored = _factor(s, same, inverse, definite, gated.fuse)
         v, whitened = _whiten(factored, gated.fuse, hp, nu)
         xi = linalg.gram(v, whitened[:, None])[:, 0]
         if first:
-            correction = _report(gated, factored, whitened)
+            jacobian = jnp.concatenate(model.seen, axis=2)
+            basis = basis_of_each(settings.chart, joint.pose, joint.landmarks[slot])
+            correction = _report(gated, factored, whitened, jacobian, basis)
     assert xi is not None
     assert gated is not None
     return Innovation(
@@ -175,9 +180,7 @@ def innovate(
         hp=hp,
         hx=hx,
         noise=noise,
-        own_noise=own_noise,
         jacobians=(by_pose, by_landmark),
-        seen=seen,
         fuse=gated.fuse,
         correction=correction,
     )
@@ -237,7 +240,7 @@ def _project(
     rows: Float[Array, "m Z C"], view: View, joint: Joint, settings: EkfSettings
 ) -> tuple[Float[Array, "m Z D"], Float[Array, "m Z D"]]:
     """H X and H P of a square-root filter; else H P twice."""
-    hp = hx = no_inline(_seen_rows, rows, view.robot, view.own)
+    hp = hx = no_inline(seen_rows, rows, view.robot, view.own)
     if settings.square_root:
         m, size_z = rows.shape[:2]
         hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
@@ -300,7 +303,13 @@ def _whiten(
     return no_inline(_solved, factored.factor.reshape(-1), hp, nu.reshape(-1))
 
 
-def _report(gated: _Gated, factored: _Factored, whitened: Float[Array, "K"]) -> Correction:
+def _report(
+    gated: _Gated,
+    factored: _Factored,
+    whitened: Float[Array, "K"],
+    jacobian: Float[Array, "m Z W"],
+    basis: Float[Array, "m W W"] | None,
+) -> Correction:
     """The `Correction`: NIS of fused measurements from their joint S, of the others each alone."""
     m, size_z = gated.innovation.shape
     pivots, positive = factored.pivots, gated.positive & factored.regular
@@ -315,11 +324,13 @@ def _report(gated: _Gated, factored: _Factored, whitened: Float[Array, "K"]) -> 
         log_likelihood=jnp.where(gated.fuse & positive, log_likelihood, 0.0),
         inside=gated.inside,
         positive=positive,
+        jacobian=jacobian,
+        basis=basis,
     )
 
 
 @linalg.kept_whole
-def _seen_rows(
+def seen_rows(
     rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], own: Float[Array, "m L D"]
 ) -> Float[Array, "m Z D"]:
     """H P from the blocks of H, first by rows, and P of the robot and the landmarks seen."""

@@ -1,76 +1,155 @@
-"""Information gained along directions that should stay unobservable: `slots.Watch`."""
+"""The observability monitor: information gained along directions that should stay unobservable."""
+
+import dataclasses
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
+from jaxslam import validation
+from jaxslam.filters.ekf.linear_system import (
+    InTurn,
+    LinearLandmarks,
+    LinearMeasurements,
+    LinearSystem,
+    linearized_steps,
+)
 from jaxslam.math import linalg
-from jaxslam.protocols import Chart
-from jaxslam.slots import Joint, Watch
+from jaxslam.protocols import Filter
+from jaxslam.types import Estimate, Info, Scan
 
 _TINY = 1e-30
 
 
-def with_information(
-    joint: Joint,
-    chart: Chart,
-    by_pose: Float[Array, "m Z 3"],
-    by_landmark: Float[Array, "m Z L"],
-    slot: Int[Array, "m"],
-    noise: Float[Array, "m Z Z"],
-    fused: Bool[Array, "m"],
-) -> Watch:
-    """The watch with the information of these measurements added; H by coordinates."""
-    watch: Watch = joint.watch
-    directions = _in_coordinates(chart, joint)
+class Monitor(NamedTuple):
+    """The three directions that should stay unobservable, propagated by the linearized system.
+
+    A direction n starts at the robot and is propagated by the transition matrices and by the
+    Jacobians of new landmarks. It is unobservable as long as H n = 0 for all later measurements;
+    these directions span the unobservable subspace.
+    """
+
+    directions: Float[Array, "D 3"]
+    """in the filter's chart; rows of the robot begin as the unit matrix. Those of a free slot mean
+    nothing"""
+    information: Float[Array, "3 3"]
+    """Σ (H n)ᵀ R⁻¹ (H n) of all corrections"""
+    scale: Float[Array, "3"]
+    """Σ of the same with absolute values, the scale of rounding errors"""
+    turn: Float[Array, "3"]
+    """the combination of directions that rotates robot and map about the origin by 1 rad"""
+
+
+class Monitored(NamedTuple):
+    """The state of a monitored filter."""
+
+    state: Any
+    """of the filter itself"""
+    monitor: Monitor
+
+
+def monitored(filter: Filter) -> Filter:
+    """The filter with an observability monitor of its own linearized system, for campaigns.
+
+    The state is a `Monitored`; estimates and infos are the filter's. A landmark merged into another
+    is not a measurement here.
+
+    Args:
+        filter: of `ekf_slam`, or that pruned, merged or with loops closed.
+    Raises:
+        ValueError: on a filter of another type, or that does not return its linear system.
+    """
+    validation.check_record("monitored", "filter", filter, Filter)
+    steps, chart = linearized_steps(filter), filter.chart
+    if steps is None:
+        raise ValueError(
+            f"monitored: the steps of {filter.name} do not return the linear system they use, as "
+            "those of ekf_slam do; wrap that first"
+        )
+
+    def init(pose: Array, pose_cov: Array) -> Monitored:
+        state = filter.init(pose, pose_cov)
+        turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
+        if chart.basis is not None:
+            ground = jnp.zeros(len(filter.landmark), pose.dtype)
+            turn = linalg.inverse(chart.basis(pose, ground).pose) @ turn
+        nothing = jnp.zeros((3, 3), pose.dtype)
+        directions = jnp.eye(state.cov.shape[0], 3, dtype=pose.dtype)
+        return Monitored(state, Monitor(directions, nothing, nothing[0], turn))
+
+    def predict(whole: Monitored, u: Array, key: Array) -> Monitored:
+        state, system = steps.predict_linearized(whole.state, u, key)
+        return Monitored(state, after(whole.monitor, system))
+
+    def update(whole: Monitored, scan: Scan, key: Array) -> tuple[Monitored, Info]:
+        state, info, system = steps.update_linearized(whole.state, scan, key)
+        return Monitored(state, after(whole.monitor, system)), info
+
+    def estimate(whole: Monitored) -> Estimate:
+        return filter.estimate(whole.state)
+
+    return dataclasses.replace(
+        filter,
+        name=f"monitored {filter.name}",
+        init=init,
+        predict=predict,
+        update=update,
+        estimate=estimate,
+        square_root=False,
+        landmark=(),
+    )
+
+
+def after(monitor: Monitor, system: LinearSystem) -> Monitor:
+    """The monitor after a linear system."""
+    for part in system:
+        if isinstance(part, InTurn):
+            monitor = jax.lax.scan(lambda m, one: (after(m, one), None), monitor, part.system)[0]
+        elif isinstance(part, LinearMeasurements):
+            monitor = _with_information(monitor, part)
+        elif isinstance(part, LinearLandmarks):
+            monitor = monitor._replace(directions=_with_landmarks(monitor.directions, part))
+        else:
+            monitor = monitor._replace(directions=part.times(monitor.directions))
+    return monitor
+
+
+def _with_information(monitor: Monitor, seen: LinearMeasurements) -> Monitor:
+    """The monitor with the information of these measurements added."""
+    rows = _rows(seen.slot, seen.jacobian.shape[2] - 3)
+    robot = jnp.broadcast_to(monitor.directions[:3], (len(rows), 3, 3))
+    local = jnp.concatenate([robot, monitor.directions[rows]], axis=1)
+    if seen.basis is not None:
+        local = _product(seen.basis, local)
+    signed = _product(seen.jacobian, local)
+    size = _product(jnp.abs(seen.jacobian), jnp.abs(local))
 
     def whiten(cov: Float[Array, "Z Z"], y: Float[Array, "Z k"]) -> Float[Array, "Z k"]:
         return linalg.solve_lower(linalg.cholesky(cov)[0], y)
 
-    signed = times_directions(by_pose, by_landmark, *directions, slot)
-    robot, landmarks = directions
-    size = times_directions(
-        jnp.abs(by_pose), jnp.abs(by_landmark), jnp.abs(robot), jnp.abs(landmarks), slot
-    )
-    signed = jax.vmap(whiten)(noise, signed)
-    size = size / jnp.sqrt(jnp.maximum(jnp.diagonal(noise, axis1=1, axis2=2), _TINY))[:, :, None]
-    signed, size = (jnp.where(fused[:, None, None], part, 0.0) for part in (signed, size))
-    return watch._replace(
-        information=watch.information
+    signed = jax.vmap(whiten)(seen.noise, signed)
+    variances = jnp.diagonal(seen.noise, axis1=1, axis2=2)
+    size = size / jnp.sqrt(jnp.maximum(variances, _TINY))[:, :, None]
+    signed, size = (jnp.where(seen.fused[:, None, None], part, 0.0) for part in (signed, size))
+    return monitor._replace(
+        information=monitor.information
         + (signed[:, :, :, None] * signed[:, :, None, :]).sum(axis=(0, 1)),
-        scale=watch.scale + (size**2).sum(axis=(0, 1)),
+        scale=monitor.scale + (size**2).sum(axis=(0, 1)),
     )
 
 
-def times_directions(
-    by_pose: Float[Array, "m Z 3"],
-    by_landmark: Float[Array, "m Z L"],
-    robot: Float[Array, "3 k"],
-    landmarks: Float[Array, "N L k"],
-    slot: Int[Array, "m"],
-) -> Float[Array, "m Z k"]:
-    """H times k directions of the robot and of each landmark."""
-    own = landmarks[slot]
-    terms = [by_pose[:, :, i, None] * robot[None, None, i] for i in range(3)]
-    terms += [by_landmark[:, :, i, None] * own[:, None, i] for i in range(own.shape[1])]
-    return linalg.total(terms)
+def _with_landmarks(directions: Float[Array, "D k"], new: LinearLandmarks) -> Float[Array, "D k"]:
+    """The directions with rows of new landmarks."""
+    rows = jnp.where(new.granted[:, None], _rows(new.slot, new.by_pose.shape[1]), len(directions))
+    return directions.at[rows].set(new.by_pose @ directions[:3], mode="drop")
 
 
-def split_directions(
-    directions: Float[Array, "D k"], capacity: int
-) -> tuple[Float[Array, "3 k"], Float[Array, "N L k"]]:
-    """The directions split into rows of the robot and of each landmark."""
-    return directions[:3], directions[3:].reshape(capacity, -1, directions.shape[1])
+def _rows(slot: Array, size: int) -> Array:
+    """The rows (m, L) of the errors of landmarks in slot (m,)."""
+    return 3 + slot[:, None] * size + jnp.arange(size)[None, :]
 
 
-def _in_coordinates(
-    chart: Chart, joint: Joint
-) -> tuple[Float[Array, "3 3"], Float[Array, "N L 3"]]:
-    """The watched directions in map coordinates: of the pose and of each landmark."""
-    robot, landmarks = split_directions(joint.watch.directions, joint.landmarks.shape[0])
-    if chart.basis is None:
-        return robot, landmarks
-    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
-    if basis.landmark is not None:
-        landmarks = jnp.einsum("nij,njk->nik", basis.landmark, landmarks)
-    return basis.pose[0] @ robot, landmarks + basis.cross @ robot
+def _product(a: Float[Array, "m i j"], b: Float[Array, "m j k"]) -> Float[Array, "m i k"]:
+    """The product of each pair of matrices."""
+    return a @ b

@@ -1,12 +1,11 @@
 """The prediction of a Kalman-type SLAM filter, for any chart and linearizer."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam import slots
+from jaxslam.filters.ekf.linear_system import Transition
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg, se2
 from jaxslam.math.xla import materialize
@@ -14,12 +13,14 @@ from jaxslam.protocols import Basis, Here, Motion
 from jaxslam.slots import Joint, Last
 
 
-def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfSettings) -> Joint:
-    """The state after the robot's motion, O(N) where landmark errors are constant: Solà (14)-(17).
+def propagate(
+    joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfSettings
+) -> tuple[Joint, Transition]:
+    """The state after the robot's motion, and the transition of its errors: Solà (14)-(17).
 
-    pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM. In another chart the errors of
-    the landmarks change too, by A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by block. A
-    square root X of P = X Xᵀ becomes the triangular root of [A X, G √N]; O(N³).
+    pose ← f(pose, u, 0), P_RR ← F P_RR Fᵀ + W Q Wᵀ, P_RM ← F P_RM; O(N). In another chart the
+    errors of the landmarks change too, by A = E(x')⁻¹ F E(x), E the chart's basis; O(N²), block by
+    block. A square root X of P = X Xᵀ becomes the triangular root of [A X, G √N]; O(N³).
     """
     chart, square_root = settings.chart, settings.square_root
     robot = slots.robot_cov(joint, square_root)
@@ -38,57 +39,12 @@ def propagate(joint: Joint, u: Float[Array, "U"], motion: Motion, settings: EkfS
         cov = linalg.triangular_root(jnp.concatenate([moved.times(joint.cov), added], axis=1))
     else:
         cov = moved_cov(joint.cov, moved, noise)
-    watch = joint.watch
-    if watch:
-        watch = watch._replace(directions=moved.times(watch.directions))
     last = joint.last
     if chart.motion_apart:
         back = se2.adjoint(jnp.stack([0 * pose[0], 0 * pose[1], joint.pose[2]])).T
         cov_last = linalg.matmul(back @ noise, moved.lift(joint.cov.shape[0]).T)
         last = Last(joint.pose[2], cov_last, back @ noise @ back.T)
-    return joint._replace(pose=pose, cov=cov, lin=lin, watch=watch, last=last)
-
-
-class Transition(NamedTuple):
-    """The error model: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise through dx]."""
-
-    robot: Float[Array, "3 3"]
-    """A"""
-    cross: Float[Array, "N L 3"] | None
-    """a_i; None where landmark errors are constant"""
-    landmark: Float[Array, "N L L"] | None
-    """B_i; None where they are the identity"""
-    noise: Float[Array, "3 3"]
-    """noise of the pose's coordinates, to dx"""
-    cross_noise: Float[Array, "N L 3"] | None
-    """the same, to dl_i"""
-
-    def times(self, matrix: Float[Array, "D k"]) -> Float[Array, "D k"]:
-        """The transition matrix times a matrix."""
-        robot = linalg.matmul(self.robot, matrix[:3])
-        if self.cross is None:
-            return matrix.at[:3].set(robot)
-        turned = self.turn(matrix)[3:]
-        by_robot = linalg.matmul(self.cross.reshape(turned.shape[0], 3), matrix[:3])
-        return jnp.concatenate([robot, by_robot + turned])
-
-    def turn(self, matrix: Float[Array, "D k"]) -> Float[Array, "D k"]:
-        """The matrix with B_i applied to the landmarks' rows."""
-        if self.landmark is None:
-            return matrix
-        capacity, size = self.landmark.shape[:2]
-        rows = matrix[3:].reshape(capacity, size, -1)
-        turned = linalg.total(
-            self.landmark[:, :, k, None] * rows[:, k, None, :] for k in range(size)
-        )
-        return jnp.concatenate([matrix[:3], turned.reshape(capacity * size, -1)])
-
-    def lift(self, size: int) -> Float[Array, "D 3"]:
-        """The matrix from noise of the pose's coordinates to all errors."""
-        rest = jnp.zeros((size - 3, 3), self.noise.dtype)
-        if self.cross_noise is not None:
-            rest = self.cross_noise.reshape(size - 3, 3)
-        return jnp.concatenate([self.noise, rest])
+    return joint._replace(pose=pose, cov=cov, lin=lin, last=last), moved
 
 
 def in_charts(

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.filters.ekf.predict import Transition, in_charts, moved_cov
-from jaxslam.linearize.first_order import turned
+from jaxslam.filters.ekf.linear_system import Transition
+from jaxslam.filters.ekf.predict import in_charts, moved_cov
+from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Chart
@@ -37,8 +38,8 @@ def moved_anew(
     step: Float[Array, "3"],
     lever: Float[Array, "D 3"],
     chart: Chart,
-) -> Joint:
-    """The corrected map composed with the last motion, which a step has corrected.
+) -> tuple[Joint, Transition]:
+    """The corrected map composed with the last motion, which a step has corrected; and T.
 
     With T the transition of e_rest and h = g' - T g, P ← T P Tᵀ + h C Tᵀ + (h C Tᵀ)ᵀ + h Q hᵀ,
     C = cov(δ, e) and Q = cov(δ), all after the correction.
@@ -55,19 +56,28 @@ def moved_anew(
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
     still = jnp.eye(3, dtype=pose.dtype)
-    moved = in_charts(turned(still, change[:2]), before, after, joint.alive)
+    moved = in_charts(with_lever_arm(still, change[:2]), before, after, joint.alive)
     composed = joint._replace(pose=pose, last=joint.last._replace(frame=frame))
     h = (lever_by(moved, frame) - moved.times(lever)).T
     cov_last = moved.times(joint.last.cov.T).T
     half = cov_last + 0.5 * linalg.matmul(joint.last.own, h)
-    watch = joint.watch
-    if watch:
-        watch = watch._replace(directions=moved.times(watch.directions))
-    return composed._replace(
+    composed = composed._replace(
         cov=moved_cov(joint.cov, moved, None, (h, half)),
-        watch=watch,
         last=composed.last._replace(cov=cov_last + linalg.matmul(joint.last.own, h)),
     )
+    return composed, moved
+
+
+def unmoved(joint: Joint, chart: Chart) -> Transition:
+    """The transition of a map that is not composed anew."""
+    assert chart.basis is not None
+    capacity, size = joint.landmarks.shape
+    still = jnp.eye(3, dtype=joint.pose.dtype)
+    cross = jnp.zeros((capacity, size, 3), joint.pose.dtype)
+    landmark = None
+    if chart.basis(joint.pose, joint.landmarks[0]).landmark is not None:
+        landmark = jnp.broadcast_to(jnp.eye(size, dtype=cross.dtype), (capacity, size, size))
+    return Transition(still, cross, landmark, still, cross)
 
 
 def out_of(frame: Float[Array, ""]) -> Float[Array, "3 3"]:

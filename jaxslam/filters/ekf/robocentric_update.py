@@ -9,11 +9,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.ekf.coordinates import retracted
 from jaxslam.filters.ekf.innovation import Correction, innovate, view_of
-from jaxslam.filters.ekf.observability import with_information
-from jaxslam.filters.ekf.predict import Transition, in_charts, moved_cov
+from jaxslam.filters.ekf.linear_system import Transition
+from jaxslam.filters.ekf.predict import in_charts, moved_cov
 from jaxslam.filters.ekf.robocentric_motion import lever_by, lever_of_motion, out_of
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.linearize.first_order import turned
+from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.xla import materialize, no_inline
@@ -76,13 +76,13 @@ def composition_of(state: MapAndMotion, chart: Chart) -> Composition:
     pose = materialize(jnp.concatenate([pose[:2], wrap(pose[2:])]))
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before, after = over_map(rest.pose, rest.landmarks), over_map(pose, rest.landmarks)
-    by_pose = turned(jnp.eye(3, dtype=pose.dtype), change[:2])
+    by_pose = with_lever_arm(jnp.eye(3, dtype=pose.dtype), change[:2])
     moved = in_charts(by_pose, before, after, rest.alive)
     return Composition(pose, moved, lever_by(moved, frame))
 
 
-def compose_map(state: MapAndMotion, chart: Chart) -> Joint:
-    """The composed map: P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ, C = cov(δ, x)."""
+def compose_map(state: MapAndMotion, chart: Chart) -> tuple[Joint, Transition]:
+    """The composed map, P = T cov(x) Tᵀ + g C Tᵀ + (g C Tᵀ)ᵀ + g Q gᵀ with C = cov(δ, x); and T."""
     found, rest = composition_of(state, chart), state.rest
     size = rest.cov.shape[0] - 3
     own, lever = rest.cov[size:, size : size + 3], found.lever.T
@@ -90,11 +90,8 @@ def compose_map(state: MapAndMotion, chart: Chart) -> Joint:
     shared = linalg.matmul(own, lever)
     half = cross + 0.5 * shared
     cov = moved_cov(rest.cov[:size, :size], found.moved, None, (lever, half))
-    watch = rest.watch
-    if watch:
-        watch = watch._replace(directions=found.moved.times(watch.directions))
     last = Last(state.frame, cross + shared, own)
-    return rest._replace(pose=found.pose, cov=cov, watch=watch, last=last)
+    return rest._replace(pose=found.pose, cov=cov, last=last), found.moved
 
 
 def correct_map_and_motion(
@@ -112,16 +109,12 @@ def correct_map_and_motion(
     of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
     at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1), size + jnp.arange(3)])
     rows = rest.cov[at]
-    watch: Any = rest.watch
-    if watch:
-        watch = watch._replace(directions=watch.directions[at[:-3]])
     # The local map, with the matrix from the initial P_I to the current P_I appended to its P.
     local = rest._replace(
         landmarks=rest.landmarks[slot],
         cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
         alive=rest.alive[slot],
         tag=rest.tag[slot],
-        watch=watch,
     )
 
     def one(
@@ -138,13 +131,10 @@ def correct_map_and_motion(
     v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
     xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
     landmarks = retracted(settings.chart, rest, xi[:size])[1]
-    if watch:
-        watch = after.rest.watch._replace(directions=rest.watch.directions)
     rest = rest._replace(
         pose=after.rest.pose,
         landmarks=jnp.where(known.any(), landmarks, rest.landmarks),  # adding zero would round
         cov=rest.cov - linalg.gram(v[:, : size + 3], v),
-        watch=watch,
     )
     return after._replace(rest=rest), done
 
@@ -167,23 +157,17 @@ def _correct_one(
     at = jnp.concatenate(
         [jnp.arange(3), 3 + i[0] * size_l + jnp.arange(size_l), size + jnp.arange(3)]
     )
-    watch: Any = rest.watch
-    if watch:
-        watch = watch._replace(directions=watch.directions[at[:-3]])
     local = rest._replace(
         landmarks=rest.landmarks[i],
         cov=rest.cov[at],
         alive=rest.alive[i],
         tag=rest.tag[i],
-        watch=watch,
     )
     found = composition_of(state._replace(rest=local), chart)
     against = found.times(local.cov)
     among = found.times(against[:, at].T).T
-    if watch:
-        watch = watch._replace(directions=found.moved.times(watch.directions))
     cov = jnp.concatenate([among, against], axis=1)
-    here = local._replace(pose=found.pose, cov=cov, watch=watch)
+    here = local._replace(pose=found.pose, cov=cov)
     first = jnp.zeros_like(i)
     memory = whole._replace(pose=found.pose), slot
     said = innovate(here, first, view_of(here, first), z, known, memory, settings)
@@ -192,16 +176,18 @@ def _correct_one(
     xi = linalg.gram(v, said.whitened[:, None])[:, 0]
     pose, landmarks = retracted(chart, rest, xi[:size])
     pose = jnp.where(known[0], pose, rest.pose)  # a move by zero would round
-    if watch:
-        fused = said.fuse & said.correction.positive
-        watch = with_information(here, chart, *said.seen, first, said.own_noise, fused)
-        watch = watch._replace(directions=rest.watch.directions)
     rest = rest._replace(
         pose=pose,
         landmarks=jnp.where(known[0], landmarks, rest.landmarks),
         cov=rest.cov - linalg.gram(v, said.v[:, len(among) :]),
-        watch=watch,
     )
     frame = state.frame + (pose[2] - state.rest.pose[2])
-    done = jax.tree.map(lambda leaf: leaf[0], said.correction)
+    done = jax.tree.map(lambda leaf: leaf[0], _of_errors(said.correction, found.moved))
     return MapAndMotion(rest, frame, state.step + xi[size:]), (reach, said.whitened, done)
+
+
+def _of_errors(done: Correction, moved: Transition) -> Correction:
+    """The correction by one measurement of T x, with the coordinates by errors x."""
+    assert done.basis is not None
+    transition = moved.times(jnp.eye(done.basis.shape[2], dtype=done.basis.dtype))
+    return done._replace(basis=done.basis @ transition)

@@ -10,12 +10,19 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
 from jaxslam.filters.ekf.augmentation import augment
 from jaxslam.filters.ekf.innovation import Correction
+from jaxslam.filters.ekf.linear_system import (
+    InTurn,
+    LinearLandmarks,
+    LinearMeasurements,
+    LinearSystem,
+)
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct, correct_in_turn
@@ -45,6 +52,18 @@ class NewLandmarks(NamedTuple):
     repeated: Bool[Array, "M"]
     evicted: Bool[Array, "N"]
     """slots that were emptied to make room"""
+    by_pose: Float[Array, "M L 3"]
+    """derivatives of the errors of those granted, by that of the pose"""
+
+
+class ScanUpdate(NamedTuple):
+    """The result of an update by a scan."""
+
+    joint: Joint
+    info: Info
+    evicted: Bool[Array, "N"]
+    """slots that were emptied to make room"""
+    system: LinearSystem
 
 
 def turns_of(sensor: Sensor, settings: EkfSettings) -> list[SensorTurn]:
@@ -70,16 +89,15 @@ def turn_of(part: Part, size: int, settings: EkfSettings) -> SensorTurn:
     )
 
 
-def update_by_scan(
-    joint: Joint, scan: Scan, turns: Sequence[SensorTurn]
-) -> tuple[Joint, Info, Bool[Array, "N"]]:
-    """The state after the update by each sensor in turn, the `Info`, and the slots evicted.
+def update_by_scan(joint: Joint, scan: Scan, turns: Sequence[SensorTurn]) -> ScanUpdate:
+    """The update by each sensor in turn.
 
     Raises ValueError if the scan does not have their measurement slots.
     """
     first = turns[0]
     if first.places is None and first.settings is not None:
         return update_by_sensor(joint, scan, first.settings)
+    system: LinearSystem = ()
     infos, evicted = [], jnp.zeros_like(joint.alive)
     counts = [turn.places or 0 for turn in turns]
     for own, turn in zip(split_scan(scan, counts), turns, strict=True):
@@ -87,24 +105,26 @@ def update_by_scan(
             infos.append(nothing_of(own))
             continue
         own = own._replace(z=own.z[:, : len(turn.settings.sensor.measurements)])
-        joint, info, gone = update_by_sensor(joint, own, turn.settings)
+        joint, info, gone, more = update_by_sensor(joint, own, turn.settings)
         infos.append(info)
-        evicted = evicted | gone
-    return joint, joined(infos, scan.z.shape[1]), evicted
+        evicted, system = evicted | gone, (*system, *more)
+    return ScanUpdate(joint, joined(infos, scan.z.shape[1]), evicted, system)
 
 
-def update_by_sensor(
-    joint: Joint, scan: Scan, settings: EkfSettings
-) -> tuple[Joint, Info, Bool[Array, "N"]]:
-    """The state after the scan of one sensor, the `Info`, and the slots (N,) evicted."""
+def update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> ScanUpdate:
+    """The update by the scan of one sensor."""
     # Padding may hold any number, and is multiplied by zero below.
     scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
     found, matched = associate_scan(joint, scan, settings)
     at_once = settings.update == "joint" and len(scan.tag) > 0
     by_scan = correct if at_once else correct_in_turn
-    joint, done = by_scan(joint, scan.z, jnp.maximum(found.slot, 0), matched, settings)
+    slot = jnp.maximum(found.slot, 0)
+    joint, done = by_scan(joint, scan.z, slot, matched, settings)
     joint, new = initialize_landmarks(joint, scan, found, matched, done, settings)
-    return joint, report_scan(scan, found, matched, done, new, settings), new.evicted
+    info = report_scan(scan, found, matched, done, new, settings)
+    system = linear_corrections(scan.z, slot, matched, done, settings)
+    born = LinearLandmarks(new.slot, new.granted, new.by_pose)
+    return ScanUpdate(joint, info, new.evicted, (*system, born))
 
 
 def associate_scan(
@@ -137,7 +157,12 @@ def initialize_landmarks(
     """
     is_new, none = found.is_new, jnp.zeros_like(found.is_new)
     nothing = NewLandmarks(
-        jnp.zeros_like(found.slot), none, none, none, jnp.zeros_like(joint.alive)
+        slot=jnp.zeros_like(found.slot),
+        granted=none,
+        deferred=none,
+        repeated=none,
+        evicted=jnp.zeros_like(joint.alive),
+        by_pose=jnp.zeros((len(none), joint.landmarks.shape[1], 3), joint.pose.dtype),
     )
     if settings.births == 0:
         return joint, nothing._replace(deferred=is_new)
@@ -152,8 +177,8 @@ def initialize_landmarks(
         wanted = wanted & ~deferred
         used = matched & done.inside & done.positive
         joint, evicted = _with_room(joint, wanted, found.slot, used, settings)
-        joint, slot, granted = _started(joint, scan, wanted, rank, settings)
-        return joint, NewLandmarks(slot, granted, deferred, repeated, evicted)
+        joint, slot, granted, by_pose = _started(joint, scan, wanted, rank, settings)
+        return joint, NewLandmarks(slot, granted, deferred, repeated, evicted, by_pose)
 
     return where_any(is_new.any(), start, lambda joint: (joint, nothing), joint)
 
@@ -180,8 +205,8 @@ def _started(
     wanted: Bool[Array, "M"],
     rank: Int[Array, "M"],
     settings: EkfSettings,
-) -> tuple[Joint, Int[Array, "M"], Bool[Array, "M"]]:
-    """The map with landmarks started in free slots, the slot of each, and whether it was granted.
+) -> tuple[Joint, Int[Array, "M"], Bool[Array, "M"], Float[Array, "M L 3"]]:
+    """The map with landmarks started in free slots; slot, granted and by_pose of `NewLandmarks`.
 
     rank: (M,) the number wanted up to each measurement.
     """
@@ -189,14 +214,15 @@ def _started(
     taken = joint.alive if settings.reserved is None else joint.alive | settings.reserved
     if births is None or births >= len(wanted):
         slot, granted = slots.allocate(taken, wanted)
-        return augment(joint, scan.z, scan.tag, slot, granted, settings), slot, granted
+        joint, by_pose = augment(joint, scan.z, scan.tag, slot, granted, settings)
+        return joint, slot, granted, by_pose
     # No more than may be granted are computed.
     turn = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
     at, there = slots.where_set(turn)
     slot, granted = slots.allocate(taken, there)
-    joint = augment(joint, scan.z[at], scan.tag[at], slot, granted, settings)
+    joint, by_pose = augment(joint, scan.z[at], scan.tag[at], slot, granted, settings)
     mine = jnp.clip(rank - 1, 0, births - 1)
-    return joint, slot[mine], wanted & granted[mine]
+    return joint, slot[mine], wanted & granted[mine], by_pose[mine]
 
 
 def report_scan(
@@ -230,6 +256,28 @@ def report_scan(
         log_likelihood=done.log_likelihood.sum(),
         exhausted=jnp.asarray(found.exhausted),
     )
+
+
+def linear_corrections(
+    z: Float[Array, "M Z"],
+    slot: Int[Array, "M"],
+    matched: Bool[Array, "M"],
+    done: Correction,
+    settings: EkfSettings,
+) -> LinearSystem:
+    """The linear system of the correction by these measurements."""
+    seen = LinearMeasurements(
+        jacobian=done.jacobian,
+        basis=done.basis,
+        noise=jax.vmap(settings.sensor.noise_cov)(z),
+        slot=slot,
+        fused=matched & done.inside & done.positive,
+    )
+    if done.moved is None:
+        return (seen,)
+    if done.moved.robot.ndim == 2:
+        return seen, done.moved
+    return (InTurn((jax.tree.map(lambda leaf: leaf[:, None], seen), done.moved)),)
 
 
 def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:

@@ -50,7 +50,7 @@ class EkfSettings:
         return self.covariance == "square_root"
 
 
-def check_options(
+def check_ekf_options(
     filter: str,
     capacity: int,
     update: str,

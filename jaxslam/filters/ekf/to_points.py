@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
+from jaxslam.filters.ekf.linear_system import Transition
 from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Sensor
@@ -45,14 +46,15 @@ def at_slot(sensor: Sensor, joint: Joint, slot: Int[Array, ""]) -> Sensor:
 
 def reduced_where_ready(
     joint: Joint, sensor: Sensor, square_root: bool
-) -> tuple[Joint, Bool[Array, "N"]]:
-    """The map with all landmarks reduced that may become points, and which."""
+) -> tuple[Joint, Bool[Array, "N"], Transition]:
+    """The map with all landmarks reduced that may become points, which, and the transition."""
     which = ready(joint, sensor, square_root)
 
     def reduced(joint: Joint) -> Joint:
         return reduce(joint, which, sensor, square_root)
 
-    return where_any(which.any(), reduced, lambda joint: joint, joint), which
+    after = where_any(which.any(), reduced, lambda joint: joint, joint)
+    return after, which, reduction(joint, which, sensor)
 
 
 def ready(joint: Joint, sensor: Sensor, square_root: bool) -> Bool[Array, "N"]:
@@ -72,19 +74,9 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
     columns of P. The other L - 2 coordinates become padding. In a chart with identity
     `Basis.landmark` (None), J is the derivative by e_l at a fixed pose error.
     """
-    capacity, size = joint.landmarks.shape
+    size = joint.landmarks.shape[1]
     points = jax.vmap(sensor.position)(joint.landmarks)
-    by_landmark = jax.vmap(jax.jacfwd(sensor.position))(joint.landmarks)
-    still = jnp.eye(size, dtype=points.dtype)
-    freed = jnp.pad(by_landmark, [(0, 0), (0, size - 2), (0, 0)])
-    gain = jnp.where(which[:, None, None], freed, still)
-
-    def turned(matrix: Float[Array, "D k"]) -> Float[Array, "D k"]:
-        """The matrix with J applied to the rows of landmarks."""
-        rows = matrix[3:].reshape(capacity, size, -1)
-        rows = linalg.total(gain[:, :, k, None] * rows[:, k, None, :] for k in range(size))
-        return jnp.concatenate([matrix[:3], rows.reshape(capacity * size, -1)])
-
+    turned = reduction(joint, which, sensor).turn
     padding = jnp.concatenate(
         [jnp.zeros(3, bool), (which[:, None] & (jnp.arange(size) >= 2)[None, :]).reshape(-1)]
     )
@@ -95,13 +87,19 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
         cov = linalg.symmetrize(turned(turned(joint.cov).T)) + unit
     # Exactly the same for a run that gets here only because of another run of the batch.
     cov = jnp.where(which.any(), cov, joint.cov)
-    watch = joint.watch
-    if watch:
-        watch = watch._replace(directions=turned(watch.directions))
     landmarks = jnp.pad(points, [(0, 0), (0, size - 2)])
     return joint._replace(
         landmarks=jnp.where(which[:, None], landmarks, joint.landmarks),
         cov=cov,
-        watch=watch,
         reduced=joint.reduced | which,
     )
+
+
+def reduction(joint: Joint, which: Bool[Array, "N"], sensor: Sensor) -> Transition:
+    """The transition of the errors in `reduce`."""
+    capacity, size = joint.landmarks.shape
+    by_landmark = jax.vmap(jax.jacfwd(sensor.position))(joint.landmarks)
+    still = jnp.eye(3, dtype=by_landmark.dtype)
+    freed = jnp.pad(by_landmark, [(0, 0), (0, size - 2), (0, 0)])
+    gain = jnp.where(which[:, None, None], freed, jnp.eye(size, dtype=still.dtype))
+    return Transition(still, jnp.zeros((capacity, size, 3), still.dtype), gain, still, None)

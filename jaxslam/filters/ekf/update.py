@@ -6,6 +6,7 @@ the settings, so one set of equations serves every sensor, chart and linearizer.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -14,9 +15,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.ekf import robocentric_update
 from jaxslam.filters.ekf.coordinates import retracted
-from jaxslam.filters.ekf.innovation import Correction, Innovation, innovate, view_of
-from jaxslam.filters.ekf.observability import split_directions, times_directions, with_information
-from jaxslam.filters.ekf.robocentric_motion import lever_of_motion, moved_anew
+from jaxslam.filters.ekf.innovation import (
+    Correction,
+    Innovation,
+    innovate,
+    seen_rows,
+    view_of,
+)
+from jaxslam.filters.ekf.linear_system import Transition
+from jaxslam.filters.ekf.robocentric_motion import lever_of_motion, moved_anew, unmoved
 from jaxslam.filters.ekf.settings import Covariance, EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize, no_inline, where_any
@@ -62,9 +69,9 @@ def correct(
     found = innovate(joint, slot, view, z, known, (joint, slot), settings)
     cov = _corrected_cov(joint.cov, found, settings.covariance)
     if joint.last:
-        return _with_last_motion(joint, found, cov, slot, settings.chart), found.correction
-    moved = _moved(joint, found, found.xi, slot, settings.chart)
-    return moved._replace(cov=cov), found.correction
+        joint, moved = _with_last_motion(joint, found, cov, slot, settings.chart)
+        return joint, found.correction._replace(moved=moved)
+    return _moved(joint, found.xi, settings.chart)._replace(cov=cov), found.correction
 
 
 def _corrected_cov(
@@ -90,10 +97,12 @@ def _corrected_cov(
 
 def _with_last_motion(
     joint: Joint, found: Innovation, cov: Float[Array, "D D"], slot: Int[Array, "m"], chart: Chart
-) -> Joint:
-    """The map corrected, then composed with the corrected last motion."""
-    last, capacity = joint.last, joint.landmarks.shape[0]
-    seen_last = times_directions(*found.jacobians, *split_directions(last.cov.T, capacity), slot)
+) -> tuple[Joint, Transition]:
+    """The map corrected, then composed with the corrected last motion; and its transition."""
+    last, size_l = joint.last, joint.landmarks.shape[1]
+    of_map = last.cov.T
+    own = of_map[3:].reshape(-1, size_l, 3)[slot]
+    seen_last = seen_rows(jnp.concatenate(found.jacobians, axis=2), of_map[:3], own)
     seen_last = linalg.solve_lower(found.factor, seen_last.reshape(-1, 3))
     step = linalg.gram(seen_last, found.whitened[:, None])[:, 0]
     lever = lever_of_motion(joint, chart)
@@ -101,7 +110,7 @@ def _with_last_motion(
         cov=last.cov - linalg.gram(seen_last, found.v),
         own=last.own - linalg.gram(seen_last, seen_last),
     )
-    moved = _moved(joint, found, found.xi - lever @ step, slot, chart)
+    moved = _moved(joint, found.xi - lever @ step, chart)
     moved = moved._replace(cov=cov, last=last)
     return moved_anew(moved, moved.pose[2] - joint.pose[2], step, lever, chart)
 
@@ -133,9 +142,7 @@ def correct_in_turn(
     measurements = z, slot, known
     size = joint.cov.shape[1]
     if settings.covariance != "plain":
-        return _in_groups(
-            lambda joint, one: correct(joint, *one, settings), joint, measurements, 1, joint
-        )
+        return _one_by_one(joint, measurements, settings)
     cached = size <= _CACHED
     group = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
     if settings.chart.motion_apart and joint.last:
@@ -143,16 +150,38 @@ def correct_in_turn(
     if cached:
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
     joint, done = _in_groups(
-        lambda joint, part: correct_group(joint, part, settings), joint, measurements, group, joint
+        lambda joint, part: correct_group(joint, part, settings),
+        joint,
+        measurements,
+        group,
+        partial(_nothing, joint, chart=settings.chart),
     )
     return joint._replace(cov=joint.cov[:, :size]), done
+
+
+def _one_by_one(
+    joint: Joint, measurements: Measurements, settings: EkfSettings
+) -> tuple[Joint, Correction]:
+    """`correct_in_turn` by `correct` of each measurement alone."""
+
+    def of_one(done: Correction) -> Correction:
+        return done._replace(moved=jax.tree.map(lambda leaf: leaf[None], done.moved))
+
+    def work(joint: Joint, one: Measurements) -> tuple[Joint, Correction]:
+        joint, done = correct(joint, *one, settings)
+        return joint, of_one(done)
+
+    def nothing(one: Measurements) -> Correction:
+        return of_one(_nothing(joint, one, settings.chart))
+
+    return _in_groups(work, joint, measurements, 1, nothing)
 
 
 def _in_turn_with_motion(
     joint: Joint, measurements: Measurements, group: int, settings: EkfSettings
 ) -> tuple[Joint, Correction]:
     """`correct_in_turn` in a chart with `motion_apart`; P has columns for the last motion."""
-    z, _, known = measurements
+    known = measurements[2]
     size = joint.cov.shape[1]
     columns = size + 3 + (-(size + 3) % _LANES if size <= _CACHED else 0)
 
@@ -162,14 +191,15 @@ def _in_turn_with_motion(
             robocentric_update.separate_motion(joint, settings.chart, columns),
             measurements,
             group,
-            joint,
+            partial(_nothing, joint._replace(last=None), chart=settings.chart),
         )
         # A run without a measurement must keep exactly its map.
         after = robocentric_update.compose_map(rest, settings.chart)
-        kept: Joint = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, joint)
-        return kept, done
+        before = joint, unmoved(joint, settings.chart)
+        kept, moved = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, before)
+        return kept, done._replace(moved=moved)
 
-    nothing = _nothing(joint, z)
+    nothing = _nothing(joint, measurements, settings.chart)
     return where_any(known.any(), with_motion, lambda joint: (joint, nothing), joint)
 
 
@@ -178,11 +208,11 @@ def _in_groups(
     state: _State,
     measurements: Measurements,
     group: int,
-    joint: Joint,
+    nothing: Callable[[Measurements], Correction],
 ) -> tuple[_State, Correction]:
     """The state after work(state, g measurements) on each group of m, padded: (⌈m/g⌉, g, …).
 
-    joint: the map, whose dtype the reported numbers have.
+    nothing: of unused measurements, the `Correction`.
     """
     m = len(measurements[0])
     groups = -(-m // group)
@@ -192,9 +222,8 @@ def _in_groups(
         return wide.reshape(groups, group, *part.shape[1:])
 
     def of_group(state: _State, part: Measurements) -> tuple[_State, Correction]:
-        nothing = _nothing(joint, part[0])
-        known = part[2].any()
-        return where_any(known, lambda s: work(s, part), lambda s: (s, nothing), state)
+        unused = nothing(part)
+        return where_any(part[2].any(), lambda s: work(s, part), lambda s: (s, unused), state)
 
     state, done = jax.lax.scan(of_group, state, jax.tree.map(padded, measurements))
     shape = (groups * group,)
@@ -216,15 +245,11 @@ def correct_group(
     of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
     at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
     rows = joint.cov[at]
-    watch: Any = joint.watch
-    if watch:
-        watch = watch._replace(directions=watch.directions[at])
     local = joint._replace(
         landmarks=joint.landmarks[slot],
         cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
         alive=joint.alive[slot],
         tag=joint.tag[slot],
-        watch=watch,
     )
 
     def one(local: Joint, measurement: tuple[jax.Array, Any]) -> tuple[Joint, Any]:
@@ -238,10 +263,8 @@ def correct_group(
     )
     v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
     landmarks = _moved_map(joint, v[:, :size], whitened, chart)
-    if watch:
-        watch = local.watch._replace(directions=joint.watch.directions)
     cov = joint.cov - linalg.gram(v[:, :size], v)
-    return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov, watch=watch), done
+    return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov), done
 
 
 def _correct_local(
@@ -254,19 +277,20 @@ def _correct_local(
     Returns reach (Z, W), and L⁻¹ ν (Z,).
     """
     i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], measurement)
-    width, chart = local.cov.shape[0], settings.chart
+    width = local.cov.shape[0]
     memory = whole._replace(pose=local.pose), slot
     found = innovate(local, i, view_of(local, i), z, known, memory, settings)
     v, reach = found.v[:, :width], found.v[:, width:]
-    moved = _moved(local, found, found.xi[:width], i, chart)
+    moved = _moved(local, found.xi[:width], settings.chart)
     moved = moved._replace(cov=local.cov - linalg.gram(v, found.v))
     done = jax.tree.map(lambda leaf: leaf[0], found.correction)
     return moved, (reach, found.whitened, done)
 
 
-def _nothing(joint: Joint, z: Float[Array, "m Z"]) -> Correction:
-    """The `Correction` of m unused measurements, all zero."""
-    m, size = z.shape
+def _nothing(joint: Joint, unused: Measurements, chart: Chart) -> Correction:
+    """The `Correction` of m unused measurements, all zero; the map is not composed anew."""
+    z = unused[0]
+    (m, size), width = z.shape, 3 + joint.landmarks.shape[1]
     dtype = jnp.result_type(z, joint.pose, joint.cov)
     each, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
     return Correction(
@@ -276,23 +300,16 @@ def _nothing(joint: Joint, z: Float[Array, "m Z"]) -> Correction:
         log_likelihood=each,
         inside=flags,
         positive=flags,
+        jacobian=jnp.zeros((m, size, width), dtype),
+        basis=None if chart.basis is None else jnp.zeros((m, width, width), dtype),
+        moved=unmoved(joint, chart) if joint.last else None,
     )
 
 
-def _moved(
-    joint: Joint,
-    found: Innovation,
-    xi: Float[Array, "D"],
-    slot: Int[Array, "m"],
-    chart: Chart,
-) -> Joint:
-    """The means retracted by ξ, and the watch updated by the measurements; P is not changed."""
+def _moved(joint: Joint, xi: Float[Array, "D"], chart: Chart) -> Joint:
+    """The means retracted by ξ; P is not changed."""
     pose, landmarks = retracted(chart, joint, xi)
-    watch = joint.watch
-    if watch:
-        fused = found.fuse & found.correction.positive
-        watch = with_information(joint, chart, *found.seen, slot, found.own_noise, fused)
-    return joint._replace(pose=pose, landmarks=landmarks, watch=watch)
+    return joint._replace(pose=pose, landmarks=landmarks)
 
 
 def _moved_map(
@@ -304,9 +321,7 @@ def _moved_map(
         return retracted(chart, joint, xi)[1]
 
     def move(joint: Joint, one: tuple[jax.Array, jax.Array]) -> tuple[Joint, None]:
-        xi = linalg.gram(one[0], one[1][:, None])[:, 0]
-        pose, landmarks = retracted(chart, joint, xi)
-        return joint._replace(pose=pose, landmarks=landmarks), None
+        return _moved(joint, linalg.gram(one[0], one[1][:, None])[:, 0], chart), None
 
     each = v.reshape(*whitened.shape, -1)
     return jax.lax.scan(move, joint, (each, whitened))[0].landmarks

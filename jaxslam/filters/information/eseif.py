@@ -13,7 +13,6 @@ from jaxslam.filters.information.active_set import (
 )
 from jaxslam.filters.information.canonical import CanonicalInnovations
 from jaxslam.filters.information.mean_recovery import (
-    recover_active_means,
     recover_passive_means,
     repeat_recovery,
 )
@@ -21,14 +20,13 @@ from jaxslam.filters.information.relocation import relocate_or_correct
 from jaxslam.filters.information.settings import RelocationSettings
 from jaxslam.filters.information.sparse_filter import (
     check_scan_size,
-    enter_landmarks,
+    correct_active,
     finish_scan,
+    initialize_active,
     sparse_filter,
 )
 from jaxslam.filters.information.sparse_state import (
     SparseState,
-    active_means,
-    active_residual,
     linked_to_robot,
 )
 from jaxslam.filters.information.sparsification import cut_robot_links
@@ -116,20 +114,15 @@ def eseif(
         state, first, solved = relocate_or_correct(settings, state, scan, measured, matches)
         state, index, entered = activate_others(settings, state, measured, matches, solved)
         active, late = matches.any(axis=1) | entered, measured.known & entered
-        second = canonical.innovations(
-            settings, state.omega, state.pose, active_means(state), scan, index, late
-        )
-        omega, residual = canonical.measurement_update(state.omega, active_residual(state), second)
-        state, corrected = recover_active_means(state, omega, residual, second.omega_positive)
+        state, omega, second, corrected = correct_active(settings, state, scan, index, late)
         solved = solved & corrected
         state = repeat_recovery(settings, state, omega, solved)
-        omega, landmarks, initialized = canonical.initialize_landmarks(
-            sensor, omega, state.pose, scan.z, index, active & measured.new & solved
+        room = active & measured.new & solved
+        state, omega, initialized = initialize_active(
+            settings, state, omega, scan, measured.slot, index, room
         )
-        state = enter_landmarks(state, measured.slot, landmarks, initialized)
         state = finish_scan(state, scan, index, active, omega, solved)
         waiting = measured.has_slot & ~active
-        second = canonical.refuse_unless(corrected, second)
         innovations = merge_passes(first, second, late, waiting, solved)
         return state, canonical.report(scan, measured, innovations, initialized, waiting & solved)
 

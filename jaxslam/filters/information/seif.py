@@ -12,18 +12,18 @@ from jaxslam.filters.information.active_set import (
     deactivate,
 )
 from jaxslam.filters.information.mean_recovery import (
-    recover_active_means,
     recover_passive_means,
     repeat_recovery,
 )
 from jaxslam.filters.information.settings import SparseSettings
 from jaxslam.filters.information.sparse_filter import (
     check_scan_size,
-    enter_landmarks,
+    correct_active,
     finish_scan,
+    initialize_active,
     sparse_filter,
 )
-from jaxslam.filters.information.sparse_state import SparseState, active_means, active_residual
+from jaxslam.filters.information.sparse_state import SparseState
 from jaxslam.filters.information.sparsification import cut_robot_links
 from jaxslam.filters.information.tag_association import TagAssociation, associate_by_index
 from jaxslam.protocols import Filter, Motion, Sensor
@@ -104,21 +104,15 @@ def seif(
         state = recover_passive_means(state, settings.recovered)
         measured = associate_by_index(state.alive, scan)
         state, index = sparsify_and_activate(settings, state, measured)
-        innovations = canonical.innovations(
-            settings, state.omega, state.pose, active_means(state), scan, index, measured.known
+        state, omega, innovations, solved = correct_active(
+            settings, state, scan, index, measured.known
         )
-        omega, residual = canonical.measurement_update(
-            state.omega, active_residual(state), innovations
-        )
-        state, solved = recover_active_means(state, omega, residual, innovations.omega_positive)
         state = repeat_recovery(settings, state, omega, solved)
         room = measured.new & measured.has_slot & solved
-        omega, landmarks, initialized = canonical.initialize_landmarks(
-            sensor, omega, state.pose, scan.z, index, room
+        state, omega, initialized = initialize_active(
+            settings, state, omega, scan, measured.slot, index, room
         )
-        state = enter_landmarks(state, measured.slot, landmarks, initialized)
         state = finish_scan(state, scan, index, measured.has_slot, omega, solved)
-        innovations = canonical.refuse_unless(solved, innovations)
         return state, canonical.report(scan, measured, innovations, initialized)
 
     return sparse_filter(settings, update)

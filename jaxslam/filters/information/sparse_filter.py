@@ -1,4 +1,4 @@
-"""The common parts of `seif` and `eseif`: initialization, prediction, estimate, end of a scan."""
+"""The common parts of `seif` and `eseif`: prediction, estimate, and the steps of a scan."""
 
 from collections.abc import Callable
 
@@ -7,10 +7,13 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information import canonical
+from jaxslam.filters.information.canonical import CanonicalInnovations
 from jaxslam.filters.information.marginals import blanket_marginals, whole_marginals
+from jaxslam.filters.information.mean_recovery import recover_active_means
 from jaxslam.filters.information.settings import SparseSettings
 from jaxslam.filters.information.sparse_state import (
     SparseState,
+    active_means,
     active_residual,
     empty_map,
     with_active_residual,
@@ -61,18 +64,43 @@ def check_scan_size(settings: SparseSettings, scan: Scan) -> None:
         )
 
 
-def enter_landmarks(
+def correct_active(
+    settings: SparseSettings,
     state: SparseState,
+    scan: Scan,
+    index: Int[Array, "M"],
+    known: Bool[Array, "M"],
+) -> tuple[SparseState, Float[Array, "D D"], CanonicalInnovations, Bool[Array, ""]]:
+    """The state with its mean corrected by measurements of active landmarks, Ω after them, their
+    innovations, and whether the mean could be solved for."""
+    found = canonical.innovations(
+        settings, state.omega, state.pose, active_means(state), scan, index, known
+    )
+    omega, residual = canonical.measurement_update(state.omega, active_residual(state), found)
+    state, solved = recover_active_means(state, omega, residual, found.omega_positive)
+    return state, omega, canonical.refuse_unless(solved, found), solved
+
+
+def initialize_active(
+    settings: SparseSettings,
+    state: SparseState,
+    omega: Float[Array, "D D"],
+    scan: Scan,
     slot: Int[Array, "M"],
-    landmarks: Float[Array, "M 2"],
-    initialized: Bool[Array, "M"],
-) -> SparseState:
-    """The state with new landmarks in their slots, where initialized."""
+    index: Int[Array, "M"],
+    wanted: Bool[Array, "M"],
+) -> tuple[SparseState, Float[Array, "D D"], Bool[Array, "M"]]:
+    """The state with new landmarks in their slots where wanted, Ω with them, and which were
+    started."""
+    omega, landmarks, initialized = canonical.initialize_landmarks(
+        settings.sensor, omega, state.pose, scan.z, index, wanted
+    )
     into = jnp.where(initialized, slot, state.alive.shape[0])
-    return state._replace(
+    state = state._replace(
         landmarks=state.landmarks.at[into].set(landmarks, mode="drop"),
         alive=state.alive.at[into].set(True, mode="drop"),
     )
+    return state, omega, initialized
 
 
 def finish_scan(

@@ -18,8 +18,8 @@ from jaxslam.filters.ekf.settings import (
     EkfSettings,
     Update,
     check_covariance_form,
+    check_ekf_options,
     check_iterations,
-    check_options,
 )
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
@@ -86,7 +86,7 @@ def localization(
     capacity = points.shape[0]
     chart = _of_pose(chart or euclidean())
     linearize = linearize or at_estimate()
-    check_options("localization", capacity, update, gate, iterations, None)
+    check_ekf_options("localization", capacity, update, gate, iterations, None)
     check_covariance_form("localization", covariance, ("plain", "joseph"))
     if linearize.own_landmarks:
         raise ValueError(
@@ -125,11 +125,10 @@ def localization(
         return joint._replace(alive=jnp.ones(capacity, bool), tag=jnp.asarray(names))
 
     def predict(joint: Joint, u: Array, key: Array) -> Joint:
-        return propagate(joint, u, motion, settings)
+        return propagate(joint, u, motion, settings)[0]
 
     def update_pose(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        joint, info, _ = update_by_scan(joint, scan, turns)
-        return joint, info
+        return update_by_scan(joint, scan, turns)[:2]
 
     def estimate(joint: Joint) -> Estimate:
         cov = joint.cov

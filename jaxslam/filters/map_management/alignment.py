@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.filters.map_management.point_pairs import PointSets, squared_distances, turned
+from jaxslam.filters.map_management.point_pairs import PointSets, quarter_turned, squared_distances
 from jaxslam.math import linalg, se2
 
 
@@ -39,7 +39,7 @@ class _Residuals(NamedTuple):
     positive: Bool[Array, ""]
 
 
-def align(points: PointSets, slot: Int[Array, "M"]) -> Alignment:
+def align_points(points: PointSets, slot: Int[Array, "M"]) -> Alignment:
     """The pose that aligns cluster points with their map points, -1 for none.
 
     The closed form without weights (as `se2.align`), and from there one step of generalized least
@@ -68,7 +68,7 @@ def align(points: PointSets, slot: Int[Array, "M"]) -> Alignment:
     centred = start - step
     shift = map_centroid + centred[:2] - se2.rotation(centred[2]) @ centroid
     heading = jnp.arctan2(jnp.sin(centred[2:]), jnp.cos(centred[2:]))
-    by_turn = jnp.where(there[:, None], turned(target - shift[None, :]), 0.0)
+    by_turn = jnp.where(there[:, None], quarter_turned(target - shift[None, :]), 0.0)
     return Alignment(
         pose=jnp.concatenate([shift, heading]),
         distance=((whitened - by_pose @ step) ** 2).sum(),
@@ -97,7 +97,7 @@ def _residuals(
     factor, positive = linalg.cholesky(linalg.symmetrize(cov.reshape(2 * m, 2 * m)))
     error = jnp.where(there[:, None], z @ rotation.T + pose[None, :2] - goal, 0.0)
     eye = jnp.broadcast_to(jnp.eye(2, dtype=z.dtype), (m, 2, 2))
-    by_turn = turned(goal - pose[None, :2])[:, :, None]
+    by_turn = quarter_turned(goal - pose[None, :2])[:, :, None]
     jacobian = jnp.where(there[:, None, None], jnp.concatenate([eye, by_turn], 2), 0.0)
     own = cov[jnp.arange(m), :, jnp.arange(m)]
     return _Residuals(error.reshape(-1), jacobian.reshape(2 * m, 3), own, factor, positive)

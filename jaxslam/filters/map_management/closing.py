@@ -1,6 +1,5 @@
 """A filter wrapper that closes long loops and merges successive duplicates."""
 
-import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from jaxslam.filters.map_management.loop_closure import (
     no_closing,
 )
 from jaxslam.filters.map_management.successive import merge_histories, successive_duplicate
-from jaxslam.filters.map_management.wrapping import joint_of
+from jaxslam.filters.map_management.wrapping import joint_of, managed
 from jaxslam.filters.reporting import with_extra, with_removed
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
@@ -70,9 +69,7 @@ def closing(
         check_recency("closing", joint, chart)
         return joint
 
-    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        found = filter.update(joint, scan, key)
-        joint, info = validation.state_and_info(f"closing: {filter.name}", joint, scan, found)
+    def manage(joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
         before = joint.alive
         joint, report = change_where(
             (joint.life.now % every == 0) & scan.valid.any(),
@@ -92,5 +89,4 @@ def closing(
         )
         return joint, report._replace(duplicates=same.astype(jnp.int32))
 
-    name = f"closing {filter.name}"
-    return dataclasses.replace(filter, name=name, init=init, update=update)
+    return managed("closing", filter, init, manage)

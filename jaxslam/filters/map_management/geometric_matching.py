@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.filters.map_management.alignment import align
+from jaxslam.filters.map_management.alignment import align_points
 from jaxslam.filters.map_management.point_pairs import (
     PointSets,
     equal_lengths,
@@ -150,7 +150,7 @@ def fit_hypothesis(points: PointSets, slot: Int[Array, "M"], limits: SearchLimit
     levels = jnp.asarray(limits.joint, points.cluster.dtype)
 
     def drop(_: int, slot: Array) -> Array:
-        aligned = align(points, slot)
+        aligned = align_points(points, slot)
         count = (slot >= 0).sum()
         over = (aligned.distance > levels[count]) & (count > 2)
         worst = jnp.argmax(aligned.each)
@@ -158,7 +158,7 @@ def fit_hypothesis(points: PointSets, slot: Int[Array, "M"], limits: SearchLimit
 
     # Two pairs always have one degree of freedom, which the agreement of distances has tested.
     slot = jax.lax.fori_loop(0, max(m - 2, 0), drop, slot)
-    aligned = align(points, slot)
+    aligned = align_points(points, slot)
     count = (slot >= 0).sum()
     ok = (count >= 2) & aligned.regular & (aligned.distance <= levels[count])
     none = jnp.zeros((), jnp.int32)

@@ -105,9 +105,9 @@ def close_loop(joint: Joint, chart: Chart, **options: Any) -> tuple[Joint, Closi
     only if it was initialized after that was last measured: landmarks observed over overlapping
     periods cannot be duplicates. The pair must agree with the joint covariance of both,
     δ = l_i - l_k, δᵀ cov(δ)⁻¹ δ <= χ²(2, drift). Of these pairs `geometric_matching.match` finds
-    the largest set of consistent geometry, whatever the drift. They are merged (`merging.merge`)
-    if there are enough of them, clearly more than any other hypothesis has, and D² of all δ
-    together is at most χ²(2n, drift).
+    the largest set of consistent geometry, whatever the drift. They are merged
+    (`merging.merge_landmarks`) if there are enough of them, clearly more than any other hypothesis
+    has, and D² of all δ together is at most χ²(2n, drift).
     The old slot keeps the landmark.
 
     The joint compatibility of Neira & Tardós 2001, on relative geometry first, so that a large

@@ -1,6 +1,5 @@
 """Duplicate landmarks: found by a joint chi-square test, and merged by an exact constraint."""
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -9,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots, validation
 from jaxslam.filters.ekf.coordinates import retracted
-from jaxslam.filters.map_management.wrapping import joint_of
+from jaxslam.filters.map_management.wrapping import joint_of, managed
 from jaxslam.filters.reporting import with_extra
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import gaussian_terms
@@ -62,9 +61,7 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
         capacity = joint.alive.shape[0]
         return joint._replace(co_observed=jnp.zeros((capacity, capacity), bool))
 
-    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        found = filter.update(joint, scan, key)
-        joint, info = validation.state_and_info(f"merging: {filter.name}", joint, scan, found)
+    def manage(joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
         together = co_observed(joint, info, filter.places)
         joint = joint._replace(co_observed=together)
         kept, freed, distance = closest_pair(
@@ -73,14 +70,15 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
         same = distance <= gate
         joint = change_where(
             same,
-            lambda joint: merge(joint, filter.chart, kept, freed, square_root=filter.square_root),
+            lambda joint: merge_landmarks(
+                joint, filter.chart, kept, freed, square_root=filter.square_root
+            ),
             joint,
         )
         pair = jnp.where(same, jnp.stack([kept, freed]), -1).astype(jnp.int32)
         return joint, with_extra(info, "merging", Merged(pair))
 
-    name = f"merging {filter.name}"
-    return dataclasses.replace(filter, name=name, init=init, update=update)
+    return managed("merging", filter, init, manage)
 
 
 def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[Array, "N N"]:
@@ -112,7 +110,8 @@ def closest_pair(
 
     d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), including the correlation of the two: for
     landmarks with large covariances but a certain difference d² is large. i = j = 0 and d² infinite
-    where no pair is within reach [m] of another and allowed (N, N). square_root: as in `merge`.
+    where no pair is within reach [m] of another and allowed (N, N). square_root: as in
+    `merge_landmarks`.
 
     Raises ValueError on a reach not above 0, or allowed of another shape.
     """
@@ -153,7 +152,9 @@ def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Floa
     return jnp.where(terms.positive, terms.distance, jnp.inf)
 
 
-def merge(joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False) -> Joint:
+def merge_landmarks(
+    joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False
+) -> Joint:
     """The map conditioned on equal landmarks in slots i and j, of which slot i is kept.
 
     The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with

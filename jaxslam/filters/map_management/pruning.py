@@ -1,12 +1,10 @@
 """A filter wrapper that removes landmarks by a rule after each scan."""
 
-import dataclasses
-
 from jaxtyping import Array, Float
 
 from jaxslam import validation
 from jaxslam.filters.ekf.scan import without_landmarks
-from jaxslam.filters.map_management.wrapping import joint_of
+from jaxslam.filters.map_management.wrapping import joint_of, managed
 from jaxslam.filters.reporting import with_removed
 from jaxslam.protocols import Filter, Life
 from jaxslam.slots import Joint
@@ -35,9 +33,7 @@ def pruning(filter: Filter, life: Life) -> Filter:
         joint = joint_of("pruning", filter, filter.init(pose, pose_cov))
         return joint._replace(life=life.init(pose, joint.landmarks))
 
-    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        found = filter.update(joint, scan, key)
-        joint, info = validation.state_and_info(f"pruning: {filter.name}", joint, scan, found)
+    def manage(joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
         if life.make_room is not None and "pruning" not in (info.extra or {}):
             raise ValueError(
                 f"pruning: {life.name} makes room in a full map, and {filter.name} does not ask it "
@@ -48,5 +44,4 @@ def pruning(filter: Filter, life: Life) -> Filter:
         joint = without_landmarks(joint, dead, square_root=filter.square_root)
         return joint, with_removed(info, dead)
 
-    name = f"pruning {filter.name}"
-    return dataclasses.replace(filter, name=name, init=init, update=update)
+    return managed("pruning", filter, init, manage)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxslam.filters.ekf.coordinates import cov_of_coordinates, with_cov_of_coordinates
-from jaxslam.filters.map_management.alignment import align
+from jaxslam.filters.map_management.alignment import align_points
 from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
 from jaxslam.filters.map_management.point_pairs import PointSets
 from jaxslam.math import linalg
@@ -211,7 +211,7 @@ def relocated(
     shared = jnp.zeros((m, 2, capacity, 2), cov.dtype)
     allowed = (slot >= 0)[:, None] & joint.alive[None]
     slot = jnp.where((slot >= 0) & joint.alive[jnp.maximum(slot, 0)], slot, -1)
-    found = align(PointSets(seen, joint.landmarks, own, among, shared, allowed), slot)
+    found = align_points(PointSets(seen, joint.landmarks, own, among, shared, allowed), slot)
     there = (slot >= 0)[:, None]
     rows = jnp.where(there[:, :, None], among[jnp.maximum(slot, 0)].reshape(m, 2, -1), 0.0)
     rows = linalg.solve_lower(found.factor, rows.reshape(2 * m, -1))

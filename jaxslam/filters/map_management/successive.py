@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxslam.filters.ekf.coordinates import cov_of_coordinates
-from jaxslam.filters.map_management.merging import closest_pair, merge
+from jaxslam.filters.map_management.merging import closest_pair, merge_landmarks
 from jaxslam.life.recency import Recency
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Chart
@@ -13,7 +13,7 @@ from jaxslam.slots import Joint
 
 def merge_histories(joint: Joint, chart: Chart, old: Int[Array, ""], new: Int[Array, ""]) -> Joint:
     """The map with slot new merged into slot old, including their times; unchanged if equal."""
-    after = merge(joint, chart, old, new)
+    after = merge_landmarks(joint, chart, old, new)
     known: Recency = joint.life
     freed = joint.alive & ~after.alive
     happened = freed.any()

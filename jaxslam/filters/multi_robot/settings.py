@@ -49,7 +49,7 @@ class TeamSettings:
         return self.capacity - 1 + robot
 
 
-def check_options(
+def check_team_options(
     robots: Sequence[Robot],
     report: int,
     chart: Chart | None,

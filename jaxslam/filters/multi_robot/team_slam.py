@@ -18,8 +18,8 @@ from jaxslam.filters.multi_robot.pose_initialization import best_initialization,
 from jaxslam.filters.multi_robot.settings import (
     SIZE,
     TeamSettings,
-    check_options,
     check_sensors,
+    check_team_options,
 )
 from jaxslam.filters.multi_robot.team_state import (
     InitialPose,
@@ -93,7 +93,7 @@ def team_slam(
     for robot in robots:
         validation.check_models("team_slam", robot.motion, robot.sensors)
     validation.check_parts("team_slam", chart=chart, associate=associate)
-    check_options(robots, report, chart, update, gate, iterations, births)
+    check_team_options(robots, report, chart, update, gate, iterations, births)
     check_sensors(robots)
     check_covariance_form("team_slam", covariance, ("plain", "joseph"))
     ekf = EkfSettings(
@@ -112,7 +112,7 @@ def team_slam(
     control_ends, place_ends, size_z = sizes(robots)
 
     def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        return initial_state(pose, pose_cov, settings)
+        return initial_team_state(pose, pose_cov, settings)
 
     def predict(joint: Joint, u: Float[Array, "U"], key: Array) -> Joint:
         for b, own in enumerate(jnp.split(u, control_ends[:-1])):
@@ -184,7 +184,7 @@ def _headings_wrapped() -> Chart:
     return dataclasses.replace(plain, retract=retract)
 
 
-def initial_state(
+def initial_team_state(
     pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"], settings: TeamSettings
 ) -> Joint:
     """The initial state: robot 0 at a pose, the others relative to it, x_b = x_0 ∘ start_b."""
@@ -204,7 +204,7 @@ def initial_state(
 
 def moved(joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings) -> Joint:
     """The state after the prediction of one robot, if it is in the map."""
-    after = propagate(
+    after, _ = propagate(
         seen_from(joint, robot, settings), u, settings.robots[robot].motion, settings.ekf
     )
     after = seen_from_first(after, robot, joint, settings)
@@ -247,7 +247,7 @@ def corrected(joint: Joint, robot: int, scan: Scan, settings: TeamSettings) -> t
     others = jnp.where(jnp.arange(len(there)) == robot, False, there)
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~there[robot]
     own = scan._replace(valid=scan.valid & ~unknown)
-    after, info, _ = update_by_scan(seen_from(joint, robot, settings), own, settings.turns[robot])
+    after, info = update_by_scan(seen_from(joint, robot, settings), own, settings.turns[robot])[:2]
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))
     return seen_from_first(after, robot, joint, settings), info

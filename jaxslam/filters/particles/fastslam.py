@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
@@ -22,7 +22,11 @@ from jaxslam.filters.particles.proposal import (
     sample_motion,
 )
 from jaxslam.filters.particles.scan_association import zero_padding
-from jaxslam.filters.particles.settings import check_resampling, particle_map_settings
+from jaxslam.filters.particles.settings import (
+    ParticleMapSettings,
+    check_resampling,
+    particle_map_settings,
+)
 from jaxslam.filters.particles.slam_state import (
     SlamParticles,
     draw_poses,
@@ -127,12 +131,8 @@ def fastslam(
         return with_finite_poses(state, moved, jnp.zeros_like(state.pose_cov))
 
     def update(state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
-        scan = zero_padding(scan)
+        each = partial(of_each_particle, zero_padding(scan), settings)
         key_resample, key_draw = jax.random.split(key)
-
-        def each(step: Callable[..., _T], *of_particles: Any) -> _T:
-            return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)
-
         state = state._replace(best=None)
         association = each(associate_particle, state)
         proposed, innovations = each(propose_pose, state, association)
@@ -148,12 +148,7 @@ def fastslam(
         state = with_drawn_poses(state._replace(log_weight=weight), key_draw)
         state, infos = each(update_map, state, association, innovations)
         best = jnp.argmax(before).astype(jnp.int32)
-        info: Info = jax.tree.map(lambda of_all: of_all[best], infos)
-        info = info._replace(
-            nis=jnp.where(has_distance(info.status), nis, 0.0),
-            log_likelihood=log_likelihood,
-            exhausted=association.exhausted.any(),
-        )
+        info = report_best(infos, best, nis, log_likelihood, association.exhausted)
         return state._replace(best=best), with_extra(info, "particles", found)
 
     def estimate(state: SlamParticles) -> Estimate:
@@ -168,6 +163,29 @@ def fastslam(
         update=update,
         estimate=estimate,
         chart=euclidean(),
+    )
+
+
+def of_each_particle(
+    scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: Any
+) -> _T:
+    """step(*of_particle, scan=…, settings=…) of every particle."""
+    return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)
+
+
+def report_best(
+    infos: Info,
+    best: Int[Array, ""],
+    nis: Float[Array, "M"],
+    log_likelihood: Float[Array, ""],
+    exhausted: Bool[Array, "P"],
+) -> Info:
+    """The `Info` of the best particle of all `infos`, with the numbers that are of all of them."""
+    info: Info = jax.tree.map(lambda of_all: of_all[best], infos)
+    return info._replace(
+        nis=jnp.where(has_distance(info.status), nis, 0.0),
+        log_likelihood=log_likelihood,
+        exhausted=exhausted.any(),
     )
 
 

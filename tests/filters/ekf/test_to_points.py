@@ -12,7 +12,7 @@ import pytest
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.charts import right_invariant
 from jaxslam.filters import compressed_ekf_slam, ekf_slam
-from jaxslam.filters.ekf.to_points import ready, reduce
+from jaxslam.filters.ekf.to_points import ready, reduce, reduction
 from jaxslam.linearize import unscented
 from jaxslam.protocols import Basis
 from jaxslam.types import Log, Scan, Status
@@ -63,7 +63,7 @@ def state_of(joint):
 def traced(name, square_root, to_point):
     """A run whose probe is the state after every step; one program for every `to_point`."""
     covariance = "square_root" if square_root else "plain"
-    options = {"chart": CHARTS[name](), "covariance": covariance, "watch": True}
+    options = {"chart": CHARTS[name](), "covariance": covariance}
     filter = ekf_slam(MOTION, camera(to_point=to_point), 4, **options)
     return jax.device_get(driven(filter, a_log(), probe=state_of)._replace(final=()))
 
@@ -93,8 +93,8 @@ def test_the_covariance_goes_through_the_derivative_of_position(name, square_roo
     np.testing.assert_array_equal(less.landmarks[0, 2:], [0, 0])
     np.testing.assert_array_equal(less.landmarks[1], joint.landmarks[1])
     np.testing.assert_array_equal(less.reduced, which)
-    directions = slope @ joint.watch.directions
-    np.testing.assert_allclose(less.watch.directions, directions, rtol=1e-9, atol=1e-9)
+    transition = reduction(joint, which, SENSOR).times(np.eye(19))
+    np.testing.assert_allclose(transition, slope, rtol=1e-9, atol=1e-9)
 
 
 @cache
@@ -125,8 +125,6 @@ def test_a_reduced_map_is_filtered_as_one_of_points(options):
     """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
     log = a_log()
     start = jax.device_get(REDUCE(joint_of(), np.array([1, 1, 1, 0], bool), SENSOR, False))
-    # Without a watch, and never to be reduced again.
-    start = start._replace(watch=None)
     keep = np.r_[0:3, np.arange(3, 19).reshape(4, 4)[:, :2].reshape(-1)]
     point = slots.Joint(
         start.pose,

@@ -12,7 +12,7 @@ from jaxslam import association, charts, motion, programs, sensors, slots
 from jaxslam.filters import eif_slam, ekf_slam
 from jaxslam.filters.map_management.closing import closing
 from jaxslam.filters.map_management.loop_closure import close_loop
-from jaxslam.filters.map_management.merging import merge
+from jaxslam.filters.map_management.merging import merge_landmarks
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
 from jaxslam.life.recency import Recency
@@ -60,7 +60,7 @@ def look(joint, **options):
     return programs.call(closed, (), joint)
 
 
-MERGE = jax.jit(lambda joint, k, m: merge(joint, EUCLIDEAN, k, m))
+MERGE = jax.jit(lambda joint, k, m: merge_landmarks(joint, EUCLIDEAN, k, m))
 
 
 @pytest.mark.parametrize("seed", range(3))

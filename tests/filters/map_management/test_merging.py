@@ -11,7 +11,7 @@ import pytest
 
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.merging import closest_pair, merge, merging
+from jaxslam.filters.map_management.merging import closest_pair, merge_landmarks, merging
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
 
@@ -32,7 +32,7 @@ def some_joint(seed=0, count=4):
     return Joint(*parts, ())
 
 
-MERGE = jax.jit(merge, static_argnums=1, static_argnames="square_root")
+MERGE = jax.jit(merge_landmarks, static_argnums=1, static_argnames="square_root")
 CLOSEST = jax.jit(closest_pair, static_argnums=1, static_argnames="square_root")
 
 

@@ -1,0 +1,54 @@
+"""The observability monitor as a wrapper: of what it is refused, and of maps that are managed."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import catalog, filters, life
+from jaxslam.filters import monitored, pruning
+from jaxslam.linearize import first_estimate
+from jaxslam.run import run
+
+WORLD = worlds.ring(steps=40)
+FEJ = catalog.variant(WORLD, linearize=first_estimate(), update="joint")
+
+
+def test_landmarks_that_leave_the_map_and_come_back_tell_nothing_of_a_turn():
+    """First estimates keep the turn unobservable; a slot begins anew with each landmark."""
+    filter = monitored(pruning(FEJ, life.existence(lambda pose, point: point[0] < 100.0)))
+    _, log = worlds.draw(WORLD)
+    valid = log.scan.valid & (np.arange(40) // 5 % 3 == 0)[:, None]
+    log = log._replace(scan=log.scan._replace(valid=valid))
+    trace = run(filter, log, WORLD.pose, WORLD.pose_cov, jax.random.key(0))
+    removed = np.asarray(trace.info.extra["pruning"].removed)
+    assert (np.diff(np.asarray(trace.estimate.alive).astype(int), axis=0) > 0)[5:].any()
+    assert removed.sum() > 5
+    state, monitor = trace.final
+    assert state.life is not None
+    turn = monitor.turn
+    assert float(turn @ monitor.information @ turn) < 1e-12 * float(monitor.scale.max())
+    assert float(monitor.scale.min()) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("filter", "why"),
+    [
+        (filters.dead_reckoning(WORLD.motion, WORLD.sensor), "dead_reckoning do not return"),
+        (filters.eif_slam(WORLD.motion, WORLD.sensor, 4), "eif_slam do not return"),
+        (dataclasses.replace(FEJ, update=lambda *given: FEJ.update(*given)), "do not return"),
+        (filters.ekf_slam, "expected filter to be a Filter"),
+    ],
+)
+def test_a_filter_without_a_linear_system_is_refused(filter, why):
+    with pytest.raises(ValueError, match=f"monitored.*{why}"):
+        monitored(filter)
+
+
+def test_a_map_is_managed_inside_the_monitor():
+    outside = pruning(monitored(FEJ), life.recency())
+    with pytest.raises(ValueError, match=r"the state of monitored ekf_slam is no slots.Joint"):
+        jax.eval_shape(outside.init, jnp.zeros(3), jnp.eye(3))
