@@ -100,6 +100,23 @@ def test_the_same_objects_are_not_traced_again():
     assert len(traced) == 4
 
 
+def test_arrays_of_numpy_need_no_program_of_their_own_and_are_copied(compilations):
+    rows = np.ones((4099, 2))
+
+    def scaled(x, y):
+        return x * rows, y + 1
+
+    x, y = np.ones((4099, 2)), np.ones(4099)
+    before = compilations()
+    first, _ = programs.call(scaled, (), x, y)
+    assert compilations() == before + 1
+    first.block_until_ready()
+    rows[:], x[:] = 7.0, 3.0
+    second, _ = programs.call(scaled, (), x, y)
+    assert (np.asarray(first) == 1.0).all()
+    assert (np.asarray(second) == 3.0).all()
+
+
 def test_within_a_trace_it_is_the_function():
     def cubed(x):
         return x**3
