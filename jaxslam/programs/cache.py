@@ -141,7 +141,7 @@ def on_device(number: Any) -> jax.Array:
     array of NumPy (jax 0.12). It is a copy: `device_put` may share the memory of its argument.
     """
     if isinstance(number, np.ndarray | np.generic):
-        return jax.device_put(np.array(number))
+        return cast(jax.Array, jax.device_put(np.array(number)))
     return jnp.asarray(number)
 
 
