@@ -20,10 +20,9 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
-from jaxtyping import install_import_hook
+import shapes
 
-# Before the package is first imported, `spending` included.
-install_import_hook("jaxslam", "shapes.checked")
+shapes.install("jaxslam")  # before the package is first imported, `spending` included
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 4)

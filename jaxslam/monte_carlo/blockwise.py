@@ -162,7 +162,8 @@ class Blockwise:
     ) -> Program:
         options = (quick_options if straight else hot_options)(self._devices[0].platform)
         compiled: Any = cache.compiled(lowered, self._devices, options)
-        keys = any(jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key) for x in numbers)
+        arrays = [x for x in numbers if isinstance(x, jax.Array)]
+        keys = any(jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in arrays)
         if self._library is not None and not keys:
             executable, _, _ = serialize_executable.serialize(compiled)
             inputs = len(jax.tree.leaves(lowered.in_avals)) - len(numbers)

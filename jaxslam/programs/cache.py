@@ -28,6 +28,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax._src import config as jax_config
 from jax._src import core as jax_core
 
@@ -124,7 +125,7 @@ def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any)
     if not outside(arguments) or jax_config.disable_jit.value:
         return function(*objects, *arguments)
     leaves, tree = jax.tree.flatten(arguments)
-    leaves = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves]
+    leaves = [leaf if isinstance(leaf, jax.Array) else on_device(leaf) for leaf in leaves]
     shapes = tuple(map(_shape_of, leaves))
     key = (Same(function), *map(Same, objects), tree, shapes, context())
     run, numbers, out = _BY_OBJECTS.get(
@@ -133,6 +134,15 @@ def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any)
     if numbers is None:  # it closes over tracers
         return function(*objects, *arguments)
     return cast(_T, jax.tree.unflatten(out, run(numbers, *leaves)))
+
+
+def on_device(number: Any) -> jax.Array:
+    """The number or array as `jnp.asarray` has it, which compiles a program for each shape of an
+    array of NumPy (jax 0.12). It is a copy: `device_put` may share the memory of its argument.
+    """
+    if isinstance(number, np.ndarray | np.generic):
+        return cast(jax.Array, jax.device_put(np.array(number)))
+    return jnp.asarray(number)
 
 
 def outside(*values: Any) -> bool:
@@ -174,7 +184,7 @@ def _program(
     if traced is None:
         return None, None, None
     lowered = jax.jit(traced.call).lower(traced.numbers, *structs)
-    numbers = [jnp.asarray(number) for number in traced.numbers]
+    numbers = [on_device(number) for number in traced.numbers]
     where = tuple(s.sharding for s in shapes), jax_config.default_device.value
     options = hot_options(jax.default_backend())
     return compiled(lowered, where, options), numbers, traced.out

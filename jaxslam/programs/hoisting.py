@@ -8,6 +8,7 @@ constants.
 """
 
 import functools
+import math
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -39,13 +40,15 @@ def _is_number(atom: Any) -> bool:
     if not isinstance(atom, core.Literal) or not jnp.issubdtype(atom.aval.dtype, jnp.floating):
         return False
     value = float(atom.val)
-    limits = jnp.finfo(atom.aval.dtype)
-    rounded = {float(np.asarray(plain, atom.aval.dtype)) for plain in _PLAIN}
-    return not (
-        np.isnan(value)
-        or value in rounded
-        or abs(value) in (float(limits.eps), float(limits.tiny), float(limits.max))
-    )
+    return not (math.isnan(value) or value in _kept(atom.aval.dtype))
+
+
+@functools.cache
+def _kept(dtype: Any) -> frozenset[float]:
+    """The numbers of a dtype that remain literals."""
+    limits = jnp.finfo(dtype)
+    ends = {sign * float(end) for sign in (1, -1) for end in (limits.eps, limits.tiny, limits.max)}
+    return frozenset({float(np.asarray(plain, dtype)) for plain in _PLAIN} | ends)
 
 
 class _Hoisting:

@@ -27,6 +27,12 @@ def random_covariance(rng, n):
     return root @ root.T
 
 
+def compiled(function):
+    """The function of one row as one of a batch, in NumPy."""
+    batched = jax.jit(jax.vmap(function))
+    return lambda *rows: jax.device_get(batched(*rows))
+
+
 @pytest.fixture(scope="module", params=REGISTRY)
 def made(request, hard_angles):
     """A sensor of the registry, mounted off the robot's centre, and its compiled functions."""
@@ -43,8 +49,8 @@ def made(request, hard_angles):
     point[1:3] += 1e4
     # Landmarks were first seen from elsewhere: one that remembers from where must not depend on it.
     first = pose + np.random.default_rng(7).normal(size=pose.shape) * [2, 2, 1]
-    embed = jax.jit(jax.vmap(sensor.embed))
-    landmark = np.asarray(embed(first, point))
+    embed = compiled(sensor.embed)
+    landmark = embed(first, point)
 
     def total(*arguments):
         return jnp.sum(sensor.observe(*arguments))
@@ -88,12 +94,12 @@ def made(request, hard_angles):
         absolute=not sensor.landmark,
         free=len(sensor.free.mean),
         angular=np.array([unit.endswith("[rad]") for unit in sensor.measurements]),
-        batched=jax.jit(jax.vmap(everything)),
-        placing=jax.jit(jax.vmap(placing)),
+        batched=compiled(everything),
+        placing=compiled(placing),
         embed=embed,
-        observe=jax.jit(jax.vmap(sensor.observe)),
-        residual=jax.jit(jax.vmap(sensor.residual)),
-        invert=jax.jit(jax.vmap(sensor.invert)),
+        observe=compiled(sensor.observe),
+        residual=compiled(sensor.residual),
+        invert=compiled(sensor.invert),
     )
 
 

@@ -67,7 +67,7 @@ def slopes():
         each = {n: partial(estimated, method=m, count=150) for n, m in METHODS.items()}
         return {n: jax.value_and_grad(f)(a, key) for n, f in each.items()}
 
-    found = jax.jit(jax.vmap(all_of, (None, 0)))(A, keys)
+    found = jax.device_get(jax.jit(jax.vmap(all_of, (None, 0)))(A, keys))
     return {n: [(x.mean(), x.std() / seeds) for x in both] for n, both in found.items()}
 
 
@@ -97,7 +97,7 @@ def test_soft_resampling_lies_between_and_is_biased(slopes):
 def test_the_weights_of_soft_copies_are_the_ratio_to_what_they_were_drawn_from():
     w = np.array([0.5, 0.3, 0.2, 0.0])
     with np.errstate(divide="ignore"):
-        log_w = jnp.asarray(np.log(w) + 50)
+        log_w = np.log(w) + 50
     ancestor, after = jax.jit(soft(0.6))(log_w, jax.random.key(3))
     q = 0.6 * w + 0.4 / 4
     share = (w / q)[np.asarray(ancestor)]
@@ -118,7 +118,7 @@ def test_gradients_stay_finite_and_the_sum_is_one(method, log_w):
         ancestor, after = method(x, jax.random.key(0))
         return (jnp.exp(after) * (1.0 + ancestor)).sum(), after
 
-    (value, after), slope = jax.jit(jax.value_and_grad(cost, has_aux=True))(jnp.array(log_w))
+    (value, after), slope = jax.jit(jax.value_and_grad(cost, has_aux=True))(np.array(log_w))
     chex.assert_tree_all_finite((value, slope))
     np.testing.assert_allclose(np.exp(after).sum(), 1.0, rtol=1e-12)
 
@@ -131,22 +131,24 @@ def test_bad_shares_are_refused():
 
 # --- KLD sampling -------------------------------------------------------------------------------
 
+BOUND = jax.jit(kld_bound, static_argnums=2)
+
 
 def test_the_bound_against_plain_arithmetic_and_against_chi_square():
     z = scipy.stats.norm.ppf(0.99)
     for k in (2, 10, 100, 1000):
         d = k - 1
         wanted = d / (2 * 0.05) * (1 - 2 / (9 * d) + math.sqrt(2 / (9 * d)) * z) ** 3
-        np.testing.assert_allclose(kld_bound(jnp.asarray(k), 0.05, 0.99), wanted, rtol=1e-12)
+        np.testing.assert_allclose(BOUND(np.asarray(k), 0.05, 0.99), wanted, rtol=1e-12)
         # what it approximates: the quantile of chi square over 2 ε
         np.testing.assert_allclose(wanted, scipy.stats.chi2.ppf(0.99, d) / 0.1, rtol=0.02)
-    np.testing.assert_array_equal(kld_bound(jnp.array([0, 1]), 0.05, 0.99), 0.0)
+    np.testing.assert_array_equal(BOUND(np.array([0, 1]), 0.05, 0.99), 0.0)
 
 
 def test_the_bound_keeps_its_promise():
     """Of n draws of a uniform distribution over k bins the divergence is below ε, 99 in 100."""
     rng, k, error = np.random.default_rng(0), 30, 0.05
-    n = math.ceil(float(kld_bound(jnp.asarray(k), error, 0.99)))
+    n = math.ceil(float(BOUND(np.asarray(k), error, 0.99)))
     share = rng.multinomial(n, np.full(k, 1 / k), size=4000) / n
     divergence = (share * np.log(np.where(share > 0, share * k, 1.0))).sum(axis=1)
     assert abs((divergence < error).mean() - 0.99) < 0.006
@@ -157,24 +159,26 @@ def test_enough_is_foxs_loop():
     rng = np.random.default_rng(2)
     pose = np.column_stack([rng.normal(size=(600, 2)), rng.uniform(-np.pi, np.pi, 600)])
     size = (0.5, 0.7, math.radians(25))
+    enough = jax.jit(lambda moved, *of: kld.enough(kld.bins_of(moved, size), *of, 0.99))
     for spread, least, error in ((1.0, 20, 0.5), (0.2, 20, 0.1), (0.01, 33, 0.05), (3.0, 5, 0.05)):
         moved = pose * [spread, spread, 1.0]
-        bound = np.asarray(kld_bound(jnp.arange(601), error, 0.99))
+        bound = np.asarray(BOUND(np.arange(601), error, 0.99))
         seen, wanted, few = set(), len(pose), True
         for m, (x, y, heading) in enumerate(moved, start=1):
             seen.add((x // size[0], y // size[1], (heading + math.pi) // size[2]))
             if m >= least and m >= bound[len(seen)]:
                 wanted, few = m, False
                 break
-        found, short = kld.enough(kld.bins_of(jnp.asarray(moved), size), least, error, 0.99)
+        found, short = enough(moved, least, error)
         assert (int(found), bool(short)) == (wanted, few)
 
 
 def test_headings_on_both_sides_of_the_seam_and_poses_far_away_have_bins():
     size = (1.0, 1.0, 2 * math.pi / 6)
     pose = np.array([[0, 0, np.pi], [0, 0, -np.pi], [1e300, -1e300, 0.0], [-0.5, 0.5, 0.0]])
-    bins = np.asarray(kld.bins_of(jnp.asarray(pose), size))
+    bins = np.asarray(jax.jit(partial(kld.bins_of, size=size))(pose))
+    occupied = jax.jit(kld.occupied)
     np.testing.assert_array_equal(bins[:2], [[0, 0, 5], [0, 0, 0]])
     np.testing.assert_array_equal(bins[3], [-1, 0, 3])
-    np.testing.assert_array_equal(kld.occupied(jnp.asarray(bins)), [1, 2, 3, 4])
-    np.testing.assert_array_equal(kld.occupied(jnp.asarray(bins[[0, 0, 1, 0, 1]])), [1, 1, 2, 2, 2])
+    np.testing.assert_array_equal(occupied(bins), [1, 2, 3, 4])
+    np.testing.assert_array_equal(occupied(bins[[0, 0, 1, 0, 1]]), [1, 1, 2, 2, 2])

@@ -168,7 +168,7 @@ def test_gradients_reach_alpha(name):
     slope = jax.jit(jax.grad(total))
     np.testing.assert_allclose(slope(np.zeros(count)), expected, rtol=1e-13)
     # Some of the constants may be traced, the others not.
-    part = jax.grad(lambda a: total([a, *[0.1] * (count - 1)]))(0.2)
+    part = jax.jit(jax.grad(lambda a: total([a, *[0.1] * (count - 1)])))(0.2)
     np.testing.assert_allclose(part, expected[0], rtol=1e-13)
 
 
@@ -196,7 +196,7 @@ def test_bad_alphas_are_refused(name, spoil):
         noise(bad)
     if np.shape(bad) != (count,) and bad is not None:
         with pytest.raises(ValueError, match=f"^{name}_noise: .*alpha"):
-            jax.eval_shape(lambda a: noise(a)(jnp.zeros(3), jnp.zeros(3)), jnp.asarray(bad))
+            jax.eval_shape(lambda a: noise(a)(np.zeros(3), np.zeros(3)), np.asarray(bad))
 
 
 # --- velocity -----------------------------------------------------------------------------------
@@ -496,7 +496,7 @@ def test_gradients_reach_the_cars_lengths():
         np.concatenate([np.ravel(s) for s in slopes]), rises / 2e-5, rtol=1e-8
     )
     # One of the sensor's two lengths may be traced, the other not.
-    part = jax.grad(lambda a: total(L, (a, B), H))(A)
+    part = jax.jit(jax.grad(lambda a: total(L, (a, B), H)))(A)
     np.testing.assert_allclose(part, slopes[1][0], rtol=1e-12)
 
 
@@ -528,8 +528,8 @@ def test_impossible_cars_are_refused(bad):
 def test_traced_lengths_are_checked_for_their_shape():
     def build(**lengths):
         model = ackermann(NO_NOISE[2], **lengths)
-        return model.step(jnp.zeros(3), jnp.ones(3), jnp.zeros(2))
+        return model.step(np.zeros(3), np.ones(3), np.zeros(2))
 
     for name, shape in (("wheelbase", (1,)), ("sensor", (3,)), ("encoder", (2,))):
         with pytest.raises(ValueError, match=f"^ackermann: .*{name}"):
-            jax.eval_shape(build, **{name: jnp.zeros(shape)})
+            jax.eval_shape(build, **{name: np.zeros(shape)})

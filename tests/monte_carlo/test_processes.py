@@ -9,17 +9,23 @@ import subprocess
 import sys
 import time
 
+import jax
 import pytest
+
+from jaxslam import cli
 
 RUNS = 24
 
 
-def command(out, *more, runs=RUNS):
-    """Of a filter that is soon compiled: each process compiles for itself."""
-    asked = ["--scenario", "circle", "--filters", "dead_reckoning", "--steps", "60", "--no-bound"]
+def arguments(out, *more, runs=RUNS, filters="ekf"):
+    asked = ["--scenario", "circle", "--filters", filters, "--steps", "60", "--no-bound"]
     asked += ["--runs", str(runs)]
     shape = ["--devices", "1", "--block", "2", "--out", str(out)]
-    return [sys.executable, "-m", "jaxslam", "consistency", *asked, *shape, *more]
+    return ["consistency", *asked, *shape, *more]
+
+
+def command(out, *more, **options):
+    return [sys.executable, "-m", "jaxslam", *arguments(out, *more, **options)]
 
 
 def together(out, count, *more, **options):
@@ -47,8 +53,10 @@ def results(out):
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
+    """By the command in this process; its programs are kept on the disk, where the others find them."""
     out = tmp_path_factory.mktemp("alone")
-    subprocess.run(command(out), check=True, capture_output=True)
+    jax.devices()  # before the command can ask for another number of them
+    assert cli.main(arguments(out)) == 0
     return results(out)
 
 
@@ -62,8 +70,9 @@ def test_processes_together_are_one_alone(tmp_path, alone, count):
 
 
 def test_a_killed_process_loses_no_finished_run(tmp_path):
-    many = 8000  # so many that they are not done before one is killed
-    processes = together(tmp_path, 2, runs=many)
+    # So many that they are not done before one is killed, of a filter that is soon compiled.
+    many = {"runs": 8000, "filters": "dead_reckoning"}
+    processes = together(tmp_path, 2, **many)
     blocks = tmp_path / "blocks"
     deadline = time.monotonic() + 200
     while len(list(blocks.glob("*.npz"))) < 6 and time.monotonic() < deadline:
@@ -76,7 +85,7 @@ def test_a_killed_process_loses_no_finished_run(tmp_path):
     assert len(done) >= 6
 
     stale = sorted(done)[-1]
-    again = command(tmp_path, runs=many)
+    again = command(tmp_path, **many)
     again = [
         *again[: again.index("--out")],
         "--resume",
@@ -93,7 +102,7 @@ def test_a_killed_process_loses_no_finished_run(tmp_path):
     resumed.send_signal(signal.SIGINT)
     said = resumed.communicate(timeout=120)[0]
     assert resumed.returncode == 130, said
-    assert f"of {many} runs done" in said
+    assert f"of {many['runs']} runs done" in said
     assert "--resume" in said
     now = {path.name: path.read_bytes() for path in blocks.glob("block-*.npz")}
     assert len(now) > count

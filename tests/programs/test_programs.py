@@ -100,6 +100,30 @@ def test_the_same_objects_are_not_traced_again():
     assert len(traced) == 4
 
 
+def ones(rows):
+    """(rows, 2) at an address from which JAX on a CPU may share memory: a multiple of 64."""
+    room = np.ones(2 * rows + 8)
+    return room[-room.ctypes.data % 64 // 8 :][: 2 * rows].reshape(rows, 2)
+
+
+def test_arrays_of_numpy_need_no_program_of_their_own_and_are_copied(compilations):
+    rows = ones(4099)
+
+    def scaled(x, y):
+        return x * rows, y + 1
+
+    programs.call(jnp.sin, (), 0.5)  # a first program asks which options the compiler has
+    x, y = ones(4099), np.ones(4099)
+    before = compilations()
+    first, _ = programs.call(scaled, (), x, y)
+    assert compilations() == before + 1
+    first.block_until_ready()
+    rows[:], x[:] = 7.0, 3.0
+    second, _ = programs.call(scaled, (), x, y)
+    assert (np.asarray(first) == 1.0).all()
+    assert (np.asarray(second) == 3.0).all()
+
+
 def test_within_a_trace_it_is_the_function():
     def cubed(x):
         return x**3

@@ -27,7 +27,7 @@ def world():
 
 
 def on_poses(filter, truth, log):
-    start = jnp.zeros(3), jnp.zeros((3, 3)), KEY
+    start = np.zeros(3), np.zeros((3, 3)), KEY
     return jax.device_get(run(filter, log._replace(control=truth.pose), *start))
 
 
@@ -117,9 +117,14 @@ def test_refusals():
             mapping(sensor, **({"capacity": 3} | options))
     with pytest.raises(ValueError, match="absolute"):
         mapping(sensors.compass(np.eye(1)), 3)
-    final = mapping(sensor, 2).init(jnp.zeros(3), jnp.eye(3))
+    final = jax.eval_shape(mapping(sensor, 2).init, np.zeros(3), np.eye(3))
+
+    def prior(slam, pose):
+        return jax.eval_shape(lambda final: as_prior(final, slam, pose, np.eye(3)), final)
+
+    assert prior(ekf_slam(ring(3).motion, sensor, 2), np.zeros(3)).cov.shape == (7, 7)
     with pytest.raises(ValueError, match=r"pose \(3,\)"):
-        as_prior(final, ekf_slam(ring(3).motion, sensor, 2), jnp.zeros(2), jnp.eye(3))
+        prior(ekf_slam(ring(3).motion, sensor, 2), np.zeros(2))
     for options, message in (
         ({"capacity": 3}, "a filter of 2 landmarks"),
         ({"chart": charts.right_invariant()}, "Euclidean"),
@@ -129,4 +134,4 @@ def test_refusals():
     ):
         other = ekf_slam(ring(3).motion, sensor, **({"capacity": 2} | options))
         with pytest.raises(ValueError, match=message):
-            as_prior(final, other, jnp.zeros(3), jnp.eye(3))
+            prior(other, np.zeros(3))
