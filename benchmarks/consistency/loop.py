@@ -16,6 +16,7 @@ from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
 from jaxslam.consistency import own_error_of, score
+from jaxslam.consistency.statistics import statistics
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.results.plot import COLORS
 from jaxslam.run import run
@@ -135,11 +136,18 @@ def campaign(names, maps: int, runs: int, steps: int, seed: int, noise=1.0, bloc
             probe=lambda state: state.monitor.information,
         )
         own = own_error_of(filter.chart, here.sensor, trace, truth)
-        scores = score(trace, truth, here.sensor, own)
+        # Of the estimate a score looks at poses alone.
+        seen = trace._replace(estimate=trace.estimate[:2])
+        return seen, truth, statistics(trace, truth, here.sensor), own
 
-        def average(total: jax.Array, weight: jax.Array) -> jax.Array:
+    def averages(go, rows):
+        """Each run's own averages, and how many measurements found no slot in a scan."""
+        trace, truth, *found = jax.device_get(go(jnp.asarray(landmarks[rows]), keys[rows]))
+        scores = score(trace, truth, *found)
+
+        def average(total, weight):
             there = scores.finite & (weight > 0)
-            return jnp.where(there, total / jnp.where(there, weight, 1), jnp.nan)
+            return np.where(there, total / np.where(there, weight, 1), np.nan)
 
         return {m: average(*scores.measures[m]) for m in MEASURES}, truth.missed.sum()
 
@@ -151,14 +159,7 @@ def campaign(names, maps: int, runs: int, steps: int, seed: int, noise=1.0, bloc
             go = (
                 jax.jit(jax.vmap(partial(one, name))).lower(landmarks[first], keys[first]).compile()
             )
-            parts = list(
-                pool.map(
-                    lambda i, go=go: jax.device_get(
-                        go(jnp.asarray(landmarks[i : i + block]), keys[i : i + block])
-                    ),
-                    starts,
-                )
-            )
+            parts = list(pool.map(lambda i, go=go: averages(go, slice(i, i + block)), starts))
             assert sum(missed.sum() for _, missed in parts) == 0, "a scan had too few places"
             out[name] = {
                 m: np.concatenate([kept[m] for kept, _ in parts]).reshape(maps, runs)
