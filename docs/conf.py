@@ -18,7 +18,13 @@ project = "jaxslam"
 author = copyright = "The jaxslam authors"
 version = release = importlib.metadata.version("jaxslam")
 
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.mathjax", "myst_nb", "reference"]
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",
+    "myst_nb",
+    "reference",
+]
 exclude_patterns = ["_build", "_ext"]
 suppress_warnings = ["mystnb.unknown_mime_type"]
 

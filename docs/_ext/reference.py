@@ -166,8 +166,9 @@ def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: lis
 
     text = "\n".join(lines)
     of = obj if inspect.isclass(obj) else type(obj)
-    borrowed = (inspect.getdoc(of) or "").partition("\n")[0]
-    if what in ("data", "attribute") and text.partition("\n")[0].strip() == borrowed:
+    first = text.strip().partition("\n")[0]
+    borrowed = first.startswith(f"{of.__name__}(") or first in (inspect.getdoc(of) or "")
+    if what in ("data", "attribute") and borrowed:
         lines.clear()
         return
     pieces = re.split(r"(`[^`]*`)", text)

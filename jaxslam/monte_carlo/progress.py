@@ -11,15 +11,16 @@ from jaxslam.consistency import DOF, Measure
 class Progress:
     """A progress bar on a terminal's standard error or below a notebook's cell, gone at the end.
 
-    Where there is neither, as in a pipe, nothing is written and `shown` is false.
+    Where there is neither, as in a pipe, or where TERM is "dumb", nothing is written and `shown` is
+    false.
     """
 
     def __init__(self, what: str, unit: str = "runs") -> None:
         self._what, self._unit = what, unit
         self._began = time.perf_counter()
-        there = sys.stderr is not None and sys.stderr.isatty()
-        self._terminal = there and os.environ.get("TERM") != "dumb"
-        self._cell = None if self._terminal else _notebook_cell()
+        plain = os.environ.get("TERM") == "dumb"
+        self._terminal = not plain and sys.stderr is not None and sys.stderr.isatty()
+        self._cell = None if plain or self._terminal else _notebook_cell()
         self._first: tuple[float, int] | None = None
 
     @property

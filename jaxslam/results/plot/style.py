@@ -76,7 +76,7 @@ def describe(figure: Figure) -> str:
     return (f"{said}. Drawn: {', '.join(named)}." if named else f"{said}.").replace(r"\$", "$")
 
 
-class ShownFigure(Figure):
+class _ShownFigure(Figure):
     """A figure that a notebook shows as it is, whether or not pyplot was imported."""
 
     def _repr_png_(self) -> bytes:
@@ -99,7 +99,7 @@ def panels_of(
     share: whether panels share abscissae and ordinates, as Matplotlib says it. widths, heights:
     ratios of columns and rows.
     """
-    figure = ShownFigure(figsize=(width, height), dpi=150, layout="constrained")
+    figure = _ShownFigure(figsize=(width, height), dpi=150, layout="constrained")
     grid = figure.subplots(
         rows,
         columns,
