@@ -4,6 +4,7 @@ import hashlib
 import importlib.metadata
 import os
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import jax
@@ -21,7 +22,6 @@ version = release = importlib.metadata.version("jaxslam")
 extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
-    "sphinx-mathjax-offline",
     "myst_nb",
     "reference",
 ]
@@ -30,7 +30,10 @@ suppress_warnings = ["mystnb.unknown_mime_type"]
 
 html_theme = "furo"
 html_title = "jaxslam"
-html_static_path = ["_static"]
+# MathJax from a package instead of a network. As an extension it would forbid parallel reading.
+(mathjax,) = find_spec("sphinx-mathjax-offline").submodule_search_locations
+html_static_path = ["_static", str(Path(mathjax) / "static")]
+mathjax_path = "mathjax/tex-mml-chtml.js"
 html_css_files = ["jaxslam.css"]
 pygments_style = "friendly"
 
