@@ -43,7 +43,7 @@ class Spread(NamedTuple):
     three times s/m, which that of a run's average NEES is about (the χ² of the common factor of its
     steps has 2, a sum of a constant and such a χ² more). f = `SKEW` accounts for the spread of s of
     skewed numbers, and 1 is for numbers whose spread is small. Calibrated by simulation:
-    `python -m benchmarks.verdict`.
+    `python -m benchmarks --record --only verdict`.
     """
 
     mean: float

@@ -102,10 +102,11 @@ def mrclam_team(
     (v, ω, Δt) for each robot as in `mrclam`. Measurement slots of a scan are ordered by robot,
     those for landmarks before those for robots; tags N, N + 1, … are the robots in the given order.
     The first robot's start is the map's frame. The files do not give the others' starts, which the
-    filter has to estimate. Measurements of robots are less accurate than those of landmarks: over
-    the first half of data set 1, robots 1 to 3, their errors are 0.24 m and 0.078 rad (NIS/dof 5.7
-    with the noise of landmarks), so a `sighting_cov` of their own is advisable. Measurements of
-    other robots are dropped and counted; all else is as in `mrclam`.
+    filter has to estimate. Measurements of robots are less accurate than those of landmarks: of
+    robots 1 to 3 of data set 1, their innovations have standard deviations of 0.18 m and 0.048 rad
+    (NIS/dof 2.5 with the noise of landmarks; `python -m benchmarks --record --only team`), so a
+    `sighting_cov` of their own is advisable. Measurements of other robots are dropped and counted;
+    all else is as in `mrclam`.
 
         data = mrclam_team(folder)
         filter = team_slam(data.robots, data.capacity)
