@@ -1,16 +1,15 @@
 """The record that readers return: a log with models, noise and options of a filter for it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.team import Robot
-from jaxslam.types import Log, Scan
+from jaxslam.types import Log
 from jaxslam.validation.logs import check_log
 
 
@@ -91,32 +90,3 @@ class Dataset:
     def measurements(self) -> int:
         """The number of measurements in the log."""
         return int(np.sum(self.log.scan.valid))
-
-
-def make_log(
-    control: Sequence[Sequence[float]] | Float[np.ndarray, "T U"],
-    row: Sequence[int] | Int[np.ndarray, "K"],
-    tag: Sequence[int] | Int[np.ndarray, "K"],
-    z: Sequence[Sequence[float]] | Float[np.ndarray, "K Z"],
-) -> Log:
-    """A log of T controls, with measurement z[k] of tag[k] in the scan of row[k].
-
-    Scans keep the order of the measurements. They are padded to the largest one with z 0, tag -1.
-    """
-    controls, rows = np.asarray(control, np.float64), np.asarray(row, np.int64)
-    values = np.asarray(z, np.float64)
-    steps = controls.shape[0]
-    count = np.bincount(rows, minlength=steps)
-    order = np.argsort(rows, kind="stable")
-    rows = rows[order]
-    slot = np.arange(rows.size) - (np.cumsum(count) - count)[rows]
-    slots = int(np.max(count))
-    # Any, because the fields of a Log are declared as JAX arrays.
-    padded_z: Any = np.zeros((steps, slots, values.shape[1]))
-    padded_tag: Any = np.full((steps, slots), -1, np.int32)
-    valid: Any = np.zeros((steps, slots), bool)
-    padded_z[rows, slot] = values[order]
-    padded_tag[rows, slot] = np.asarray(tag, np.int32)[order]
-    valid[rows, slot] = True
-    held: Any = controls
-    return Log(held, Scan(padded_z, padded_tag, valid))
