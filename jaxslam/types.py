@@ -75,7 +75,13 @@ class Log(NamedTuple):
     ) -> "Log":
         """The log of odometry (times, values) and measurements (times, tags, values); see
         `streams.align`, which says what they, the rule and the rows are. Arrays are NumPy's."""
-        return _log_of(streams.align(odometry, measurements, rule, rows))
+        return cls.from_rows(streams.align(odometry, measurements, rule, rows))
+
+    @classmethod
+    def from_rows(cls, rows: streams.Rows) -> "Log":
+        """The log of aligned rows; arrays are NumPy's."""
+        held: Any = rows  # the fields are declared as JAX arrays
+        return cls(held.control, Scan(held.z, held.tag, held.valid))
 
     @classmethod
     def from_records(
@@ -112,12 +118,7 @@ class Log(NamedTuple):
         columns = records.measurement_columns(measured, sensor.landmark)
         seen = records.table(f"{name}: measurements", measurements, lambda _: columns)
         rows, tags, dropped = records.align(moved, seen, controls, measured)
-        return Recording(_log_of(rows), rows.time, tags, dropped)
-
-
-def _log_of(rows: streams.Rows) -> Log:
-    held: Any = rows  # the fields of a Log are declared as JAX arrays
-    return Log(held.control, Scan(held.z, held.tag, held.valid))
+        return Recording(cls.from_rows(rows), rows.time, tags, dropped)
 
 
 class Recording(NamedTuple):

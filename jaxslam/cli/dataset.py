@@ -13,13 +13,12 @@ from jaxtyping import Float
 
 from jaxslam.cli.common import Progress, pick
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
-from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS
+from jaxslam.datasets.evaluation import Evaluation, evaluate
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.math import se2
 from jaxslam.results import report
 from jaxslam.results.files import check_writable, json_text, versions, write_files
-from jaxslam.types import Status
+from jaxslam.types import Status, Truth
 
 
 def run_dataset(options: argparse.Namespace, command: str) -> int:
@@ -57,21 +56,24 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         },
         "dropped by the reader": data.dropped,
         "corrections to the data": list(data.corrections),
+        "defaults taken": list(data.assumed),
         "NIS / dof": float(nis / max(int(result.dof.sum()), 1)),
         "log-likelihood": float(result.log_likelihood.sum()),
         "P positive definite": _definiteness(result),
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
-    surveyed = None
-    if data.landmarks is not None and summary["landmarks"]:
-        frame, summary["map RMSE after alignment [m]"] = align_map(last, data.landmarks)
-        into_map = jax.vmap(se2.to_frame, (None, 0))
-        surveyed = np.asarray(into_map(jnp.asarray(frame), jnp.asarray(data.landmarks)))
+    found = evaluate(data, result.path, last)
+    summary |= found.errors
     from jaxslam.results import plot  # matplotlib is slow to load
 
     at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive")}
-    figure = plot.map_figure(result.path._replace(**at_end), true_points=surveyed, title=data.name)
+    figure = plot.map_figure(
+        result.path._replace(**at_end),
+        truth=_truth(found),
+        true_points=found.points,
+        title=data.name,
+    )
     files: dict[str, str | Callable[[Path], object]] = {
         "trajectory.csv": report.trajectory_csv(data.time, result.path),
         "map.csv": report.map_csv(last, data.tags),
@@ -83,6 +85,16 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     written = write_files(options.out, files)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
+
+
+def _truth(found: Evaluation) -> Truth | None:
+    """The true path and the survey as the figure takes them; None without a true path."""
+    if found.path is None:
+        return None
+    points: Any = np.zeros((0, 2)) if found.points is None else found.points
+    path: Any = found.path
+    missed: Any = np.zeros(len(path))
+    return Truth(path, points, missed, path[0])
 
 
 def positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
