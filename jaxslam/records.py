@@ -9,12 +9,13 @@ import numpy as np
 from jaxslam import streams
 
 UNITS: dict[str, dict[str, float]] = {
-    "rad": {"deg": math.pi / 180},
-    "rad/s": {"deg/s": math.pi / 180},
-    "m": {"mm": 1e-3, "cm": 1e-2},
-    "s": {"ms": 1e-3},
+    "rad": {"deg": 180 / math.pi},
+    "rad/s": {"deg/s": 180 / math.pi},
+    "m": {"mm": 1000.0, "cm": 100.0},
+    "s": {"ms": 1000.0},
 }
-"""Other units in which a column may be given, with what brings them to the unit of the model."""
+"""Other units in which a column may be given, and how many of them are one of the model's. Values
+are divided by it, so that 1400 ms are the 1.4 s of another file to the bit."""
 
 TIME, TAG, INTERVAL = "t [s]", "tag", "dt [s]"
 POSE = ("x [m]", "y [m]", "theta [rad]")
@@ -49,8 +50,8 @@ def split_unit(name: str) -> tuple[str, str | None]:
     return bare.strip(), unit.rstrip("] ").strip() if bracket else None
 
 
-def unit_factor(unit: str | None, wanted: str) -> float | None:
-    """What brings a column in a unit to the wanted column's; None where nothing does."""
+def unit_divisor(unit: str | None, wanted: str) -> float | None:
+    """By what a column in a unit is divided to be the wanted column; None where nothing does."""
     target = split_unit(wanted)[1] or ""
     if unit is None or unit == target:
         return 1.0
@@ -136,11 +137,9 @@ def check_times(table: Table, *, strict: bool) -> None:
     time = table.columns[TIME]
     back = np.flatnonzero(np.diff(time) <= 0 if strict else np.diff(time) < 0)
     if back.size:
-        before, at = time[back[0]], time[back[0] + 1]
-        wanted = f"above {before:.17g}" if strict else f"of at least {before:.17g}"
-        raise ValueError(
-            f"{table.at(int(back[0]) + 1, TIME)}: expected a time {wanted}, got {at:.17g}"
-        )
+        before, at = time[back[0] : back[0] + 2].tolist()
+        wanted = f"above {before}" if strict else f"of at least {before}"
+        raise ValueError(f"{table.at(int(back[0]) + 1, TIME)}: expected a time {wanted}, got {at}")
 
 
 def ordered(names: set[Any]) -> list[Any]:
@@ -179,18 +178,18 @@ def table(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence[str]
                     f"got {size}"
                 )
         found = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
-        factors = dict.fromkeys(needed, 1.0)
+        divisors = dict.fromkeys(needed, 1.0)
     else:
         own = {split_unit(name)[0]: name for name in names}
-        found, factors = {}, {}
+        found, divisors = {}, {}
         for name in needed:
             bare = split_unit(name)[0]
             if bare not in own:
                 raise ValueError(f"{what}: expected a column {name!r}, got {', '.join(names)}")
-            factor = unit_factor(split_unit(own[bare])[1], name)
-            if factor is None:
+            divisor = unit_divisor(split_unit(own[bare])[1], name)
+            if divisor is None:
                 raise ValueError(f"{what}: expected the column {name!r}, got {own[bare]!r}")
-            found[name], factors[name] = list(given[own[bare]]), factor
+            found[name], divisors[name] = list(given[own[bare]]), divisor
         lengths = {name: len(column) for name, column in found.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"{what}: expected columns of one length, got {lengths}")
@@ -199,7 +198,7 @@ def table(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence[str]
         if name == TAG:
             columns[name] = [_landmark(at(k, name), value) for k, value in enumerate(column)]
         else:
-            columns[name] = factors[name] * _numbers(at, name, column)
+            columns[name] = _numbers(at, name, column) / divisors[name]
     if not columns[TIME].size:
         raise ValueError(f"{what}: expected at least one row, got none")
     return Table(columns, at)

@@ -80,8 +80,9 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         "summary.json": json_text(summary | {"versions": versions()}),
         "map.png": figure.savefig,
     }
+    width = max(map(len, summary))
     for name, value in summary.items():
-        print(f"{name:30} {_shown(value)}")
+        print(f"{name:{width}} {_shown(value)}")
     written = write_files(options.out, files)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.records import TAG, UNITS, Table, split_unit, unit_factor
+from jaxslam.records import TAG, UNITS, Table, split_unit, unit_divisor
 
 
 class CsvTable:
@@ -35,6 +35,8 @@ class CsvTable:
         self.head_line, self.header = lines[0]
         self.lines = [number for number, _ in lines[1:]]
         self.cells = [cells for _, cells in lines[1:]]
+        if len(self.header) == 1 and ";" in self.header[0]:
+            raise self._error(self.head_line, "expected cells separated by commas, got ';'")
         if not self.cells:
             raise self._error(self.head_line, "expected lines below the header, got none")
         self.names = [split_unit(name)[0] for name in self.header]
@@ -78,17 +80,13 @@ class CsvTable:
     def _place(self, name: str, why: str) -> int:
         bare = split_unit(name)[0]
         if bare not in self.names:
-            got, hint = ", ".join(map(repr, self.header)), ""
-            if len(self.header) == 1 and ";" in self.header[0]:
-                hint = "; cells are separated by commas"
-            raise self._error(
-                self.head_line, f"expected a column {name!r} ({why}), got {got}{hint}"
-            )
+            got = ", ".join(map(repr, self.header))
+            raise self._error(self.head_line, f"expected a column {name!r} ({why}), got {got}")
         place = self.names.index(bare)
         unit, target = split_unit(self.header[place])[1], split_unit(name)[1]
         if target is None:
             return place
-        if unit is None or unit_factor(unit, name) is None:
+        if unit is None or unit_divisor(unit, name) is None:
             known = " or ".join(f"[{one}]" for one in (target, *UNITS.get(target, {})))
             raise self._error(
                 self.head_line, f"expected a unit {known}, got {self.header[place]!r}", place
@@ -96,7 +94,7 @@ class CsvTable:
         return place
 
     def _numbers(self, place: int, name: str) -> np.ndarray:
-        factor = unit_factor(split_unit(self.header[place])[1], name)
+        divisor = unit_divisor(split_unit(self.header[place])[1], name)
         values = np.empty(len(self.cells))
         for row, cells in enumerate(self.cells):
             values[row] = _number(cells[place])
@@ -107,7 +105,7 @@ class CsvTable:
             raise self._error(
                 self.lines[row], f"expected a finite number, got {cell!r}{hint}", place
             )
-        return values * (factor or 1.0)
+        return values / (divisor or 1.0)
 
     def _tags(self, place: int) -> list[int | None]:
         tags: list[int | None] = []

@@ -104,7 +104,7 @@ class Settings:
         if not all(deviations):
             raise ValueError(f"{self.path}: [sensor] noise: expected numbers above 0")
         if "mount" not in options and "mount" in inspect.signature(factory).parameters:
-            self.assumed.append("[sensor] mount = [0, 0, 0]")
+            self.assumed.append("[sensor] mount = [0.0, 0.0, 0.0]")
         built: Sensor = self._built("sensor", factory, options, np.diag(deviations) ** 2)
         return built
 
@@ -163,11 +163,11 @@ class Settings:
     def start_noise(self) -> np.ndarray:
         """Its standard deviations (3,)."""
         asked = self._three("start_noise")
-        if asked is not None and (asked < 0).any():
+        if asked is None:
+            return np.array(self._default("filter", "start_noise", [0.0, 0.0, 0.0]))
+        if (asked < 0).any():
             raise ValueError(f"{self.path}: [filter] start_noise: expected numbers of at least 0")
-        return (
-            np.array(self._default("filter", "start_noise", [0, 0, 0])) if asked is None else asked
-        )
+        return asked
 
     def _filter(self) -> dict[str, Any]:
         section: dict[str, Any] = self.content.get("filter", {})

@@ -72,3 +72,24 @@ def test_the_command_says_in_how_many_steps_it_looked(tmp_path, capsys, refused)
     refused([*run, tmp_path / "b", "--check-every", "-1"], message)
     assert not (tmp_path / "b").exists()
     assert jax.config.jax_enable_x64
+
+
+def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
+    (tmp_path / "odometry.csv").write_text("t [s],v [m/s],omega [rad/s]\n0,1,0.1\n1,1,0\n")
+    (tmp_path / "measurements.csv").write_text(
+        "t [s],tag,range [m],bearing [rad]\n0,7,5,0.1\n1,7,4,0.1\n1,,3,-1\n"
+    )
+    (tmp_path / "truth.csv").write_text("t [s],x [m],y [m],theta [deg]\n0,0,0,0\n1,1,0,6\n")
+    (tmp_path / "landmarks.csv").write_text("tag,x [m],y [m]\n7,5,0.5\n")
+    (tmp_path / "dataset.toml").write_text("[filter]\ncapacity = 3\n")
+    out = tmp_path / "out"
+    assert cli.main(["run", "--dataset", "table", str(tmp_path), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "[sensor] noise = [0.1, 0.05] (range [m], bearing [rad])" in printed
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["ATE [m]"] < 0.2
+    assert 0 < summary["landmark NEES (2 is honest)"] < 10
+    assert summary["status"]["born"] == 2
+    # The landmark without a tag has no name.
+    named = [line.split(",")[0] for line in (out / "map.csv").read_text().splitlines()]
+    assert named == ["landmark", "7", ""]
