@@ -1,10 +1,11 @@
-"""The command `jaxslam run`: EKF-SLAM on a recorded data set."""
+"""The command `jaxslam run`: filters on a recorded data set."""
 
 import argparse
 import time
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,37 +13,27 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.cli.common import Progress, pick
+from jaxslam.cli.dataset_filters import chosen, with_options
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
-from jaxslam.datasets import READERS
+from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets.evaluation import Evaluation, evaluate
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.protocols import Filter
 from jaxslam.results import report
 from jaxslam.results.files import check_writable, json_text, versions, write_files
+from jaxslam.slots import Joint
 from jaxslam.types import Status, Truth
 
 
 def run_dataset(options: argparse.Namespace, command: str) -> int:
-    """Run EKF-SLAM over the data set, print and write its results; returns the exit status."""
+    """Run filters over the data set, print and write their results; returns the exit status."""
     if options.check_every is not None and options.check_every < 0:
         raise ValueError(f"--check-every: expected at least 0, got {options.check_every}")
     data = pick("dataset", options.dataset, READERS)(options.path, options.robot)
+    data = with_options(data, options)
+    filters = chosen(data, options.filters)
     check_writable(options.out)
-    ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
-    with Progress(data.name, "steps") as progress:
-        began = time.perf_counter()
-        # The reader has checked the values; `asarray` converts the log to the chosen dtype.
-        result = run_in_pieces(
-            ekf,
-            jax.tree.map(jnp.asarray, data.log),
-            data.pose,
-            data.pose_cov,
-            every=options.check_every,
-            check=lambda joint: positive_definite(np.asarray(joint.cov)),
-            progress=progress,
-        )
-    seconds = time.perf_counter() - began
-    last = result.last
-    nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
+    runs = {name: _run(name, filter, data, options) for name, filter in filters.items()}
+    last = next(iter(runs.values())).result.last
     summary: dict[str, Any] = {
         "dataset": data.name,
         "source": data.source,
@@ -50,42 +41,103 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         "dtype": str(last.pose.dtype),
         "steps": data.steps,
         "measurements": data.measurements,
+        "dropped by the reader": data.dropped,
+        "corrections to the data": list(data.corrections),
+        "defaults taken": list(data.assumed),
+    }
+    several = len(runs) > 1
+    print(_table({"": summary}))
+    print(
+        _table({name: _flat(run.summary) if several else run.summary for name, run in runs.items()})
+    )
+    if several:
+        summary["filters"] = {name: run.summary for name, run in runs.items()}
+    else:
+        summary |= next(iter(runs.values())).summary
+    files: dict[str, str | Callable[[Path], object]] = {}
+    for name, run in runs.items():
+        suffix = f"-{name}" if several else ""
+        files[f"trajectory{suffix}.csv"] = report.trajectory_csv(data.time, run.result.path)
+        files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
+    files["summary.json"] = json_text(summary | {"versions": versions()})
+    files["map.png"] = _figure(data, runs).savefig
+    written = write_files(options.out, files)
+    print("\nwrote " + ", ".join(str(path) for path in written))
+    return 0
+
+
+class _Run(NamedTuple):
+    """A filter's results on a data set."""
+
+    result: PiecewiseRun
+    found: Evaluation
+    summary: dict[str, Any]
+
+
+def _run(name: str, filter: Filter, data: Dataset, options: argparse.Namespace) -> _Run:
+    """Run one filter over a data set; its covariance is checked where the state holds P."""
+
+    def check(state: Any) -> bool:
+        return positive_definite(np.asarray(state.cov))
+
+    pose, pose_cov = (np.asarray(part, np.float64) for part in (data.pose, data.pose_cov))
+    state = jax.eval_shape(filter.init, pose, pose_cov)
+    has_covariance = isinstance(state, Joint) and name != "square_root"
+    with Progress(f"{data.name}, {name}", "steps") as progress:
+        began = time.perf_counter()
+        # The reader has checked the values; `asarray` converts the log to the chosen dtype.
+        result = run_in_pieces(
+            filter,
+            jax.tree.map(jnp.asarray, data.log),
+            pose,
+            pose_cov,
+            every=options.check_every if has_covariance else 0,
+            check=check,
+            progress=progress,
+        )
+    seconds = time.perf_counter() - began
+    last = result.last
+    nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
+    found = evaluate(data, result.path, last)
+    summary = {
         "landmarks": int(last.alive.sum()),
         "status": {
             s.name.lower(): int((result.status == s).sum()) for s in Status if s != Status.EMPTY
         },
-        "dropped by the reader": data.dropped,
-        "corrections to the data": list(data.corrections),
-        "defaults taken": list(data.assumed),
         "NIS / dof": float(nis / max(int(result.dof.sum()), 1)),
         "log-likelihood": float(result.log_likelihood.sum()),
         "P positive definite": _definiteness(result),
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
-    found = evaluate(data, result.path, last)
-    summary |= found.errors
+    return _Run(result, found, summary | found.errors)
+
+
+def _figure(data: Dataset, runs: dict[str, _Run]) -> Any:
+    """The map of the first filter with the truth, and the paths and landmarks of the others."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
+    (_, first), *others = runs.items()
+    last = first.result.last
     at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive")}
     figure = plot.map_figure(
-        result.path._replace(**at_end),
-        truth=_truth(found),
-        true_points=found.points,
-        title=data.name,
+        first.result.path._replace(**at_end),
+        truth=_truth(first.found),
+        true_points=first.found.points,
+        title=data.name if not others else f"{data.name}: {next(iter(runs))} with ellipses",
     )
-    files: dict[str, str | Callable[[Path], object]] = {
-        "trajectory.csv": report.trajectory_csv(data.time, result.path),
-        "map.csv": report.map_csv(last, data.tags),
-        "summary.json": json_text(summary | {"versions": versions()}),
-        "map.png": figure.savefig,
-    }
-    width = max(map(len, summary))
-    for name, value in summary.items():
-        print(f"{name:{width}} {_shown(value)}")
-    written = write_files(options.out, files)
-    print("\nwrote " + ", ".join(str(path) for path in written))
-    return 0
+    (axes,) = figure.axes
+    for (name, run), color in zip(others, cycle(plot.COLORS[2:]), strict=False):
+        path, last = run.result.path, run.result.last
+        axes.plot(*path.pose[:, :2].T, color=color, lw=1.2, label=f"path, {name}", zorder=3)
+        axes.plot(*last.points[last.alive].T, ".", color=color, ms=4, zorder=5)
+    if others:
+        for line in axes.get_lines():
+            if line.get_label() == "estimated path":
+                line.set_label(f"path, {next(iter(runs))}")
+        where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.11)}
+        axes.legend(ncols=3, frameon=False, fontsize="small", **where)
+    return figure
 
 
 def _truth(found: Evaluation) -> Truth | None:
@@ -116,6 +168,36 @@ def _definiteness(result: PiecewiseRun) -> str:
         return count
     more = ", …" if len(failed) > 5 else ""
     return f"{count}, not at {', '.join(map(str, failed[:5]))}{more}"
+
+
+def _flat(summary: dict[str, Any]) -> dict[str, Any]:
+    """The summary as rows of one value: a row a status that occurs, a row a coordinate."""
+    counts = {f"status: {name}": count for name, count in summary["status"].items() if count}
+    names = ("x [m]", "y [m]", "theta [rad]")
+    pose = {f"final {n}": value for n, value in zip(names, summary["final pose"], strict=True)}
+    rows = {key: summary[key] for key in summary if key not in ("status", "final pose")}
+    return counts | rows | pose
+
+
+def _table(columns: dict[str, dict[str, Any]]) -> str:
+    """Summaries side by side, a row an entry; names above them where there are several."""
+    rows = list(dict.fromkeys(key for column in columns.values() for key in column))
+    head = [["", *columns]] if len(columns) > 1 else []
+    lines = head + [
+        [
+            row,
+            *(
+                _shown(column.get(row, 0 if row.startswith("status: ") else "-"))
+                for column in columns.values()
+            ),
+        ]
+        for row in rows
+    ]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    return "\n".join(
+        "  ".join([*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]])
+        for line in lines
+    )
 
 
 def _shown(value: object) -> str:

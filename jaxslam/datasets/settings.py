@@ -111,11 +111,6 @@ class Settings:
     def filter_options(self, size: int, unknown: bool) -> dict[str, Any]:
         """The options of `ekf_slam`. size: of a measurement; unknown: whether tags are unknown."""
         section = self._filter()
-        gate = section.get("gate")
-        if gate is not None and not (_is_number(gate) and 0 < gate < 1):
-            raise ValueError(
-                f"{self.path}: [filter] gate: expected a probability between 0 and 1, got {gate!r}"
-            )
         options: dict[str, Any] = {"update": section.get("update")}
         if options["update"] is None:
             options["update"] = self._default("filter", "update", "sequential")
@@ -124,24 +119,15 @@ class Settings:
                 f'{self.path}: [filter] update: expected "sequential" or "joint", '
                 f"got {options['update']!r}"
             )
-        method = section.get("associate")
+        method, gate = section.get("associate"), section.get("gate")
         if method is None:
             method = self._default("filter", "associate", METHODS[0] if unknown else "known")
-        if method not in METHODS:
-            raise ValueError(
-                f"{self.path}: [filter] associate: expected one of {', '.join(METHODS)}, "
-                f"got {method!r}"
-            )
-        if method == "known":
-            if gate is None:
-                self.assumed.append("[filter] gate: none")
-            else:
-                options["gate"] = stats.chi2_quantile(gate, size)
-            return options
-        inner = self._default("filter", "gate", GATE) if gate is None else gate
-        beyond = stats.chi2_quantile(max(inner, NEW_GATE), size)
-        limit = inner if method == "joint" else stats.chi2_quantile(inner, size)
-        options["associate"] = getattr(association, method)(limit, beyond)
+        try:
+            options |= association_options(method, gate, size)
+        except ValueError as problem:
+            raise ValueError(f"{self.path}: [filter] {problem}") from problem
+        if gate is None:
+            self.assumed.append(f"[filter] gate{': none' if method == 'known' else f' = {GATE}'}")
         return options
 
     def capacity(self, tags: int, unknown: bool) -> int:
@@ -244,6 +230,29 @@ class Settings:
             if key not in known:
                 where = f"[{section}] " if section else ""
                 raise ValueError(f"{self.path}: {where}{key}: expected one of {', '.join(known)}")
+
+
+def association_options(method: str, gate: float | None, size: int) -> dict[str, Any]:
+    """Options of `ekf_slam` for a method by name and a gate by probability.
+
+    Raises ValueError, "associate: …" or "gate: …", on a name that is none and a gate that is no
+    probability. Known identities need no gate (None); other methods take `GATE`.
+
+    Args:
+        method: one of `METHODS`.
+        gate: the probability that a correct measurement passes.
+        size: numbers of a measurement.
+    """
+    if gate is not None and not (_is_number(gate) and 0 < gate < 1):
+        raise ValueError(f"gate: expected a probability between 0 and 1, got {gate!r}")
+    if method not in METHODS:
+        raise ValueError(f"associate: expected one of {', '.join(METHODS)}, got {method!r}")
+    if method == "known":
+        return {} if gate is None else {"gate": stats.chi2_quantile(gate, size)}
+    inner = GATE if gate is None else gate
+    beyond = stats.chi2_quantile(max(inner, NEW_GATE), size)
+    limit = inner if method == "joint" else stats.chi2_quantile(inner, size)
+    return {"associate": getattr(association, method)(limit, beyond)}
 
 
 def _fitting(
