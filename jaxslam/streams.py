@@ -115,7 +115,7 @@ def divide(
     track[1:, 1] = np.cumsum(parts[0] * np.sin(middle))
     track[:, 2] = heading
     at = np.searchsorted(edges, rows)
-    return _increments(track[np.concatenate([[0], at[:-1]])], track[at])
+    return relative(track[np.concatenate([[0], at[:-1]])], track[at])
 
 
 def relative_poses(
@@ -124,7 +124,7 @@ def relative_poses(
     """Pose increments between successive rows of a path of poses, zero to the first row."""
     path = interpolate_poses(clock, pose, rows)
     path[:, 2] = np.unwrap(path[:, 2])
-    return _increments(np.concatenate([path[:1], path[:-1]]), path)
+    return relative(np.concatenate([path[:1], path[:-1]]), path)
 
 
 def interpolate_poses(
@@ -136,7 +136,7 @@ def interpolate_poses(
     return np.column_stack([x, y, np.arctan2(np.sin(heading), np.cos(heading))])
 
 
-def _increments(
+def relative(
     before: Float[np.ndarray, "T 3"], after: Float[np.ndarray, "T 3"]
 ) -> Float[np.ndarray, "T 3"]:
     """Poses relative to those before; headings are not wrapped."""

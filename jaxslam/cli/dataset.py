@@ -46,14 +46,13 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         "defaults taken": list(data.assumed),
     }
     several = len(runs) > 1
-    print(_table({"": summary}))
-    print(
-        _table({name: _flat(run.summary) if several else run.summary for name, run in runs.items()})
-    )
     if several:
+        print(_table({"": summary}), end="\n\n")
+        print(_table({name: _flat(run.summary) for name, run in runs.items()}))
         summary["filters"] = {name: run.summary for name, run in runs.items()}
     else:
         summary |= next(iter(runs.values())).summary
+        print(_table({"": summary}))
     files: dict[str, str | Callable[[Path], object]] = {}
     for name, run in runs.items():
         suffix = f"-{name}" if several else ""

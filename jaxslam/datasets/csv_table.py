@@ -20,13 +20,17 @@ class CsvTable:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         try:
-            text = self.path.read_bytes().decode("utf-8-sig")
+            data = self.path.read_bytes()
+            text = data.decode("utf-8-sig")
         except OSError as problem:
             raise ValueError(f"{self.path}: cannot be read: {problem.strerror}") from problem
         except UnicodeDecodeError as problem:
-            raise ValueError(f"{self.path}: expected UTF-8 text: {problem.reason}") from problem
+            line = data.count(b"\n", 0, problem.start) + 1
+            raise ValueError(f"{self.path}:{line}: expected text in UTF-8") from problem
         if "\0" in text:
-            raise ValueError(f"{self.path}: expected text, got a file with bytes of zero")
+            raise self._error(
+                text.count("\n", 0, text.index("\0")) + 1, "expected text, got a zero byte"
+            )
         reader = csv.reader(text.splitlines(keepends=True))
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
         lines = [(number, cells) for number, cells in lines if any(cells)]

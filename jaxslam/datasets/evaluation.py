@@ -11,7 +11,11 @@ from jaxslam.consistency import align_map
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.math import se2
+from jaxslam.streams import relative
 from jaxslam.types import Estimate
+
+SPAN = 1.0
+"""Time over which relative errors of a path are taken [s]."""
 
 
 class Evaluation(NamedTuple):
@@ -28,10 +32,11 @@ class Evaluation(NamedTuple):
 def evaluate(data: Dataset, path: Estimate, last: Estimate) -> Evaluation:
     """The errors of a path and of its last map, as far as the data set has a truth.
 
-    In one frame: ATE (RMSE of the positions), RMSE of the heading, mean and median NEES of the pose
-    where its covariance is regular; RMSE and mean NEES of the landmarks with a tag. NEES is of each
-    landmark's own covariance. In frames of their own path and map are compared after the rigid
-    motion that fits each best, and the pose has no NEES.
+    In one frame: ATE (RMSE of the positions), RMSE of the heading, RPE (RMSE of the translation
+    from each row to the first at least `SPAN` later, in the frame of the former), mean and median
+    NEES of the pose where its covariance is regular; RMSE and mean NEES of the landmarks with a
+    tag. NEES is of each landmark's own covariance. In frames of their own path and map are compared
+    after the rigid motion that fits each best, and the pose has no NEES.
 
     Args:
         path: pose (T, 3) and pose_cov (T, 3, 3).
@@ -50,6 +55,7 @@ def evaluate(data: Dataset, path: Estimate, last: Estimate) -> Evaluation:
         error = pose_error(true, pose)
         errors[f"ATE{after} [m]"] = _rms(np.hypot(error[:, 0], error[:, 1]))
         errors[f"heading RMSE{after} [deg]"] = float(np.rad2deg(_rms(error[:, 2])))
+        errors |= _relative_error(np.asarray(data.time)[known], true, pose)
         nees, regular = block_nees(pose, error, error, cov)["pose"]
         if data.one_frame and regular.any():
             errors["pose NEES, mean (3 is honest)"] = float(nees[regular].mean())
@@ -74,6 +80,20 @@ def evaluate(data: Dataset, path: Estimate, last: Estimate) -> Evaluation:
             honest = "(2 is honest)" if data.one_frame else "(honest: below 2)"
             errors[f"landmark NEES{after} {honest}"] = float(square.mean())
     return Evaluation(errors, points, true)
+
+
+def _relative_error(
+    time: Float[np.ndarray, "K"], true: Float[np.ndarray, "K 3"], pose: Float[np.ndarray, "K 3"]
+) -> dict[str, float]:
+    """RMSE of the translation over `SPAN`, in the frame of its first pose; empty if shorter."""
+    after = np.searchsorted(time, time + SPAN - 1e-6)  # times since 1970 have 2e-7 s
+    start = np.flatnonzero(after < len(time))
+    if not start.size:
+        return {}
+    ends = after[start]
+    steps = [relative(path[start], path[ends])[:, :2] for path in (true, pose)]
+    gap = np.linalg.norm(steps[1] - steps[0], axis=1)
+    return {f"RPE over {SPAN:g} s [m]": _rms(gap)}
 
 
 def _rms(values: np.ndarray) -> float:

@@ -204,9 +204,9 @@ def test_a_bad_table_says_where(tmp_path, name, old, new, reason):
 @pytest.mark.parametrize("name", OWN)
 def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
     write(tmp_path, OWN)
-    for content in (b"t [s]\xff\n1\n", b"t\0\n"):
+    for content in (b"t [s]\n\xff\n1\n", b"t\n\0\n"):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=f"{name}: expected"):
+        with pytest.raises(ValueError, match=f"{name}:2: expected text"):
             datasets.table(tmp_path)
     (tmp_path / name).unlink()
     with pytest.raises(ValueError, match=f"{name}: cannot be read: No such file"):
@@ -286,3 +286,26 @@ def test_errors_in_frames_of_their_own_are_taken_after_an_alignment(tmp_path):
     ]
     np.testing.assert_allclose(list(found.errors.values()), 0, atol=1e-5)
     assert found.path.shape == (3, 3)
+
+
+def test_a_relative_error_by_hand(tmp_path):
+    """Of poses 1 s apart: the second is 0.3 m ahead of the truth, in the frame of the first."""
+    lines = "t [s],x [m],y [m],theta [rad]\n1,0,0,0\n2,1,0,0\n3,2,0,0\n"
+    odometry = "t [s],v [m/s],omega [rad/s]\n1,1,0\n2,1,0\n3,1,0\n"
+    seen = "t [s],tag,range [m],bearing [rad]\n2,7,1,0\n"
+    data = datasets.table(
+        write(tmp_path, {"odometry.csv": odometry, "measurements.csv": seen, "truth.csv": lines})
+    )
+    pose = np.array([[0, 0, np.pi / 2], [0, 1.3, np.pi / 2], [0, 2.3, np.pi / 2]])
+    path = Estimate(pose, np.zeros((3, 3, 3)), (), (), (), ())
+    empty = Estimate(
+        pose[-1],
+        np.zeros((3, 3)),
+        np.zeros((1, 2)),
+        np.zeros((1, 2, 2)),
+        np.zeros(1, bool),
+        -np.ones(1, int),
+    )
+    errors = evaluate(data, path, empty).errors
+    np.testing.assert_allclose(errors["RPE over 1 s [m]"], 0.3 / np.sqrt(2))
+    assert "pose NEES, mean (3 is honest)" not in errors
