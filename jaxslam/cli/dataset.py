@@ -194,7 +194,9 @@ def _table(columns: dict[str, dict[str, Any]]) -> str:
     ]
     widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
     return "\n".join(
-        "  ".join([*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]])
+        "  ".join(
+            [*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]]
+        ).replace("\n", "\n" + " " * (widths[0] + 2))
         for line in lines
     )
 
@@ -204,5 +206,6 @@ def _shown(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
     if isinstance(value, list):
-        return "; ".join(_shown(part) for part in value) or "-"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+        lines = all(isinstance(part, str) for part in value)
+        return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"
