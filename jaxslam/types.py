@@ -11,6 +11,9 @@ from typing import Any, NamedTuple
 import jax
 from jax import Array
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jaxslam import records, streams
 
 
 class Status(IntEnum):
@@ -61,6 +64,73 @@ class Log(NamedTuple):
     """the interval Δt, where a model needs one, is part of it."""
     scan: Scan
     """with leading T."""
+
+    @classmethod
+    def from_streams(
+        cls,
+        odometry: tuple[ArrayLike, ArrayLike],
+        measurements: tuple[ArrayLike, ArrayLike, ArrayLike],
+        rule: streams.Rule,
+        rows: ArrayLike | None = None,
+    ) -> "Log":
+        """The log of odometry (times, values) and measurements (times, tags, values); see
+        `streams.align`, which says what they, the rule and the rows are. Arrays are NumPy's."""
+        return cls.from_rows(streams.align(odometry, measurements, rule, rows))
+
+    @classmethod
+    def from_rows(cls, rows: streams.Rows) -> "Log":
+        """The log of aligned rows; arrays are NumPy's."""
+        held: Any = rows  # the fields are declared as JAX arrays
+        return cls(held.control, Scan(held.z, held.tag, held.valid))
+
+    @classmethod
+    def from_records(
+        cls, odometry: Any, measurements: Any, motion: Any, sensor: Any
+    ) -> "Recording":
+        """The log of lines of odometry and measurements, each with times of its own.
+
+            log, time, tags, dropped = Log.from_records(odometry, measurements, motion, sensor)
+
+        odometry has columns t and the motion's controls without Δt; measurements has t, tag and
+        what the sensor measures (no tag for a sensor of no landmark, as a compass). Either is a
+        sequence of rows in this order (lists, a NumPy array), or has columns with names: a mapping,
+        a structured array, a data frame. A name may have a unit, as "bearing [deg]"; else it is the
+        model's. With `pose_increment` columns named t, x, y, theta may be a path of poses.
+
+        There is a row at every time of either. A velocity holds until the next; poses are
+        interpolated; other controls stand as they are, and measurements must be at their times.
+        Tags are whole numbers or text, in any order; None, "", NaN and -1 are unknown. Measurements
+        before the first or after the last line of odometry are dropped and counted; the last
+        velocity holds for the longest interval.
+
+        Args:
+            motion, sensor: the models.
+        Raises:
+            ValueError: with row and column, on a missing column, a value that is no finite number,
+                times that go back (of odometry: or repeat), or a tag twice at a time.
+        """
+        name, controls, measured = "Log.from_records", motion.controls, sensor.measurements
+        moved = records.table(
+            f"{name}: odometry",
+            odometry,
+            lambda given: (records.TIME, *records.odometry_columns(controls, given)),
+        )
+        columns = records.measurement_columns(measured, sensor.landmark)
+        seen = records.table(f"{name}: measurements", measurements, lambda _: columns)
+        rows, tags, dropped = records.align(moved, seen, controls, measured)
+        return Recording(cls.from_rows(rows), rows.time, tags, dropped)
+
+
+class Recording(NamedTuple):
+    """The result of `Log.from_records`."""
+
+    log: Log
+    time: Any
+    """(T,) the time of each row"""
+    tags: tuple[int | str, ...]
+    """the names of the landmarks with tags 0, 1, …, N-1, sorted"""
+    dropped: dict[str, int]
+    """number of measurements that are not in the log, by reason"""
 
 
 class Truth(NamedTuple):

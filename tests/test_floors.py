@@ -15,7 +15,7 @@ PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
     "math programs",
-    "types protocols slots validation noise derivatives",
+    "types protocols slots validation noise derivatives streams records",
     "motion sensors charts linearize association resampling life team",
     "run filters smoothing simulation",
     "consistency monte_carlo verify catalog calibration",

@@ -35,6 +35,8 @@ INTRODUCED = {
     "jaxslam.verify": "Verification of Jacobians",
     "jaxslam.catalog": "The filters of a campaign by name",
     "jaxslam.datasets": "Data sets",
+    "jaxslam.records": "Tables as records",
+    "jaxslam.streams": "Alignment of streams",
     "jaxslam.calibration": "Calibration of odometry",
     "jaxslam.results": "Reports, figures and files",
     "jaxslam.math": "Mathematics",

@@ -18,6 +18,7 @@ from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
 from jaxslam.datasets import READERS
+from jaxslam.datasets.settings import METHODS
 from jaxslam.results.campaign_files import FORMATS
 from jaxslam.simulation.scenarios import SCENARIOS
 
@@ -75,8 +76,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(
         commands.add_parser(
             "run",
-            help="run EKF-SLAM on a recorded data set",
-            description="Run EKF-SLAM on recorded data. Prints a summary and writes trajectory, "
+            help="run filters on a recorded data set",
+            description="Run filters on recorded data. Prints a summary and writes trajectory, "
             "map, summary and a figure.",
         )
     )
@@ -180,6 +181,23 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         "--robot",
         type=int,
         help="number of the robot, where there are several (default: the first)",
+    )
+    parser.add_argument(
+        "--filters",
+        default="ekf",
+        help=f"some of: {','.join(ALL)}; comma-separated (default: ekf)",
+    )
+    parser.add_argument(
+        "--gate",
+        type=float,
+        metavar="P",
+        help="probability that a correct measurement passes the gate, as 0.999 (default: as the "
+        "reader says, mostly none)",
+    )
+    parser.add_argument(
+        "--associate",
+        metavar="METHOD",
+        help=f"one of: {', '.join(METHODS)} (default: as the reader says, mostly known)",
     )
     parser.add_argument(
         "--check-every",

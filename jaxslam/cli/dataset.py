@@ -1,10 +1,10 @@
-"""The command `jaxslam run`: EKF-SLAM on a recorded data set."""
+"""The command `jaxslam run`: filters on a recorded data set."""
 
 import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,39 +12,28 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.cli.common import pick
+from jaxslam.cli.dataset_filters import chosen, with_options
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
-from jaxslam.consistency import align_map
 from jaxslam.datasets import READERS, Dataset
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.math import se2
+from jaxslam.datasets.evaluation import Evaluation, evaluate
 from jaxslam.monte_carlo.progress import Progress
+from jaxslam.protocols import Filter
 from jaxslam.results import report
 from jaxslam.results.files import check_writable, json_text, versions, write_files
-from jaxslam.types import Status
+from jaxslam.slots import Joint
+from jaxslam.types import Estimate, Status
 
 
 def run_dataset(options: argparse.Namespace, command: str) -> int:
-    """Run EKF-SLAM over the data set, print and write its results; returns the exit status."""
+    """Run filters over the data set, print and write their results; returns the exit status."""
     if options.check_every is not None and options.check_every < 0:
         raise ValueError(f"--check-every: expected at least 0, got {options.check_every}")
     data = pick("dataset", options.dataset, READERS)(options.path, options.robot)
+    data = with_options(data, options)
+    filters = chosen(data, options.filters)
     check_writable(options.out)
-    ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
-    with Progress(data.name, "steps") as progress:
-        began = time.perf_counter()
-        # The reader has checked the values; `asarray` converts the log to the chosen dtype.
-        result = run_in_pieces(
-            ekf,
-            jax.tree.map(jnp.asarray, data.log),
-            data.pose,
-            data.pose_cov,
-            every=options.check_every,
-            check=lambda joint: positive_definite(np.asarray(joint.cov)),
-            progress=progress,
-        )
-    seconds = time.perf_counter() - began
-    last = result.last
-    nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
+    runs = {name: _run(name, filter, data, options) for name, filter in filters.items()}
+    last = next(iter(runs.values())).result.last
     summary: dict[str, Any] = {
         "dataset": data.name,
         "source": data.source,
@@ -52,44 +41,100 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         "dtype": str(last.pose.dtype),
         "steps": data.steps,
         "measurements": data.measurements,
+        "dropped by the reader": data.dropped,
+        "corrections to the data": list(data.corrections),
+        "defaults taken": list(data.assumed),
+    }
+    several = len(runs) > 1
+    if several:
+        print(_table({"": summary}), end="\n\n")
+        print(_table({name: _flat(run.summary) for name, run in runs.items()}))
+        summary["filters"] = {name: run.summary for name, run in runs.items()}
+    else:
+        summary |= next(iter(runs.values())).summary
+        print(_table({"": summary}))
+    files: dict[str, str | Callable[[Path], object]] = {}
+    for name, run in runs.items():
+        suffix = f"-{name}" if several else ""
+        files[f"trajectory{suffix}.csv"] = report.trajectory_csv(data.time, run.result.path)
+        files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
+    files["summary.json"] = json_text(summary | {"versions": versions()})
+    files["map.png"] = _figure(data, runs)
+    written = write_files(options.out, files)
+    print("\nwrote " + ", ".join(str(path) for path in written))
+    return 0
+
+
+class _Run(NamedTuple):
+    """A filter's results on a data set."""
+
+    result: PiecewiseRun
+    found: Evaluation
+    summary: dict[str, Any]
+
+
+def _run(name: str, filter: Filter, data: Dataset, options: argparse.Namespace) -> _Run:
+    """Run one filter over a data set; its covariance is checked where the state holds P."""
+
+    def check(state: Any) -> bool:
+        return positive_definite(np.asarray(state.cov))
+
+    pose, pose_cov = (np.asarray(part, np.float64) for part in (data.pose, data.pose_cov))
+    state = jax.eval_shape(filter.init, pose, pose_cov)
+    has_covariance = isinstance(state, Joint) and name != "square_root"
+    with Progress(f"{data.name}, {name}", "steps") as progress:
+        began = time.perf_counter()
+        # The reader has checked the values; `asarray` converts the log to the chosen dtype.
+        result = run_in_pieces(
+            filter,
+            jax.tree.map(jnp.asarray, data.log),
+            pose,
+            pose_cov,
+            every=options.check_every if has_covariance else 0,
+            check=check,
+            progress=progress,
+        )
+    seconds = time.perf_counter() - began
+    last = result.last
+    nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
+    found = evaluate(data, result.path, last)
+    summary = {
         "landmarks": int(last.alive.sum()),
         "status": {
             s.name.lower(): int((result.status == s).sum()) for s in Status if s != Status.EMPTY
         },
-        "dropped by the reader": data.dropped,
-        "corrections to the data": list(data.corrections),
         "NIS / dof": float(nis / max(int(result.dof.sum()), 1)),
         "log-likelihood": float(result.log_likelihood.sum()),
         "P positive definite": _definiteness(result),
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
-    surveyed: dict[str, Any] = {}
-    if data.landmarks is not None and summary["landmarks"]:
-        frame, summary["map RMSE after alignment [m]"] = align_map(last, data.landmarks)
-        surveyed = {"true_points": _in_frame(frame, data.landmarks), "names": data.tags}
-        if data.true_path is not None:
-            surveyed["true_path"] = _in_frame(frame, data.true_path[:, :2])
+    return _Run(result, found, summary | found.errors)
+
+
+def _figure(data: Dataset, runs: dict[str, _Run]) -> Callable[[Path], object]:
+    """What writes the map: the first filter with ellipses and truth, the others without."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
-    at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive", "tag")}
+    (name, first), *rest = runs.items()
+    found = first.found
     figure = plot.map_figure(
-        result.path._replace(**at_end),
+        _whole(first.result),
+        true_points=found.points,
+        names=None if found.points is None else data.tags,
+        true_path=found.path,
         dead_reckoning=_dead_reckoning(data),
-        title=data.name,
-        **surveyed,
+        others={each: _whole(run.result) for each, run in rest},
+        title=f"{data.name}: {name} with ellipses" if rest else data.name,
     )
-    files: dict[str, str | Callable[[Path], object]] = {
-        "trajectory.csv": report.trajectory_csv(data.time, result.path),
-        "map.csv": report.map_csv(last, data.tags),
-        "summary.json": json_text(summary | {"versions": versions()}),
-        "map.png": lambda path: path.write_bytes(plot.png(figure)),
-    }
-    for name, value in summary.items():
-        print(f"{name:30} {_shown(value)}")
-    written = write_files(options.out, files)
-    print("\nwrote " + ", ".join(str(path) for path in written))
-    return 0
+    return lambda path: path.write_bytes(plot.png(figure))
+
+
+def _whole(result: PiecewiseRun) -> Estimate:
+    """The estimated path with the map of its end."""
+    last = result.last
+    at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive", "tag")}
+    return result.path._replace(**at_end)
 
 
 def positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
@@ -98,14 +143,6 @@ def positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
         return bool(np.isfinite(np.linalg.cholesky(cov)).all())
     except np.linalg.LinAlgError:
         return False
-
-
-def _in_frame(
-    frame: Float[np.ndarray, "3"], points: Float[np.ndarray, "N 2"]
-) -> Float[np.ndarray, "N 2"]:
-    """Points in the coordinates of a frame."""
-    into = jax.vmap(se2.to_frame, (None, 0))
-    return np.asarray(into(jnp.asarray(frame), jnp.asarray(points)))
 
 
 def _dead_reckoning(data: Dataset) -> Float[np.ndarray, "T 3"]:
@@ -132,10 +169,43 @@ def _definiteness(result: PiecewiseRun) -> str:
     return f"{count}, not at {', '.join(map(str, failed[:5]))}{more}"
 
 
+def _flat(summary: dict[str, Any]) -> dict[str, Any]:
+    """The summary as rows of one value: a row a status that occurs, a row a coordinate."""
+    counts = {f"status: {name}": count for name, count in summary["status"].items() if count}
+    names = ("x [m]", "y [m]", "theta [rad]")
+    pose = {f"final {n}": value for n, value in zip(names, summary["final pose"], strict=True)}
+    rows = {key: summary[key] for key in summary if key not in ("status", "final pose")}
+    return counts | rows | pose
+
+
+def _table(columns: dict[str, dict[str, Any]]) -> str:
+    """Summaries side by side, a row an entry; names above them where there are several."""
+    rows = list(dict.fromkeys(key for column in columns.values() for key in column))
+    head = [["", *columns]] if len(columns) > 1 else []
+    lines = head + [
+        [
+            row,
+            *(
+                _shown(column.get(row, 0 if row.startswith("status: ") else "-"))
+                for column in columns.values()
+            ),
+        ]
+        for row in rows
+    ]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    return "\n".join(
+        "  ".join(
+            [*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]]
+        ).replace("\n", "\n" + " " * (widths[0] + 2))
+        for line in lines
+    )
+
+
 def _shown(value: object) -> str:
     """A value of the summary as it is printed."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
     if isinstance(value, list):
-        return "; ".join(_shown(part) for part in value) or "-"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+        lines = all(isinstance(part, str) for part in value)
+        return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"

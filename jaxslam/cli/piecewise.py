@@ -50,6 +50,7 @@ def run_in_pieces(
     every: int | None = None,
     check: Callable[[State], bool],
     progress: Callable[[int, int], object],
+    seed: int = 0,
 ) -> PiecewiseRun:
     """Predict and update row by row, as `run` does, for a log whose values have been checked.
 
@@ -61,28 +62,32 @@ def run_in_pieces(
             0: no checks. Default: `CHECKS` checks.
         check: the check, called with the filter's own state.
         progress: called after each piece with the steps done and their total.
+        seed: of the random numbers of a particle filter.
     """
     total = log.control.shape[0]
     every = max(1, -(-total // CHECKS)) if every is None else every
     size = min(every or _LONGEST, _LONGEST, total)
-    key = jax.random.key(0)  # these filters are deterministic
+    key = jax.random.key(seed)
 
-    def step(state: State, row: Log) -> tuple[State, tuple[jax.Array, ...]]:
-        state = filter.predict(state, row.control, key)
-        state, info = filter.update(state, row.scan, key)
+    def step(state: State, row: Log, number: jax.Array) -> tuple[State, tuple[jax.Array, ...]]:
+        to_predict, to_update = jax.random.split(jax.random.fold_in(key, number))
+        state = filter.predict(state, row.control, to_predict)
+        state, info = filter.update(state, row.scan, to_update)
         at = filter.estimate(state)
         kept = info.status, info.nis, info.dof, info.log_likelihood
         return state, (at.pose, at.pose_cov, *kept)
 
     @jax.jit
-    def piece(state: State, rows: Log, count: jax.Array) -> tuple[State, Rows, Estimate]:
+    def piece(
+        state: State, rows: Log, count: jax.Array, before: jax.Array
+    ) -> tuple[State, Rows, Estimate]:
         def one(i: jax.Array, carry: tuple[State, Rows]) -> tuple[State, Rows]:
             state, kept = carry
-            state, new = step(state, jax.tree.map(lambda leaf: leaf[i], rows))
+            state, new = step(state, jax.tree.map(lambda leaf: leaf[i], rows), before + i)
             return state, jax.tree.map(lambda all, one: all.at[i].set(one), kept, new)
 
         first = jax.tree.map(lambda leaf: leaf[0], rows)
-        shapes = jax.eval_shape(step, state, first)[1]
+        shapes = jax.eval_shape(step, state, first, before)[1]
         kept = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), shapes)
         state, kept = jax.lax.fori_loop(0, count, one, (state, kept))
         return state, kept, filter.estimate(state)
@@ -94,7 +99,7 @@ def run_in_pieces(
         until = total if not every else min(total, (done // every + 1) * every)
         until = min(until, done + size)
         rows = jax.tree.map(lambda leaf, a=done, b=until: _padded(leaf[a:b], size), log)
-        state, kept, last = piece(state, rows, jnp.asarray(until - done))
+        state, kept, last = piece(state, rows, jnp.asarray(until - done), jnp.asarray(done))
         pieces.append([np.asarray(part)[: until - done] for part in kept])
         done = until
         progress(done, total)

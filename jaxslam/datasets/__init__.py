@@ -1,4 +1,4 @@
-"""Readers of public data sets, one in each file; they return a `Dataset`.
+"""Readers of public data sets and of your own (`table`), one in each file; they return a `Dataset`.
 
 `READERS` has them by name, for the command line; each takes (path, robot). `robot` is the number of
 a robot where a data set has several (None: the first one); elsewhere it must be None.
@@ -12,6 +12,7 @@ from jaxslam.datasets.bonn import bonn
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam import mrclam, mrclam_team
 from jaxslam.datasets.plaza import plaza
+from jaxslam.datasets.table import table
 from jaxslam.datasets.victoria_park import victoria_park
 
 Reader = Callable[[str | Path, int | None], Dataset]
@@ -35,7 +36,8 @@ READERS: dict[str, Reader] = {
     "bonn": partial(_of_one_robot, bonn),
     "mrclam": partial(_of_several_robots, mrclam),
     "plaza": partial(_of_one_robot, plaza),
+    "table": partial(_of_one_robot, table),
     "victoria_park": partial(_of_one_robot, victoria_park),
 }
 
-__all__ = ["READERS", "Dataset", "bonn", "mrclam", "mrclam_team", "plaza", "victoria_park"]
+__all__ = ["READERS", "Dataset", "bonn", "mrclam", "mrclam_team", "plaza", "table", "victoria_park"]

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.datasets.dataset import Dataset, make_log
+from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import TextFile
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import range_bearing
+from jaxslam.streams import as_recorded
+from jaxslam.types import Log
 
 SOURCE = (
     "C. Stachniss, Robot Mapping, course exercises, University of Freiburg and University of Bonn"
@@ -78,10 +80,11 @@ def bonn(
             raise file.error(line, f"unknown keyword {keyword!r}")
     if not z:
         raise file.end_error(f"no {'SENSOR' if controls else 'ODOMETRY'} line in the file")
+    time = np.arange(1.0, len(controls) + 1.0)
     return Dataset(
         name="bonn",
-        log=make_log(controls, rows, tags, z),
-        time=np.arange(1.0, len(controls) + 1.0),
+        log=Log.from_streams((time, controls), (time[rows], tags, z), as_recorded, time),
+        time=time,
         motion=pose_increment(odometry_cov),
         sensor=range_bearing(measurement_cov),
         tags=names,

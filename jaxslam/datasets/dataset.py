@@ -1,16 +1,15 @@
 """The record that readers return: a log with models, noise and options of a filter for it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.team import Robot
-from jaxslam.types import Log, Scan
+from jaxslam.types import Log
 from jaxslam.validation.logs import check_log
 
 
@@ -44,10 +43,19 @@ class Dataset:
     """surveyed positions [m] in the order of tags, in a frame of their own; None if unknown"""
     true_path: Float[np.ndarray, "T 3"] | None = None
     """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown"""
+    true_at: Bool[np.ndarray, "T"] | None = None
+    """in which rows the true pose is known; None if in all"""
+    one_frame: bool = False
+    """whether `pose`, `landmarks` and `true_path` are in one frame; if not, compare after an
+    alignment"""
+    slots: int | None = None
+    """landmark slots of the filter; None for one a tag"""
     dropped: dict[str, int] = field(default_factory=dict)
     """number of measurements of the file that are not in the log, by reason"""
     corrections: tuple[str, ...] = ()
     """descriptions of what the reader changed"""
+    assumed: tuple[str, ...] = ()
+    """defaults that the reader took where the files do not say"""
     source: str = ""
     """the publication of the data"""
     robots: tuple[Robot, ...] = ()
@@ -66,9 +74,9 @@ class Dataset:
             raise ValueError(f"{self.name}: expected {self.steps} times, got {np.shape(self.time)}")
         if np.max(self.log.scan.tag, initial=-1) >= self.capacity + len(self.robots):
             raise ValueError(f"{self.name}: a tag is not below the capacity {self.capacity}")
-        if self.landmarks is not None and np.shape(self.landmarks) != (self.capacity, 2):
+        if self.landmarks is not None and np.shape(self.landmarks) != (len(self.tags), 2):
             raise ValueError(
-                f"{self.name}: expected landmarks of shape ({self.capacity}, 2), "
+                f"{self.name}: expected landmarks of shape ({len(self.tags)}, 2), "
                 f"got {np.shape(self.landmarks)}"
             )
         if self.true_path is not None and np.shape(self.true_path) != (self.steps, 3):
@@ -84,39 +92,10 @@ class Dataset:
 
     @property
     def capacity(self) -> int:
-        """The number of landmarks N."""
-        return len(self.tags)
+        """The number of landmark slots of a filter, that of tags N or `slots`."""
+        return len(self.tags) if self.slots is None else self.slots
 
     @property
     def measurements(self) -> int:
         """The number of measurements in the log."""
         return int(np.sum(self.log.scan.valid))
-
-
-def make_log(
-    control: Sequence[Sequence[float]] | Float[np.ndarray, "T U"],
-    row: Sequence[int] | Int[np.ndarray, "K"],
-    tag: Sequence[int] | Int[np.ndarray, "K"],
-    z: Sequence[Sequence[float]] | Float[np.ndarray, "K Z"],
-) -> Log:
-    """A log of T controls, with measurement z[k] of tag[k] in the scan of row[k].
-
-    Scans keep the order of the measurements. They are padded to the largest one with z 0, tag -1.
-    """
-    controls, rows = np.asarray(control, np.float64), np.asarray(row, np.int64)
-    values = np.asarray(z, np.float64)
-    steps = controls.shape[0]
-    count = np.bincount(rows, minlength=steps)
-    order = np.argsort(rows, kind="stable")
-    rows = rows[order]
-    slot = np.arange(rows.size) - (np.cumsum(count) - count)[rows]
-    slots = int(np.max(count))
-    # Any, because the fields of a Log are declared as JAX arrays.
-    padded_z: Any = np.zeros((steps, slots, values.shape[1]))
-    padded_tag: Any = np.full((steps, slots), -1, np.int32)
-    valid: Any = np.zeros((steps, slots), bool)
-    padded_z[rows, slot] = values[order]
-    padded_tag[rows, slot] = np.asarray(tag, np.int32)[order]
-    valid[rows, slot] = True
-    held: Any = controls
-    return Log(held, Scan(padded_z, padded_tag, valid))

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.datasets.dataset import Dataset, make_log
+from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam_files import ROBOTS, read_landmarks, read_robot
 from jaxslam.motion import unicycle
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import Part, range_bearing, suite
+from jaxslam.streams import hold
 from jaxslam.team import Robot, motion_of, sensors_of
 from jaxslam.types import Log, Scan
 
@@ -74,7 +75,7 @@ def mrclam(
     row, tag, kept, dropped = _associate(seen, time, subject_of, names)
     return Dataset(
         name=f"mrclam robot {robot}",
-        log=make_log(_hold(odometry, time), row, tag, seen[kept, 2:]),
+        log=_log(odometry, time, row, tag, seen[kept, 2:]),
         time=time,
         motion=unicycle(white_noise(*ODOMETRY_DENSITY) if odometry_cov is None else odometry_cov),
         sensor=range_bearing(measurement_cov),
@@ -134,13 +135,13 @@ def mrclam_team(
     for odometry, seen in files:
         row, tag, kept, lost = _associate(seen, time, subject_of, names + asked)
         dropped = {why: dropped[why] + lost[why] for why in dropped}
-        tags, rows, held = np.array(tag), np.array(row), _hold(odometry, time)
-        controls.append(held)
+        tags, rows = np.array(tag), np.array(row)
+        controls.append(hold(odometry[:, 0], odometry[:, 1:], time))
         parts = []
         for robots_seen in (False, True):
             mine = (tags >= len(names)) == robots_seen
             if mine.any():
-                scan = make_log(held, rows[mine], tags[mine], seen[kept, 2:][mine]).scan
+                scan = _log(odometry, time, rows[mine], tags[mine], seen[kept, 2:][mine]).scan
                 sees: Literal["landmarks", "robots"] = "robots" if robots_seen else "landmarks"
                 sensor = sight if robots_seen else eye
                 parts.append(Part(sensor, scan.tag.shape[1], sees=sees))
@@ -178,15 +179,15 @@ def white_noise(v: float, omega: float) -> NoiseCov:
     return noise_cov
 
 
-def _hold(
-    odometry: Float[np.ndarray, "K 3"], time: Float[np.ndarray, "T"]
-) -> Float[np.ndarray, "T 3"]:
-    """Controls: the velocity at the time before, and the interval since."""
-    start = np.concatenate([time[:1], time[:-1]])
-    latest = np.searchsorted(odometry[:, 0], start, side="right") - 1
-    velocity = np.where((latest >= 0)[:, None], odometry[np.maximum(latest, 0), 1:], 0.0)
-    velocity[0] = 0.0
-    return np.column_stack([velocity, time - start])
+def _log(
+    odometry: Float[np.ndarray, "K 3"],
+    time: Float[np.ndarray, "T"],
+    row: Any,
+    tag: Any,
+    z: Float[np.ndarray, "J Z"],
+) -> Log:
+    """The log of odometry (t, v, ω) and of measurements in some rows."""
+    return Log.from_streams((odometry[:, 0], odometry[:, 1:]), (time[row], tag, z), hold, time)
 
 
 def _associate(

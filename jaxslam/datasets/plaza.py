@@ -1,5 +1,6 @@
 """Reader of the Plaza data sets: a lawn mower with range measurements to four radio beacons."""
 
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -7,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.datasets.dataset import Dataset, make_log
+from jaxslam.datasets.dataset import Dataset
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import range_only
+from jaxslam.streams import divide, interpolate_poses
+from jaxslam.types import Log
 
 SOURCE = (
     "J. Djugash, B. Hamner, S. Roth, Navigating with ranging radios: five data sets with ground "
@@ -94,15 +97,18 @@ def plaza(
     points = {int(name): (x, y) for name, x, y in survey}
     return Dataset(
         name="plaza",
-        log=make_log(
-            _increments(odometry, begin, times), row[positive], tag[positive], z[positive, None]
+        log=Log.from_streams(
+            (odometry[:, 0], odometry[:, 1:]),
+            (times[row[positive]], tag[positive], z[positive, None]),
+            partial(divide, begin=begin),
+            times,
         ),
         time=times,
         motion=pose_increment(_by_travel if odometry_cov is None else odometry_cov),
         sensor=range_only(measurement_cov),
         tags=names,
         landmarks=np.array([points[name] for name in names]),
-        true_path=_between(truth, times),
+        true_path=interpolate_poses(truth[:, 0], truth[:, 1:], times),
         dropped={
             "ranges outside the odometry": int((~inside).sum()),
             "repeated ranges": int(inside.sum() - len(first)),
@@ -137,43 +143,6 @@ def _read(path: Path) -> dict[str, Float[np.ndarray, "_ _"]]:
             raise ValueError(f"{path}: {name} has something other than finite numbers")
         tables[name] = table.astype(np.float64)
     return tables
-
-
-def _increments(
-    odometry: Float[np.ndarray, "K 3"], begin: float, times: Float[np.ndarray, "T"]
-) -> Float[np.ndarray, "T 3"]:
-    """Pose increments (T, 3) between successive times.
-
-    A row of the odometry is a constant twist from the time of the row before to its own.
-    """
-    edges = np.unique(np.concatenate([[begin], odometry[:, 0], times]))
-    edges = edges[(edges >= begin) & (edges <= times[-1])]
-    ends = np.concatenate([[begin], odometry[:, 0]])
-    parts = []
-    for total in odometry[:, 1:].T:
-        along = np.interp(edges, ends, np.concatenate([[0.0], np.cumsum(total)]))
-        parts.append(np.diff(along))
-    heading = np.concatenate([[0.0], np.cumsum(parts[1])])
-    middle = heading[:-1] + 0.5 * parts[1]
-    track = np.zeros((len(edges), 2))
-    track[1:, 0] = np.cumsum(parts[0] * np.cos(middle))
-    track[1:, 1] = np.cumsum(parts[0] * np.sin(middle))
-    at = np.searchsorted(edges, times)
-    before = np.concatenate([[0], at[:-1]])
-    step, angle = track[at] - track[before], heading[before]
-    c, s = np.cos(angle), np.sin(angle)
-    return np.column_stack(
-        [c * step[:, 0] + s * step[:, 1], -s * step[:, 0] + c * step[:, 1], heading[at] - angle]
-    )
-
-
-def _between(
-    truth: Float[np.ndarray, "G 4"], times: Float[np.ndarray, "T"]
-) -> Float[np.ndarray, "T 3"]:
-    """Poses at some times, linear between the rows of the ground truth."""
-    heading = np.interp(times, truth[:, 0], np.unwrap(truth[:, 3]))
-    x, y = (np.interp(times, truth[:, 0], truth[:, k]) for k in (1, 2))
-    return np.column_stack([x, y, np.arctan2(np.sin(heading), np.cos(heading))])
 
 
 def _by_travel(pose: jax.Array, u: jax.Array) -> jax.Array:

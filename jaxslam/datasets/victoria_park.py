@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxslam.datasets.dataset import Dataset, make_log
+from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import TextFile
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import relative_position
+from jaxslam.streams import as_recorded
+from jaxslam.types import Log
 from jaxslam.validation.numbers import check_covariance
 
 SOURCE = (
@@ -88,15 +90,16 @@ def victoria_park(
     tag_of = {name: tag for tag, name in enumerate(names)}
     first = 0 if at_start else 1
     odometry_file = _unless_still(odometry_noise.cov) if at_start else odometry_noise.cov
+    time = np.arange(first, first + len(controls), dtype=np.float64)
+    seen = (
+        [poses[i] for _, i, _, _ in landmark_lines],
+        [tag_of[j] for _, _, j, _ in landmark_lines],
+        [z for _, _, _, z in landmark_lines],
+    )
     return Dataset(
         name="victoria_park",
-        log=make_log(
-            controls,
-            [poses[i] - first for _, i, _, _ in landmark_lines],
-            [tag_of[j] for _, _, j, _ in landmark_lines],
-            [z for _, _, _, z in landmark_lines],
-        ),
-        time=np.arange(first, first + len(controls), dtype=np.float64),
+        log=Log.from_streams((time, controls), seen, as_recorded, time),
+        time=time,
         motion=pose_increment(odometry_file if odometry_cov is None else odometry_cov),
         sensor=relative_position(
             landmark_noise.cov if measurement_cov is None else measurement_cov

@@ -181,7 +181,9 @@ def map_csv(estimate: Estimate, names: Sequence[int]) -> str:
     for i in np.flatnonzero(np.asarray(estimate.alive)):
         cov = np.asarray(estimate.point_covs[i])
         values = [*np.asarray(estimate.points[i]), cov[0, 0], cov[0, 1], cov[1, 1]]
-        rows.append([str(names[int(estimate.tag[i])]), *(f"{value:.9g}" for value in values)])
+        tag = int(estimate.tag[i])
+        name = str(names[tag]) if tag >= 0 else ""  # without a tag it has no name
+        rows.append([name, *(f"{value:.9g}" for value in values)])
     return csv_text(["landmark", "x", "y", "c_xx", "c_xy", "c_yy"], rows)
 
 

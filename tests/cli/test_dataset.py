@@ -82,3 +82,76 @@ def test_the_command_says_in_how_many_steps_it_looked(tmp_path, capsys, refused)
     refused([*run, tmp_path / "b", "--check-every", "-1"], message)
     assert not (tmp_path / "b").exists()
     assert jax.config.jax_enable_x64
+
+
+def write_table(tmp_path):
+    (tmp_path / "odometry.csv").write_text("t [s],v [m/s],omega [rad/s]\n0,1,0.1\n1,1,0\n")
+    (tmp_path / "measurements.csv").write_text(
+        "t [s],tag,range [m],bearing [rad]\n0,7,5,0.1\n1,7,4,0.1\n1,,3,-1\n"
+    )
+    (tmp_path / "truth.csv").write_text("t [s],x [m],y [m],theta [deg]\n0,0,0,0\n1,1,0,6\n")
+    (tmp_path / "landmarks.csv").write_text("tag,x [m],y [m]\n7,5,0.5\n")
+    (tmp_path / "dataset.toml").write_text("[filter]\ncapacity = 3\n")
+    return tmp_path
+
+
+def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
+    write_table(tmp_path)
+    out = tmp_path / "out"
+    assert cli.main(["run", "--dataset", "table", str(tmp_path), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "[sensor] noise = [0.1, 0.05] (range [m], bearing [rad])" in printed
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["ATE [m]"] < 0.2
+    assert 0 < summary["landmark NEES (2 is honest)"] < 10
+    assert summary["status"]["born"] == 2
+    # The landmark without a tag has no name.
+    named = [line.split(",")[0] for line in (out / "map.csv").read_text().splitlines()]
+    assert named == ["landmark", "7", ""]
+
+
+def test_several_filters_side_by_side(tmp_path, capsys):
+    data, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
+    run = ["run", "--dataset", "bonn", str(data), "--filters", "dead_reckoning,ekf"]
+    assert cli.main([*run, "--gate", "0.999", "--out", str(out)]) == 0
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["dead_reckoning", "ekf"] in printed
+    assert ["status:", "unmatched", "6", "0"] in printed
+    assert ["status:", "fused", "0", "4"] in printed
+    assert {path.name for path in out.iterdir()} == {
+        "trajectory-dead_reckoning.csv",
+        "trajectory-ekf.csv",
+        "map-dead_reckoning.csv",
+        "map-ekf.csv",
+        "summary.json",
+        "map.png",
+    }
+    filters = json.loads((out / "summary.json").read_text())["filters"]
+    assert filters["ekf"]["P positive definite"] == "at 3 of 3 checked steps"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--filters", "ekf,best"], "unknown filter 'best'; known: ekf"),
+        (["--filters", "ekf,ekf"], "--filters: expected different names"),
+        (["--filters", "ekf,"], "--filters: expected different names"),
+        (["--filters", "ideal"], "--filters: ideal needs the true path of a simulation"),
+        (["--filters", "seif"], "--filters: seif needs the tag of every measurement"),
+        (["--gate", "9.2", "--associate", "joint"], "--gate: expected a probability"),
+        (["--gate", "0.9"], "--gate: expected --associate beside it"),
+        (["--associate", "best"], "--associate: expected one of nearest"),
+    ],
+)
+def test_filters_that_a_table_cannot_have_are_refused(tmp_path, refused, options, message):
+    """A tag of it is unknown, so its default is an association."""
+    write_table(tmp_path)
+    run = ["run", "--dataset", "table", tmp_path, "--out", tmp_path / "out"]
+    refused([*run, *options], message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_known_map_must_be_in_the_frame_of_the_start(tmp_path, refused):
+    data = write_bonn(tmp_path / "bonn")
+    run = ["run", "--dataset", "bonn", data, "--filters", "localization"]
+    refused(run, "--filters: localization needs a map, landmarks.csv, in the frame of the start")

@@ -1,6 +1,6 @@
 """Figures of maps: paths, landmarks with covariance ellipses, the truth or a survey."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from jaxslam.results.plot.style import (
     SHADE,
     caption,
     every_handle,
+    look,
     panels_of,
     plain,
     titled,
@@ -66,6 +67,7 @@ def map_figure(
     true_points: np.ndarray | None = None,
     true_path: np.ndarray | None = None,
     dead_reckoning: np.ndarray | None = None,
+    others: Mapping[str, Estimate] | None = None,
     names: Sequence[object] | None = None,
     n_sigma: float = 3.0,
     title: str = "",
@@ -79,6 +81,7 @@ def map_figure(
         true_points: (N, 2) landmarks [m], in the order of tags where names is given, and
         true_path: (T, 2 or 3) poses.
         dead_reckoning: (T, 2 or 3) poses; what is far from the rest of the map is not shown.
+        others: estimates of other filters by name; their paths and landmarks are drawn.
         names: of the landmarks, by tag. A panel below shows the distance of each landmark of the
             map from its point in true_points, with what its covariance claims in that direction,
             and lines join the two.
@@ -99,6 +102,11 @@ def map_figure(
         path = np.asarray(dead_reckoning)[:, :2]
         axes.plot(*path.T, color=FAINT, lw=1.0, ls=(0, (1, 1.2)), label="dead reckoning", zorder=2)
         shown += [path] if _size([*shown, path]) < _NEAR * _size(shown) else []
+    for i, (name, other) in enumerate((others or {}).items(), start=3):
+        line = {key: look(i)[key] for key in ("color", "ls")}
+        axes.plot(*np.asarray(other.pose)[:, :2].T, lw=1.0, label=plain(name), zorder=2.5, **line)
+        points = np.asarray(other.points[-1])[np.asarray(other.alive[-1])]
+        axes.plot(*points.T, ".", color=line["color"], ms=3, zorder=4.2)
     _limits(axes, shown)
     if names is not None:
         _draw_residuals(axes, panels[1], estimate, np.asarray(true_points), names, n_sigma)

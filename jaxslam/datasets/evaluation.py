@@ -1,0 +1,100 @@
+"""A filter's path and map against the truth and the survey of a data set."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.consistency import align_map
+from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.datasets.dataset import Dataset
+from jaxslam.math import se2
+from jaxslam.streams import relative
+from jaxslam.types import Estimate
+
+SPAN = 1.0
+"""Time over which relative errors of a path are taken [s]."""
+
+
+class Evaluation(NamedTuple):
+    """What is known of a filter's errors, and the truth as it lies in the filter's map."""
+
+    errors: dict[str, float]
+    """by name with unit, as printed"""
+    points: Float[np.ndarray, "N 2"] | None
+    """surveyed landmarks [m]"""
+    path: Float[np.ndarray, "K 3"] | None
+    """true poses, of the rows in which they are known"""
+
+
+def evaluate(data: Dataset, path: Estimate, last: Estimate) -> Evaluation:
+    """The errors of a path and of its last map, as far as the data set has a truth.
+
+    In one frame: ATE (RMSE of the positions), RMSE of the heading, RPE (RMSE of the translation
+    from each row to the first at least `SPAN` later, in the frame of the former), mean and median
+    NEES of the pose where its covariance is regular; RMSE and mean NEES of the landmarks with a
+    tag. NEES is of each landmark's own covariance. In frames of their own path and map are compared
+    after the rigid motion that fits each best, and the pose has no NEES.
+
+    Args:
+        path: pose (T, 3) and pose_cov (T, 3, 3).
+        last: the map.
+    """
+    errors: dict[str, float] = {}
+    after = "" if data.one_frame else " after alignment"
+    true = points = None
+    if data.true_path is not None:
+        known = np.ones(data.steps, bool) if data.true_at is None else data.true_at
+        pose, cov = np.asarray(path.pose)[known], np.asarray(path.pose_cov)[known]
+        true = np.asarray(data.true_path, pose.dtype)[known]
+        if not data.one_frame:
+            frame = se2.align(jnp.asarray(true[:, :2]), jnp.asarray(pose[:, :2]))
+            true = np.asarray(jax.vmap(se2.compose, (None, 0))(frame, jnp.asarray(true)))
+        error = pose_error(true, pose)
+        errors[f"ATE{after} [m]"] = _rms(np.hypot(error[:, 0], error[:, 1]))
+        errors[f"heading RMSE{after} [deg]"] = float(np.rad2deg(_rms(error[:, 2])))
+        errors |= _relative_error(np.asarray(data.time)[known], true, pose)
+        nees, regular = block_nees(pose, error, error, cov)["pose"]
+        if data.one_frame and regular.any():
+            errors["pose NEES, mean (3 is honest)"] = float(nees[regular].mean())
+            errors["pose NEES, median (2.37 is honest)"] = float(np.median(nees[regular]))
+    named = np.asarray(last.alive) & (np.asarray(last.tag) >= 0)
+    if data.landmarks is not None and named.any():
+        points = np.asarray(data.landmarks, np.asarray(last.points).dtype)
+        tag, found = np.asarray(last.tag)[named], np.asarray(last.points)[named]
+        if data.one_frame:
+            rmse = _rms(np.linalg.norm(found - points[tag], axis=1))
+        else:
+            survey, rmse = align_map(last, data.landmarks)
+            into_map = jax.vmap(se2.to_frame, (None, 0))
+            points = np.asarray(into_map(jnp.asarray(survey), jnp.asarray(points)))
+        errors[f"map RMSE{after} [m]"] = rmse
+        gap = (points[tag] - found)[:, :, None]
+        covs = np.asarray(last.point_covs)[named].astype(np.float64)
+        regular = np.linalg.eigvalsh(covs)[:, 0] > 0
+        if regular.any():
+            gap, covs = gap[regular], covs[regular]
+            square = np.swapaxes(gap, 1, 2) @ np.linalg.solve(covs, gap)
+            honest = "(2 is honest)" if data.one_frame else "(honest: below 2)"
+            errors[f"landmark NEES{after} {honest}"] = float(square.mean())
+    return Evaluation(errors, points, true)
+
+
+def _relative_error(
+    time: Float[np.ndarray, "K"], true: Float[np.ndarray, "K 3"], pose: Float[np.ndarray, "K 3"]
+) -> dict[str, float]:
+    """RMSE of the translation over `SPAN`, in the frame of its first pose; empty if shorter."""
+    after = np.searchsorted(time, time + SPAN - 1e-6)  # times since 1970 have 2e-7 s
+    start = np.flatnonzero(after < len(time))
+    if not start.size:
+        return {}
+    ends = after[start]
+    steps = [relative(path[start], path[ends])[:, :2] for path in (true, pose)]
+    gap = np.linalg.norm(steps[1] - steps[0], axis=1)
+    return {f"RPE over {SPAN:g} s [m]": _rms(gap)}
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

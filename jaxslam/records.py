@@ -1,0 +1,238 @@
+"""Columns of odometry and measurements, from lists, arrays or data frames, as the rows of a log."""
+
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxslam import streams
+
+UNITS: dict[str, dict[str, float]] = {
+    "rad": {"deg": 180 / math.pi},
+    "rad/s": {"deg/s": 180 / math.pi},
+    "m": {"mm": 1000.0, "cm": 100.0},
+    "s": {"ms": 1000.0},
+}
+"""Other units in which a column may be given, and how many of them are one of the model's. Values
+are divided by it, so that 1400 ms are the 1.4 s of another file to the bit."""
+
+TIME, TAG, INTERVAL = "t [s]", "tag", "dt [s]"
+POSE = ("x [m]", "y [m]", "theta [rad]")
+_INCREMENT = ("forward [m]", "left [m]", "turn [rad]")
+
+
+class Table(NamedTuple):
+    """Columns of one length by name, and where a cell is, for messages."""
+
+    columns: dict[str, Any]
+    """(K,) float64 by name with unit, as "v [m/s]"; `TAG` is a list of names, None where unknown"""
+    at: Callable[[int, str], str]
+    """(row, column) -> the place of a cell, with which a message begins"""
+
+    def values(self, names: Sequence[str]) -> np.ndarray:
+        """(K, len(names)) some columns side by side."""
+        return np.column_stack([self.columns[name] for name in names])
+
+
+class Aligned(NamedTuple):
+    """The rows of two tables, and what became of their names and measurements."""
+
+    rows: streams.Rows
+    tags: tuple[Any, ...]
+    """the names of the landmarks with tags 0, 1, …"""
+    dropped: dict[str, int]
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """("v", "m/s") of "v [m/s]"; None where there is no unit."""
+    bare, bracket, unit = name.strip().partition("[")
+    return bare.strip(), unit.rstrip("] ").strip() if bracket else None
+
+
+def unit_divisor(unit: str | None, wanted: str) -> float | None:
+    """By what a column in a unit is divided to be the wanted column; None where nothing does."""
+    target = split_unit(wanted)[1] or ""
+    if unit is None or unit == target:
+        return 1.0
+    return UNITS.get(target, {}).get(unit)
+
+
+def odometry_columns(controls: tuple[str, ...], given: Sequence[str]) -> tuple[str, ...]:
+    """The columns beside the time from which a model's controls come, out of those given."""
+    own = tuple(name for name in controls if name != INTERVAL)
+    poses = {split_unit(name)[0] for name in POSE} <= {split_unit(name)[0] for name in given}
+    return POSE if poses and own == _INCREMENT else own
+
+
+def measurement_columns(measured: tuple[str, ...], landmark: tuple[str, ...]) -> tuple[str, ...]:
+    """The columns of measurements: with a tag, unless the sensor's are of no landmark."""
+    return (TIME, *((TAG,) if landmark else ()), *measured)
+
+
+def align(
+    odometry: Table,
+    measurements: Table,
+    controls: tuple[str, ...],
+    measured: tuple[str, ...],
+    names: Sequence[Hashable] = (),
+) -> Aligned:
+    """The rows of two tables: a row at every time of odometry, and of measurements within it.
+
+    Velocities (controls with an interval) hold until the next line; poses are interpolated; other
+    controls stand as they are, and measurements must then be at their times. Measurements before
+    the first or after the last odometry are dropped and counted; the last velocity holds as long as
+    the longest interval between lines.
+
+    Args:
+        controls, measured: the names of the models, with units.
+        names: of landmarks that have a tag though none may be measured; else those measured.
+    Raises:
+        ValueError: with the place, on times that do not rise (equal ones are a scan), a tag that
+            occurs twice in a scan, or a measurement without odometry at its time.
+    """
+    clock, when = odometry.columns[TIME], measurements.columns[TIME]
+    for table, least in ((odometry, True), (measurements, False)):
+        check_times(table, strict=least)
+    named = measurements.columns.get(TAG) or [None] * len(when)
+    tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
+    tag = np.array([tag_of.get(name, -1) for name in named], np.int64)
+    seen: set[tuple[float, int]] = set()
+    for row, pair in enumerate(zip(when.tolist(), tag.tolist(), strict=True)):
+        if pair[1] >= 0 and pair in seen:
+            raise ValueError(
+                f"{measurements.at(row, TAG)}: expected a tag once at a time, got "
+                f"{named[row]!r} twice at t = {pair[0]:.12g}"
+            )
+        seen.add(pair)
+    columns = odometry_columns(controls, tuple(odometry.columns))
+    last = clock[-1]
+    rule: streams.Rule = streams.relative_poses if columns == POSE else streams.as_recorded
+    if columns != POSE and INTERVAL in controls and controls[:3] != _INCREMENT:
+        rule = streams.hold
+        last += np.max(np.diff(clock), initial=0.0)
+    inside = (when >= clock[0]) & (when <= last)
+    if rule is streams.as_recorded:
+        lost = np.flatnonzero(inside & ~np.isin(when, clock))
+        if lost.size:
+            raise ValueError(
+                f"{measurements.at(int(lost[0]), TIME)}: expected a time of the odometry, since "
+                f"{', '.join(columns)} cannot be divided, got {when[lost[0]]:.12g}; poses can: "
+                f"{TIME}, {', '.join(POSE)}"
+            )
+    rows = streams.align(
+        (clock, odometry.values(columns)),
+        (when[inside], tag[inside], measurements.values(measured)[inside]),
+        rule,
+    )
+    if INTERVAL in controls and rule is not streams.hold:
+        interval = np.diff(rows.time, prepend=rows.time[:1])
+        rows = rows._replace(control=np.column_stack([rows.control, interval]))
+    dropped = {"measurements outside the odometry": int((~inside).sum())}
+    return Aligned(rows, tuple(tag_of), dropped)
+
+
+def check_times(table: Table, *, strict: bool) -> None:
+    """Raise ValueError, with the place, unless times rise; equal ones pass where not strict."""
+    time = table.columns[TIME]
+    back = np.flatnonzero(np.diff(time) <= 0 if strict else np.diff(time) < 0)
+    if back.size:
+        before, at = time[back[0] : back[0] + 2].tolist()
+        wanted = f"above {before}" if strict else f"of at least {before}"
+        raise ValueError(f"{table.at(int(back[0]) + 1, TIME)}: expected a time {wanted}, got {at}")
+
+
+def ordered(names: set[Any]) -> list[Any]:
+    """The names of landmarks, whole numbers before text; None, the unknown one, is left out."""
+    return sorted(names - {None}, key=lambda name: (isinstance(name, str), name))
+
+
+def table(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence[str]]) -> Table:
+    """The table of a data frame, a mapping of columns, a structured array, or a sequence of rows.
+
+    Columns with names are found by them; a name may have a unit ("bearing [deg]"). Without names
+    the columns are in the order wanted. Other columns are left out.
+
+    Args:
+        what: the name of the argument, for messages.
+        wanted: (names given) -> the columns needed, with units.
+    Raises:
+        ValueError: on a column that is missing, in another unit, of another length, or with a value
+            that is no finite number.
+    """
+    names = _names(given)
+    needed = list(wanted(names or ()))
+
+    def at(row: int, column: str) -> str:
+        return f"{what}, row {row}, column {split_unit(column)[0]}"
+
+    if names is None:
+        rows = list(given) if isinstance(given, Sequence | np.ndarray) else None
+        if rows is None:
+            raise ValueError(f"{what}: expected rows or columns, got {type(given).__name__}")
+        for k, row in enumerate(rows):
+            size = len(row) if isinstance(row, Sequence | np.ndarray) else 1
+            if size != len(needed) or isinstance(row, str):
+                raise ValueError(
+                    f"{what}, row {k}: expected {len(needed)} values ({', '.join(needed)}), "
+                    f"got {size}"
+                )
+        found = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
+        divisors = dict.fromkeys(needed, 1.0)
+    else:
+        own = {split_unit(name)[0]: name for name in names}
+        found, divisors = {}, {}
+        for name in needed:
+            bare = split_unit(name)[0]
+            if bare not in own:
+                raise ValueError(f"{what}: expected a column {name!r}, got {', '.join(names)}")
+            divisor = unit_divisor(split_unit(own[bare])[1], name)
+            if divisor is None:
+                raise ValueError(f"{what}: expected the column {name!r}, got {own[bare]!r}")
+            found[name], divisors[name] = list(given[own[bare]]), divisor
+        lengths = {name: len(column) for name, column in found.items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"{what}: expected columns of one length, got {lengths}")
+    columns: dict[str, Any] = {}
+    for name, column in found.items():
+        if name == TAG:
+            columns[name] = [_landmark(at(k, name), value) for k, value in enumerate(column)]
+        else:
+            columns[name] = _numbers(at, name, column) / divisors[name]
+    if not columns[TIME].size:
+        raise ValueError(f"{what}: expected at least one row, got none")
+    return Table(columns, at)
+
+
+def _names(given: Any) -> tuple[str, ...] | None:
+    """The names of the columns, or None where they have none."""
+    if isinstance(given, Mapping):
+        return tuple(map(str, given))
+    if isinstance(given, np.ndarray):
+        return None if given.dtype.names is None else tuple(given.dtype.names)
+    columns = getattr(given, "columns", None)
+    return None if columns is None else tuple(map(str, columns))
+
+
+def _numbers(at: Callable[[int, str], str], name: str, column: list[Any]) -> np.ndarray:
+    """(K,) float64; raises ValueError on anything else than finite numbers."""
+    for row, value in enumerate(column):
+        good = isinstance(value, int | float | np.integer | np.floating)
+        if not good or isinstance(value, bool) or not math.isfinite(value):
+            raise ValueError(f"{at(row, name)}: expected a finite number, got {value!r}")
+    return np.array(column, np.float64)
+
+
+def _landmark(place: str, value: Any) -> Hashable:
+    """The name of a landmark, an int or a str; None where it is unknown (None, "", -1 or NaN)."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or value in ("", -1) or value != value:
+        return None
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int | str):
+        raise ValueError(f"{place}: expected a whole number or text, got {value!r}")
+    if isinstance(value, int) and value < 0:
+        raise ValueError(f"{place}: expected a number >= 0, or -1 for unknown, got {value}")
+    return value

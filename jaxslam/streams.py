@@ -1,0 +1,147 @@
+"""Asynchronous streams of odometry and measurements as the rows of a log; NumPy in, NumPy out.
+
+A row is a time: the control that leads to it from the row before, and the scan at it. `align` makes
+rows of two streams with times of their own; the rules say what control a stream of odometry gives.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""(times (K,), odometry (K, V), rows (T,)) -> control (T, U) that leads to each row"""
+
+
+class Rows(NamedTuple):
+    """T rows, with scans padded to M measurement slots: the fields of a log as NumPy arrays."""
+
+    time: Float[np.ndarray, "T"]
+    control: Float[np.ndarray, "T U"]
+    z: Float[np.ndarray, "T M Z"]
+    tag: Int[np.ndarray, "T M"]
+    valid: Bool[np.ndarray, "T M"]
+
+
+def align(
+    odometry: tuple[ArrayLike, ArrayLike],
+    measurements: tuple[ArrayLike, ArrayLike, ArrayLike],
+    rule: Rule,
+    rows: ArrayLike | None = None,
+) -> Rows:
+    """The rows of a stream of odometry and a stream of measurements.
+
+    Scans keep the order of the measurements. They are padded to the largest one with z 0, tag -1.
+
+    Args:
+        odometry: times (K,), and values (K, V).
+        measurements: times (J,) in any order, tags (J,), and values (J, Z). Those of one time are a
+            scan.
+        rule: `hold`, `divide`, `relative_poses` or `as_recorded`.
+        rows: (T,) the times of the rows, rising; default every time of either stream.
+    Raises:
+        ValueError: on a measurement at a time that is no row.
+    """
+    clock, moved = (np.asarray(part, np.float64) for part in odometry)
+    seen, tag, z = measurements[0], np.asarray(measurements[1]), np.asarray(measurements[2])
+    when = np.asarray(seen, np.float64)
+    time = np.unique(np.concatenate([clock, when])) if rows is None else np.asarray(rows, float)
+    row = np.searchsorted(time, when)
+    lost = when[time[np.minimum(row, len(time) - 1)] != when]
+    if lost.size:
+        raise ValueError(f"align: expected measurements at times of rows, got one at {lost[0]}")
+    count = np.bincount(row, minlength=len(time))
+    order = np.argsort(row, kind="stable")
+    row = row[order]
+    slot = np.arange(row.size) - (np.cumsum(count) - count)[row]
+    places = len(time), int(np.max(count, initial=0))
+    padded_z = np.zeros((*places, z.shape[1]))
+    padded_tag = np.full(places, -1, np.int32)
+    valid = np.zeros(places, bool)
+    padded_z[row, slot] = z[order]
+    padded_tag[row, slot] = tag[order]
+    valid[row, slot] = True
+    return Rows(time, rule(clock, moved, time), padded_z, padded_tag, valid)
+
+
+def as_recorded(
+    clock: Float[np.ndarray, "K"], moved: Float[np.ndarray, "K U"], rows: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T U"]:
+    """The odometry itself, a line a row; raises ValueError where rows have other times."""
+    if not np.array_equal(clock, rows):
+        raise ValueError("as_recorded: expected a row at each time of the odometry and no other")
+    return moved
+
+
+def hold(
+    clock: Float[np.ndarray, "K"], velocity: Float[np.ndarray, "K V"], rows: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T U"]:
+    """The velocity at the row before, and the interval Δt since.
+
+    A velocity holds from its time to the next; it is zero before the first. Of odometry with equal
+    times the last counts. Δt = 0 in the first row.
+    """
+    start = np.concatenate([rows[:1], rows[:-1]])
+    latest = np.searchsorted(clock, start, side="right") - 1
+    held = np.where((latest >= 0)[:, None], velocity[np.maximum(latest, 0)], 0.0)
+    held[:1] = 0.0
+    return np.column_stack([held, rows - start])
+
+
+def divide(
+    clock: Float[np.ndarray, "K"],
+    moved: Float[np.ndarray, "K 2"],
+    rows: Float[np.ndarray, "T"],
+    begin: float,
+) -> Float[np.ndarray, "T 3"]:
+    """Pose increments (T, 3) between successive rows, the first from the time `begin` on.
+
+    A line (distance, turn) of the odometry is a constant twist from the line before to its own
+    time; rows in between divide it in proportion.
+    """
+    edges = np.unique(np.concatenate([[begin], clock, rows]))
+    edges = edges[(edges >= begin) & (edges <= rows[-1])]
+    ends = np.concatenate([[begin], clock])
+    parts = []
+    for total in moved.T:
+        along = np.interp(edges, ends, np.concatenate([[0.0], np.cumsum(total)]))
+        parts.append(np.diff(along))
+    heading = np.concatenate([[0.0], np.cumsum(parts[1])])
+    middle = heading[:-1] + 0.5 * parts[1]
+    track = np.zeros((len(edges), 3))
+    track[1:, 0] = np.cumsum(parts[0] * np.cos(middle))
+    track[1:, 1] = np.cumsum(parts[0] * np.sin(middle))
+    track[:, 2] = heading
+    at = np.searchsorted(edges, rows)
+    return relative(track[np.concatenate([[0], at[:-1]])], track[at])
+
+
+def relative_poses(
+    clock: Float[np.ndarray, "K"], pose: Float[np.ndarray, "K 3"], rows: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T 3"]:
+    """Pose increments between successive rows of a path of poses, zero to the first row."""
+    path = interpolate_poses(clock, pose, rows)
+    path[:, 2] = np.unwrap(path[:, 2])
+    return relative(np.concatenate([path[:1], path[:-1]]), path)
+
+
+def interpolate_poses(
+    clock: Float[np.ndarray, "K"], pose: Float[np.ndarray, "K 3"], rows: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T 3"]:
+    """Poses at some times, linear in (x, y, θ) between those given; headings in [-π, π]."""
+    heading = np.interp(rows, clock, np.unwrap(pose[:, 2]))
+    x, y = (np.interp(rows, clock, pose[:, k]) for k in (0, 1))
+    return np.column_stack([x, y, np.arctan2(np.sin(heading), np.cos(heading))])
+
+
+def relative(
+    before: Float[np.ndarray, "T 3"], after: Float[np.ndarray, "T 3"]
+) -> Float[np.ndarray, "T 3"]:
+    """Poses relative to those before; headings are not wrapped."""
+    step, angle = after[:, :2] - before[:, :2], before[:, 2]
+    c, s = np.cos(angle), np.sin(angle)
+    return np.column_stack(
+        [c * step[:, 0] + s * step[:, 1], -s * step[:, 0] + c * step[:, 1], after[:, 2] - angle]
+    )
