@@ -19,7 +19,7 @@ def test_the_readme_is_a_page():
 def test_the_readme_runs(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(blocks) == 1
-    code = blocks[0].replace("steps=500", "steps=12").replace("runs=100", "runs=3")
+    code = blocks[0].replace("circle()", "circle(steps=12)").replace("runs=100", "runs=3")
     exec(compile(code, "README.md", "exec"), {})
     printed = capsys.readouterr().out
     assert "ekf" in printed

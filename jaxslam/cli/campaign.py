@@ -94,6 +94,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
             if not keep.spans():  # other processes may have saved some
                 shutil.rmtree(keep.folder, ignore_errors=True)
             raise
+        if jax.process_index() == 0:
             print(stop.campaign)
             print(f"\njaxslam: interrupted, {stop}; --resume {out} continues it", file=sys.stderr)
         return INTERRUPTED

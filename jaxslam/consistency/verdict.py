@@ -151,6 +151,11 @@ def _doubts(per_run: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> tup
         dropped = sum(drops.values())
         reasons = ", ".join(f"{count:,} {name}" for name, count in drops.items() if count)
         out.append(f"{dropped:,} of {used + dropped:,} measurements were dropped: {reasons}")
+    elif counts.get("overflow", 0):
+        out.append(
+            f"{counts['overflow']:,} measurements of new landmarks found the map full: expected a "
+            "larger capacity, or a filter that removes landmarks"
+        )
     free = np.asarray(per_run.get("unobservable", ()), np.float64)
     free = free[np.isfinite(free)]
     if free.size and free.mean() < 3:

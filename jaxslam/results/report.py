@@ -48,6 +48,14 @@ ROWS = (
 _COLUMNS = 5
 
 
+_RARE = {
+    "undecided": "too few runs, or too unequal, to reject even a pose NEES of 6: take more runs.",
+    "incomplete": "not rejected, but over half of the measurements were dropped.",
+    "diverged": "over half of the runs diverged or were not finite.",
+}
+"""What verdicts mean that a table seldom has."""
+
+
 def campaign_table(campaign: Campaign) -> str:
     """The campaign as a text table: a column a filter, a row a measure, and notes below.
 
@@ -62,8 +70,10 @@ def campaign_table(campaign: Campaign) -> str:
         f"± or [low, high]: {LEVEL:.0%} interval over the runs.",
         "verdict: optimistic where the interval of pose NEES or of NIS / dof lies above the honest",
         "value (covariances too small), pessimistic where it lies below, with the rejecting test.",
-        "consistent: neither test rejects, which is no proof; of honest filters "
-        f"{1 - LEVEL:.0%} are rejected.",
+        f"The tests' intervals are wider than {LEVEL:.0%}: together they reject {1 - LEVEL:.0%} of "
+        "honest filters.",
+        "consistent: neither test rejects, which is no proof.",
+        *_explained(campaign),
         f"divergent: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the ideal "
         "EKF.",
     ]
@@ -77,6 +87,12 @@ def campaign_table(campaign: Campaign) -> str:
     if campaign.published:
         notes.append(f"published: {campaign.source}")
     return "\n".join([title, "", text, "", *notes])
+
+
+def _explained(campaign: Campaign) -> list[str]:
+    """The meaning of the rarer verdicts that this campaign has."""
+    found = {summary.verdict for summary in campaign.filters.values()}
+    return [f"{word}: {meaning}" for word, meaning in _RARE.items() if word in found]
 
 
 def qualified(campaign: Campaign) -> list[str]:

@@ -3,6 +3,7 @@
 import json
 import threading
 
+import drawn
 import numpy as np
 import pytest
 
@@ -20,6 +21,20 @@ def test_an_interrupt_exits_with_130_and_writes_nothing(tmp_path, capsys, monkey
     assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
     assert "nothing was written" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.*"))
+
+
+def test_an_interrupt_shows_what_is_done_and_how_to_go_on(tmp_path, capsys, monkeypatch):
+    done = drawn.campaign(("ekf",))
+
+    def interrupted(*arguments, **options):
+        raise Interrupted(done, 300)
+
+    monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
+    out = tmp_path / "out"
+    assert cli.main([*QUICK, "--out", str(out)]) == 130
+    told = capsys.readouterr()
+    assert str(done) in told.out
+    assert f"--resume {out} continues it" in told.err
 
 
 def test_an_interrupted_command_leaves_no_thread_that_would_be_torn_down(tmp_path, monkeypatch):

@@ -115,5 +115,5 @@ def test_missing_is_every_run_not_done():
         assert listed == [run for run in range(runs) if run not in finished]
     assert missing([(32, 32)], 128, 32) == [(0, 32), (64, 32), (96, 32)]
     assert missing([(8, 8)], 40, 16) == [(0, 8), (16, 16), (32, 8)]
-    with pytest.raises(ValueError, match="block = 0"):
+    with pytest.raises(ValueError, match="block: expected an integer >= 1, got 0"):
         missing([], 3, 0)

@@ -50,5 +50,8 @@ def test_a_filter_without_a_linear_system_is_refused(filter, why):
 
 def test_a_map_is_managed_inside_the_monitor():
     outside = pruning(monitored(FEJ), life.recency())
-    with pytest.raises(ValueError, match=r"the state of monitored ekf_slam is no slots.Joint"):
+    with pytest.raises(
+        ValueError,
+        match=r"pruning: expected a filter whose state is a slots.Joint, as from ekf_slam, got monitored ekf_slam",
+    ):
         jax.eval_shape(outside.init, jnp.zeros(3), jnp.eye(3))

@@ -249,7 +249,9 @@ def test_a_scan_as_points():
         slope = np.array([[np.cos(phi), -r * np.sin(phi)], [np.sin(phi), r * np.cos(phi)]])
         np.testing.assert_allclose(covs[i], slope @ SENSOR.noise_cov(z[i]) @ slope.T, atol=1e-12)
     np.testing.assert_array_equal(points[2], 0.0)
-    with pytest.raises(ValueError, match="not a point"):
+    with pytest.raises(
+        ValueError, match="expected a sensor that measures points, got bearing_only"
+    ):
         seen_points(sensors.bearing_only(0.1 * np.eye(1)), scan)
 
 
