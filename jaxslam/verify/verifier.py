@@ -21,6 +21,7 @@ from jaxslam.verify.functions import (
     Function,
     at_state,
     example_line,
+    makes_a_model,
     motion_functions,
     plain_function,
     sensor_functions,
@@ -108,6 +109,12 @@ def verify_jacobians(
         raise ValueError(
             "verify_jacobians: expected a Motion, a Sensor or a function of vectors, got "
             f"{type(model).__name__}"
+        )
+    if not isinstance(model, Motion | Sensor) and jacobian is None and makes_a_model(model):
+        factory = getattr(model, "__name__", "factory")
+        raise ValueError(
+            f"verify_jacobians: expected a Motion or a Sensor, got the factory {factory} of one: "
+            f"call it, as in {factory}(noise_cov), or use jaxslam.verify.build({factory})"
         )
     if not (jacobian is None or callable(jacobian)):
         raise ValueError(
@@ -202,9 +209,11 @@ def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
 def build(factory: Callable[..., Motion] | Callable[..., Sensor]) -> Motion | Sensor:
     """A model made by a factory like those of the registries, with noise 0.01 I.
 
-    A sensor is mounted off the robot's centre.
+    A sensor is mounted off the robot's centre. Raises ValueError where the factory returns neither.
     """
     probe = factory(lambda *_: None)
+    if not isinstance(probe, Motion | Sensor):
+        raise ValueError(f"expected a Motion or a Sensor, got {type(probe).__name__}")
     size = len(probe.noises if isinstance(probe, Motion) else probe.measurements)
     mounted = {"mount": MOUNT} if "mount" in inspect.signature(factory).parameters else {}
     return factory(0.01 * np.eye(size), **mounted)

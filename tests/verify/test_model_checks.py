@@ -8,7 +8,7 @@ import pytest
 from verified import failed
 
 from jaxslam import motion, sensors
-from jaxslam.verify import build, verify_jacobians
+from jaxslam.verify import Check, Report, build, verify_jacobians
 
 LASER = build(sensors.range_bearing)
 CAMERA = build(sensors.bearing_only)
@@ -113,3 +113,14 @@ def test_a_sensor_whose_embed_fails_is_still_looked_at():
     assert [f for f in report.findings if f.function == "observe"]
     assert "later" in str(report)
     assert not report.passed
+
+
+def test_a_factory_in_place_of_a_model_is_named():
+    with pytest.raises(ValueError, match=r"got the factory range_bearing of one: call it"):
+        verify_jacobians(sensors.range_bearing)
+
+
+def test_the_first_line_of_a_report_counts_its_notes():
+    check = Check("is pure", True)
+    head = str(Report("f", "function", checks=(check,), notes=("an angle",))).splitlines()[0]
+    assert head == "function f: verified, with 1 note"
