@@ -85,7 +85,7 @@ def verify_jacobians(
             without a unit that jumps by 2π is noted; that is no failure, since its derivative is
             right on both sides, and only its author knows whether it is an angle.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
-            sensor those of `observe`.
+            sensor those of `observe`; `invert` is tried at the measurements of these.
         name: of a function, its name in the report; default: its own.
         count: number of random states.
         seed: seed of the random states.
@@ -191,6 +191,10 @@ def examine(
         drawn = _samples_of(functions, model, count, seed)
         if given is not None:
             drawn = (given, *drawn[1:])
+            if isinstance(model, Sensor) and model.landmark:
+                # Where `observe` fails, its own checks say so, and `invert` keeps the drawn states.
+                with contextlib.suppress(Exception, SystemExit):
+                    drawn = (given, samples.given_inverse(model, given, drawn[1]))
         evaluated = tuple(evaluate(f, sampled) for f, sampled in zip(functions, drawn, strict=True))
         checks: list[Check] = []
         for one in evaluated:
@@ -238,7 +242,7 @@ def _typical_linearity(model: Model, examined: Examined) -> float | None:
     if not isinstance(model, Motion | Sensor):
         return None
     first = examined.evaluated[0]
-    usual = [i for i, label in enumerate(first.samples.labels) if label == "random"]
+    usual = [i for i, label in enumerate(first.samples.labels) if label in samples.NOMINAL]
     states = tuple(a[usual] for a in first.samples.values)
     spread = [
         np.array([_standard_deviation(e) for e in a.entries]) for a in first.function.arguments
