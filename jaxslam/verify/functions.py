@@ -203,3 +203,15 @@ def _has_signature(call: Callable[..., object]) -> bool:
     except (TypeError, ValueError):
         return False
     return True
+
+
+def makes_a_model(factory: Callable[..., object]) -> bool:
+    """Whether a function is annotated as a factory: `def mine(noise_cov, mount=…) -> Sensor`."""
+    try:
+        signature = inspect.signature(factory)
+    except (TypeError, ValueError):
+        return False
+    returns = signature.return_annotation
+    required = [p for p in signature.parameters.values() if p.default is p.empty]
+    named = returns if isinstance(returns, str) else getattr(returns, "__name__", "")
+    return named.rpartition(".")[2] in ("Motion", "Sensor") and len(required) == 1

@@ -16,10 +16,10 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.validation.numbers import check_covariance
 from jaxslam.verify.differences import on_circle
 from jaxslam.verify.errors import describe_error, line_of
-from jaxslam.verify.functions import Function, at_state, periods
+from jaxslam.verify.functions import Function, at_state, periods, sensor_functions
 from jaxslam.verify.jacobians import Evaluated
 from jaxslam.verify.record import Check
-from jaxslam.verify.samples import Samples
+from jaxslam.verify.samples import NOMINAL, Samples
 from jaxslam.verify.singular import CURES, singular_operation
 
 Values: TypeAlias = np.ndarray
@@ -106,7 +106,14 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
         regular = np.array(["zero" not in label and "= 0" not in label for label in inverse.labels])
         few = tuple(a[regular] for a in inverse.values)
         size = 1 + np.abs(few[0]).max()
-        return _exactly(np.asarray(quick_jit(jax.vmap(again))(*few)) / size)
+        off = np.asarray(quick_jit(jax.vmap(again))(*few)) / size
+        if not (trouble := _exactly(off)):
+            return ""
+        row, entry = np.unravel_index(
+            np.argmax(np.where(np.isnan(off), np.inf, abs(off))), off.shape
+        )
+        at = at_state(sensor_functions(sensor)[1], [a[row] for a in few])
+        return f"{sensor.measurements[entry]} is {trouble}, at {at}"
 
     yield from _guarded("observe undoes invert, whatever is free", observation_error)
     yield from _guarded(
@@ -116,9 +123,11 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
 
 def _inversion_error(sensor: Sensor, seen: Samples) -> str:
     """The error of invert(pose, observe(pose, l), s) = l for the best s, or ""."""
-    usual = [i for i, label in enumerate(seen.labels) if label == "random"]
+    usual = [i for i, label in enumerate(seen.labels) if label in NOMINAL]
     pose = seen.values[0][usual]
     point = pose[:, :2] + np.roll(pose[:, :2], 1, axis=0) / 2 + 1
+    if "given" in seen.labels and len(sensor.landmark) == 2:
+        point = seen.values[1]
     mean = np.asarray(sensor.free.mean, np.float64)
     spread = np.sqrt(np.diagonal(np.asarray(sensor.free.cov, np.float64)))
 

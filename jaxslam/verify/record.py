@@ -144,6 +144,8 @@ class Report:
     def __str__(self) -> str:
         """The report as text."""
         verdict = "verified" if self.passed else f"{self.failures} FAILED"
+        if self.passed and self.notes:
+            verdict += f", with {len(self.notes)} note{'s' if len(self.notes) > 1 else ''}"
         head = f"{self.kind} {self.model}: {verdict}"
         lines = [head]
         for finding in self.findings:

@@ -1,6 +1,6 @@
 """The states at which models are verified: random ones, and difficult ones by unit."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Sensor
-from jaxslam.verify.functions import POSE, Argument
+from jaxslam.verify.functions import POSE, Argument, periods
 
 Values: TypeAlias = Float[np.ndarray, "_ _"]
 """States (S, n) of one argument."""
@@ -124,12 +124,38 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
 
     back: list[Group] = [("random", (pose, z, s))]
     back += list(_one_at_a_time((pose, z, s), 0, Argument("pose", POSE)))
-    back += list(_one_at_a_time((pose, z, s), 1, Argument("measurement", sensor.measurements)))
-    back.append(("zero measurement", (pose[few], 0 * z[few], s[few])))
+    angular = np.isfinite(periods(sensor.measurements))
+    seen = np.asarray(quick_jit(jax.vmap(sensor.observe))(*observed.values), np.float64)
+    reached = _reached(seen, periods(sensor.measurements))
+    difficult = _one_at_a_time((pose, z, s), 1, Argument("measurement", sensor.measurements))
+    back += [(label, part) for label, part in difficult if reached(part[1]).all()]
+    zero = np.where(angular & ~reached(0 * z[few]), z[few], 0.0)
+    back.append(("zero measurement", (pose[few], zero, s[few])))
     if len(mean):
         back.append(("free coordinates zero", (pose[few], z[few], 0 * s[few])))
     back.append(("large coordinates", (away, z[:2], s[:2])))
     return observed, _concatenated(back)
+
+
+def given_inverse(sensor: Sensor, given: Samples, drawn: Samples) -> Samples:
+    """Samples (pose, measurement, free) for `invert`: what `observe` returns at given states.
+
+    The free coordinates are those of drawn samples.
+    """
+    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*given.values), np.float64)
+    s = np.resize(drawn.values[2], (len(z), drawn.values[2].shape[1]))
+    return Samples((given.values[0], z, s), given.labels)
+
+
+def _reached(seen: Values, circle: Float[np.ndarray, "m"]) -> Callable[[Values], np.ndarray]:
+    """The function of measurements (B, m) -> whether each entry is one that the sensor can return.
+
+    An angle is, if it is between the smallest and the largest observed one, or if these cover
+    nearly the whole turn; other entries always are.
+    """
+    low, high = np.fmin.reduce(seen), np.fmax.reduce(seen)
+    free = ~np.isfinite(circle) | (high - low > 0.9 * circle)
+    return lambda z: free | ((low < z) & (z < high))
 
 
 def _sampled_entry(rng: np.random.Generator, name: str, count: int) -> Float[np.ndarray, "S"]:

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import importlib.util
-import inspect
 import io
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,6 +15,7 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.claims import Claim
 from jaxslam.verify.errors import describe_error, is_user_file
+from jaxslam.verify.functions import makes_a_model
 from jaxslam.verify.verifier import Model
 
 CLAIMS = ("_jacobian", "_jacobians")
@@ -80,10 +80,10 @@ def load(target: str) -> list[Target]:
     """
     path, name = split_target(target)
     module = import_file(path)
-    found = [t for key in vars(module) if (t := _target(module, key)) is not None]
+    keys = [key for key in vars(module) if name in ("", key)]
+    found = [t for key in keys if (t := _target(module, key)) is not None]
     if name:
-        found = [t for t in found if t.name == name]
-        if not found and hasattr(module, name):
+        if not found and keys:
             raise UnusableFile(
                 f"{path.name}: expected {name} to be a Motion, a Sensor, a factory of one, or a "
                 f"function with its Jacobian, and there is no {name}{CLAIMS[0]}"
@@ -187,21 +187,9 @@ def _target(module: ModuleType, name: str) -> Target | None:
     if claims:
         about = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
         return Target(name, value, claims[0], *about)
-    if getattr(value, "__module__", "") == module.__name__ and _makes_a_model(value):
+    if getattr(value, "__module__", "") == module.__name__ and makes_a_model(value):
         try:
             return Target(name, build(value))
         except Exception as error:
             raise UnusableFile(f"the factory {name}: {describe_error(error)}") from error
     return None
-
-
-def _makes_a_model(factory: Callable[..., object]) -> bool:
-    """Whether a function is annotated as a factory: `def mine(noise_cov, mount=…) -> Sensor`."""
-    try:
-        signature = inspect.signature(factory)
-    except (TypeError, ValueError):
-        return False
-    returns = signature.return_annotation
-    required = [p for p in signature.parameters.values() if p.default is p.empty]
-    named = returns if isinstance(returns, str) else getattr(returns, "__name__", "")
-    return named.rpartition(".")[2] in ("Motion", "Sensor") and len(required) == 1

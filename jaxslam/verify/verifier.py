@@ -21,6 +21,7 @@ from jaxslam.verify.functions import (
     Function,
     at_state,
     example_line,
+    makes_a_model,
     motion_functions,
     plain_function,
     sensor_functions,
@@ -84,7 +85,7 @@ def verify_jacobians(
             without a unit that jumps by 2π is noted; that is no failure, since its derivative is
             right on both sides, and only its author knows whether it is an angle.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
-            sensor those of `observe`.
+            sensor those of `observe`; `invert` is tried at the measurements of these.
         name: of a function, its name in the report; default: its own.
         count: number of random states.
         seed: seed of the random states.
@@ -108,6 +109,12 @@ def verify_jacobians(
         raise ValueError(
             "verify_jacobians: expected a Motion, a Sensor or a function of vectors, got "
             f"{type(model).__name__}"
+        )
+    if not isinstance(model, Motion | Sensor) and jacobian is None and makes_a_model(model):
+        factory = getattr(model, "__name__", "factory")
+        raise ValueError(
+            f"verify_jacobians: expected a Motion or a Sensor, got the factory {factory} of one: "
+            f"call it, as in {factory}(noise_cov), or use jaxslam.verify.build({factory})"
         )
     if not (jacobian is None or callable(jacobian)):
         raise ValueError(
@@ -184,6 +191,10 @@ def examine(
         drawn = _samples_of(functions, model, count, seed)
         if given is not None:
             drawn = (given, *drawn[1:])
+            if isinstance(model, Sensor) and model.landmark:
+                # Where `observe` fails, its own checks say so, and `invert` keeps the drawn states.
+                with contextlib.suppress(Exception, SystemExit):
+                    drawn = (given, samples.given_inverse(model, given, drawn[1]))
         evaluated = tuple(evaluate(f, sampled) for f, sampled in zip(functions, drawn, strict=True))
         checks: list[Check] = []
         for one in evaluated:
@@ -202,9 +213,11 @@ def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
 def build(factory: Callable[..., Motion] | Callable[..., Sensor]) -> Motion | Sensor:
     """A model made by a factory like those of the registries, with noise 0.01 I.
 
-    A sensor is mounted off the robot's centre.
+    A sensor is mounted off the robot's centre. Raises ValueError where the factory returns neither.
     """
     probe = factory(lambda *_: None)
+    if not isinstance(probe, Motion | Sensor):
+        raise ValueError(f"expected a Motion or a Sensor, got {type(probe).__name__}")
     size = len(probe.noises if isinstance(probe, Motion) else probe.measurements)
     mounted = {"mount": MOUNT} if "mount" in inspect.signature(factory).parameters else {}
     return factory(0.01 * np.eye(size), **mounted)
@@ -229,7 +242,7 @@ def _typical_linearity(model: Model, examined: Examined) -> float | None:
     if not isinstance(model, Motion | Sensor):
         return None
     first = examined.evaluated[0]
-    usual = [i for i, label in enumerate(first.samples.labels) if label == "random"]
+    usual = [i for i, label in enumerate(first.samples.labels) if label in samples.NOMINAL]
     states = tuple(a[usual] for a in first.samples.values)
     spread = [
         np.array([_standard_deviation(e) for e in a.entries]) for a in first.function.arguments

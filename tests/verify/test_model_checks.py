@@ -8,7 +8,10 @@ import pytest
 from verified import failed
 
 from jaxslam import motion, sensors
-from jaxslam.verify import build, verify_jacobians
+from jaxslam.math import se2
+from jaxslam.math.angles import wrap
+from jaxslam.protocols import Sensor
+from jaxslam.verify import Check, Report, build, verify_jacobians
 
 LASER = build(sensors.range_bearing)
 CAMERA = build(sensors.bearing_only)
@@ -113,3 +116,56 @@ def test_a_sensor_whose_embed_fails_is_still_looked_at():
     assert [f for f in report.findings if f.function == "observe"]
     assert "later" in str(report)
     assert not report.passed
+
+
+def test_a_factory_in_place_of_a_model_is_named():
+    with pytest.raises(ValueError, match=r"got the factory range_bearing of one: call it"):
+        verify_jacobians(sensors.range_bearing)
+
+
+def test_the_first_line_of_a_report_counts_its_notes():
+    check = Check("is pure", True)
+    head = str(Report("f", "function", checks=(check,), notes=("an angle",))).splitlines()[0]
+    assert head == "function f: verified, with 1 note"
+
+
+def mast_camera(invert_sign=1.0):
+    """A camera 1.5 m above the ground: bearing, and depression in (0, π/2]."""
+
+    def observe(pose, landmark):
+        distance, bearing = se2.polar_in_frame(pose, landmark)
+        return jnp.stack([bearing, jnp.arctan2(1.5, distance)])
+
+    def invert(pose, z, s):
+        polar = jnp.stack([1.5 / jnp.tan(z[1]), invert_sign * z[0]])
+        return se2.from_frame(pose, se2.rectangular(polar))
+
+    return Sensor(
+        name="mast_camera",
+        measurements=("bearing [rad]", "depression [rad]"),
+        observe=observe,
+        residual=lambda z, z_hat: wrap(z - z_hat),
+        noise_cov=lambda z: 0.01 * jnp.eye(2, dtype=z.dtype),
+        invert=invert,
+    )
+
+
+def test_a_measurement_that_no_state_gives_is_not_tried():
+    report = verify_jacobians(mast_camera())
+    assert report.passed, report
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_the_states_of_a_sensor_are_those_of_its_inverse_too():
+    rng = np.random.default_rng(0)
+    states = (rng.normal(size=(10, 3)), 5 + rng.normal(size=(10, 2)))
+    report = verify_jacobians(mast_camera(), states=states)
+    assert report.passed, report
+    assert [f.samples for f in report.findings] == [10] * 5
+    assert np.isfinite(report.linearity)
+
+
+def test_a_failed_round_trip_names_entry_and_state():
+    checks = {c.name: c for c in verify_jacobians(mast_camera(-1.0)).checks}
+    assert checks[INVERTED].detail.startswith("bearing [rad] is off by ")
+    assert ", at pose = (" in checks[INVERTED].detail

@@ -213,3 +213,27 @@ def test_neighbours_can_be_imported_and_nothing_stays_behind(verify, tmp_path):
 
 def test_a_path_with_a_name_is_split():
     assert user_files.split_target(str(EXAMPLES / "notes_velocity.py") + ":move")[1] == "move"
+
+
+FACTORIES = """
+from jaxslam import sensors
+from jaxslam.protocols import Sensor
+
+good = sensors.range_bearing([[0.1, 0.0], [0.0, 0.1]])
+
+def bad(noise_cov) -> Sensor:
+    raise RuntimeError("not finished")
+
+def number(noise_cov) -> Sensor:
+    return 3
+"""
+
+
+def test_only_the_named_factory_is_built(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(FACTORIES, encoding="utf-8")
+    assert [t.name for t in user_files.load(f"{path}:good")] == ["good"]
+    with pytest.raises(user_files.UnusableFile, match=r"factory bad: .*not finished"):
+        user_files.load(f"{path}:bad")
+    with pytest.raises(user_files.UnusableFile, match=r"number: .*a Sensor, got int"):
+        user_files.load(f"{path}:number")
