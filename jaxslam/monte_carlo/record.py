@@ -79,11 +79,12 @@ class Campaign:
         Args:
             folder: it is created if needed.
             figures: formats of the files of figures, of png, pdf and svg; () writes none.
-            overwrite: whether files of these names that are in the folder are replaced.
+            overwrite: whether files of these names that are in the folder are replaced. Figures of
+                another campaign's report are then removed.
         Raises:
-            ValueError: on another format, and on the first file that is there already unless it may
-                be overwritten.
-            OSError: if the folder cannot be written.
+            ValueError: on another format, an empty name of a folder, and on the first file that is
+                there already unless it may be overwritten.
+            OSError: if the folder cannot be written, before anything is drawn.
         """
         from jaxslam.results import campaign_files
 
