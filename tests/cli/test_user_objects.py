@@ -139,4 +139,9 @@ def test_a_campaign_of_a_file_is_resumed_while_the_file_computes_the_same(
     assert cli.main([*again, "--figures", "pdf,png"]) == 0  # of a finished campaign
     assert {path.suffix for path in out.glob("map.*")} == {".svg", ".pdf", ".png"}
     mine.write_text(MINE.replace("factor = 2.0", "factor = 3.0"))
-    refused([*again, "--runs", "4"], f"{out / 'blocks'} holds another campaign: filter blind: ")
+    message = refused(
+        [*again, "--runs", "4"],
+        f"{out / 'blocks'} holds another campaign: filter blind: computes something else than in "
+        "the stored runs (was its file edited?); choose another folder, or replace",
+    )
+    assert "--overwrite" in message
