@@ -46,10 +46,17 @@ class Campaign:
     """(runs,) the number of each run, in the order of `Summary.per_run`; run i has key
     fold_in(key, i)"""
 
+    @property
+    def size(self) -> str:
+        """Runs, steps and precision, as "100 runs × 40 steps, float64"."""
+        counts = (
+            f"{n} {what}" + "s" * (n != 1) for n, what in ((self.runs, "run"), (self.steps, "step"))
+        )
+        return f"{' × '.join(counts)}, {self.dtype}"
+
     def __repr__(self) -> str:
         verdicts = ", ".join(f"{name}={s.verdict}" for name, s in self.filters.items())
-        size = f"{self.runs} runs × {self.steps} steps, {self.dtype}"
-        text = f"Campaign({self.scenario}, {size}, {verdicts})"
+        text = f"Campaign({self.scenario}, {self.size}, {verdicts})"
         return textwrap.fill(text, 100, subsequent_indent="    ", break_long_words=False)
 
     def __str__(self) -> str:

@@ -72,10 +72,16 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--filters", "mine.py"], "--filters: expected FILE.py:NAME, got mine.py"),
+        (
+            ["--filters", "mine.py"],
+            "--filters: expected FILE.py:NAME, got mine.py; it defines: world, short, blind",
+        ),
         (["--filters", "other.py:blind"], "other.py: no such file"),
         (["--filters", "mine.txt:blind"], "expected a Python file"),
-        (["--filters", "mine.py:nobody"], "mine.py: there is no nobody"),
+        (
+            ["--filters", "mine.py:nobody"],
+            "--filters: there is no nobody in mine.py; it defines: world",
+        ),
         (
             ["--filters", "mine.py:number"],
             "mine.py:number: expected a Filter, or a function of the",
@@ -92,7 +98,10 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
             ["--scenario", "mine.py:world", "--steps", "3"],
             "mine.py:world is a Scenario, which has 4",
         ),
-        (["--scenario", "mine.py:world", "--filters", "magic"], "unknown filter 'magic'"),
+        (
+            ["--scenario", "mine.py:world", "--filters", "magic"],
+            "; or FILE.py:NAME, one of your own",
+        ),
         (["--figures", "gif"], "--figures: expected formats of png, pdf, svg, got 'gif'"),
         (["--figures", ""], "--figures: expected formats of png, pdf, svg, got ''"),
     ],

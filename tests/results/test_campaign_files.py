@@ -54,6 +54,8 @@ def test_printed_it_is_the_table_and_in_a_line_its_verdicts(found):
         f"Campaign(world {EVIL}, {size}, good=consistent, other=optimistic)"
     )
     assert repr(found.filters["good"]) == "Summary(consistent, nees_pose=3.041, rmse_position=1.2)"
+    one = dataclasses.replace(found, runs=1, steps=1)
+    assert "1 run × 1 step, float32" in repr(one) and "1 run × 1 step, float32" in str(one)
     many = dataclasses.replace(found, filters={f"f{i}": found.filters["good"] for i in range(20)})
     assert max(map(len, repr(many).splitlines())) <= 100
 
