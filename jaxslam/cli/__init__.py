@@ -1,6 +1,7 @@
 """The command line `jaxslam`; only here are arguments parsed and JAX configured."""
 
 import argparse
+import os
 import platform
 import shlex
 import sys
@@ -25,12 +26,14 @@ from jaxslam.simulation.scenarios import SCENARIOS
 __all__ = ["main"]
 
 USAGE_ERROR = 2
+PIPE_CLOSED = 141  # 128 + SIGPIPE, as a shell reports it
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status.
 
-    0 on success, 1 for a wrong model, 2 on bad input, 130 if interrupted.
+    0 on success, 1 for a wrong model, 2 on bad input, 130 if interrupted, 141 if the reader of its
+    output has gone.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
@@ -47,7 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             status = int(options.command(options, shlex.join(["jaxslam", *arguments])))
             if status != INTERRUPTED and jax.process_index() == 0:
                 print(clock)
+        sys.stdout.flush()  # here, so that a closed pipe is met below
         return status
+    except BrokenPipeError:  # the reader, as `head`, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return PIPE_CLOSED
     except (ValueError, OSError) as error:
         print(f"jaxslam: {error}", file=sys.stderr)
         return USAGE_ERROR

@@ -42,7 +42,7 @@ def _as_option(value: object) -> str:
 
 
 def check_same_campaign(
-    options: argparse.Namespace, there: store.Store, asked: Mapping[str, object]
+    options: argparse.Namespace, there: store.Store, asked: Mapping[str, Any]
 ) -> None:
     """Raise ValueError unless the options agree with the campaign that is to be resumed."""
     folder = options.resume
@@ -62,7 +62,15 @@ def check_same_campaign(
         if name in told and told[name] != value
     ]
     if differences:
-        raise ValueError(f"--resume: {folder} holds another campaign: {'; '.join(differences)}")
+        raise ValueError(
+            f"--resume: {folder} holds another campaign: {'; '.join(differences)}: leave these "
+            "options out to continue it, or begin another with --out in another folder"
+        )
+    if (done := there.done()) > (runs := asked.get("runs", done)):
+        raise ValueError(
+            f"--runs: {folder} holds {done} runs: expected at least as many, got {runs}; leave "
+            "--runs out to use all of them, or begin another campaign with --out in another folder"
+        )
 
 
 def open_store(

@@ -11,10 +11,10 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
 
-def pick(kind: str, name: str, known: Mapping[str, _T]) -> _T:
-    """The entry of `known` with a name; raises ValueError that lists the known names."""
+def pick(kind: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
+    """The entry of `known` with a name; raises ValueError with the known names and `more`."""
     if name not in known:
-        raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(known)}")
+        raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(known)}{more}")
     return known[name]
 
 

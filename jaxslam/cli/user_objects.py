@@ -21,6 +21,8 @@ from jaxslam.simulation.worlds import Scenario
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.user_files import import_file, split_target
 
+_OWN = "; or FILE.py:NAME, one of your own"
+
 
 class UserObjects:
     """The objects of a user's files; each file is executed once."""
@@ -40,7 +42,7 @@ class UserObjects:
         """
         arguments = () if steps is None else (steps,)
         if not _in_file(asked):
-            return pick("scenario", asked, SCENARIOS)(*arguments)
+            return pick("scenario", asked, SCENARIOS, _OWN)(*arguments)
         _, made = self._find("--scenario", asked)
         if isinstance(made, Scenario) and steps is not None:
             raise ValueError(
@@ -89,14 +91,15 @@ class UserObjects:
     def _find(self, option: str, asked: str) -> tuple[str, Any]:
         """The name and the object of FILE.py:NAME."""
         path, name = split_target(asked)
-        if not name:
-            raise ValueError(f"{option}: expected FILE.py:NAME, got {asked}")
         path = path.resolve()
         if path not in self._modules:
             self._modules[path] = import_file(path)
-        if not hasattr(self._modules[path], name):
-            raise ValueError(f"{path.name}: there is no {name}")
-        return name, getattr(self._modules[path], name)
+        module = self._modules[path]
+        if not name:
+            raise ValueError(f"{option}: expected FILE.py:NAME, got {asked}{_names(module)}")
+        if not hasattr(module, name):
+            raise ValueError(f"{option}: there is no {name} in {path.name}{_names(module)}")
+        return name, getattr(module, name)
 
     def _own(self, asked: str, scenario: Scenario) -> tuple[str, Candidate]:
         """The name of a user's filter, and the filter for the scenario."""
@@ -121,6 +124,21 @@ class UserObjects:
             return function(*arguments)
 
 
+def _names(module: ModuleType) -> str:
+    """The functions, filters and scenarios that a user's file defines, as the end of a message."""
+    found = [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and not isinstance(value, type)
+        and (
+            isinstance(value, Filter | Scenario)
+            or (callable(value) and getattr(value, "__module__", "") == module.__name__)
+        )
+    ]
+    return f"; it defines: {', '.join(found)}" if found else "; it defines none"
+
+
 def _in_file(asked: str) -> bool:
     """Whether an object is asked for by its file."""
     return ":" in asked or asked.endswith(".py")
@@ -128,7 +146,7 @@ def _in_file(asked: str) -> bool:
 
 def _of_catalog(name: str, scenario: Scenario) -> tuple[str, Candidate]:
     """The name and a filter of the catalog; raises ValueError if it cannot run the scenario."""
-    make = pick("filter", name, ALL)
+    make = pick("filter", name, ALL, _OWN)
     try:
         return name, make(scenario, watch=True)
     except ValueError as error:

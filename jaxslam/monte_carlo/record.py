@@ -46,10 +46,17 @@ class Campaign:
     """(runs,) the number of each run, in the order of `Summary.per_run`; run i has key
     fold_in(key, i)"""
 
+    @property
+    def size(self) -> str:
+        """Runs, steps and precision, as "100 runs × 40 steps, float64"."""
+        counts = (
+            f"{n} {what}" + "s" * (n != 1) for n, what in ((self.runs, "run"), (self.steps, "step"))
+        )
+        return f"{' × '.join(counts)}, {self.dtype}"
+
     def __repr__(self) -> str:
         verdicts = ", ".join(f"{name}={s.verdict}" for name, s in self.filters.items())
-        size = f"{self.runs} runs × {self.steps} steps, {self.dtype}"
-        text = f"Campaign({self.scenario}, {size}, {verdicts})"
+        text = f"Campaign({self.scenario}, {self.size}, {verdicts})"
         return textwrap.fill(text, 100, subsequent_indent="    ", break_long_words=False)
 
     def __str__(self) -> str:
@@ -79,11 +86,12 @@ class Campaign:
         Args:
             folder: it is created if needed.
             figures: formats of the files of figures, of png, pdf and svg; () writes none.
-            overwrite: whether files of these names that are in the folder are replaced.
+            overwrite: whether files of these names that are in the folder are replaced. Figures of
+                another campaign's report are then removed.
         Raises:
-            ValueError: on another format, and on the first file that is there already unless it may
-                be overwritten.
-            OSError: if the folder cannot be written.
+            ValueError: on another format, an empty name of a folder, and on the first file that is
+                there already unless it may be overwritten.
+            OSError: if the folder cannot be written, before anything is drawn.
         """
         from jaxslam.results import campaign_files
 

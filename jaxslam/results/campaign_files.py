@@ -1,5 +1,6 @@
 """The report of a campaign: its files, written whole or not at all, and its part of a notebook."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results import report
-from jaxslam.results.files import versions, write_files
+from jaxslam.results.files import check_writable, versions, write_files
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Figure
@@ -32,7 +33,12 @@ def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list
 
 def check_formats(caller: str, asked: str | Iterable[str]) -> tuple[str, ...]:
     """The formats that were asked for, each once; raises ValueError that names another one."""
-    kinds = tuple(dict.fromkeys([asked] if isinstance(asked, str) else asked))
+    try:
+        kinds = tuple(dict.fromkeys([asked] if isinstance(asked, str) else asked))
+    except TypeError:
+        raise ValueError(
+            f"{caller}: expected formats of {', '.join(FORMATS)}, or () for none, got {asked!r}"
+        ) from None
     for kind in kinds:
         if kind not in FORMATS:
             raise ValueError(f"{caller}: expected formats of {', '.join(FORMATS)}, got {kind!r}")
@@ -59,7 +65,11 @@ def save(
         command, seed: those of the campaign, for the page and the JSON; "" and None where it has
             none.
     """
-    formats, folder = check_formats("Campaign.save", figures), Path(folder)
+    formats = check_formats("Campaign.save", figures)
+    if not isinstance(folder, str | os.PathLike) or not str(folder).strip():
+        raise ValueError(f"Campaign.save: expected a folder, got {folder!r}")
+    folder = Path(folder)
+    check_writable(folder)
     drawings = _drawings(campaign, seed)
     there = [name for name in file_names(formats, drawings) if (folder / name).exists()]
     if there and not overwrite:
@@ -90,7 +100,19 @@ def save(
     }
     for name, (_, figure) in drawn.items():
         files |= {f"{name}.{kind}": saved(figure, kind) for kind in formats}
-    return write_files(folder, files)
+    stale = () if _holds(folder / RESULT, files[RESULT]) else file_names(FORMATS)
+    paths = write_files(folder, files)
+    for name in {*stale} - {*files}:
+        (folder / name).unlink(missing_ok=True)
+    return paths
+
+
+def _holds(path: Path, text: object) -> bool:
+    """Whether a file has this text."""
+    try:
+        return path.read_text(encoding="utf-8") == text
+    except (OSError, ValueError):
+        return False
 
 
 def notebook(campaign: Campaign) -> str:

@@ -64,7 +64,7 @@ def campaign_table(campaign: Campaign) -> str:
     names = list(campaign.filters)
     parts = [names[i : i + _COLUMNS] for i in range(0, len(names), _COLUMNS)]
     text = "\n\n".join(_columns(campaign, part) for part in parts)
-    title = f"{campaign.scenario}: {campaign.runs} runs × {campaign.steps} steps, {campaign.dtype}"
+    title = f"{campaign.scenario}: {campaign.size}"
     notes = [
         "honest: the average of a consistent filter; NEES is not divided by its dof.",
         f"± or [low, high]: {LEVEL:.0%} interval over the runs.",

@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,6 +37,9 @@ FORMAT = 2
 MANIFEST = "manifest.json"
 """File with the format, the settings, the fingerprint, their digest, and the number of runs."""
 
+_DIGEST = re.compile("[0-9a-f]{16}")
+"""Digest of what is computed, in a fingerprint; its digits tell a user nothing."""
+
 
 @dataclass(frozen=True)
 class Store:
@@ -58,12 +62,15 @@ class Store:
         """Note in a new folder the campaign it belongs to; check it in any other folder.
 
         The number of runs is noted, too, which may extend the campaign. Raises ValueError that
-        names every difference of fingerprints, as "key: … there, … here".
+        names every difference of fingerprints, as "key: … there, … here", and what to do then.
         """
         mine = {str(name): str(value) for name, value in fingerprint.items()}
         there = resume(self.folder)  # another process may have claimed it since
         if there.campaign and (differences := _differences(there.campaign, mine)):
-            raise ValueError(f"{self.folder} holds another campaign: {'; '.join(differences)}")
+            raise ValueError(
+                f"{self.folder} holds another campaign: {'; '.join(differences)}; choose another "
+                "folder, or replace its runs (in the command, --overwrite)"
+            )
         runs = there.runs if self.runs is None else self.runs
         if not there.campaign or runs != there.runs:
             _write_manifest(self.folder, there.settings, mine, runs)
@@ -258,5 +265,9 @@ def _differences(there: Mapping[str, Any], here: Mapping[str, Any], above: str =
                 else "absent"
                 for side in (there, here)
             )
-            found.append(f"{above}{key}: {old} there, {new} here")
+            if len(values) == 2 and plain and all(map(_DIGEST.fullmatch, values)):
+                how = "computes something else than in the stored runs (was its file edited?)"
+            else:
+                how = f"{old} there, {new} here"
+            found.append(f"{above}{key}: {how}")
     return found

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.claims import Claim
-from jaxslam.verify.errors import describe_error, is_user_file
+from jaxslam.verify.errors import describe_error, is_user_file, line_of
 from jaxslam.verify.functions import makes_a_model
 from jaxslam.verify.verifier import Model
 
@@ -89,7 +89,13 @@ def load(target: str) -> list[Target]:
                 f"function with its Jacobian, and there is no {name}{CLAIMS[0]}"
             )
         if not found:
-            raise UnusableFile(f"{path.name}: there is no {name}")
+            names = ", ".join(
+                key
+                for key, value in vars(module).items()
+                if not key.startswith("_") and not isinstance(value, ModuleType)
+            )
+            there = f"; it defines: {names}" if names else ""
+            raise UnusableFile(f"{path.name}: there is no {name} to verify{there}")
     if not found:
         raise UnusableFile(
             f"{path.name}: defines nothing to verify: no Motion, no Sensor, no function f with an "
@@ -167,7 +173,9 @@ def import_file(path: Path) -> ModuleType:
     except SyntaxError as error:
         raise UnusableFile(f"{path.name}:{error.lineno}: {error.msg}") from error
     except (Exception, SystemExit) as error:
-        raise UnusableFile(f"does not import: {describe_error(error)}") from error
+        where = line_of(error)
+        why = describe_error(error).removeprefix(f"{where}: ")
+        raise UnusableFile(f"{where or path.name}: does not import: {why}") from error
     finally:
         sys.path.pop(0)
         del sys.modules[name]

@@ -1,6 +1,7 @@
 """The command: files, exit codes, and nothing left behind after bad input or an interrupt."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -170,3 +171,13 @@ def test_the_module_runs_as_a_program_in_float32_and_imports_late_what_draws(tmp
     assert {"matplotlib", "scipy.stats"}.isdisjoint(modules.split())
     assert "The filters ran in float32: for float64" in said
     assert json.loads((tmp_path / "consistency.json").read_text())["dtype"] == "float32"
+
+
+def test_a_closed_pipe_ends_the_command_silently(tmp_path, monkeypatch, capfd):
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as closed, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", closed)
+        patch.setattr(cli, "verify_models", lambda *a: print("report") or 0)
+        assert cli.main(["verify", "--out", str(tmp_path)]) == 141
+    assert capfd.readouterr().err == ""

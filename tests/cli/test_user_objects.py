@@ -72,10 +72,16 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--filters", "mine.py"], "--filters: expected FILE.py:NAME, got mine.py"),
+        (
+            ["--filters", "mine.py"],
+            "--filters: expected FILE.py:NAME, got mine.py; it defines: world, short, blind",
+        ),
         (["--filters", "other.py:blind"], "other.py: no such file"),
         (["--filters", "mine.txt:blind"], "expected a Python file"),
-        (["--filters", "mine.py:nobody"], "mine.py: there is no nobody"),
+        (
+            ["--filters", "mine.py:nobody"],
+            "--filters: there is no nobody in mine.py; it defines: world",
+        ),
         (
             ["--filters", "mine.py:number"],
             "mine.py:number: expected a Filter, or a function of the",
@@ -92,7 +98,10 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
             ["--scenario", "mine.py:world", "--steps", "3"],
             "mine.py:world is a Scenario, which has 4",
         ),
-        (["--scenario", "mine.py:world", "--filters", "magic"], "unknown filter 'magic'"),
+        (
+            ["--scenario", "mine.py:world", "--filters", "magic"],
+            "; or FILE.py:NAME, one of your own",
+        ),
         (["--figures", "gif"], "--figures: expected formats of png, pdf, svg, got 'gif'"),
         (["--figures", ""], "--figures: expected formats of png, pdf, svg, got ''"),
     ],
@@ -139,4 +148,9 @@ def test_a_campaign_of_a_file_is_resumed_while_the_file_computes_the_same(
     assert cli.main([*again, "--figures", "pdf,png"]) == 0  # of a finished campaign
     assert {path.suffix for path in out.glob("map.*")} == {".svg", ".pdf", ".png"}
     mine.write_text(MINE.replace("factor = 2.0", "factor = 3.0"))
-    refused([*again, "--runs", "4"], f"{out / 'blocks'} holds another campaign: filter blind: ")
+    message = refused(
+        [*again, "--runs", "4"],
+        f"{out / 'blocks'} holds another campaign: filter blind: computes something else than in "
+        "the stored runs (was its file edited?); choose another folder, or replace",
+    )
+    assert "--overwrite" in message

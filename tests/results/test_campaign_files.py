@@ -54,6 +54,8 @@ def test_printed_it_is_the_table_and_in_a_line_its_verdicts(found):
         f"Campaign(world {EVIL}, {size}, good=consistent, other=optimistic)"
     )
     assert repr(found.filters["good"]) == "Summary(consistent, nees_pose=3.041, rmse_position=1.2)"
+    one = dataclasses.replace(found, runs=1, steps=1)
+    assert "1 run × 1 step, float32" in repr(one) and "1 run × 1 step, float32" in str(one)
     many = dataclasses.replace(found, filters={f"f{i}": found.filters["good"] for i in range(20)})
     assert max(map(len, repr(many).splitlines())) <= 100
 
@@ -133,6 +135,34 @@ def test_what_exists_is_not_overwritten_unasked_and_nothing_half_written_stays(
     with pytest.raises(KeyboardInterrupt):
         found.save(tmp_path / "new" / "er", figures=("svg",))
     assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_cannot_be_used_is_refused_before_anything_is_drawn(
+    found, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(campaign_files, "_drawings", lambda *a: pytest.fail("drawn"))
+    monkeypatch.chdir(tmp_path)
+    for folder in ("", " ", None):
+        with pytest.raises(ValueError, match=r"^Campaign.save: expected a folder, got "):
+            found.save(folder)
+    with pytest.raises(ValueError, match=r"^Campaign.save: expected formats of .*, got None"):
+        found.save("out", figures=None)
+    assert not [*tmp_path.iterdir()]
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OSError, match=r"^results cannot be written to file: .*file is not a fold"):
+        found.save("file")
+
+
+def test_figures_of_another_campaign_do_not_stay_beside_the_report(found, tmp_path, undrawn):
+    (tmp_path / "mine.png").write_text("mine")
+    found.save(tmp_path, "pdf")
+    found.save(tmp_path, "svg", overwrite=True)  # the same campaign
+    assert {path.suffix for path in tmp_path.glob("map.*")} == {".pdf", ".svg"}
+    other = dataclasses.replace(found, first={}, scenario="another")
+    paths = other.save(tmp_path, "png", overwrite=True)
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in paths} | {
+        "mine.png"
+    }
 
 
 def test_a_figure_is_the_same_bytes_each_time(found):

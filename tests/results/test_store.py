@@ -108,6 +108,7 @@ def test_a_campaign_claims_its_folder_and_no_other_gets_it(made):
         "key: fry 0:1 there, fry 0:2 here",
         "filter σ: abc there, absent here",
         "steps: absent there, 5 here",
+        "choose another folder, or replace its runs (in the command, --overwrite)",
     ]
     assert store.resume(made.folder).campaign == mine
     # Of two that were opened before either claimed it, the second to claim finds the first.

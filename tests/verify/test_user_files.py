@@ -142,13 +142,21 @@ def test_one_of_them_by_name(verify):
 @pytest.mark.parametrize(
     ("text", "name", "why"),
     [
-        ("import nothing_of_this_name\n", "", "mine.py:1: ModuleNotFoundError"),
+        (
+            "import nothing_of_this_name\n",
+            "",
+            "jaxslam: mine.py:1: does not import: ModuleNotFoundError",
+        ),
         ("x = 1\nx = = 2\n", "", "mine.py:2: invalid syntax"),
-        ("x = 1\n\nraise RuntimeError('not today')\n", "", "mine.py:3: RuntimeError: not today"),
-        ("import sys\nsys.exit(3)\n", "", "mine.py:2: SystemExit"),
+        (
+            "x = 1\n\nraise RuntimeError('not today')\n",
+            "",
+            "mine.py:3: does not import: RuntimeError: not today",
+        ),
+        ("import sys\nsys.exit(3)\n", "", "mine.py:2: does not import: SystemExit"),
         ("x = 1\n", "", "mine.py: defines nothing to verify"),
         ("", "", "mine.py: defines nothing to verify"),
-        (GOOD, ":g", "there is no g"),
+        (GOOD, ":g", "mine.py: there is no g to verify; it defines: "),
         (GOOD.replace("f_jacobian", "f_slope"), ":f", "there is no f_jacobian"),
         (UNTOLD, "", "what is the length of its argument 'u'"),
         (GOOD + "\nf_jacobians = f_jacobian\n", "", "expected f_jacobian or f_jacobians, got both"),
