@@ -250,7 +250,7 @@ def test_information_gained_is_drawn_for_watched_filters_and_zeros_below_the_axi
         found.filters[name].curves["rotation_information"] = values
     figure = plot.gained_figure(found)
     assert named(figure) == ["learns", "honest"]
-    assert title(figure).endswith("Not watched: dead_reckoning")
+    assert title(figure).endswith("Not monitored: dead_reckoning")
     (axes,) = figure.axes
     learns, honest = (line(axes, name).get_ydata() for name in ("learns", "honest"))
     np.testing.assert_array_equal(learns[3:], gained[3:])
@@ -261,7 +261,9 @@ def test_information_gained_is_drawn_for_watched_filters_and_zeros_below_the_axi
     assert not np.isclose(honest[0], learns[0], rtol=0.2)  # each at a height of its own
     assert high > 50
     nobody = plot.gained_figure(drawn.campaign(["dead_reckoning"]))
-    assert [text.get_text() for text in nobody.axes[0].texts] == ["no filter was watched"]
+    assert [text.get_text() for text in nobody.axes[0].texts] == [
+        "no filter has an observability monitor (filters.monitored)"
+    ]
 
 
 @pytest.mark.parametrize("names", [("ekf", "fej"), tuple(ALL)])

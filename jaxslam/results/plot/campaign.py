@@ -145,12 +145,12 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         axes.set(yscale="log", xlim=span(campaign.steps), ylim=(_NOTHING * 10**-strip, top))
         _label_powers(axes, strip, decades)
     if not curves:
-        said = "no filter was watched"
+        said = "no filter has an observability monitor (filters.monitored)"
         axes.text(0.5, 0.6, said, transform=axes.transAxes, ha="center", fontsize=8)
     title = (
         f"{head(campaign)}: information gained on a turn of the whole frame, {runs_of(campaign)}"
     )
-    title += f". Not watched: {', '.join(map(plain, others))}" * bool(others and curves)
+    title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
     finish(figure, rows, title, "step")
     return figure
 
