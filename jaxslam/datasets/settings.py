@@ -279,8 +279,8 @@ def _fitting(
 
 
 def _of_no_noise(*_: Any) -> Any:
-    """Stands for a noise while only the names of a model matter."""
-    raise NotImplementedError
+    """The noise of a model that is made for its names alone, and is never evaluated."""
+    raise AssertionError("a model that was made for its names was evaluated")
 
 
 def _is_number(value: Any) -> bool:
