@@ -28,6 +28,7 @@ INTRODUCED = {
     "jaxslam.life": "Which landmarks exist",
     "jaxslam.resampling": "Resampling",
     "jaxslam.smoothing": "Smoothing and batch estimation",
+    "jaxslam.graphs": "Graphs of poses and points",
     "jaxslam.team": "Several robots",
     "jaxslam.simulation": "Simulated worlds",
     "jaxslam.monte_carlo": "Monte-Carlo campaigns",

@@ -1,0 +1,42 @@
+"""The data of a graph: variables, and measurements between them in tables by kind.
+
+The cost of a graph is χ² = Σ eᵀ Ω e over all valid rows of all tables, without a factor ½: e is the
+residual of the row (`factor.Factor`) and Ω its information.
+"""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Table(NamedTuple):
+    """Measurements of one kind, E rows: K variables, Z numbers measured and R residuals each."""
+
+    who: Int[Array, "E K"]
+    """the variables of a row: indices of poses or points, as the factor's `variables` says"""
+    z: Float[Array, "E Z"]
+    """what was measured"""
+    information: Float[Array, "E R R"]
+    """Ω, the inverse of the residual's covariance; symmetric, positive semidefinite"""
+    valid: Bool[Array, "E"]
+    """false for padding, and for rows that are left out"""
+
+
+class Graph(NamedTuple):
+    """A graph of N poses and P points (or landmarks of L numbers); leading axes by `vmap`.
+
+    The factor of a table stands in a dictionary of the same keys beside the graph, since data hold
+    no functions: `graphs.REGISTRY` has those of files.
+    """
+
+    poses: Float[Array, "N 3"]
+    """(x, y, θ), θ wrapped"""
+    points: Float[Array, "P L"]
+    tables: dict[str, Table]
+    fixed_pose: Bool[Array, "N"]
+    """poses that optimization does not move"""
+    fixed_point: Bool[Array, "P"]
+    pose_id: Int[Array, "N"]
+    """identity in a file, or row of a log"""
+    point_id: Int[Array, "P"]
+    """identity in a file, or tag in a log"""
