@@ -203,6 +203,11 @@ plot(0).focus(); key(0, "0");
 found.reset = steps();
 key(0, "End"); key(0, "+");
 found.closer = steps();
+key(0, "+");
+found.closest = [...steps(), read(0)[0]];
+key(0, "Escape"); key(0, "-"); key(0, "-"); key(0, "-");
+found.back = steps();
+key(0, "End"); key(0, "+");
 key(0, "0", {ctrlKey: true});
 found.browsers = steps();
 const [from, to] = all(".knob input");
@@ -219,6 +224,9 @@ found.again = steps();
     for ticks in found["ticks"]:
         assert ticks and min(ticks) >= 10 and max(ticks) <= 20
     assert found["closer"][1] == STEPS and 18 <= found["closer"][0] <= 22
+    first, last, cursor = found["closest"]
+    assert last == STEPS and 28 <= first <= 32 and cursor == "step 40"
+    assert found["back"] == [1, STEPS]  # without a cursor about the middle
     assert found["browsers"] == found["closer"]  # Ctrl 0 is the browser's
     assert found["typed"] == found["refused"] == [5, 12]
 
@@ -239,7 +247,7 @@ does(0, "pointermove", 0.5, 50);
 found.under = all(".values")[0].getBoundingClientRect().top >= plot(0).getBoundingClientRect().bottom;
 found.cursor = all(".cursor").length;
 """,
-        width=500,
+        width=400,
     )
     assert found["auto"] == found["again"] == "colours: auto"
     assert found["light"] == ["colours: light", "rgb(255, 255, 255)"]

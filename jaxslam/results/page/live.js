@@ -66,7 +66,7 @@
     : Array.isArray(curve[0]) ? [curve[0][j], curve[1][j]] : [curve[j], curve[j]]);
   const x = (panel, j) => (panel.at ? panel.at[j] : j * data.each + (data.each + 1) / 2);
   const points = (panel) => (panel.at ? panel.at.length : Math.ceil(data.steps / data.each));
-  const limits = (panel) => panel.limits ?? view;
+  const limits = (panel) => panel.limits ?? (view[0] < view[1] ? view : [view[0] - 0.5, view[0] + 0.5]);
   const inView = (panel) => {
     const [a, b] = limits(panel), found = [];
     for (let j = 0; j < points(panel); j += 1) {
@@ -175,6 +175,12 @@
       const at = inView(panel), here = Math.max(at.indexOf(panel.cursor), 0), leap = event.shiftKey ? 10 : 1;
       const mine = visible().filter((i) => panel.values[i]);
       const next = (by) => mine[(mine.indexOf(picked) + by + mine.length) % mine.length] ?? null;
+      const around = (by) => { // the cursor stays where it is
+        if (panel.limits) return;
+        const here = panel.cursor === undefined ? undefined : x(panel, panel.cursor);
+        closer(by, here);
+        if (here !== undefined) point(panel, nearest(panel, here));
+      };
       const acts = {
         ArrowLeft: () => point(panel, at[Math.max(here - leap, 0)]),
         ArrowRight: () => point(panel, at[Math.min(here + leap, at.length - 1)]),
@@ -182,9 +188,9 @@
         End: () => point(panel, at[at.length - 1]),
         ArrowDown: () => { pick(next(1)); point(panel, panel.cursor); },
         ArrowUp: () => { pick(next(-1)); point(panel, panel.cursor); },
-        "+": () => panel.limits || closer(0.5, x(panel, panel.cursor)),
-        "=": () => acts["+"](),
-        "-": () => panel.limits || closer(2, x(panel, panel.cursor)),
+        "+": () => around(0.5),
+        "=": () => around(0.5),
+        "-": () => around(2),
         0: () => panel.limits || zoom(1, data.steps),
         Escape: leave,
       };
@@ -230,7 +236,10 @@
     if (drawn) {
       const there = at.filter((j) => ends(drawn[0], j)[0] !== null);
       const side = (k) => there.map((j) => `${px(x(panel, j)).toFixed(1)} ${py(ends(drawn[k], j)[k]).toFixed(1)}`);
-      if (there.length) lines.append(draw("path", { class: "band", d: `M${[...side(1), ...side(0).reverse()].join("L")}Z` }));
+      if (there.length === 1) {
+        const edges = [0, 1].map((k) => py(ends(drawn[k], there[0])[k]));
+        lines.append(draw("rect", { class: "band", x: EDGE.left, width: right - EDGE.left, y: edges[1], height: edges[0] - edges[1] }));
+      } else if (there.length) lines.append(draw("path", { class: "band", d: `M${[...side(1), ...side(0).reverse()].join("L")}Z` }));
     }
     if (panel.reference) lines.append(draw("path", { class: "reference", d: path(panel.reference.values) }));
     for (const i of [...mine].sort((p, q) => (p === picked) - (q === picked))) {
@@ -254,7 +263,7 @@
     }
     const across = panel.at && panel.scale !== "unit" ? panel.at : linear(a, b > a ? b : a + 1, width / 110).ticks;
     for (const v of across) {
-      if (v < a || v > b) continue;
+      if (v < a || v > b || (!panel.at && !Number.isInteger(v))) continue;
       grid.append(draw("text", { x: px(v), y: bottom + 15, "text-anchor": "middle" }, said(v)));
     }
     grid.append(draw("path", { class: "line", d: `M${EDGE.left} ${EDGE.top}V${bottom}H${right}` }),
