@@ -1,12 +1,13 @@
-"""The pictures of docs/gallery.md: `python -m benchmarks.gallery [NAME …]`.
+"""docs/gallery.md and its pictures: `python -m benchmarks.gallery [NAME …]`.
 
-Each is made by a script of its name in `examples/gallery/`, which binds `figure`. Those of data
+A picture is made by a script of its name in `examples/gallery/`, which binds `figure`. Those of data
 sets take a folder as their argument, and their pictures are left as they are where it is absent
 (JAXSLAM_DATA, by default ../shared/data beside the checkout). A picture holds the hash of its
 script, so that a test finds one that is no longer its script's.
 """
 
 import argparse
+import ast
 import hashlib
 import io
 import runpy
@@ -21,6 +22,7 @@ from benchmarks.real_data import DATA
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS, PICTURES = ROOT / "examples" / "gallery", ROOT / "benchmarks" / "figures" / "gallery"
+PAGE = ROOT / "docs" / "gallery.md"
 FOLDERS = {"bonn": "bonn", "mrclam": "mrclam1", "mrclam_team": "mrclam1"}
 """The folder of recorded data that a script takes, by its name."""
 
@@ -28,10 +30,54 @@ COLOURS, DOTS = 64, 110
 """Colours of a picture, and dots an inch."""
 
 
+HEAD = """# Gallery
+
+Every scenario, family of filters and data set, with one picture and the lines that made it. Each
+script is a file of `examples/gallery/`, and runs alone: the picture is its `figure`, which
+`figure.savefig("picture.png")` writes. `python -m benchmarks.gallery` makes all pictures and this
+page again, `python -m benchmarks.gallery circle` one picture. Those of data sets need the
+[files](guide/real_data.md).
+"""
+
+PARTS = {
+    "scenarios": """## Scenarios
+
+{py:mod}`jaxslam.simulation.scenarios` has them by name. Steps are fewer here than in the published
+experiments.
+""",
+    "filters": """## Families of filters
+
+[Choosing a filter](guide/choosing_a_filter.md) says which is for what. {py:mod}`jaxslam.catalog`
+has the families that run in every scenario.
+""",
+    "datasets": """## Data sets
+
+{py:mod}`jaxslam.datasets` has the readers. [Real data](guide/real_data.md) says where the files
+are, [Your own data](guide/own_data.md) how to write your own.
+""",
+}
+"""What the page says of each folder of scripts."""
+
+
+def page() -> str:
+    """The text of docs/gallery.md: each script with its picture."""
+    parts = [HEAD]
+    for kind, said in PARTS.items():
+        parts.append(said)
+        for path in sorted((SCRIPTS / kind).glob("*.py")):
+            name = path.stem
+            title = name.replace("_", " ").capitalize() if kind == "filters" else f"`{name}`"
+            about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+            parts.append(
+                f"### {title}\n\n![{about}](../benchmarks/figures/gallery/{name}.png)\n\n"
+                f"```{{literalinclude}} ../examples/gallery/{kind}/{name}.py\n```\n"
+            )
+    return "\n".join(parts)
+
+
 def scripts() -> dict[str, Path]:
     """Every script by its name: scenarios, families of filters, data sets."""
-    kinds = ("scenarios", "filters", "datasets")
-    return {path.stem: path for kind in kinds for path in sorted((SCRIPTS / kind).glob("*.py"))}
+    return {path.stem: path for kind in PARTS for path in sorted((SCRIPTS / kind).glob("*.py"))}
 
 
 def digest(script: Path) -> str:
@@ -67,6 +113,7 @@ def main() -> None:
     for name in names:
         if name not in known:
             parser.error(f"NAME: expected one of {', '.join(known)}, got {name}")
+    PAGE.write_text(page(), encoding="utf-8")
     for name in names:
         began = time.process_time()
         path = draw(name, known[name])

@@ -19,7 +19,6 @@ from jaxslam.catalog import KINDS
 from jaxslam.simulation.scenarios import SCENARIOS
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
 SCRIPTS = gallery.scripts()
 
 IN_KINDS = {"ekf", "information", "particles", "known"}
@@ -41,9 +40,11 @@ def test_every_scenario_family_and_data_set_has_a_script():
     assert kinds["datasets"] == set(datasets.__all__) - {"READERS", "Dataset"}
 
 
-def test_every_script_stands_on_the_page_with_its_picture():
-    included = re.findall(r"\{literalinclude\} \.\./examples/gallery/\w+/(\w+)\.py", PAGE)
-    shown = re.findall(r"\]\(\.\./benchmarks/figures/gallery/(\w+)\.png\)", PAGE)
+def test_the_page_shows_every_script_with_its_picture():
+    text = gallery.page()
+    assert gallery.PAGE.read_text(encoding="utf-8") == text
+    included = re.findall(r"\{literalinclude\} \.\./examples/gallery/\w+/(\w+)\.py", text)
+    shown = re.findall(r"\]\(\.\./benchmarks/figures/gallery/(\w+)\.png\)", text)
     assert included == shown == list(SCRIPTS)
 
 
@@ -61,7 +62,7 @@ def test_a_picture_is_small_and_of_its_script(name):
 def test_a_script_is_short_and_names_what_there_is(name):
     tree = ast.parse(SCRIPTS[name].read_text(encoding="utf-8"))
     said = ast.get_docstring(tree)
-    assert said in PAGE and "\n" not in said
+    assert said and "\n" not in said
     body = [node for node in tree.body[1:] if not isinstance(node, ast.Import | ast.ImportFrom)]
     assert len(body) <= 14
     for node in ast.walk(tree):

@@ -106,8 +106,8 @@
     }
     const log = panel.log ?? (panel.scale === "log" && high > 10 * low);
     panel.isLog = log;
-    if (panel.scale === "log") high = Math.min(high, Math.max(100 * panel.honest, 3 * rest));
-    else if (!log && tops.length) { // one filter alone does not set the scale
+    if (panel.scale === "log" && mine.length > 1) high = Math.min(high, Math.max(100 * panel.honest, 3 * rest));
+    else if (panel.scale === "zero" && !log && tops.length) { // one filter alone does not set the scale
       const limit = 3 * tops[Math.floor((tops.length - 1) / 2)];
       high = Math.max(rest, ...tops.filter((v) => v <= limit));
     }
