@@ -1,7 +1,7 @@
 """docs/gallery.md and its pictures: `python -m benchmarks.gallery [NAME …]`.
 
-A picture is made by a script of its name in `examples/gallery/`, which binds `figure`. Those of data
-sets take a folder as their argument, and their pictures are left as they are where it is absent
+A picture is made by a script of its name in `examples/gallery/`, which binds `figure`. Those of
+data sets take a folder as their argument; where it is absent, their pictures are left as they are
 (JAXSLAM_DATA, by default ../shared/data beside the checkout). A picture holds the hash of its
 script, so that a test finds one that is no longer its script's.
 """
