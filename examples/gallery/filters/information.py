@@ -1,17 +1,25 @@
-"""Information: SEIF cuts weak links of the information matrix, and finds nearly the same map."""
-
-import dataclasses
+"""Information: the normalized matrix of an information filter, and that of SEIF, which cuts links."""
 
 import jax
+import numpy as np
+from matplotlib.figure import Figure
 
 import jaxslam
+from jaxslam.filters.information.marginals import whole_information
 
 jax.config.update("jax_enable_x64", True)
 world = jaxslam.scenarios.circle(steps=240)
-world = dataclasses.replace(world, filter_options={})
-filters = {name: jaxslam.catalog.CANONICAL[name](world) for name in ("seif", "eif_slam")}
 truth, log = jaxslam.simulate(world, jax.random.key(0))
 start = world.pose, world.pose_cov, jax.random.key(0)
-found = {name: jaxslam.run(filter, log, *start).estimate for name, filter in filters.items()}
-others = {"eif_slam": found["eif_slam"]}
-figure = jaxslam.plot.map_figure(found["seif"], truth=truth, others=others, title="circle: SEIF")
+exact = jaxslam.filters.eif_slam(world.motion, world.sensor, 20)
+sparse = jaxslam.filters.seif(world.motion, world.sensor, 20, active=6, links=6)
+dense = np.asarray(jaxslam.run(exact, log, *start).final.omega)
+links = whole_information(jaxslam.run(sparse, log, *start).final).toarray()
+figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+panels = zip(figure.subplots(1, 2), ("EIF", "SEIF"), (dense, links), strict=True)
+for axes, name, omega in panels:
+    scale = np.sqrt(np.diagonal(omega))
+    shown = np.log10(np.maximum(np.abs(omega) / np.outer(scale, scale), 1e-6))
+    image = axes.imshow(shown, cmap="Blues", vmin=-6, vmax=0)
+    axes.set(title=name, xlabel="entry of the state")
+figure.colorbar(image, ax=figure.axes, label="log₁₀ of the normalized information")
