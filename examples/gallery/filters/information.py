@@ -1,4 +1,4 @@
-"""Information: the normalized matrix of an information filter, and that of SEIF, which cuts links."""
+"""Information: the normalized matrix of the information filter, and of SEIF, which cuts links."""
 
 import jax
 import numpy as np
