@@ -47,8 +47,9 @@ nb_merge_streams = True
 
 # What a page printed and drew is kept until the page or the package changes.
 sources = hashlib.sha256()
-for path in sorted((ROOT / "jaxslam").rglob("*.py")):
-    sources.update(path.read_bytes())
+for path in sorted((ROOT / "jaxslam").rglob("*")):
+    if path.suffix in (".py", ".css", ".js"):
+        sources.update(path.read_bytes())
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / ".cache" / f"docs-{sources.hexdigest()[:16]}")
 get_cache(nb_execution_cache_path).list_cache_records()  # makes it, before several processes do

@@ -92,7 +92,7 @@ def save(
             command,
             seed,
             versions(),
-            dict(drawn.values()),
+            drawn,
             lambda figure: encode(figure, "png"),
         ),
         RESULT: report.as_json(campaign, command, seed),
@@ -120,8 +120,8 @@ def notebook(campaign: Campaign) -> str:
     from jaxslam.results import page, plot  # matplotlib is slow to load
 
     drawings = _drawings(campaign, None)
-    shown = [drawings[name] for name in _IN_NOTEBOOK]
-    figures = {caption: make() for caption, make in shown}
+    shown = ((name, *drawings[name]) for name in _IN_NOTEBOOK)
+    figures = {name: (caption, make()) for name, caption, make in shown}
     return page.fragment(campaign, report.ROWS, figures, partial(plot.png, dpi=110))
 
 

@@ -1,6 +1,8 @@
-"""The report of a campaign as one self-contained HTML5 file, without scripts; and as a fragment.
+"""The report of a campaign as one self-contained HTML5 file; and as a fragment, without scripts.
 
-Figures are embedded, and the page forbids the browser to load anything else.
+Figures are embedded, and the page forbids the browser to load anything else. Its script (`live.js`)
+draws the figures that have curves again, to be explored, from the numbers of `curves.py`; on paper
+and without JavaScript the page shows the static figures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -8,6 +10,7 @@ from html import escape
 
 from jaxslam.consistency import DOF, LEVEL
 from jaxslam.monte_carlo import Campaign
+from jaxslam.results.page import curves
 from jaxslam.results.page.parts import (
     VERDICTS,
     badge,
@@ -16,7 +19,7 @@ from jaxslam.results.page.parts import (
     measures_table,
     verdict_list,
 )
-from jaxslam.results.page.style import CSS, FRAGMENT_CSS, POLICY
+from jaxslam.results.page.style import CSS, FRAGMENT_CSS, SCRIPT, policy
 from jaxslam.results.page.text import duration, percentage, with_noun
 from jaxslam.results.plot import Figure, png
 
@@ -32,8 +35,9 @@ def page(
     command: str,
     seed: int | None,
     versions: Mapping[str, str],
-    figures: Mapping[str, Figure],
+    figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
+    film: str = "",
 ) -> str:
     """The HTML report of a campaign.
 
@@ -43,18 +47,24 @@ def page(
             label that starts with a space is indented. Rows that no filter has are left out.
         command, seed: those of the campaign; None where there was no seed.
         versions: of the software, by name.
-        figures: in order, by caption.
+        figures: in order, by name, each with its caption. Those of the names of `curves.py` are
+            drawn by the script, too.
         draw: makes a PNG file of a figure; with a cache where the files are needed elsewhere, too.
+        film: a fragment of HTML above the figures. It is not escaped; its scripts run if they stand
+            in it, in elements without attributes.
     """
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
     shown = _figures(figures, draw)
+    data = curves.embedded(campaign)
+    scripts = f"""<script type="application/json" id="curves">{data.text}</script>
+<script>{SCRIPT}</script>"""
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="{POLICY}">
+<meta http-equiv="Content-Security-Policy" content="{policy(film + scripts)}">
 <title>{escape(heading)}</title>
 <style>{CSS}</style>
 </head>
@@ -81,12 +91,14 @@ same draws.</p>
 <h2>How to read it</h2>
 {_conventions(campaign)}
 </section>
+{f"<section><h2>Film</h2>{film}</section>" if film else ""}
 {f"<section><h2>Figures</h2>{shown}</section>" if shown else ""}
 <section>
 <h2>Parameters</h2>
-{_parameters(campaign, command, seed, versions)}
+{_parameters(campaign, command, seed, versions, data)}
 </section>
 </main>
+{scripts}
 </body>
 </html>
 """
@@ -95,7 +107,7 @@ same draws.</p>
 def fragment(
     campaign: Campaign,
     table: Sequence[tuple[str, str, str]],
-    figures: Mapping[str, Figure],
+    figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
     """What a notebook shows of a campaign: verdicts, these figures, and the measures, folded.
@@ -124,11 +136,11 @@ def _setup(campaign: Campaign) -> str:
     return f"{runs} of {with_noun(campaign.steps, 'step')}"
 
 
-def _figures(figures: Mapping[str, Figure], draw: Callable[[Figure], bytes]) -> str:
+def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure], bytes]) -> str:
     """The figures as HTML, numbered."""
     return "\n".join(
-        embedded(i, caption, figure, draw(figure))
-        for i, (caption, figure) in enumerate(figures.items(), 1)
+        embedded(i, name, caption, figure, draw(figure))
+        for i, (name, (caption, figure)) in enumerate(figures.items(), 1)
     )
 
 
@@ -162,7 +174,11 @@ reject. An asterisk marks a verdict with a reservation:</p>
 
 
 def _parameters(
-    campaign: Campaign, command: str, seed: int | None, versions: Mapping[str, str]
+    campaign: Campaign,
+    command: str,
+    seed: int | None,
+    versions: Mapping[str, str],
+    data: curves.Curves,
 ) -> str:
     """The parameters of the campaign as HTML."""
     compiling = duration(campaign.compile_seconds)
@@ -176,6 +192,12 @@ def _parameters(
         "command": f"<code>{escape(command)}</code>" if command else "",
         "divergence limit": f"{campaign.divergence_limit:.4g} m",
         "time": f"{duration(campaign.seconds)}, {compiling} of it compilation",
+        "curves on this page": f"{len(data.text.encode()) / 1e3:,.0f} kB, four digits, "
+        + (
+            "every step"
+            if data.each == 1
+            else f"least and greatest of each {data.each} steps (consistency.csv has every step)"
+        ),
         "versions": escape(", ".join(f"{name} {number}" for name, number in versions.items())),
     }
     shown = (f"<dt>{name}</dt><dd>{value}</dd>" for name, value in rows.items() if value)

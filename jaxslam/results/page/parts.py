@@ -3,11 +3,19 @@
 import base64
 from collections.abc import Iterable, Sequence
 from html import escape
+from itertools import repeat
 
 from jaxslam.consistency import DOF, LEVEL, Summary, power_of
 from jaxslam.consistency.verdict import TESTS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.page.text import breakable, cell, interval_title, percentage, published_note
+from jaxslam.results.page.text import (
+    breakable,
+    cell,
+    interval_title,
+    percentage,
+    published_note,
+    sortable,
+)
 from jaxslam.results.plot import Figure, describe
 
 VERDICTS = {
@@ -66,14 +74,19 @@ def measures_table(campaign: Campaign, table: Sequence[tuple[str, str, str]]) ->
     """The table of measures × filters as HTML; published values below our own."""
     summaries = campaign.filters
     head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in summaries)
-    verdicts = "".join(f"<td>{badge(s.verdict, s)}</td>" for s in summaries.values())
+    ranks = list(VERDICTS)
+    verdicts = "".join(
+        f"<td{sortable(ranks.index(s.verdict) if s.verdict in ranks else None)}>"
+        f"{badge(s.verdict, s)}</td>"
+        for s in summaries.values()
+    )
     body = [_row("verdict", "consistent", verdicts)]
     for key, label, honest in table:
         published = [campaign.published.get(name, {}).get(key) for name in summaries]
         measures = [s.measures.get(key) for s in summaries.values()]
         if any(m is not None for m in measures) or any(p is not None for p in published):
             cells = "".join(
-                f"<td{interval_title(m)}>{cell(m)}{published_note(p)}</td>"
+                f"<td{sortable(m and m.value)}{interval_title(m)}>{cell(m)}{published_note(p)}</td>"
                 for m, p in zip(measures, published, strict=True)
             )
             body.append(_row(label, honest, cells))
@@ -88,16 +101,15 @@ def measures_table(campaign: Campaign, table: Sequence[tuple[str, str, str]]) ->
     white = (f"± {half:.4f}" if half < float("inf") else "–" for half in first)
     bands.append(_row(f"autocorrelation, {percentage(LEVEL)} band", "", _cells(white)))
     for block in DOF:
-        shares = [
-            percentage(s.inside[block], 1) if block in s.inside else "–" for s in summaries.values()
-        ]
-        bands.append(_row(f"steps in {block} band", percentage(LEVEL, 1), _cells(shares)))
+        inside = [s.inside.get(block) for s in summaries.values()]
+        shares = ["–" if share is None else percentage(share, 1) for share in inside]
+        bands.append(_row(f"steps in {block} band", percentage(LEVEL, 1), _cells(shares, inside)))
     counts = []
     for key in dict.fromkeys(key for s in summaries.values() for key in s.counts):
         found = [s.counts.get(key, 0) for s in summaries.values()]
         if key in _ALWAYS or any(found):
             label = "finite runs" if key == "runs" else key.replace("_", " ")
-            counts.append(_row(label, "", _cells(f"{n:,}" for n in found)))
+            counts.append(_row(label, "", _cells((f"{n:,}" for n in found), found)))
     groups = (("", body), ("Bands", bands), ("Counts", counts))
     span = len(summaries) + 2
     parts = "\n".join(
@@ -124,9 +136,10 @@ def _row(label: str, honest: str, cells: str) -> str:
     )
 
 
-def _cells(texts: Iterable[str]) -> str:
-    """Cells of the table as HTML."""
-    return "".join(f"<td>{text}</td>" for text in texts)
+def _cells(texts: Iterable[str], values: Iterable[float | None] | None = None) -> str:
+    """Cells of the table as HTML, with the values by which filters are sorted if there are any."""
+    pairs = zip(texts, repeat(None) if values is None else values, strict=False)
+    return "".join(f"<td{sortable(value)}>{text}</td>" for text, value in pairs)
 
 
 def lost_runs(campaign: Campaign) -> str:
@@ -143,12 +156,13 @@ def lost_runs(campaign: Campaign) -> str:
     return "\n".join(out)
 
 
-def embedded(number: int, caption: str, figure: Figure, drawn: bytes) -> str:
-    """A figure with its caption as HTML, the PNG file embedded."""
+def embedded(number: int, name: str, caption: str, figure: Figure, drawn: bytes) -> str:
+    """A figure with its caption as HTML, the PNG file embedded; the script knows it by its name."""
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
     data = base64.b64encode(drawn).decode("ascii")
     return (
-        f'<figure><img width="{width}" height="{height}" alt="{escape(describe(figure))}" '
+        f'<figure data-chart="{escape(name)}"><img width="{width}" height="{height}" '
+        f'alt="{escape(describe(figure))}" '
         f'src="data:image/png;base64,{data}">'
         f"<figcaption><strong>Figure {number}.</strong> {escape(caption)}</figcaption></figure>"
     )

@@ -42,6 +42,11 @@ def interval_title(measure: Measure | None) -> str:
     return f' title="{percentage(LEVEL)} interval {measure.low:.5g} to {measure.high:.5g}"'
 
 
+def sortable(value: float | None) -> str:
+    """The HTML attribute of a cell by which the script sorts filters."""
+    return "" if value is None or not np.isfinite(value) else f' data-v="{value:.6g}"'
+
+
 def published_note(value: float | None) -> str:
     """The published value as HTML, if there is one."""
     return "" if value is None else f'<span class="published">published {number(value, 4)}</span>'

@@ -1,0 +1,25 @@
+"""Information: the normalized matrix of the information filter, and of SEIF, which cuts links."""
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+import jaxslam
+from jaxslam.filters.information.marginals import whole_information
+
+jax.config.update("jax_enable_x64", True)
+world = jaxslam.scenarios.circle(steps=240)
+truth, log = jaxslam.simulate(world, jax.random.key(0))
+start = world.pose, world.pose_cov, jax.random.key(0)
+exact = jaxslam.filters.eif_slam(world.motion, world.sensor, 20)
+sparse = jaxslam.filters.seif(world.motion, world.sensor, 20, active=6, links=6)
+dense = np.asarray(jaxslam.run(exact, log, *start).final.omega)
+links = whole_information(jaxslam.run(sparse, log, *start).final).toarray()
+figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+panels = zip(figure.subplots(1, 2), ("EIF", "SEIF"), (dense, links), strict=True)
+for axes, name, omega in panels:
+    scale = np.sqrt(np.diagonal(omega))
+    shown = np.log10(np.maximum(np.abs(omega) / np.outer(scale, scale), 1e-6))
+    image = axes.imshow(shown, cmap="Blues", vmin=-6, vmax=0)
+    axes.set(title=name, xlabel="entry of the state")
+figure.colorbar(image, ax=figure.axes, label="log₁₀ of the normalized information")

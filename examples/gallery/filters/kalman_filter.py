@@ -1,0 +1,12 @@
+"""Kalman filter: the NEES of an EKF rises out of its band; that of the ideal EKF does not."""
+
+import jax
+
+import jaxslam
+from jaxslam.catalog import FILTERS
+
+jax.config.update("jax_enable_x64", True)
+world = jaxslam.scenarios.circle(steps=500)
+filters = {name: FILTERS[name](world) for name in ("ekf", "iterated", "ideal")}
+campaign = jaxslam.monte_carlo(world, filters, runs=40, key=jax.random.key(0))
+figure = jaxslam.plot.nees_figure(campaign, blocks=("pose",))

@@ -1,0 +1,78 @@
+"""The gallery shows everything, and its pictures are those of its scripts.
+
+The scripts are run by `python -m benchmarks.gallery`; here one of them is, and the names in the
+others are looked up.
+"""
+
+import ast
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+import jaxslam
+from benchmarks import gallery
+from jaxslam import datasets, plot
+from jaxslam.catalog import KINDS
+from jaxslam.simulation.scenarios import SCENARIOS
+
+ROOT = Path(__file__).parents[1]
+SCRIPTS = gallery.scripts()
+
+IN_KINDS = {"ekf", "information", "particles", "known"}
+"""Folders of filters whose members are in the kinds of the catalog."""
+
+
+def families():
+    """The kinds of the catalog, and the folders of filters that have none there."""
+    folders = {path.parent.name for path in (ROOT / "jaxslam" / "filters").glob("*/__init__.py")}
+    return {kind.lower().replace(" ", "_") for kind in KINDS} | (folders - IN_KINDS)
+
+
+def test_every_scenario_family_and_data_set_has_a_script():
+    kinds = {kind: set() for kind in ("scenarios", "filters", "datasets")}
+    for name, path in SCRIPTS.items():
+        kinds[path.parent.name].add(name)
+    assert kinds["scenarios"] == set(SCENARIOS)
+    assert kinds["filters"] == families()
+    assert kinds["datasets"] == set(datasets.__all__) - {"READERS", "Dataset"}
+
+
+def test_the_page_shows_every_script_with_its_picture():
+    text = gallery.page()
+    assert gallery.PAGE.read_text(encoding="utf-8") == text
+    included = re.findall(r"\{literalinclude\} \.\./examples/gallery/\w+/(\w+)\.py", text)
+    shown = re.findall(r"\]\(\.\./benchmarks/figures/gallery/(\w+)\.png\)", text)
+    assert included == shown == list(SCRIPTS)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_picture_is_small_and_of_its_script(name):
+    path = gallery.PICTURES / f"{name}.png"
+    assert path.stat().st_size < 60_000
+    with Image.open(path) as picture:
+        assert picture.text["script"] == gallery.digest(SCRIPTS[name]), (
+            f"the script has changed since: python -m benchmarks.gallery {name}"
+        )
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_script_is_short_and_names_what_there_is(name):
+    tree = ast.parse(SCRIPTS[name].read_text(encoding="utf-8"))
+    said = ast.get_docstring(tree)
+    assert said and "\n" not in said
+    body = [node for node in tree.body[1:] if not isinstance(node, ast.Import | ast.ImportFrom)]
+    assert len(body) <= 14
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            path = ast.unparse(node)
+            if re.fullmatch(r"jaxslam(\.\w+)+", path):
+                at = jaxslam
+                for part in path.split(".")[1:]:
+                    at = getattr(at, part)
+
+
+def test_a_script_makes_a_figure_by_itself():
+    assert isinstance(runpy.run_path(str(SCRIPTS["table"]))["figure"], plot.Figure)
