@@ -12,7 +12,7 @@ import jax
 from threadpoolctl import threadpool_limits
 
 from jaxslam.catalog import ALL
-from jaxslam.cli import cache, devices
+from jaxslam.cli import cache, devices, fit
 from jaxslam.cli.campaign import DEFAULTS, OUT, consistency
 from jaxslam.cli.common import INTERRUPTED, as_folders
 from jaxslam.cli.compile_clock import CompileClock
@@ -87,6 +87,16 @@ def _parser() -> argparse.ArgumentParser:
             description="Run filters on recorded data. Prints a summary and writes trajectory, "
             "map, summary and a figure.",
         )
+    )
+    fit.add_options(
+        commands.add_parser(
+            "fit",
+            help="fit the noises of your own data to its log",
+            description="Find the standard deviations of motion and sensor by maximum likelihood, "
+            "with standard errors, from a folder as of `jaxslam run --dataset table`. Prints a "
+            "table and writes fit.json and fit.toml, lines for dataset.toml.",
+        ),
+        OUT,
     )
     _add_verify(
         commands.add_parser(

@@ -14,8 +14,9 @@ from jaxslam.records import TAG, UNITS, Table, split_unit, unit_divisor
 class CsvTable:
     """The cells of a CSV file (UTF-8, separated by commas, any line ends) below its header.
 
-    It is NAME or NAME.gz. Every column but `tag` has its unit in the header, as in `v [m/s]`. Raises ValueError where the
-    file cannot be read, has no line below its header, or a line with another number of cells.
+    It is NAME or NAME.gz. Every column but `tag` has its unit in the header, as in `v [m/s]`.
+    Raises ValueError where the file cannot be read, has no line below its header, or a line with
+    another number of cells.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ from jaxslam import association, motion, sensors
 from jaxslam.math import stats
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.records import INTERVAL, POSE, odometry_columns, split_unit
+
+_Model = TypeVar("_Model")
 
 MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
 MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
@@ -29,6 +31,21 @@ METHODS = ("nearest", "global_nearest", "maximum_likelihood", "joint", "known")
 _FILTER = ("gate", "capacity", "associate", "update", "start", "start_noise")
 _FIRST = ("unicycle", "pose_increment", "range_bearing")
 """Of models with the same columns, those taken by default."""
+
+
+class Parametric(NamedTuple, Generic[_Model]):
+    """A model by the standard deviations of its noise and its mount, and what the file says."""
+
+    names: tuple[str, ...]
+    deviations: tuple[float, ...]
+    mount: tuple[float, ...] | None
+    """None where the model has none"""
+    make: Callable[[Any, Any], _Model]
+    """(deviations (W,) an array, mount (3,) or None) -> model"""
+
+    def made(self) -> _Model:
+        """The model that the file describes."""
+        return self.make(np.array(self.deviations), self.mount)
 
 
 class Settings:
@@ -59,7 +76,7 @@ class Settings:
         """The name or the source of the data."""
         return str(self.content.get(name, default))
 
-    def motion(self, given: Sequence[str], interval: float) -> Motion:
+    def motion(self, given: Sequence[str], interval: float) -> Parametric[Motion]:
         """The motion model; its noise is that of a line of odometry, whatever rows divide it.
 
         Velocities have the covariance σ² interval/Δt over Δt, white noise. Poses give increments
@@ -71,42 +88,55 @@ class Settings:
         """
         factory, options = self._model("motion", motion.REGISTRY, given)
         shell = self._built("motion", factory, options, _of_no_noise)
-        deviations = self._noise("motion", shell.noises, MOTION_NOISE)
         from_poses = odometry_columns(shell.controls, given) == POSE
         with_interval = INTERVAL in shell.controls
 
-        def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
-            cov = jnp.diag(jnp.asarray(deviations, u.dtype) ** 2)
-            if from_poses:
-                return cov * u[-1] / interval
-            if with_interval:
-                moving = u[-1] > 0
-                return cov * jnp.where(moving, interval / jnp.where(moving, u[-1], 1.0), 0.0)
-            return cov
+        def model(deviations: Any, mount: Any = None) -> Motion:
+            def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
+                cov = jnp.diag(jnp.asarray(deviations, u.dtype) ** 2)
+                if from_poses:
+                    return cov * u[-1] / interval
+                if with_interval:
+                    moving = u[-1] > 0
+                    return cov * jnp.where(moving, interval / jnp.where(moving, u[-1], 1.0), 0.0)
+                return cov
 
-        model: Motion = self._built("motion", factory, options, noise_cov)
-        if not from_poses:
-            return model
-        return replace(
-            model,
-            controls=(*model.controls, INTERVAL),
-            step=lambda pose, u, w: model.step(pose, u[:-1], w),
-            noise_cov=noise_cov,
-            perturb=None,
-            jacobians=None,
-        )
+            plain: Motion = self._built("motion", factory, options, noise_cov)
+            if not from_poses:
+                return plain
+            return replace(
+                plain,
+                controls=(*plain.controls, INTERVAL),
+                step=lambda pose, u, w: plain.step(pose, u[:-1], w),
+                noise_cov=noise_cov,
+                perturb=None,
+                jacobians=None,
+            )
 
-    def sensor(self, given: Sequence[str]) -> Sensor:
+        deviations = self._noise("motion", shell.noises, MOTION_NOISE)
+        return Parametric(shell.noises, tuple(deviations), None, model)
+
+    def sensor(self, given: Sequence[str]) -> Parametric[Sensor]:
         """The sensor. given: the columns of the measurements."""
         factory, options = self._model("sensor", sensors.REGISTRY, given)
+        mount, has_mount = None, "mount" in inspect.signature(factory).parameters
+        if "mount" in options:
+            mount = self._numbers("sensor", "mount", options.pop("mount"), POSE)
         names = self._built("sensor", factory, options, _of_no_noise).measurements
         deviations = self._noise("sensor", names, MEASUREMENT_NOISE)
         if not all(deviations):
             raise ValueError(f"{self.path}: [sensor] noise: expected numbers above 0")
-        if "mount" not in options and "mount" in inspect.signature(factory).parameters:
-            self.assumed.append("[sensor] mount = [0.0, 0.0, 0.0]")
-        built: Sensor = self._built("sensor", factory, options, np.diag(deviations) ** 2)
-        return built
+        if has_mount and mount is None:
+            mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
+
+        def model(deviations: Any, mount: Any) -> Sensor:
+            # In NumPy where they are numbers, so that nothing is compiled.
+            cov = deviations[:, None] ** 2 * np.eye(len(names))
+            more = options if mount is None else options | {"mount": mount}
+            built: Sensor = self._built("sensor", factory, more, cov)
+            return built
+
+        return Parametric(names, tuple(deviations), None if mount is None else tuple(mount), model)
 
     def filter_options(self, size: int, unknown: bool) -> dict[str, Any]:
         """The options of `ekf_slam`. size: of a measurement; unknown: whether tags are unknown."""

@@ -6,9 +6,10 @@ import numpy as np
 
 from jaxslam import records
 from jaxslam.datasets.csv_table import CsvTable
-from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.datasets.lines import stored
-from jaxslam.datasets.settings import Settings
+from jaxslam.datasets.settings import Parametric, Settings
+from jaxslam.protocols import Motion, Sensor
 from jaxslam.records import POSE, TAG, TIME
 from jaxslam.streams import interpolate_poses
 from jaxslam.types import Log
@@ -58,8 +59,9 @@ def table(folder: str | Path) -> Dataset:
     seen_file = CsvTable(folder / "measurements.csv")
     clock = odometry_file.table((TIME,), "the time").columns[TIME]
     interval = float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0
-    motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
-    sensor = settings.sensor(seen_file.header)
+    by_motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
+    by_sensor = settings.sensor(seen_file.header)
+    motion, sensor = by_motion.made(), by_sensor.made()
     moved = (TIME, *records.odometry_columns(motion.controls, odometry_file.header))
     measured = records.measurement_columns(sensor.measurements, sensor.landmark)
     odometry = odometry_file.table(moved, f"of the motion model {motion.name}")
@@ -102,9 +104,25 @@ def table(folder: str | Path) -> Dataset:
         true_at=covered,
         one_frame=one_frame,
         slots=capacity,
+        adjustable=_adjustable(by_motion, by_sensor),
         dropped=dropped,
         assumed=tuple(settings.assumed + notes),
         source=settings.text("source", ""),
+    )
+
+
+def _adjustable(motion: Parametric[Motion], sensor: Parametric[Sensor]) -> Adjustable:
+    """Both models by the deviations of both, one after the other."""
+    count = len(motion.names)
+    return Adjustable(
+        names=tuple(f"motion {n}" for n in motion.names)
+        + tuple(f"sensor {n}" for n in sensor.names),
+        deviations=motion.deviations + sensor.deviations,
+        mount=sensor.mount,
+        models=lambda sigma, mount: (
+            motion.make(sigma[:count], None),
+            sensor.make(sigma[count:], mount),
+        ),
     )
 
 

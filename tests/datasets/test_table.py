@@ -243,7 +243,7 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("[motion]\nnoise = [0.1, -1]", "[motion] noise: expected standard deviations >= 0"),
         ("[sensor]\nnoise = [0.1, 0]", "[sensor] noise: expected numbers above 0"),
         ("[sensor]\nnoise = [0.1, nan]", "[sensor] noise: expected 2 numbers"),
-        ("[sensor]\nmount = [1, 2]", "[sensor] range_bearing: expected a mounting pose of shape (3,)"),
+        ("[sensor]\nmount = [1, 2]", "[sensor] mount: expected 3 numbers (x [m], y [m], theta [rad])"),
         ("[sensor]\nheight = 2", "[sensor] height: expected one of model, noise, mount"),
         ("[filter]\ngate = 9.2", "[filter] gate: expected a probability between 0 and 1, got 9.2"),
         ("[filter]\ncapacity = 1", "[filter] capacity: expected a whole number of at least 2"),
