@@ -16,6 +16,7 @@ from jaxslam.cli.dataset_filters import chosen, with_options
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets.evaluation import Evaluation, evaluate
+from jaxslam.datasets.map_test import joint_map_cov
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.protocols import Filter
 from jaxslam.results import report
@@ -97,7 +98,7 @@ def _run(name: str, filter: Filter, data: Dataset, options: argparse.Namespace) 
     seconds = time.perf_counter() - began
     last = result.last
     nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
-    found = evaluate(data, result.path, last)
+    found = evaluate(data, result.path, last, joint_map_cov(filter, result.final))
     summary = {
         "landmarks": int(last.alive.sum()),
         "status": {
@@ -109,7 +110,8 @@ def _run(name: str, filter: Filter, data: Dataset, options: argparse.Namespace) 
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
-    return _Run(result, found, summary | found.errors)
+    tested = {} if found.map_test is None else found.map_test.rows()
+    return _Run(result, found, summary | found.errors | tested)
 
 
 def _figure(data: Dataset, runs: dict[str, _Run]) -> Callable[[Path], object]:

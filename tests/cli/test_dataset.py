@@ -103,7 +103,12 @@ def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
     assert "[sensor] noise = [0.1, 0.05] (range [m], bearing [rad])" in printed
     summary = json.loads((out / "summary.json").read_text())
     assert summary["ATE [m]"] < 0.2
-    assert 0 < summary["landmark NEES (2 is honest)"] < 10
+    # Of one landmark the joint NEES is its own.
+    assert summary["map NEES is"] == "joint, 2 dof"
+    np.testing.assert_allclose(summary["map NEES"], summary["landmark NEES (2 is honest)"])
+    assert 0 < summary["map NEES"] < 10
+    assert summary["map NEES, 95% of honest maps"] == [0.05064, 7.378]
+    assert summary["map verdict"] in ("consistent", "optimistic")
     assert summary["status"]["born"] == 2
     # The landmark without a tag has no name.
     named = [line.split(",")[0] for line in (out / "map.csv").read_text().splitlines()]
