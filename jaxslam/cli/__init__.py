@@ -21,6 +21,7 @@ from jaxslam.cli.models import verify_models
 from jaxslam.datasets import READERS
 from jaxslam.datasets.settings import METHODS
 from jaxslam.results.campaign_files import FORMATS
+from jaxslam.results.run_table import FORMATS as RUN_FORMATS
 from jaxslam.simulation.scenarios import SCENARIOS
 
 __all__ = ["main"]
@@ -150,6 +151,12 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
         help=f"formats of the files of figures, of {','.join(FORMATS)}; comma-separated (default: "
         "png; the page always has its own)",
     )
+    parser.add_argument(
+        "--table",
+        default="",
+        metavar="FORMATS",
+        help=f"also write each run's averages as runs.csv, …; formats of {','.join(RUN_FORMATS)}",
+    )
     earlier = parser.add_mutually_exclusive_group()
     earlier.add_argument(
         "--resume",
@@ -222,6 +229,12 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         metavar="K",
         help="check after every K steps that the covariance is positive definite; 0: never "
         "(default: at 20 steps spread over the log)",
+    )
+    parser.add_argument(
+        "--figures",
+        default="png",
+        metavar="FORMATS",
+        help=f"formats of the figure, of {','.join(FORMATS)}; comma-separated (default: png)",
     )
     cache.add_options(parser)
     parser.add_argument(
