@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import association, motion, sensors
+from jaxslam.datasets.settings_text import line_of
 from jaxslam.math import stats
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.records import INTERVAL, POSE, odometry_columns, split_unit
@@ -58,9 +59,10 @@ class Settings:
         self.path = path
         self.assumed: list[str] = []
         try:
-            self.content = tomllib.loads(path.read_text(encoding="utf-8"))
+            self._text = path.read_text(encoding="utf-8")
+            self.content = tomllib.loads(self._text)
         except FileNotFoundError:
-            self.content = {}
+            self._text, self.content = "", {}
             self.assumed.append(f"no {path.name}")
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
             raise ValueError(f"{path}: cannot be read: {problem}") from problem
@@ -70,7 +72,7 @@ class Settings:
             kind = str if name in ("name", "source") else dict
             if not isinstance(self.content.get(name, kind()), kind):
                 wanted = "text" if kind is str else f"a section [{name}]"
-                raise ValueError(f"{path}: {name}: expected {wanted}")
+                raise ValueError(f"{self._at('', name)}: expected {wanted}")
 
     def text(self, name: str, default: str) -> str:
         """The name or the source of the data."""
@@ -125,7 +127,7 @@ class Settings:
         names = self._built("sensor", factory, options, _of_no_noise).measurements
         deviations = self._noise("sensor", names, MEASUREMENT_NOISE)
         if not all(deviations):
-            raise ValueError(f"{self.path}: [sensor] noise: expected numbers above 0")
+            raise ValueError(f"{self._at('sensor', 'noise')}: expected numbers above 0")
         if has_mount and mount is None:
             mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
 
@@ -146,7 +148,7 @@ class Settings:
             options["update"] = self._default("filter", "update", "sequential")
         if options["update"] not in ("sequential", "joint"):
             raise ValueError(
-                f'{self.path}: [filter] update: expected "sequential" or "joint", '
+                f'{self._at("filter", "update")}: expected "sequential" or "joint", '
                 f"got {options['update']!r}"
             )
         method, gate = section.get("associate"), section.get("gate")
@@ -155,7 +157,8 @@ class Settings:
         try:
             options |= association_options(method, gate, size)
         except ValueError as problem:
-            raise ValueError(f"{self.path}: [filter] {problem}") from problem
+            key, _, reason = str(problem).partition(": ")
+            raise ValueError(f"{self._at('filter', key)}: {reason}") from problem
         if gate is None:
             self.assumed.append(f"[filter] gate{': none' if method == 'known' else f' = {GATE}'}")
         return options
@@ -167,7 +170,7 @@ class Settings:
             return int(self._default("filter", "capacity", max(tags, 1) + ROOM * unknown))
         if type(asked) is not int or asked < max(tags, 1):
             raise ValueError(
-                f"{self.path}: [filter] capacity: expected a whole number of at least "
+                f"{self._at('filter', 'capacity')}: expected a whole number of at least "
                 f"{max(tags, 1)}, the number of tags, got {asked!r}"
             )
         return asked
@@ -182,7 +185,7 @@ class Settings:
         if asked is None:
             return np.array(self._default("filter", "start_noise", [0.0, 0.0, 0.0]))
         if (asked < 0).any():
-            raise ValueError(f"{self.path}: [filter] start_noise: expected numbers of at least 0")
+            raise ValueError(f"{self._at('filter', 'start_noise')}: expected numbers of at least 0")
         return asked
 
     def _filter(self) -> dict[str, Any]:
@@ -206,8 +209,7 @@ class Settings:
             name = self._default(section, "model", _fitting(section, registry, given, self.path))
         if name not in registry:
             raise ValueError(
-                f"{self.path}: [{section}] model: expected one of {', '.join(registry)}, "
-                f"got {name!r}"
+                f"{self._at(section, 'model')}: expected one of {', '.join(registry)}, got {name!r}"
             )
         known = [key for key in inspect.signature(registry[name]).parameters if key != "noise_cov"]
         self._check_keys(section, options, ("model", "noise", *known))
@@ -226,7 +228,7 @@ class Settings:
         found = self._numbers(section, "noise", asked, names)
         if min(found) < 0:
             raise ValueError(
-                f"{self.path}: [{section}] noise: expected standard deviations >= 0, got {asked}"
+                f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {asked}"
             )
         return found
 
@@ -237,7 +239,7 @@ class Settings:
             or not all(map(_is_number, asked))
         ):
             raise ValueError(
-                f"{self.path}: [{section}] {key}: expected {len(names)} numbers "
+                f"{self._at(section, key)}: expected {len(names)} numbers "
                 f"({', '.join(names)}), got {asked!r}"
             )
         return [float(value) for value in asked]
@@ -258,8 +260,13 @@ class Settings:
     def _check_keys(self, section: str, content: Mapping[str, Any], known: Sequence[str]) -> None:
         for key in content:
             if key not in known:
-                where = f"[{section}] " if section else ""
-                raise ValueError(f"{self.path}: {where}{key}: expected one of {', '.join(known)}")
+                raise ValueError(f"{self._at(section, key)}: expected one of {', '.join(known)}")
+
+    def _at(self, section: str, key: str) -> str:
+        """The place of a key, with which a message begins."""
+        line = line_of(self._text, section, key)
+        where = f"{self.path}:" + (f"{line}: " if line else " ")
+        return where + (f"[{section}] " if section else "") + key
 
 
 def association_options(method: str, gate: float | None, size: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The text of a `dataset.toml` with other numbers in it; the rest stays as it is."""
+"""The text of a `dataset.toml`: where a key is, and the text with other numbers in it."""
 
 import re
 import tomllib
@@ -24,7 +24,7 @@ def fragment(changes: Changes, comments: Mapping[str, str] | None = None) -> str
 
 
 def changed(path: Path, changes: Changes) -> str:
-    """The text of a file of settings with these numbers; of no file, the fragment.
+    """The text of a file of settings with these numbers, else as it is; of no file, the fragment.
 
     A list of numbers that stands on one line is replaced, its comment stays; others are inserted
     below the head of their section, or at the end.
@@ -38,14 +38,13 @@ def changed(path: Path, changes: Changes) -> str:
     before = tomllib.loads(text)
     lines = text.split("\n")
     for section, keys in changes.items():
-        head = _find(lines, rf"\s*\[\s*{section}\s*\]", 0, len(lines))
+        head = _head(lines, section)
         if head is None:
             lines = [*"\n".join(lines).rstrip("\n").split("\n"), ""]
             lines += fragment({section: keys}).split("\n")
             continue
         for key, numbers in keys.items():
-            end = _find(lines, r"\s*\[", head + 1, len(lines)) or len(lines)
-            at = _find(lines, rf"\s*{key}\s*=", head + 1, end)
+            at = _find(lines, rf"\s*{key}\s*=", head + 1, _end(lines, head))
             if at is None:
                 lines.insert(head + 1, f"{key} = {_list(numbers)}")
             else:
@@ -63,6 +62,28 @@ def changed(path: Path, changes: Changes) -> str:
     if not good:
         raise ValueError(f"{path}: cannot be changed line by line: paste fit.toml by hand")
     return result
+
+
+def line_of(text: str, section: str, key: str) -> int | None:
+    """The line, from 1, of a key in a section ("": at the top), or of the section, or None."""
+    lines = text.split("\n")
+    head = _head(lines, section) if section else -1
+    if head is None:
+        return None
+    at = _find(lines, rf"\s*{re.escape(key)}\s*=", head + 1, _end(lines, head))
+    if at is None and not section:  # a section that stands where none is known
+        at = _head(lines, key)
+    return None if at is None and head < 0 else (head if at is None else at) + 1
+
+
+def _head(lines: Sequence[str], section: str) -> int | None:
+    return _find(lines, rf"\s*\[\s*{re.escape(section)}\s*\]", 0, len(lines))
+
+
+def _end(lines: Sequence[str], head: int) -> int:
+    """The line after a section."""
+    after = _find(lines, r"\s*\[", head + 1, len(lines))
+    return len(lines) if after is None else after
 
 
 def _list(numbers: Sequence[float]) -> str:

@@ -251,16 +251,17 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("[filter]\nstart_noise = [0, 0, -1]", "[filter] start_noise: expected numbers of at least"),
         ("[filter]\nassociate = 'best'", "[filter] associate: expected one of nearest, global_near"),
         ("[filter]\nupdate = 'batch'", '[filter] update: expected "sequential" or "joint"'),
-        ("[robot]\nmass = 1", ": robot: expected one of name, source, motion, sensor, filter"),
-        ("filter = 3", "filter: expected a section [filter]"),
+        ("[robot]\nmass = 1", ":1: robot: expected one of name, source, motion, sensor, filter"),
+        ("filter = 3", ":1: filter: expected a section [filter]"),
+        ("# mine\n[sensor]\n[motion]\nnoise = [1]", ":4: [motion] noise: expected 2 numbers"),
         ("[motion\n", "cannot be read: Expected ']'"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(tmp_path, toml, reason):
     with pytest.raises(ValueError) as caught:  # noqa: PT011 the message is compared below
         datasets.table(write(tmp_path, OWN | {"dataset.toml": toml}))
-    assert str(caught.value).startswith(f"{tmp_path / 'dataset.toml'}: ")
-    assert reason in str(caught.value)
+    assert str(caught.value).startswith(f"{tmp_path / 'dataset.toml'}:")
+    assert (f":2: {reason}" if reason[0] == "[" else reason) in str(caught.value)
 
 
 def test_columns_of_no_model_list_those_of_all(tmp_path):
