@@ -38,7 +38,7 @@ INTRODUCED = {
     "jaxslam.datasets": "Data sets",
     "jaxslam.records": "Tables as records",
     "jaxslam.streams": "Alignment of streams",
-    "jaxslam.calibration": "Calibration of odometry",
+    "jaxslam.calibration": "Calibration and noises",
     "jaxslam.results": "Reports, figures and files",
     "jaxslam.math": "Mathematics",
     "jaxslam.noise": "Noise models",

@@ -12,7 +12,7 @@ import jax
 from threadpoolctl import threadpool_limits
 
 from jaxslam.catalog import ALL
-from jaxslam.cli import cache, devices
+from jaxslam.cli import cache, devices, fit
 from jaxslam.cli.campaign import DEFAULTS, OUT, consistency
 from jaxslam.cli.common import INTERRUPTED, as_folders
 from jaxslam.cli.compile_clock import CompileClock
@@ -21,6 +21,7 @@ from jaxslam.cli.models import verify_models
 from jaxslam.datasets import READERS
 from jaxslam.datasets.settings import METHODS
 from jaxslam.results.campaign_files import FORMATS
+from jaxslam.results.run_table import FORMATS as RUN_FORMATS
 from jaxslam.simulation.scenarios import SCENARIOS
 
 __all__ = ["main"]
@@ -88,6 +89,16 @@ def _parser() -> argparse.ArgumentParser:
             "map, summary and a figure.",
         )
     )
+    fit.add_options(
+        commands.add_parser(
+            "fit",
+            help="fit the noises of your own data to its log",
+            description="Find the standard deviations of motion and sensor by maximum likelihood, "
+            "with standard errors, from a folder as of `jaxslam run --dataset table`. Prints a "
+            "table and writes fit.json and fit.toml, lines for dataset.toml.",
+        ),
+        OUT,
+    )
     _add_verify(
         commands.add_parser(
             "verify",
@@ -139,6 +150,12 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
         metavar="FORMATS",
         help=f"formats of the files of figures, of {','.join(FORMATS)}; comma-separated (default: "
         "png; the page always has its own)",
+    )
+    parser.add_argument(
+        "--table",
+        default="",
+        metavar="FORMATS",
+        help=f"also write each run's averages as runs.csv, …; formats of {','.join(RUN_FORMATS)}",
     )
     earlier = parser.add_mutually_exclusive_group()
     earlier.add_argument(
@@ -212,6 +229,12 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         metavar="K",
         help="check after every K steps that the covariance is positive definite; 0: never "
         "(default: at 20 steps spread over the log)",
+    )
+    parser.add_argument(
+        "--figures",
+        default="png",
+        metavar="FORMATS",
+        help=f"formats of the figure, of {','.join(FORMATS)}; comma-separated (default: png)",
     )
     cache.add_options(parser)
     parser.add_argument(

@@ -26,7 +26,7 @@ from jaxslam.monte_carlo import Interrupted, Library, monte_carlo
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.protocols import Candidate
-from jaxslam.results import campaign_files, store
+from jaxslam.results import campaign_files, run_table, store
 from jaxslam.results.files import check_writable
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Truth
@@ -55,6 +55,9 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     jax.config.update("jax_enable_x64", True)
     devices.join(options)
     formats = campaign_files.check_formats("--figures", options.figures.split(","))
+    there = [kind for kind in run_table.FORMATS if (out / f"runs.{kind}").exists()]  # up to date
+    asked_for = filter(None, options.table.split(","))
+    tables = run_table.check_formats("--table", [*asked_for, *there])
     files = UserObjects()
     scenario = files.scenario(asked["scenario"], asked["steps"])
     filters = files.filters(asked["filters"], scenario)
@@ -68,7 +71,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     identity, programs = _identity(asked, files, scenario, filters, key, here[0].platform)
     keep = open_store(options, out, asked, block)
     earlier = earlier_results(out, keep)
-    names = campaign_files.file_names(formats)
+    names = campaign_files.file_names(formats) + [f"runs.{kind}" for kind in tables]
     written = earlier is not None and all((out / name).exists() for name in names)
     if not written:
         # Matplotlib is loaded while filters run. Not in a daemon thread: such a thread crashes in
@@ -121,6 +124,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         first = _run_zero(scenario, filters[name], key, campaign.dtype)
         campaign = replace(campaign, first={name: first})
     paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"])
+    paths += [campaign.save_runs(out / f"runs.{kind}") for kind in tables]
     print("\nwrote " + ", ".join(map(str, paths)))
     print(
         f"results after {took:.1f} s"

@@ -16,9 +16,11 @@ from jaxslam.cli.dataset_filters import chosen, with_options
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets.evaluation import Evaluation, evaluate
+from jaxslam.datasets.map_test import joint_map_cov
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.protocols import Filter
 from jaxslam.results import report
+from jaxslam.results.campaign_files import check_formats
 from jaxslam.results.files import check_writable, json_text, versions, write_files
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Status
@@ -28,6 +30,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     """Run filters over the data set, print and write their results; returns the exit status."""
     if options.check_every is not None and options.check_every < 0:
         raise ValueError(f"--check-every: expected at least 0, got {options.check_every}")
+    formats = check_formats("--figures", options.figures.split(","))
     data = pick("dataset", options.dataset, READERS)(options.path, options.robot)
     data = with_options(data, options)
     filters = chosen(data, options.filters)
@@ -57,9 +60,10 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     for name, run in runs.items():
         suffix = f"-{name}" if several else ""
         files[f"trajectory{suffix}.csv"] = report.trajectory_csv(data.time, run.result.path)
+        files[f"trajectory{suffix}.tum"] = report.trajectory_tum(data.time, run.result.path)
         files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
     files["summary.json"] = json_text(summary | {"versions": versions()})
-    files["map.png"] = _figure(data, runs)
+    files |= _figure(data, runs, formats)
     written = write_files(options.out, files)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
@@ -97,7 +101,7 @@ def _run(name: str, filter: Filter, data: Dataset, options: argparse.Namespace) 
     seconds = time.perf_counter() - began
     last = result.last
     nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
-    found = evaluate(data, result.path, last)
+    found = evaluate(data, result.path, last, joint_map_cov(filter, result.final))
     summary = {
         "landmarks": int(last.alive.sum()),
         "status": {
@@ -109,10 +113,13 @@ def _run(name: str, filter: Filter, data: Dataset, options: argparse.Namespace) 
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
-    return _Run(result, found, summary | found.errors)
+    tested = {} if found.map_test is None else found.map_test.rows()
+    return _Run(result, found, summary | found.errors | tested)
 
 
-def _figure(data: Dataset, runs: dict[str, _Run]) -> Callable[[Path], object]:
+def _figure(
+    data: Dataset, runs: dict[str, _Run], formats: tuple[str, ...]
+) -> dict[str, Callable[[Path], object]]:
     """What writes the map: the first filter with ellipses and truth, the others without."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
@@ -127,7 +134,11 @@ def _figure(data: Dataset, runs: dict[str, _Run]) -> Callable[[Path], object]:
         others={each: _whole(run.result) for each, run in rest},
         title=f"{data.name}: {name} with ellipses" if rest else data.name,
     )
-    return lambda path: path.write_bytes(plot.png(figure))
+
+    def saved(kind: str) -> Callable[[Path], object]:
+        return lambda path: path.write_bytes(plot.encode(figure, kind))
+
+    return {f"map.{kind}": saved(kind) for kind in formats}
 
 
 def _whole(result: PiecewiseRun) -> Estimate:

@@ -35,6 +35,8 @@ class PiecewiseRun(NamedTuple):
     log_likelihood: Float[np.ndarray, "T"]
     last: Estimate
     """the estimate after the last step"""
+    final: State
+    """the filter's own state there"""
     checked: list[int]
     """the steps, from 1, after which the state was checked"""
     passed: list[bool]
@@ -117,6 +119,7 @@ def run_in_pieces(
         dof=dof,
         log_likelihood=log_likelihood,
         last=jax.tree.map(np.asarray, last),
+        final=state,
         checked=checked,
         passed=passed,
     )

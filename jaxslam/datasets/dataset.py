@@ -1,7 +1,8 @@
 """The record that readers return: a log with models, noise and options of a filter for it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,6 +12,19 @@ from jaxslam.sensors.suite import Suite
 from jaxslam.team import Robot
 from jaxslam.types import Log
 from jaxslam.validation.logs import check_log
+
+
+class Adjustable(NamedTuple):
+    """The models of a data set by their standard deviations and the sensor's mount."""
+
+    names: tuple[str, ...]
+    """of the deviations: "motion v [m/s]", …, then "sensor range [m]", …"""
+    deviations: tuple[float, ...]
+    """those that the data set has"""
+    mount: tuple[float, ...] | None
+    """(x [m], y [m], θ [rad]) of the sensor on the robot; None where it has none"""
+    models: Callable[[Any, Any], tuple[Motion, Sensor]]
+    """(deviations (P,) an array, mount (3,) or None) -> motion and sensor"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +64,8 @@ class Dataset:
     alignment"""
     slots: int | None = None
     """landmark slots of the filter; None for one a tag"""
+    adjustable: Adjustable | None = None
+    """the models with other noises and mount, for `datasets.fit`; None where they are fixed"""
     dropped: dict[str, int] = field(default_factory=dict)
     """number of measurements of the file that are not in the log, by reason"""
     corrections: tuple[str, ...] = ()

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxslam.consistency import align_map
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.map_test import MapTest, judge_map
 from jaxslam.math import se2
 from jaxslam.streams import relative
 from jaxslam.types import Estimate
@@ -27,24 +28,33 @@ class Evaluation(NamedTuple):
     """surveyed landmarks [m]"""
     path: Float[np.ndarray, "K 3"] | None
     """true poses, of the rows in which they are known"""
+    map_test: MapTest | None
+    """the map against the survey; None without one, or a regular covariance"""
 
 
-def evaluate(data: Dataset, path: Estimate, last: Estimate) -> Evaluation:
+def evaluate(
+    data: Dataset,
+    path: Estimate,
+    last: Estimate,
+    map_cov: Float[np.ndarray, "N 2 N 2"] | None = None,
+) -> Evaluation:
     """The errors of a path and of its last map, as far as the data set has a truth.
 
     In one frame: ATE (RMSE of the positions), RMSE of the heading, RPE (RMSE of the translation
     from each row to the first at least `SPAN` later, in the frame of the former), mean and median
     NEES of the pose where its covariance is regular; RMSE and mean NEES of the landmarks with a
-    tag. NEES is of each landmark's own covariance. In frames of their own path and map are compared
-    after the rigid motion that fits each best, and the pose has no NEES.
+    tag, each landmark by its own covariance. In frames of their own path and map are compared after
+    the rigid motion that fits each best, and the pose has no NEES. `map_test` has the verdict on
+    the map.
 
     Args:
         path: pose (T, 3) and pose_cov (T, 3, 3).
         last: the map.
+        map_cov: the joint covariance of its landmarks, as of `map_test.joint_map_cov`.
     """
     errors: dict[str, float] = {}
     after = "" if data.one_frame else " after alignment"
-    true = points = None
+    true = points = test = None
     if data.true_path is not None:
         known = np.ones(data.steps, bool) if data.true_at is None else data.true_at
         pose, cov = np.asarray(path.pose)[known], np.asarray(path.pose_cov)[known]
@@ -74,12 +84,16 @@ def evaluate(data: Dataset, path: Estimate, last: Estimate) -> Evaluation:
         gap = (points[tag] - found)[:, :, None]
         covs = np.asarray(last.point_covs)[named].astype(np.float64)
         regular = np.linalg.eigvalsh(covs)[:, 0] > 0
+        if regular.all():
+            survey, among = np.asarray(data.landmarks)[tag], np.flatnonzero(named)
+            joint = None if map_cov is None else map_cov[among][:, :, among]
+            test = judge_map(found.astype(np.float64), survey, covs, joint, data.one_frame)
         if regular.any():
             gap, covs = gap[regular], covs[regular]
             square = np.swapaxes(gap, 1, 2) @ np.linalg.solve(covs, gap)
             honest = "(2 is honest)" if data.one_frame else "(honest: below 2)"
             errors[f"landmark NEES{after} {honest}"] = float(square.mean())
-    return Evaluation(errors, points, true)
+    return Evaluation(errors, points, true, test)
 
 
 def _relative_error(

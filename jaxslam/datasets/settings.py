@@ -5,16 +5,19 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import association, motion, sensors
+from jaxslam.datasets.settings_text import line_of
 from jaxslam.math import stats
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.records import INTERVAL, POSE, odometry_columns, split_unit
+
+_Model = TypeVar("_Model")
 
 MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
 MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
@@ -31,6 +34,21 @@ _FIRST = ("unicycle", "pose_increment", "range_bearing")
 """Of models with the same columns, those taken by default."""
 
 
+class Parametric(NamedTuple, Generic[_Model]):
+    """A model by the standard deviations of its noise and its mount, and what the file says."""
+
+    names: tuple[str, ...]
+    deviations: tuple[float, ...]
+    mount: tuple[float, ...] | None
+    """None where the model has none"""
+    make: Callable[[Any, Any], _Model]
+    """(deviations (W,) an array, mount (3,) or None) -> model"""
+
+    def made(self) -> _Model:
+        """The model that the file describes."""
+        return self.make(np.array(self.deviations), self.mount)
+
+
 class Settings:
     """The settings of a folder; `assumed` lists the defaults taken so far.
 
@@ -41,9 +59,10 @@ class Settings:
         self.path = path
         self.assumed: list[str] = []
         try:
-            self.content = tomllib.loads(path.read_text(encoding="utf-8"))
+            self._text = path.read_text(encoding="utf-8")
+            self.content = tomllib.loads(self._text)
         except FileNotFoundError:
-            self.content = {}
+            self._text, self.content = "", {}
             self.assumed.append(f"no {path.name}")
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
             raise ValueError(f"{path}: cannot be read: {problem}") from problem
@@ -53,13 +72,13 @@ class Settings:
             kind = str if name in ("name", "source") else dict
             if not isinstance(self.content.get(name, kind()), kind):
                 wanted = "text" if kind is str else f"a section [{name}]"
-                raise ValueError(f"{path}: {name}: expected {wanted}")
+                raise ValueError(f"{self._at('', name)}: expected {wanted}")
 
     def text(self, name: str, default: str) -> str:
         """The name or the source of the data."""
         return str(self.content.get(name, default))
 
-    def motion(self, given: Sequence[str], interval: float) -> Motion:
+    def motion(self, given: Sequence[str], interval: float) -> Parametric[Motion]:
         """The motion model; its noise is that of a line of odometry, whatever rows divide it.
 
         Velocities have the covariance σ² interval/Δt over Δt, white noise. Poses give increments
@@ -71,42 +90,55 @@ class Settings:
         """
         factory, options = self._model("motion", motion.REGISTRY, given)
         shell = self._built("motion", factory, options, _of_no_noise)
-        deviations = self._noise("motion", shell.noises, MOTION_NOISE)
         from_poses = odometry_columns(shell.controls, given) == POSE
         with_interval = INTERVAL in shell.controls
 
-        def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
-            cov = jnp.diag(jnp.asarray(deviations, u.dtype) ** 2)
-            if from_poses:
-                return cov * u[-1] / interval
-            if with_interval:
-                moving = u[-1] > 0
-                return cov * jnp.where(moving, interval / jnp.where(moving, u[-1], 1.0), 0.0)
-            return cov
+        def model(deviations: Any, mount: Any = None) -> Motion:
+            def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
+                cov = jnp.diag(jnp.asarray(deviations, u.dtype) ** 2)
+                if from_poses:
+                    return cov * u[-1] / interval
+                if with_interval:
+                    moving = u[-1] > 0
+                    return cov * jnp.where(moving, interval / jnp.where(moving, u[-1], 1.0), 0.0)
+                return cov
 
-        model: Motion = self._built("motion", factory, options, noise_cov)
-        if not from_poses:
-            return model
-        return replace(
-            model,
-            controls=(*model.controls, INTERVAL),
-            step=lambda pose, u, w: model.step(pose, u[:-1], w),
-            noise_cov=noise_cov,
-            perturb=None,
-            jacobians=None,
-        )
+            plain: Motion = self._built("motion", factory, options, noise_cov)
+            if not from_poses:
+                return plain
+            return replace(
+                plain,
+                controls=(*plain.controls, INTERVAL),
+                step=lambda pose, u, w: plain.step(pose, u[:-1], w),
+                noise_cov=noise_cov,
+                perturb=None,
+                jacobians=None,
+            )
 
-    def sensor(self, given: Sequence[str]) -> Sensor:
+        deviations = self._noise("motion", shell.noises, MOTION_NOISE)
+        return Parametric(shell.noises, tuple(deviations), None, model)
+
+    def sensor(self, given: Sequence[str]) -> Parametric[Sensor]:
         """The sensor. given: the columns of the measurements."""
         factory, options = self._model("sensor", sensors.REGISTRY, given)
+        mount, has_mount = None, "mount" in inspect.signature(factory).parameters
+        if "mount" in options:
+            mount = self._numbers("sensor", "mount", options.pop("mount"), POSE)
         names = self._built("sensor", factory, options, _of_no_noise).measurements
         deviations = self._noise("sensor", names, MEASUREMENT_NOISE)
         if not all(deviations):
-            raise ValueError(f"{self.path}: [sensor] noise: expected numbers above 0")
-        if "mount" not in options and "mount" in inspect.signature(factory).parameters:
-            self.assumed.append("[sensor] mount = [0.0, 0.0, 0.0]")
-        built: Sensor = self._built("sensor", factory, options, np.diag(deviations) ** 2)
-        return built
+            raise ValueError(f"{self._at('sensor', 'noise')}: expected numbers above 0")
+        if has_mount and mount is None:
+            mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
+
+        def model(deviations: Any, mount: Any) -> Sensor:
+            # In NumPy where they are numbers, so that nothing is compiled.
+            cov = deviations[:, None] ** 2 * np.eye(len(names))
+            more = options if mount is None else options | {"mount": mount}
+            built: Sensor = self._built("sensor", factory, more, cov)
+            return built
+
+        return Parametric(names, tuple(deviations), None if mount is None else tuple(mount), model)
 
     def filter_options(self, size: int, unknown: bool) -> dict[str, Any]:
         """The options of `ekf_slam`. size: of a measurement; unknown: whether tags are unknown."""
@@ -116,7 +148,7 @@ class Settings:
             options["update"] = self._default("filter", "update", "sequential")
         if options["update"] not in ("sequential", "joint"):
             raise ValueError(
-                f'{self.path}: [filter] update: expected "sequential" or "joint", '
+                f'{self._at("filter", "update")}: expected "sequential" or "joint", '
                 f"got {options['update']!r}"
             )
         method, gate = section.get("associate"), section.get("gate")
@@ -125,7 +157,8 @@ class Settings:
         try:
             options |= association_options(method, gate, size)
         except ValueError as problem:
-            raise ValueError(f"{self.path}: [filter] {problem}") from problem
+            key, _, reason = str(problem).partition(": ")
+            raise ValueError(f"{self._at('filter', key)}: {reason}") from problem
         if gate is None:
             self.assumed.append(f"[filter] gate{': none' if method == 'known' else f' = {GATE}'}")
         return options
@@ -137,7 +170,7 @@ class Settings:
             return int(self._default("filter", "capacity", max(tags, 1) + ROOM * unknown))
         if type(asked) is not int or asked < max(tags, 1):
             raise ValueError(
-                f"{self.path}: [filter] capacity: expected a whole number of at least "
+                f"{self._at('filter', 'capacity')}: expected a whole number of at least "
                 f"{max(tags, 1)}, the number of tags, got {asked!r}"
             )
         return asked
@@ -152,7 +185,7 @@ class Settings:
         if asked is None:
             return np.array(self._default("filter", "start_noise", [0.0, 0.0, 0.0]))
         if (asked < 0).any():
-            raise ValueError(f"{self.path}: [filter] start_noise: expected numbers of at least 0")
+            raise ValueError(f"{self._at('filter', 'start_noise')}: expected numbers of at least 0")
         return asked
 
     def _filter(self) -> dict[str, Any]:
@@ -176,8 +209,7 @@ class Settings:
             name = self._default(section, "model", _fitting(section, registry, given, self.path))
         if name not in registry:
             raise ValueError(
-                f"{self.path}: [{section}] model: expected one of {', '.join(registry)}, "
-                f"got {name!r}"
+                f"{self._at(section, 'model')}: expected one of {', '.join(registry)}, got {name!r}"
             )
         known = [key for key in inspect.signature(registry[name]).parameters if key != "noise_cov"]
         self._check_keys(section, options, ("model", "noise", *known))
@@ -196,7 +228,7 @@ class Settings:
         found = self._numbers(section, "noise", asked, names)
         if min(found) < 0:
             raise ValueError(
-                f"{self.path}: [{section}] noise: expected standard deviations >= 0, got {asked}"
+                f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {asked}"
             )
         return found
 
@@ -207,7 +239,7 @@ class Settings:
             or not all(map(_is_number, asked))
         ):
             raise ValueError(
-                f"{self.path}: [{section}] {key}: expected {len(names)} numbers "
+                f"{self._at(section, key)}: expected {len(names)} numbers "
                 f"({', '.join(names)}), got {asked!r}"
             )
         return [float(value) for value in asked]
@@ -228,8 +260,13 @@ class Settings:
     def _check_keys(self, section: str, content: Mapping[str, Any], known: Sequence[str]) -> None:
         for key in content:
             if key not in known:
-                where = f"[{section}] " if section else ""
-                raise ValueError(f"{self.path}: {where}{key}: expected one of {', '.join(known)}")
+                raise ValueError(f"{self._at(section, key)}: expected one of {', '.join(known)}")
+
+    def _at(self, section: str, key: str) -> str:
+        """The place of a key, with which a message begins."""
+        line = line_of(self._text, section, key)
+        where = f"{self.path}:" + (f"{line}: " if line else " ")
+        return where + (f"[{section}] " if section else "") + key
 
 
 def association_options(method: str, gate: float | None, size: int) -> dict[str, Any]:

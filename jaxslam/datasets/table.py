@@ -6,8 +6,10 @@ import numpy as np
 
 from jaxslam import records
 from jaxslam.datasets.csv_table import CsvTable
-from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.settings import Settings
+from jaxslam.datasets.dataset import Adjustable, Dataset
+from jaxslam.datasets.lines import stored
+from jaxslam.datasets.settings import Parametric, Settings
+from jaxslam.protocols import Motion, Sensor
 from jaxslam.records import POSE, TAG, TIME
 from jaxslam.streams import interpolate_poses
 from jaxslam.types import Log
@@ -40,7 +42,8 @@ def table(folder: str | Path) -> Dataset:
     What is left out has a default, listed in `Dataset.assumed`. The log is `Log.from_records`. The
     noise of the motion is that of a line of odometry; a row that is shorter or longer has white
     noise of the same density. The start is that of the truth, where this covers the first row; then
-    all is in one frame. Other columns are not used, and listed.
+    all is in one frame. Other columns are not used, and listed. A CSV file may be packed by gzip,
+    as `truth.csv.gz`; where both are there the plain one is read.
 
     Args:
         folder: where the files are.
@@ -56,8 +59,9 @@ def table(folder: str | Path) -> Dataset:
     seen_file = CsvTable(folder / "measurements.csv")
     clock = odometry_file.table((TIME,), "the time").columns[TIME]
     interval = float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0
-    motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
-    sensor = settings.sensor(seen_file.header)
+    by_motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
+    by_sensor = settings.sensor(seen_file.header)
+    motion, sensor = by_motion.made(), by_sensor.made()
     moved = (TIME, *records.odometry_columns(motion.controls, odometry_file.header))
     measured = records.measurement_columns(sensor.measurements, sensor.landmark)
     odometry = odometry_file.table(moved, f"of the motion model {motion.name}")
@@ -100,15 +104,31 @@ def table(folder: str | Path) -> Dataset:
         true_at=covered,
         one_frame=one_frame,
         slots=capacity,
+        adjustable=_adjustable(by_motion, by_sensor),
         dropped=dropped,
         assumed=tuple(settings.assumed + notes),
         source=settings.text("source", ""),
     )
 
 
+def _adjustable(motion: Parametric[Motion], sensor: Parametric[Sensor]) -> Adjustable:
+    """Both models by the deviations of both, one after the other."""
+    count = len(motion.names)
+    return Adjustable(
+        names=tuple(f"motion {n}" for n in motion.names)
+        + tuple(f"sensor {n}" for n in sensor.names),
+        deviations=motion.deviations + sensor.deviations,
+        mount=sensor.mount,
+        models=lambda sigma, mount: (
+            motion.make(sigma[:count], None),
+            sensor.make(sigma[count:], mount),
+        ),
+    )
+
+
 def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
     """The position of each tag; None where there is no file."""
-    if not path.exists():
+    if stored(path) is None:
         return None
     found = CsvTable(path).table((TAG, *POSE[:2]), "of landmarks")
     survey: dict[int, tuple[float, float]] = {}
@@ -122,7 +142,7 @@ def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
 
 def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
     """The true pose at each row (T, 3), and in which rows it is known (T,); None without a file."""
-    if not path.exists():
+    if stored(path) is None:
         return None, None
     found = CsvTable(path).table((TIME, *POSE), "of a true path")
     records.check_times(found, strict=True)

@@ -114,19 +114,23 @@ class Campaign:
             raise ImportError(
                 "Campaign.to_dataframe needs pandas, which is not installed: pip install pandas"
             ) from None
-        numbers, filters = self.run_numbers, self.filters
-        none = np.full(len(numbers), np.nan)
-        names = dict.fromkeys(name for s in filters.values() for name in s.per_run)
-        columns: dict[str, np.ndarray] = {
-            "filter": np.repeat(np.array(list(filters), object), len(numbers)),
-            "run": np.tile(numbers, len(filters)),
-            "finite": np.concatenate(
-                [~np.isin(numbers, s.not_finite_runs) for s in filters.values()]
-            ),
-        }
-        for name in names:
-            columns[name] = np.concatenate([s.per_run.get(name, none) for s in filters.values()])
-        return pandas.DataFrame(columns)
+        from jaxslam.results import run_table
+
+        return pandas.DataFrame(run_table.columns(self))
+
+    def save_runs(self, path: str | Path) -> Path:
+        """Write the table of `to_dataframe` to a file, and return its path; it is replaced.
+
+        Args:
+            path: ends in .csv, .json (a list a column) or .parquet, which sets the format. Parquet
+                is there where pyarrow is installed; jaxslam does not require it.
+        Raises:
+            ValueError: on another ending, or .parquet without pyarrow.
+            OSError: if the folder cannot be written.
+        """
+        from jaxslam.results import run_table
+
+        return run_table.save(self, path)
 
 
 class Interrupted(KeyboardInterrupt):

@@ -191,6 +191,18 @@ def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
     )
 
 
+def trajectory_tum(time: np.ndarray, estimate: Estimate) -> str:
+    """A path in the format of the TUM RGB-D benchmark: lines `t x y z qx qy qz qw`, without a head.
+
+    z = 0, and the quaternion (0, 0, sin θ/2, cos θ/2) turns about z.
+    """
+    lines = []
+    for t, (x, y, theta) in zip(np.asarray(time), np.asarray(estimate.pose, float), strict=True):
+        turn = f"{np.sin(theta / 2):.9g} {np.cos(theta / 2):.9g}"
+        lines.append(f"{t:.17g} {x:.9g} {y:.9g} 0 0 0 {turn}\n")
+    return "".join(lines)
+
+
 def map_csv(estimate: Estimate, names: Sequence[int]) -> str:
     """A map as CSV: a row a landmark with its name in the data set, position and covariance."""
     rows = []

@@ -32,6 +32,7 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
     assert "fused 4, born 2, rejected 0" in printed
     assert {path.name for path in out.iterdir()} == {
         "trajectory.csv",
+        "trajectory.tum",
         "map.csv",
         "summary.json",
         "map.png",
@@ -103,7 +104,12 @@ def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
     assert "[sensor] noise = [0.1, 0.05] (range [m], bearing [rad])" in printed
     summary = json.loads((out / "summary.json").read_text())
     assert summary["ATE [m]"] < 0.2
-    assert 0 < summary["landmark NEES (2 is honest)"] < 10
+    # Of one landmark the joint NEES is its own.
+    assert summary["map NEES is"] == "joint, 2 dof"
+    np.testing.assert_allclose(summary["map NEES"], summary["landmark NEES (2 is honest)"])
+    assert 0 < summary["map NEES"] < 10
+    assert summary["map NEES, 95% of honest maps"] == [0.05064, 7.378]
+    assert summary["map verdict"] in ("consistent", "optimistic")
     assert summary["status"]["born"] == 2
     # The landmark without a tag has no name.
     named = [line.split(",")[0] for line in (out / "map.csv").read_text().splitlines()]
@@ -113,7 +119,7 @@ def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
 def test_several_filters_side_by_side(tmp_path, capsys):
     data, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
     run = ["run", "--dataset", "bonn", str(data), "--filters", "dead_reckoning,ekf"]
-    assert cli.main([*run, "--gate", "0.999", "--out", str(out)]) == 0
+    assert cli.main([*run, "--gate", "0.999", "--figures", "pdf,svg", "--out", str(out)]) == 0
     printed = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["dead_reckoning", "ekf"] in printed
     assert ["status:", "unmatched", "6", "0"] in printed
@@ -121,11 +127,15 @@ def test_several_filters_side_by_side(tmp_path, capsys):
     assert {path.name for path in out.iterdir()} == {
         "trajectory-dead_reckoning.csv",
         "trajectory-ekf.csv",
+        "trajectory-dead_reckoning.tum",
+        "trajectory-ekf.tum",
         "map-dead_reckoning.csv",
         "map-ekf.csv",
         "summary.json",
-        "map.png",
+        "map.pdf",
+        "map.svg",
     }
+    assert (out / "map.pdf").read_bytes().startswith(b"%PDF")
     filters = json.loads((out / "summary.json").read_text())["filters"]
     assert filters["ekf"]["P positive definite"] == "at 3 of 3 checked steps"
 
@@ -141,6 +151,7 @@ def test_several_filters_side_by_side(tmp_path, capsys):
         (["--gate", "9.2", "--associate", "joint"], "--gate: expected a probability"),
         (["--gate", "0.9"], "--gate: expected --associate beside it"),
         (["--associate", "best"], "--associate: expected one of nearest"),
+        (["--figures", "gif"], "--figures: expected formats of png, pdf, svg, got 'gif'"),
     ],
 )
 def test_filters_that_a_table_cannot_have_are_refused(tmp_path, refused, options, message):

@@ -103,6 +103,7 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
             "; or FILE.py:NAME, one of your own",
         ),
         (["--figures", "gif"], "--figures: expected formats of png, pdf, svg, got 'gif'"),
+        (["--table", "xls"], "--table: expected formats of csv, json, parquet, got 'xls'"),
         (["--figures", ""], "--figures: expected formats of png, pdf, svg, got ''"),
     ],
 )
@@ -145,8 +146,10 @@ def test_a_campaign_of_a_file_is_resumed_while_the_file_computes_the_same(
     mine.write_text("# the same filter\n" + MINE)
     assert cli.main([*again, "--figures", "svg"]) == 0
     assert "finished: nothing was run and nothing written" in capsys.readouterr().out
-    assert cli.main([*again, "--figures", "pdf,png"]) == 0  # of a finished campaign
+    # Of a finished campaign.
+    assert cli.main([*again, "--figures", "pdf,png", "--table", "csv,json"]) == 0
     assert {path.suffix for path in out.glob("map.*")} == {".svg", ".pdf", ".png"}
+    assert {path.name for path in out.glob("runs.*")} == {"runs.csv", "runs.json"}
     mine.write_text(MINE.replace("factor = 2.0", "factor = 3.0"))
     message = refused(
         [*again, "--runs", "4"],

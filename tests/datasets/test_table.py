@@ -1,5 +1,8 @@
 """`datasets.table`: little files by hand, settings and their defaults, and errors that say where."""
 
+import gzip
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -92,6 +95,24 @@ def test_windows_lines_degrees_and_other_columns(tmp_path):
     for found, expected in zip(jax.tree.leaves(data.log), jax.tree.leaves(plain.log), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-15)
     assert "column 'note' of measurements.csv is not used" in data.assumed
+
+
+def test_packed_tables_are_read_as_they_are(tmp_path):
+    """The same data set, and an error that names the packed file."""
+    plain = datasets.table(write(tmp_path, OWN | TRUTH))
+    for name in OWN | TRUTH:
+        (tmp_path / f"{name}.gz").write_bytes(gzip.compress((tmp_path / name).read_bytes()))
+        (tmp_path / name).unlink()
+    data = datasets.table(tmp_path)
+    assert (data.tags, data.assumed) == (plain.tags, plain.assumed)
+    for name in ("log", "pose", "landmarks", "true_path"):
+        for pair in zip(*(jax.tree.leaves(getattr(d, name)) for d in (data, plain)), strict=True):
+            np.testing.assert_array_equal(*pair)
+    spoiled = OWN["odometry.csv"].replace("1.2,1.0", "1.2,nan").encode()
+    (tmp_path / "odometry.csv.gz").write_bytes(gzip.compress(spoiled))
+    place = re.escape(f"{tmp_path / 'odometry.csv.gz'}:3: column 2 (v [m/s]): expected a finite")
+    with pytest.raises(ValueError, match=place):
+        datasets.table(tmp_path)
 
 
 def test_the_truth_gives_the_start_and_the_frame(tmp_path):
@@ -222,7 +243,7 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("[motion]\nnoise = [0.1, -1]", "[motion] noise: expected standard deviations >= 0"),
         ("[sensor]\nnoise = [0.1, 0]", "[sensor] noise: expected numbers above 0"),
         ("[sensor]\nnoise = [0.1, nan]", "[sensor] noise: expected 2 numbers"),
-        ("[sensor]\nmount = [1, 2]", "[sensor] range_bearing: expected a mounting pose of shape (3,)"),
+        ("[sensor]\nmount = [1, 2]", "[sensor] mount: expected 3 numbers (x [m], y [m], theta [rad])"),
         ("[sensor]\nheight = 2", "[sensor] height: expected one of model, noise, mount"),
         ("[filter]\ngate = 9.2", "[filter] gate: expected a probability between 0 and 1, got 9.2"),
         ("[filter]\ncapacity = 1", "[filter] capacity: expected a whole number of at least 2"),
@@ -230,16 +251,17 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("[filter]\nstart_noise = [0, 0, -1]", "[filter] start_noise: expected numbers of at least"),
         ("[filter]\nassociate = 'best'", "[filter] associate: expected one of nearest, global_near"),
         ("[filter]\nupdate = 'batch'", '[filter] update: expected "sequential" or "joint"'),
-        ("[robot]\nmass = 1", ": robot: expected one of name, source, motion, sensor, filter"),
-        ("filter = 3", "filter: expected a section [filter]"),
+        ("[robot]\nmass = 1", ":1: robot: expected one of name, source, motion, sensor, filter"),
+        ("filter = 3", ":1: filter: expected a section [filter]"),
+        ("# mine\n[sensor]\n[motion]\nnoise = [1]", ":4: [motion] noise: expected 2 numbers"),
         ("[motion\n", "cannot be read: Expected ']'"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(tmp_path, toml, reason):
     with pytest.raises(ValueError) as caught:  # noqa: PT011 the message is compared below
         datasets.table(write(tmp_path, OWN | {"dataset.toml": toml}))
-    assert str(caught.value).startswith(f"{tmp_path / 'dataset.toml'}: ")
-    assert reason in str(caught.value)
+    assert str(caught.value).startswith(f"{tmp_path / 'dataset.toml'}:")
+    assert (f":2: {reason}" if reason[0] == "[" else reason) in str(caught.value)
 
 
 def test_columns_of_no_model_list_those_of_all(tmp_path):

@@ -4,6 +4,7 @@ The campaign's numbers are made up; nothing is compiled but for the errors of ru
 """
 
 import dataclasses
+import importlib.machinery
 import json
 import sys
 import types
@@ -193,3 +194,40 @@ def test_without_pandas_a_line_says_so(found, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="to_dataframe needs pandas, which is not inst"):
         found.to_dataframe()
+
+
+def test_runs_are_written_as_csv_and_json(found, tmp_path):
+    text = found.save_runs(tmp_path / "new" / "runs.csv").read_text().splitlines()
+    assert text[0] == "filter,run,finite,nees_pose,square_position"
+    assert text[1] == "good,0,True,0.0,1.0" and text[5] == "other,4,False,,"
+    read = json.loads(found.save_runs(tmp_path / "runs.json").read_text())
+    assert list(read) == text[0].split(",")
+    assert read["nees_pose"] == [0, 1, 2, 5, None, 7] and read["run"] == [0, 4, 5] * 2
+    found.save_runs(tmp_path / "runs.json")  # replaced
+    with pytest.raises(
+        ValueError, match="save_runs: expected formats of csv, json, parquet, got 'xls'"
+    ):
+        found.save_runs(tmp_path / "runs.xls")
+
+
+def test_runs_are_written_as_parquet_by_pyarrow_alone(found, tmp_path, monkeypatch):
+    """By a stand-in that takes what pyarrow does; without one a line says so."""
+    taken = {}
+    module = types.ModuleType("pyarrow.parquet")
+    module.write_table = lambda table, path: (taken.update(table), path.write_bytes(b"PAR1"))
+    arrow = types.ModuleType("pyarrow")
+    arrow.table, arrow.__spec__ = dict, importlib.machinery.ModuleSpec("pyarrow", None)
+    monkeypatch.setitem(sys.modules, "pyarrow", arrow)
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", module)
+    assert found.save_runs(tmp_path / "runs.parquet").read_bytes() == b"PAR1"
+    assert list(taken["run"]) == [0, 4, 5] * 2
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ValueError, match="parquet needs pyarrow, which is not installed"):
+        found.save_runs(tmp_path / "runs2.parquet")
+    assert not (tmp_path / "runs2.parquet").exists()
+
+
+def test_pyarrow_takes_it(found, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    read = parquet.read_table(found.save_runs(tmp_path / "runs.parquet"))
+    assert read.column_names[:2] == ["filter", "run"] and read.num_rows == 6

@@ -11,6 +11,7 @@ import worlds
 
 from jaxslam import report
 from jaxslam.results import files
+from jaxslam.types import Estimate
 
 WORLD = worlds.ring()
 
@@ -88,3 +89,15 @@ def test_an_unwritable_folder_is_refused_beforehand(tmp_path):
         files.check_writable(tmp_path / "file" / "out")
     files.check_writable(tmp_path / "not" / "yet" / "there")
     assert not (tmp_path / "not").exists()
+
+
+def test_a_path_in_the_format_of_tum():
+    pose = np.array([[1.0, -2.0, np.pi / 2], [0.25, 0.0, -3.0]])
+    nothing = np.zeros((2, 0))
+    text = report.trajectory_tum(
+        np.array([1248272273.125, 1248272274.0]), Estimate(pose, *[nothing] * 5)
+    )
+    rows = np.array([line.split() for line in text.splitlines()], float)
+    assert text.startswith("1248272273.125 1 -2 0 0 0 ")
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1, rtol=1e-8)
+    np.testing.assert_allclose(2 * np.arctan2(rows[:, 6], rows[:, 7]), pose[:, 2], rtol=1e-8)

@@ -1,0 +1,11 @@
+"""Calibration from a filter's own innovations: systematic errors, and noises by their likelihood.
+
+`calibrate` finds parameters of which the noise covariances do not depend, by Gauss-Newton on the
+whitened innovations, also where associations change; `fit_noise` maximizes the likelihood, for
+standard deviations and what else is in it, with the associations held.
+"""
+
+from jaxslam.calibration.innovations import Calibration, calibrate
+from jaxslam.calibration.likelihood import NoiseFit, as_associated, fit_noise
+
+__all__ = ["Calibration", "NoiseFit", "as_associated", "calibrate", "fit_noise"]

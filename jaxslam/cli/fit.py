@@ -1,0 +1,198 @@
+"""The command `jaxslam fit`: the noises of one's own data by maximum likelihood."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxslam.cli import cache
+from jaxslam.datasets import Dataset, DatasetFit, fit, table
+from jaxslam.datasets.settings_text import changed, fragment
+from jaxslam.records import POSE
+from jaxslam.results.files import check_writable, json_text, versions, write_files
+
+
+def add_options(parser: argparse.ArgumentParser, out: Path) -> None:
+    """Add the options of `jaxslam fit`."""
+    parser.add_argument("path", metavar="FOLDER", help="the folder of the CSV files")
+    parser.add_argument(
+        "--mount", action="store_true", help="fit the pose of the sensor on the robot, too"
+    )
+    parser.add_argument(
+        "--fix",
+        metavar="NAMES",
+        default="",
+        help='parameters to hold, comma-separated, as "motion v,mount y"',
+    )
+    parser.add_argument(
+        "--write", action="store_true", help="also change dataset.toml in the folder"
+    )
+    cache.add_options(parser)
+    parser.add_argument(
+        "--out", metavar="DIR", default=str(out), help=f"folder for results (default: {out})"
+    )
+    parser.set_defaults(command=fit_folder, dtype="float64")
+
+
+def fit_folder(options: argparse.Namespace, command: str) -> int:
+    """Fit the noises of a folder, print and write them; returns the exit status."""
+    data = table(options.path)
+    check_writable(options.out)
+    fixed = [name.strip() for name in options.fix.split(",") if name.strip()]
+    result = fit(data, mount=options.mount, fixed=fixed)
+    print(_table(data, result))
+    changes, comments = _settings(data, result, options.mount)
+    settings = Path(options.path) / "dataset.toml"
+    good = result.found.converged and result.settled
+    text = changed(settings, changes) if options.write and good else None
+    files: dict[str, str | Callable[[Path], object]] = {
+        "fit.json": json_text(
+            _summary(data, result) | {"command": command, "versions": versions()}
+        ),
+        "fit.toml": fragment(changes, comments),
+    }
+    written = write_files(options.out, files)
+    if text is not None:
+        written += write_files(settings.parent, {settings.name: text})
+    print("\nwrote " + ", ".join(map(str, written)))
+    if options.write and not good:
+        print(f"{settings} was not changed, since the fit did not come to an end")
+    elif text is None:
+        print(f"paste fit.toml into {settings}, or use --write")
+    return 0
+
+
+def _settings(
+    data: Dataset, result: DatasetFit, mount: bool
+) -> tuple[dict[str, dict[str, Sequence[float]]], dict[str, str]]:
+    """The sections of `dataset.toml` with what was found, and a comment for each key."""
+    count = len(data.motion.noises)
+    changes: dict[str, dict[str, Sequence[float]]] = {
+        "motion": {"noise": result.deviations[:count]},
+        "sensor": {"noise": result.deviations[count:]},
+    }
+    comments = {
+        "motion.noise": ", ".join(data.motion.noises),
+        "sensor.noise": ", ".join(data.sensor.measurements),
+    }
+    if mount and result.mount is not None:
+        changes["sensor"]["mount"] = result.mount
+        comments["sensor.mount"] = ", ".join(POSE)
+    return changes, comments
+
+
+def _summary(data: Dataset, result: DatasetFit) -> dict[str, Any]:
+    """What `fit.json` says; what is infinite is null."""
+    found = result.found
+    rows = zip(
+        found.names, found.start, found.parameters, found.error, found.robust_error, strict=True
+    )
+    return {
+        "dataset": data.name,
+        "measurements used": result.used,
+        "measurements left out": result.left_out,
+        "dropped by the reader": data.dropped,
+        "parameters": {
+            name: {
+                "before": float(before),
+                "after": float(after),
+                "standard error": _finite(error),
+                "robust error": _finite(robust),
+                "upper limit, 95 %": found.upper.get(name),
+                "not determined, confounded with": (
+                    list(found.loose[name]) if name in found.loose else None
+                ),
+            }
+            for name, before, after, error, robust in rows
+        },
+        "held fixed": result.held,
+        "log-likelihood": list(found.log_likelihood),
+        "NIS / dof": list(found.nis_per_dof),
+        "dof": found.dof,
+        "steps": len(found.path) - 1,
+        "converged": found.converged,
+        "rounds of association and gate": result.rounds,
+        "associations settled": result.settled,
+        "defaults taken": list(data.assumed),
+    }
+
+
+def _table(data: Dataset, result: DatasetFit) -> str:
+    """The parameters before and after with their errors, the likelihood, and what to mind."""
+    found = result.found
+    lines = [["", "before", "after", "std. error", "robust"]]
+    for i, name in enumerate(found.names):
+        errors = found.error[i], found.robust_error[i]
+        shown = [f"{e:.2g}" if np.isfinite(e) and name not in found.upper else "-" for e in errors]
+        value = (
+            f"< {found.upper[name]:.2g}" if name in found.upper else f"{found.parameters[i]:.4g}"
+        )
+        lines.append([name, f"{found.start[i]:.4g}", value, *shown])
+    before, after = found.log_likelihood
+    lines.append(["log-likelihood", f"{before:.1f}", f"{after:.1f}", "", ""])
+    before, after = found.nis_per_dof
+    lines.append(["NIS / dof", f"{before:.3f}", f"{after:.3f}", "", ""])
+    widths = [max(len(line[i]) for line in lines) for i in range(5)]
+    text = [
+        "  ".join(
+            c.rjust(w) if i else c.ljust(w)
+            for i, (c, w) in enumerate(zip(line, widths, strict=True))
+        )
+        for line in lines
+    ]
+    out = ", ".join(f"{count:,} {name}" for name, count in result.left_out.items())
+    text.insert(
+        0,
+        f"{data.name}: {data.steps:,} rows, {result.used:,} measurements used"
+        + (f", others: {out}" if out else ""),
+    )
+    return "\n".join([*(line.rstrip() for line in text), "", *_notes(result)])
+
+
+def _notes(result: DatasetFit) -> list[str]:
+    """Sentences on convergence, parameters held and parameters that the log does not determine."""
+    found = result.found
+    steps = len(found.path) - 1
+    notes = [
+        f"converged after {steps} steps"
+        if found.converged
+        else f"NOT converged after {steps} steps: start closer, or hold a parameter (--fix)"
+    ]
+    if not result.settled:
+        notes.append(
+            f"NOT settled: after {result.rounds} rounds the noises still change what is associated "
+            "or gated"
+        )
+    notes += [f"{name} = {value:g} was held" for name, value in result.held.items()]
+    for name, limit in found.upper.items():
+        notes.append(
+            f"{name}: the log does not tell it from 0; above {limit:.2g} it is unlikely (95 %, the "
+            "others held)"
+        )
+    for name, others in found.loose.items():
+        reason = (
+            f"only together with {', '.join(others)}" if others else "its error is over a factor e"
+        )
+        notes.append(f"{name}: the log does not determine it ({reason}); hold it by --fix")
+    off = [
+        name
+        for name, one, other in zip(found.names, found.error, found.robust_error, strict=True)
+        if np.isfinite(one)
+        and not 0.5 <= other / one <= 2
+        and name not in (*found.upper, *found.loose)
+    ]
+    if off:
+        notes.append(
+            f"{', '.join(off)}: robust and standard errors differ by over a factor 2, so the "
+            "models do not fit"
+        )
+    notes.append(
+        "NIS / dof is near 1 after any fit of all noises; test them on another log (jaxslam run)"
+    )
+    return notes
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,146 @@
+"""The noises of a data set by maximum likelihood, from its own log."""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.calibration import NoiseFit, as_associated, fit_noise
+from jaxslam.datasets.dataset import Adjustable, Dataset
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.protocols import Filter
+from jaxslam.records import POSE, split_unit
+from jaxslam.run import run
+from jaxslam.types import Info, Log, Status
+from jaxslam.validation.numbers import check_count
+
+
+class DatasetFit(NamedTuple):
+    """The noises that `fit` found for a data set."""
+
+    found: NoiseFit
+    deviations: tuple[float, ...]
+    """all of them, fitted and held, in the order of `Dataset.adjustable`"""
+    mount: tuple[float, ...] | None
+    held: dict[str, float]
+    """the parameters that were not fitted, by name, with their values"""
+    used: int
+    """measurements fused or born, over which the likelihood is"""
+    left_out: dict[str, int]
+    """others, by what became of them with the noises found"""
+    rounds: int
+    """how often the filter decided what to use"""
+    settled: bool
+    """whether it decides with the noises found as it did before"""
+
+
+def fit(
+    data: Dataset, *, mount: bool = False, fixed: Iterable[str] = (), rounds: int = 5
+) -> DatasetFit:
+    """The standard deviations of a data set's noises that are most likely for its log.
+
+    EKF-SLAM with the options of the data set runs over the log, and says which measurement is of
+    which landmark, and which failed its gate. With these decisions held, `calibration.fit_noise`
+    maximizes the likelihood of the others. Both are repeated until the decisions stay; with known
+    tags and no gate they do at once. A gate cuts the tail of good measurements too, and so makes
+    noises a little too small: one of 0.999 or more is advisable, or none.
+
+    Truth and survey are not used, but for the pose at the start. A deviation of 0 is held.
+
+    Args:
+        data: with `Dataset.adjustable`, as from `table`.
+        mount: whether the pose of the sensor on the robot is fitted, too.
+        fixed: names of parameters to hold, as "motion v" or "mount y".
+        rounds: how often decisions are made at most.
+    Raises:
+        ValueError: on a data set whose noises are fixed, a mount that the sensor does not have, a
+            name that is none, nothing to fit, and what `fit_noise` raises.
+    """
+    models = data.adjustable
+    if models is None:
+        raise ValueError(f"fit: expected a data set with adjustable noises, got {data.name}")
+    check_count("fit: rounds", rounds)
+    names, values, free = _parameters(models, mount, tuple(fixed))
+    count, key = len(models.deviations), jax.random.key(0)
+    decided = {k: v for k, v in data.filter_options.items() if k not in ("gate", "associate")}
+
+    def filter(whole: Any, options: dict[str, Any]) -> Filter:
+        place = models.mount
+        if place is not None and mount:
+            place = whole[count:]
+        motion, sensor = models.models(whole[:count], place)
+        return ekf_slam(motion, sensor, data.capacity, **options)
+
+    def info(p: jax.Array, log: Log) -> Info:
+        whole = jnp.asarray(values, p.dtype).at[free].set(p)
+        return run(filter(whole, decided), log, data.pose, data.pose_cov, key).info
+
+    def decide(whole: np.ndarray) -> Info:
+        mine = filter(whole, data.filter_options)
+        found: Info = jax.device_get(run(mine, data.log, data.pose, data.pose_cov, key).info)
+        return found
+
+    whole, logged = np.array(values), np.arange(len(values)) < count
+    said = decide(whole)
+    settled, taken = False, 0
+    while taken < rounds and not settled:
+        taken += 1
+        log = as_associated(data.log, said)
+        found = fit_noise(
+            info,
+            values[free],
+            log,
+            names=[names[i] for i in free],
+            deviation=logged[free].tolist(),
+            guess=whole[free],
+        )
+        whole[free] = found.parameters
+        said = decide(whole)
+        settled = _same(log, as_associated(data.log, said))
+    outcome = {s.name.lower(): int((np.asarray(said.status) == s).sum()) for s in Status}
+    kept = ("empty", "fused", "born")
+    return DatasetFit(
+        found=found,
+        deviations=tuple(whole[:count].tolist()),
+        mount=tuple(whole[count:].tolist()) if mount else models.mount,
+        held={
+            names[i]: float(values[i])
+            for i in np.flatnonzero(~np.isin(np.arange(len(values)), free))
+        },
+        used=outcome["fused"] + outcome["born"],
+        left_out={name: n for name, n in outcome.items() if n and name not in kept},
+        rounds=taken,
+        settled=settled,
+    )
+
+
+def _parameters(
+    models: Adjustable, mount: bool, fixed: tuple[str, ...]
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """The names and values of all parameters, and the indices of those to fit."""
+    names, values = models.names, models.deviations
+    if mount:
+        if models.mount is None:
+            raise ValueError("fit: expected a sensor with a mount, got one without")
+        names += tuple(f"mount {name}" for name in POSE)
+        values += models.mount
+    bare = [split_unit(name)[0] for name in names]
+    held = {split_unit(name)[0] for name in fixed}
+    for name in held - set(bare):
+        raise ValueError(f"fit: expected fixed parameters of {', '.join(bare)}, got {name!r}")
+    free = [
+        i
+        for i, name in enumerate(bare)
+        if name not in held and (i >= len(models.deviations) or values[i] > 0)
+    ]
+    if not free:
+        raise ValueError("fit: expected a parameter to fit, got all held")
+    return names, np.array(values), np.array(free)
+
+
+def _same(one: Log, other: Log) -> bool:
+    """Whether two logs use the same measurements for the same landmarks."""
+    a, b = one.scan, other.scan
+    return np.array_equal(a.tag, b.tag) and np.array_equal(a.valid, b.valid)

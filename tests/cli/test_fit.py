@@ -1,0 +1,106 @@
+"""`jaxslam fit`: the noises of a folder of tables, held parameters, a gate, and lines for its settings."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from jaxslam import cli, datasets
+
+POINTS = {3: (3.0, 1.0), 5: (-1.0, 4.0), 8: (-3.0, -1.0)}
+SETTINGS = """[motion]
+noise = [0.05, 0.2, 0.0]  # by hand
+[sensor]
+noise = [0.3, 0.03]
+[filter]
+gate = 0.99999
+update = "joint"
+"""
+
+
+def write(folder, steps=150):
+    """A robot on a circle, velocity noise 0.1 m/s and 0.05 rad/s, range 0.1 m, bearing 0.03 rad."""
+    rng = np.random.default_rng(5)
+    pose, odometry, seen = (
+        np.zeros(3),
+        ["t [s],v [m/s],omega [rad/s]"],
+        ["t [s],tag,range [m],bearing [rad]"],
+    )
+    for k in range(steps):
+        t = 0.2 * k
+        for tag, point in POINTS.items():
+            dx, dy = np.array(point) - pose[:2]
+            z = (
+                np.hypot(dx, dy) + 0.1 * rng.normal(),
+                np.arctan2(dy, dx) - pose[2] + 0.03 * rng.normal(),
+            )
+            far = 5.0 * (k == 70 and tag == 5)
+            seen.append(f"{t:.2f},{tag},{z[0] + far:.5f},{z[1]:.5f}")
+        v, omega = 0.5 + 0.1 * rng.normal(), 0.3 + 0.05 * rng.normal()
+        odometry.append(f"{t:.2f},0.5,0.3")
+        turn = 0.2 * omega
+        pose = pose + [
+            0.2 * v * np.cos(pose[2] + turn / 2),
+            0.2 * v * np.sin(pose[2] + turn / 2),
+            turn,
+        ]
+    (folder / "odometry.csv").write_text("\n".join(odometry) + "\n")
+    (folder / "measurements.csv").write_text("\n".join(seen) + "\n")
+    (folder / "dataset.toml").write_text('[motion]\nmodel = "velocity"\n' + SETTINGS[9:])
+    return folder
+
+
+def test_the_noises_of_a_folder_are_fitted_and_written(tmp_path, capsys):
+    """Within 3.5 standard errors; an outlier at the gate is left out, a noise of 0 is held."""
+    out = tmp_path / "out"
+    assert cli.main(["fit", str(write(tmp_path)), "--write", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "449 measurements used, others: 1 rejected" in printed
+    assert "motion gamma [rad/s] = 0 was held" in printed
+    assert "NOT" not in printed
+    said = json.loads((out / "fit.json").read_text())
+    truth = {
+        "motion v [m/s]": 0.1,
+        "motion omega [rad/s]": 0.05,
+        "sensor range [m]": 0.1,
+        "sensor bearing [rad]": 0.03,
+    }
+    assert said["parameters"].keys() == truth.keys()
+    for name, value in truth.items():
+        row = said["parameters"][name]
+        z = np.log(row["after"] / value) / (row["standard error"] / row["after"])
+        assert abs(z) < 3.5, (name, row)
+        assert row["standard error"] < 0.4 * row["after"]
+    assert abs(said["NIS / dof"][1] - 1) < 0.01 < abs(said["NIS / dof"][0] - 1)
+    assert said["log-likelihood"][1] > said["log-likelihood"][0] + 20
+    assert said["converged"] and said["associations settled"]
+    written = (tmp_path / "dataset.toml").read_text()
+    assert 'model = "velocity"' in written and "# by hand" in written
+    after = datasets.table(tmp_path).adjustable.deviations
+    np.testing.assert_allclose(after[3], said["parameters"]["sensor range [m]"]["after"], rtol=1e-3)
+    assert (out / "fit.toml").read_text().startswith("[motion]\nnoise = [")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--fix", "motion w"], "fit: expected fixed parameters of motion v, motion omega"),
+        (
+            ["--fix", "motion v,motion omega,sensor range,sensor bearing"],
+            "fit: expected a parameter",
+        ),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(tmp_path, refused, options, message):
+    refused(["fit", write(tmp_path, 5), "--out", tmp_path / "out", *options], message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_data_set_with_fixed_noises_or_no_mount_is_refused(tmp_path):
+    data = datasets.table(write(tmp_path, 5))
+    with pytest.raises(ValueError, match="fit: expected a data set with adjustable noises"):
+        datasets.fit(dataclasses.replace(data, adjustable=None))
+    bare = data.adjustable._replace(mount=None)
+    with pytest.raises(ValueError, match="fit: expected a sensor with a mount"):
+        datasets.fit(dataclasses.replace(data, adjustable=bare), mount=True)

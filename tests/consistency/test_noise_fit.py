@@ -1,0 +1,176 @@
+"""`calibration.fit_noise`: closed forms of toy likelihoods, and a filter's noises from simulated logs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam import association, filters, motion, sensors
+from jaxslam.calibration import as_associated, fit_noise
+from jaxslam.math import stats
+from jaxslam.types import Info, Status
+
+RNG = np.random.default_rng(2)
+X = RNG.normal(0.3, 2.0, 400)
+
+
+def of(innovation, variance, fused=True):
+    """The info of scans of one scalar measurement each."""
+    nu, s = innovation[:, None, None], variance[:, None]
+    nis = nu[..., 0] ** 2 / s
+    fused = jnp.broadcast_to(fused, nis.shape)
+    each = -0.5 * (nis + jnp.log(2 * jnp.pi * s))
+    status = jnp.where(fused, Status.FUSED, Status.REJECTED)
+    total = jnp.where(fused, each, 0.0).sum(axis=1)
+    return Info(nis, fused.astype(int), nu, s[..., None, None], 0 * status, status, total)
+
+
+def scatter(p, x):
+    return of(x - p[1], jnp.full(x.shape, p[0] ** 2))
+
+
+def test_mean_and_deviation_of_a_sample_with_their_errors():
+    """σ̂² is the mean square about the mean; by log σ the information is 2n, by the mean n/σ²."""
+    found = fit_noise(
+        scatter, [0.5, 0.0], X, names=("sigma", "mean"), deviation=(True, False), tolerance=1e-6
+    )
+    n, sigma = len(X), X.std()
+    np.testing.assert_allclose(found.parameters, [sigma, X.mean()], rtol=1e-4)
+    np.testing.assert_allclose(found.error, sigma / np.sqrt([2 * n, n]), rtol=2e-3)
+    np.testing.assert_allclose(found.nis_per_dof[1], 1, rtol=1e-4)
+    np.testing.assert_allclose(found.nis_per_dof[0], np.mean(X**2) / 0.25)
+    best = -0.5 * n * (1 + np.log(2 * np.pi * sigma**2))
+    np.testing.assert_allclose(found.log_likelihood[1], best, rtol=1e-6)
+    z = (X - X.mean()) / sigma
+    slopes = np.stack([z**2 - 1, z / sigma])  # by log σ and by the mean
+    bread = np.diag([1 / (2 * n), sigma**2 / n])
+    robust = np.sqrt(np.diag(bread @ slopes @ slopes.T @ bread)) * [sigma, 1]
+    np.testing.assert_allclose(found.robust_error, robust, rtol=5e-3)
+    assert found.converged and not found.loose and not found.upper
+    assert (found.dof, found.names) == (n, ("sigma", "mean"))
+
+
+def test_a_search_from_elsewhere_ends_there_and_is_compared_with_the_start():
+    options = {"deviation": (True, False), "tolerance": 1e-6}
+    found = fit_noise(scatter, [0.5, 0.0], X, guess=[5.0, -1.0], **options)
+    np.testing.assert_allclose(found.path[0], [5, -1])
+    np.testing.assert_allclose(found.nis_per_dof[0], np.mean(X**2) / 0.25)
+    np.testing.assert_allclose(found.parameters, [X.std(), X.mean()], rtol=1e-4)
+
+
+def added(p, x):
+    """A part of the variance is known, and too large for these innovations."""
+    return of(x, 5.0 + p[0] ** 2 + 0 * x)
+
+
+def test_a_noise_that_goes_to_zero_has_an_upper_limit():
+    x = X - X.mean()
+    found = fit_noise(added, [1.0], x, names=["more"])
+    assert found.converged and found.parameters[0] < 0.1
+    (limit,) = found.upper.values()
+    assert not found.loose
+
+    def value(variance):
+        return -0.5 * np.sum(x**2 / variance + np.log(2 * np.pi * variance))
+
+    np.testing.assert_allclose(value(5 + limit**2), value(5.0) - 1.35, atol=0.1)
+
+
+def confounded(p, x):
+    return of(x - p[2], p[0] ** 2 + p[1] ** 2 + 0 * x)
+
+
+def test_noises_that_are_told_apart_by_nothing_are_named_together():
+    found = fit_noise(confounded, [0.5, 0.7, 1.0], X, names=("a", "b", "c"), deviation=[1, 1, 0])
+    assert found.loose == {"a": ("b",), "b": ("a",)}
+    assert (found.error[:2] > found.parameters[:2]).all()
+    np.testing.assert_allclose(found.error[2], X.std() / np.sqrt(len(X)), rtol=1e-2)
+    np.testing.assert_allclose(np.hypot(*found.parameters[:2]), X.std(), rtol=1e-2)
+
+
+def gated(p, x):
+    return of(x, p[0] ** 2 + 0 * x, fused=(jnp.abs(x) < 3 * p[0])[:, None])
+
+
+def nothing(p, x):
+    return of(x, p[0] ** 2 + 0 * x, fused=False)
+
+
+@pytest.mark.parametrize(
+    ("info", "start", "options", "reason"),
+    [
+        (gated, [0.5], {}, "expected the same measurements at all parameters, got "),
+        (nothing, [0.5], {}, "expected fused measurements, got none at parameters"),
+        (scatter, [np.nan, 1], {}, "expected a start of shape"),
+        (scatter, [0.0, 1], {}, r"expected standard deviations above 0"),
+        (scatter, [1.0, 1], {"guess": [1.0]}, "expected a guess of shape"),
+        (scatter, [1.0, 1], {"names": ["a"]}, "expected 2 names and deviations"),
+        (scatter, [1.0, 1], {"iterations": 0}, "iterations: expected an integer >= 1"),
+        (scatter, [1.0, 1], {"tolerance": 0}, "expected a tolerance above 0"),
+        (scatter, [1e-200, 1], {}, "the likelihood or its gradient is not finite"),
+    ],
+)
+def test_bad_input_is_named(info, start, options, reason):
+    with pytest.raises(ValueError, match=f"fit_noise: .*{reason}"):
+        fit_noise(info, start, X, **options)
+
+
+TRUE = np.array([0.02, 0.01, 0.05, 0.02])
+POINTS = np.array([[3.0, 1.0], [-1.0, 4.0], [-3.0, -1.0]])
+KEY = jax.random.key(0)
+
+
+def models(p):
+    cov = jnp.diag(jnp.asarray(p) ** 2)
+    return motion.increment(cov[:2, :2]), sensors.range_bearing(cov[2:, 2:])
+
+
+def world(steps=100):
+    controls = np.tile([0.1, 4 * np.pi / 200], (steps, 1))
+    moving, seeing = models(TRUE)
+    return jaxslam.Scenario("round", moving, seeing, landmarks=POINTS, controls=controls)
+
+
+def followed(p, log):
+    ekf = filters.ekf_slam(*models(p), capacity=len(POINTS), update="joint")
+    return jaxslam.run(ekf, log, np.zeros(3), np.zeros((3, 3)), KEY).info
+
+
+def test_the_noises_of_simulated_logs_are_found_and_errors_are_their_spread():
+    """From starts a factor 3 off: over 24 logs the z of each noise are standard normal numbers, by
+    bands that honest ones leave once in a thousand, and NIS/dof is 1, since P grows with all noises."""
+    place, count, z = world(), 24, []
+    for seed in range(count):
+        _, log = jaxslam.simulate(place, jax.random.key(seed))
+        found = fit_noise(followed, TRUE * [3, 1 / 3, 3, 1 / 3], log)
+        assert found.converged and not found.loose and not found.upper
+        assert found.log_likelihood[1] > found.log_likelihood[0] + 50
+        assert abs(found.nis_per_dof[1] - 1) < 1e-3
+        assert (np.abs(np.log(found.robust_error / found.error)) < np.log(1.6)).all()
+        z.append(np.log(found.parameters / TRUE) / (found.error / found.parameters))
+    z = np.array(z)
+    low, high = stats.chi2_band(count, 1, 0.999)
+    assert ((z**2).sum(axis=0) > low).all() and ((z**2).sum(axis=0) < high).all(), z
+    assert (np.abs(z.mean(axis=0)) < 3.3 / np.sqrt(count)).all(), z.mean(axis=0)
+
+
+def test_decisions_are_held_in_the_log():
+    """Unknown tags and a gate, then known tags and none: the same run, and the rest is not valid."""
+    place = world(40)
+    _, log = jaxslam.simulate(place, jax.random.key(3))
+    z = np.array(log.scan.z)
+    z[20, 1] += [0.25, 0]
+    log = log._replace(scan=log.scan._replace(z=z, tag=np.full_like(log.scan.tag, -1)))
+    nearest = association.nearest(stats.chi2_quantile(0.999, 2), stats.chi2_quantile(0.9999999, 2))
+    options = {"capacity": 5, "update": "joint"}
+    start = np.zeros(3), np.zeros((3, 3)), KEY
+    by_gate = filters.ekf_slam(*models(TRUE), associate=nearest, **options)
+    first = jaxslam.run(by_gate, log, *start)
+    held = as_associated(log, first.info)
+    assert (~held.scan.valid & log.scan.valid).sum() == 1 and not held.scan.valid[20, 1]
+    again = jaxslam.run(filters.ekf_slam(*models(TRUE), **options), held, *start)
+    np.testing.assert_allclose(again.estimate.pose, first.estimate.pose, atol=1e-12)
+    np.testing.assert_array_equal(
+        again.info.slot[held.scan.valid], first.info.slot[held.scan.valid]
+    )
