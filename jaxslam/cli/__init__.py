@@ -213,6 +213,12 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help="check after every K steps that the covariance is positive definite; 0: never "
         "(default: at 20 steps spread over the log)",
     )
+    parser.add_argument(
+        "--animate",
+        action="store_true",
+        help="also write a film of each filter: film.html to step and play, and film.mp4, or "
+        "film.gif where ffmpeg is missing",
+    )
     cache.add_options(parser)
     parser.add_argument(
         "--dtype",
