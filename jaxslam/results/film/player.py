@@ -9,11 +9,11 @@ from html import escape
 from jaxslam.results.film.encoding import size_of
 
 _ICONS = {
-    "first": "M3 3h2v10H3zM13 3v10L6 8z",
-    "back": "M12 3v10L4 8z",
-    "play": "M4 3v10l9-5z",
-    "next": "M4 3v10l8-5z",
-    "last": "M11 3h2v10h-2zM3 3v10l7-5z",
+    "first": "M2 3h2v10H2zM9 3v10L4 8zM14 3v10L9 8z",
+    "back": "M10 3v10L4 8zM11 3h2v10h-2z",
+    "play": "M4 2v12l10-6z",
+    "next": "M6 3v10l6-5zM3 3h2v10H3z",
+    "last": "M12 3h2v10h-2zM7 3v10l5-5zM2 3v10l5-5z",
 }
 
 _BUTTONS = {
@@ -89,8 +89,8 @@ SCRIPT_SOURCE = f"'sha256-{base64.b64encode(hashlib.sha256(SCRIPT.encode()).dige
 _CSS = """
 .jaxslam-film { display: inline-block; max-width: 100%; color: var(--ink, #1c2330);
   font: 14px/1.4 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-.jaxslam-film img { display: block; max-width: 100%; height: auto; margin: 0; background: #fff;
-  border: 1px solid var(--line, #dfe3ea); border-radius: .5rem; box-sizing: border-box; }
+.jaxslam-film img { display: block; max-width: 100%; height: auto; margin: 1px; padding: 0;
+  background: #fff; border: 0; border-radius: .5rem; box-shadow: 0 0 0 1px var(--line, #dfe3ea); }
 .jaxslam-film .bar { display: flex; flex-wrap: wrap; align-items: center; gap: .3rem .5rem;
   margin-top: .4rem; }
 .jaxslam-film .bar[hidden] { display: none; }

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.filters.information.eif_slam import CanonicalState
@@ -46,10 +47,11 @@ def probe(state: Any) -> Cloud | Links | None:
 
 def _links(omega: Float[Array, "D D"], size: int) -> Links:
     """The links of Ω of a robot and landmarks of `size` parameters."""
-    of_landmarks = 3 + jnp.arange((omega.shape[0] - 3) // size)[:, None] * size + jnp.arange(2)
-    rows = jnp.concatenate([jnp.arange(2)[None], of_landmarks])
+    # NumPy's arrays are constants, and cost no operation.
+    landmarks = 3 + np.arange((omega.shape[0] - 3) // size)[:, None] * size + np.arange(2)
+    rows = np.concatenate([np.arange(2)[None], landmarks])
     blocks = omega[rows[:, None, :, None], rows[None, :, None, :]]
     norm = jnp.sqrt((blocks**2).sum(axis=(2, 3)))
     own = jnp.sqrt(jnp.diagonal(norm))
-    apart = ~jnp.eye(len(rows), dtype=bool)
+    apart = ~np.eye(len(rows), dtype=bool)
     return Links(jnp.where(apart, norm / (own[:, None] * own[None, :]), 0.0).astype(jnp.float32))

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxslam.results.plot.geometry import ellipses, span, square
 from jaxslam.results.plot.scene.history import History, Measured, measured
@@ -28,6 +27,9 @@ _NEAR = 1.5
 _ROBOT = 0.035
 """length of the robot from its position to its tip, as a share of the map's side"""
 
+_MANY = 60
+"""With more landmarks their marks are smaller."""
+
 _BEAMS: dict[str, dict[str, Any]] = {
     "fused": {"color": COLORS[2], "lw": 0.8, "ls": "-"},
     "new": {"color": COLORS[4], "lw": 1.2, "ls": (0, (5, 2))},
@@ -50,8 +52,8 @@ _WEAK = 1e-9
 def run_scene(
     history: History,
     *,
-    true_points: Float[np.ndarray, "N 2"] | None = None,
-    true_path: Float[np.ndarray, "T 3"] | None = None,
+    true_points: np.ndarray | None = None,
+    true_path: np.ndarray | None = None,
     n_sigma: float = 3.0,
     title: str = "",
 ) -> Scene:
@@ -62,11 +64,16 @@ def run_scene(
     estimate where there is none.
 
     Args:
-        true_points: landmarks [m]; true_path: poses, NaN where not known, in the frame of the map.
+        true_points: (N, 2) landmarks [m], in the frame of the map.
+        true_path: (T, 3) poses, NaN where not known, in the same.
     Raises:
-        ValueError: on a true path of another length.
+        ValueError: on points or a path of other shapes.
     """
     steps = len(history.path)
+    if true_points is not None and (np.ndim(true_points) != 2 or np.shape(true_points)[1] != 2):
+        raise ValueError(
+            f"animate: expected true points of shape (N, 2), got {np.shape(true_points)}"
+        )
     if true_path is not None and np.shape(true_path) != (steps, 3):
         raise ValueError(
             f"animate: expected a true path of shape ({steps}, 3), got {np.shape(true_path)}"
@@ -140,7 +147,8 @@ def _map(history: History, n_sigma: float) -> list[Layer]:
     if not np.any(alive):
         return []
     ring: dict[str, Any] = {"color": COLORS[1], "lw": 1.0, "zorder": 4}
-    dots: dict[str, Any] = {"color": COLORS[1], "marker": "o", "ms": 3.2, "zorder": 4.1}
+    size = 3.2 if points.shape[1] <= _MANY else 1.8
+    dots: dict[str, Any] = {"color": COLORS[1], "marker": "o", "ms": size, "zorder": 4.1}
     return [
         marks(points, alive, label="_", **dots),
         rings(points, covs, alive, n_sigma, label=f"landmark, {n_sigma:g} σ", **ring),
@@ -235,7 +243,7 @@ def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
         layers,
         (-half, half),
         (-half, half),
-        title="robot: truth − estimate",
+        title="robot's position, centred" if path is None else "robot: truth − estimate",
     )
 
 
