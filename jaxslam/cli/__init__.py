@@ -140,6 +140,7 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
         help=f"formats of the files of figures, of {','.join(FORMATS)}; comma-separated (default: "
         "png; the page always has its own)",
     )
+    _add_animate(parser)
     earlier = parser.add_mutually_exclusive_group()
     earlier.add_argument(
         "--resume",
@@ -213,12 +214,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help="check after every K steps that the covariance is positive definite; 0: never "
         "(default: at 20 steps spread over the log)",
     )
-    parser.add_argument(
-        "--animate",
-        action="store_true",
-        help="also write a film of each filter: film.html to step and play, and film.mp4, or "
-        "film.gif where ffmpeg is missing",
-    )
+    _add_animate(parser)
     cache.add_options(parser)
     parser.add_argument(
         "--dtype",
@@ -230,6 +226,16 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", default=str(OUT), help=f"folder for results (default: {OUT})"
     )
     parser.set_defaults(command=run_dataset)
+
+
+def _add_animate(parser: argparse.ArgumentParser) -> None:
+    """Add the option of films."""
+    parser.add_argument(
+        "--animate",
+        action="store_true",
+        help="also write a film of each filter (consistency: of run 0): film.html to step and "
+        "play, and film.mp4, or film.gif where ffmpeg is missing",
+    )
 
 
 def _add_verify(parser: argparse.ArgumentParser) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 
 from jaxslam.cli import devices, library
+from jaxslam.cli.campaign_film import write_films
 from jaxslam.cli.campaign_folder import (
     BLOCKS,
     TIMES,
@@ -115,17 +116,19 @@ def consistency(options: argparse.Namespace, command: str) -> int:
             f"\n{out} holds this campaign, finished: nothing was run and nothing written; "
             f"--runs above {campaign.runs} extends it"
         )
-        return 0
-    if not campaign.first:
-        name = campaign_files.filter_of_run_zero(campaign)
-        first = _run_zero(scenario, filters[name], key, campaign.dtype)
-        campaign = replace(campaign, first={name: first})
-    paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"])
-    print("\nwrote " + ", ".join(map(str, paths)))
-    print(
-        f"results after {took:.1f} s"
-        + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
-    )
+    else:
+        if not campaign.first:
+            name = campaign_files.filter_of_run_zero(campaign)
+            first = _run_zero(scenario, filters[name], key, campaign.dtype)
+            campaign = replace(campaign, first={name: first})
+        paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"])
+        print("\nwrote " + ", ".join(map(str, paths)))
+        print(
+            f"results after {took:.1f} s"
+            + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
+        )
+    if options.animate:
+        write_films(out, scenario, filters, asked["seed"], campaign.dtype)
     return 0
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxslam.cli.films import film_files
 from jaxslam.cli.piecewise import PiecewiseRun
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.evaluation import Evaluation
@@ -30,14 +31,10 @@ def watching(at: Int[np.ndarray, "F"]) -> dict[str, Any]:
 def films(
     data: Dataset, runs: Mapping[str, tuple[PiecewiseRun, Evaluation]], at: Int[np.ndarray, "F"]
 ) -> dict[str, Callable[[Path], object]]:
-    """What writes the film of each filter, as MP4 or else GIF, and as a page; by file name.
-
-    Prints in a line how many steps are shown, and why there is no MP4.
-    """
+    """What writes the film of each filter, by file name; see `film_files`."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
-    files: dict[str, Callable[[Path], object]] = {}
-    said: list[str] = []
+    made = {}
     for name, (run, found) in runs.items():
         scene = plot.run_scene(
             plot.History(
@@ -54,19 +51,8 @@ def films(
             title=f"{data.name}: {name}",
         )
         with Progress(f"{data.name}, {name}: film", "frames") as progress:
-            film = plot.render(scene, progress=progress)
-        kind, content, why = film.moving()
-        said = [film.note, why]
-        suffix = f"-{name}" if len(runs) > 1 else ""
-        for ending, held in ((kind, content), ("html", film.encoded("html"))):
-            files[f"film{suffix}.{ending}"] = _writer(held)
-    if any(said):
-        print("\nfilm: " + "; ".join(filter(None, said)))
-    return files
-
-
-def _writer(content: bytes) -> Callable[[Path], object]:
-    return lambda path: path.write_bytes(content)
+            made[name] = plot.render(scene, progress=progress)
+    return film_files(made, suffixed=len(made) > 1)
 
 
 def _true_path(data: Dataset, found: Evaluation) -> Float[np.ndarray, "T 3"] | None:

@@ -5,8 +5,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import DTypeLike
 from numpy.typing import ArrayLike
 
+from jaxslam.monte_carlo.candidates import rounded
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.results.film import MOST, Film
 from jaxslam.results.plot.scene.history import history_of
@@ -73,7 +75,13 @@ def animate(
 
 
 def animate_world(
-    scenario: Scenario, candidate: Candidate, key: jax.Array, *, number: int = 0, **options: Any
+    scenario: Scenario,
+    candidate: Candidate,
+    key: jax.Array,
+    *,
+    number: int = 0,
+    dtype: DTypeLike | None = None,
+    **options: Any,
 ) -> Film:
     """The film of a filter in a simulated world, with its particles or links.
 
@@ -85,12 +93,12 @@ def animate_world(
 
     Args:
         candidate: a filter, or a function of the truth, as `monte_carlo` takes them.
-        key: of the campaign. number: of the run.
+        key: of the campaign. number: of the run. dtype: of the filter, by default that of JAX.
         options: of `animate`.
     """
     check_record("animate_world", "scenario", scenario, Scenario)
     of_world, of_filter = jax.random.split(jax.random.fold_in(key, number))
-    truth, log = simulate(scenario, of_world)
+    truth, log = rounded(simulate(scenario, of_world), dtype)
     method = candidate if isinstance(candidate, Filter) else candidate(truth)
     if isinstance(method, Filter):
         trace = run(method, log, scenario.pose, scenario.pose_cov, of_filter, probe=probe)
