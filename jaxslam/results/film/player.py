@@ -2,9 +2,13 @@
 
 import base64
 import hashlib
+import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
+
+import numpy as np
+from PIL import Image
 
 from jaxslam.results.film.encoding import size_of
 
@@ -29,7 +33,7 @@ for (const film of document.querySelectorAll(".jaxslam-film:not([data-ready])"))
   film.dataset.ready = "yes";
   const data = JSON.parse(film.querySelector("script[type='application/json']").textContent);
   const find = (what) => film.querySelector(what);
-  const image = find("img"), slider = find("input"), number = find("output");
+  const image = find(".frame"), slider = find("input"), number = find("output");
   const speed = find("select");
   const button = find("[data-do=play]"), last = data.frames.length - 1;
   let at = last, timer = 0, began = 0, from = 0;
@@ -89,8 +93,11 @@ SCRIPT_SOURCE = f"'sha256-{base64.b64encode(hashlib.sha256(SCRIPT.encode()).dige
 _CSS = """
 .jaxslam-film { display: inline-block; max-width: 100%; color: var(--ink, #1c2330);
   font: 14px/1.4 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-.jaxslam-film img { display: block; max-width: 100%; height: auto; margin: 1px; padding: 0;
-  background: #fff; border: 0; border-radius: .5rem; box-shadow: 0 0 0 1px var(--line, #dfe3ea); }
+.jaxslam-film .screen { position: relative; margin: 1px; overflow: hidden; background: #fff;
+  border-radius: .5rem; box-shadow: 0 0 0 1px var(--line, #dfe3ea); }
+.jaxslam-film img { display: block; width: auto; max-width: 100%; height: auto; margin: 0;
+  padding: 0; border: 0; border-radius: 0; background: none; }
+.jaxslam-film .frame { position: absolute; inset: 0; width: 100%; height: 100%; }
 .jaxslam-film .bar { display: flex; flex-wrap: wrap; align-items: center; gap: .3rem .5rem;
   margin-top: .4rem; }
 .jaxslam-film .bar[hidden] { display: none; }
@@ -136,7 +143,7 @@ def player(
             f"{len(said)} texts"
         )
     width, height = size_of(frames[-1])
-    images = [base64.b64encode(frame).decode("ascii") for frame in frames]
+    ground, *images = (base64.b64encode(each).decode("ascii") for each in _divided(frames))
     data = json.dumps({"fps": fps, "frames": images, "said": list(said)}, ensure_ascii=False)
     data = data.replace("<", "\\u003c")  # no end of the element within it
     buttons = "".join(
@@ -151,8 +158,9 @@ def player(
     last, named = len(frames) - 1, escape(f"Film: {title}")
     return f"""<div class="jaxslam-film" role="group" tabindex="0" aria-label="{named}">
 <style>{_CSS}</style>
-<img width="{width}" height="{height}" alt="{escape(said[-1] if said else title)}"
-src="data:image/png;base64,{images[-1]}">
+<div class="screen"><img width="{width}" height="{height}" alt=""
+src="data:image/png;base64,{ground}"><img class="frame" alt="{escape(said[-1] if said else title)}"
+src="data:image/png;base64,{images[-1]}"></div>
 <div class="bar" hidden>{buttons}<input type="range" min="0" max="{last}" value="{last}"
 aria-label="Frame"><output aria-hidden="true"></output>
 <select aria-label="Speed">{speeds}</select></div>
@@ -160,6 +168,37 @@ aria-label="Frame"><output aria-hidden="true"></output>
 <script>{SCRIPT}</script>
 </div>
 """
+
+
+def _divided(frames: Sequence[bytes]) -> Iterator[bytes]:
+    """What most frames have in common, then what each has of its own, as PNG files.
+
+    Frames of one palette become transparent where they are as the first picture, which halves them;
+    others stay as they are, and cover it.
+    """
+    images = [Image.open(io.BytesIO(frame)) for frame in frames]
+    palettes = {tuple(image.getpalette() or ()) for image in images}
+    if {image.mode for image in images} != {"P"} or len(palettes) > 1 or 768 in map(len, palettes):
+        yield from (frames[-1], *frames)
+        return
+    palette = [*palettes.pop(), 255, 255, 255]
+    clear = len(palette) // 3 - 1  # the index of what is transparent
+    samples = np.stack([np.asarray(image) for image in images[:: max(1, len(images) // 15)]])
+    ground = np.sort(samples, axis=0)[len(samples) // 2]
+    yield _file(ground, palette)
+    for image in images:
+        own = np.asarray(image)
+        yield _file(np.where(own == ground, clear, own), palette, transparency=clear)
+
+
+def _file(indices: np.ndarray, palette: Sequence[int], **more: int) -> bytes:
+    """The PNG file of a picture of colours by their index in a palette."""
+    tall, wide = indices.shape
+    image = Image.frombytes("P", (wide, tall), indices.astype(np.uint8).tobytes())
+    image.putpalette(palette)
+    out = io.BytesIO()
+    image.save(out, "PNG", **more)
+    return out.getvalue()
 
 
 def page(fragment: str, title: str = "") -> str:
