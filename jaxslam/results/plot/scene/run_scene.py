@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.results.plot.geometry import ellipses, span, square
+from jaxslam.results.plot.geometry import Limits, ellipses, span, square
 from jaxslam.results.plot.scene.history import History, Measured, measured
 from jaxslam.results.plot.scene.layers import (
     cloud,
@@ -80,7 +80,8 @@ def run_scene(
         )
     true = None if true_path is None else np.asarray(true_path, float)
     found = measured(history)
-    limits, side = _limits(history, true_points, true)
+    limits = _limits(history, true_points, true, n_sigma)
+    side = limits[0][1] - limits[0][0]
     layers = [
         *_truth(history, true_points, true, _ROBOT * side),
         *_links(history),
@@ -100,19 +101,19 @@ def run_scene(
 
 
 def _limits(
-    history: History, points: np.ndarray | None, path: np.ndarray | None
-) -> tuple[tuple[tuple[float, float], tuple[float, float]], float]:
-    """The limits of the map, and their width."""
-    mapped = history.estimate.points[history.estimate.alive]
+    history: History, points: np.ndarray | None, path: np.ndarray | None, n_sigma: float
+) -> Limits:
+    """The limits of the map: of the truth, else the estimate; and of what is near of the rest."""
+    alive = history.estimate.alive
+    mapped, covs = history.estimate.points[alive], history.estimate.point_covs[alive]
+    reach = n_sigma * np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
     estimated = [history.path[:, :2], mapped]
     clouds = [np.asarray(each, float)[:, :2] for each in (points, path) if each is not None]
-    if not clouds:
-        clouds = estimated
-    for more in estimated:
+    clouds = clouds or estimated
+    for more in (*estimated, np.concatenate([mapped - reach, mapped + reach])):
         if span([*clouds, more]) <= _NEAR * span(clouds):
             clouds = [*clouds, more]
-    limits = square(clouds)
-    return limits, limits[0][1] - limits[0][0]
+    return square(clouds)
 
 
 def _truth(
