@@ -165,7 +165,7 @@ def test_the_robot_is_shown_from_near_with_the_truth_on_a_fixed_scale():
     edge = far.beside.xlim[1]
     assert edge == pytest.approx(1.08 * 0.9)
     assert line(axes, "true position beyond")[0, 0] == edge and not len(line(axes, "true position"))
-    assert scene_of(true_path=None)[0].beside.title == "robot's position, centred"
+    assert scene_of(true_path=None)[0].beside.title == "about the estimated position"
 
 
 def test_limits_are_those_of_the_truth_unless_the_estimate_is_near():

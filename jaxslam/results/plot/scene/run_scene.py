@@ -244,7 +244,7 @@ def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
         layers,
         (-half, half),
         (-half, half),
-        title="robot's position, centred" if path is None else "robot: truth − estimate",
+        title="about the estimated position" if path is None else "robot: truth − estimate",
     )
 
 
