@@ -15,9 +15,9 @@ from jaxslam.results.plot.scene.layers import (
     still,
     track,
     triangle,
-    weighted_segments,
 )
-from jaxslam.results.plot.scene.probe import Cloud, Links
+from jaxslam.results.plot.scene.links import link_layers
+from jaxslam.results.plot.scene.probe import Cloud
 from jaxslam.results.plot.scene.render import Layer, Panel, Scene
 from jaxslam.results.plot.style import COLORS, FAINT, INK
 
@@ -37,16 +37,6 @@ _BEAMS: dict[str, dict[str, Any]] = {
     "dropped": {"color": INK, "lw": 0.9, "ls": (0, (1, 1.5))},
 }
 """Beams by what became of the measurement: another dash each, for readers without colour."""
-
-_ROBOT_LINK, _LINK = COLORS[5], COLORS[3]
-_CUT_FOR = 8
-"""number of frames in which a link that was cut is still shown"""
-
-_SEEN = 0.2
-"""A link to the robot is drawn as if it were at least so strong."""
-
-_WEAK = 1e-9
-"""strength of a link that is rounding alone"""
 
 
 def run_scene(
@@ -84,7 +74,7 @@ def run_scene(
     side = limits[0][1] - limits[0][0]
     layers = [
         *_truth(history, true_points, true, _ROBOT * side),
-        *_links(history),
+        *link_layers(history),
         *_beams(found),
         *_map(history, n_sigma),
         *_robot(history, n_sigma, _ROBOT * side),
@@ -180,38 +170,6 @@ def _particles(seen: Cloud, origin: np.ndarray, label: str) -> Layer:
     return cloud(at, np.asarray(seen.weight), label=label, **look)
 
 
-def _links(history: History) -> list[Layer]:
-    """Links of the information matrix, as wide as they are strong; those cut lately are dotted."""
-    if not isinstance(history.seen, Links):
-        return []
-    strength = np.asarray(history.seen.strength)
-    strength = np.where(np.isfinite(strength) & (strength > _WEAK), strength, 0.0)
-    between: list[np.ndarray] = []
-    robot: list[np.ndarray] = []
-    cut: list[np.ndarray] = []
-    weights: dict[str, list[np.ndarray]] = {"between": [], "robot": []}
-    for k, step in enumerate(strength):
-        nodes = np.concatenate([history.estimate.pose[k, None, :2], history.estimate.points[k]])
-        there = np.triu(step > 0)
-        lately = np.triu(strength[max(0, k - _CUT_FOR) : k + 1].max(axis=0) > 0)
-        i, j = np.nonzero(there)
-        ends, weight = nodes[np.stack([i, j], axis=1)], np.minimum(step[i, j], 1.0)
-        between.append(ends[i > 0])
-        robot.append(ends[i == 0])
-        weights["between"].append(weight[i > 0])
-        weights["robot"].append(np.maximum(weight[i == 0], _SEEN))
-        cut.append(nodes[np.stack(np.nonzero(lately & ~there), axis=1)])
-    look: dict[str, Any] = {"capstyle": "round", "zorder": 2.6}
-    dots: dict[str, Any] = {"color": INK, "lw": 1.0, "ls": (0, (1, 1.2)), "zorder": 2.8}
-    landmarks: dict[str, Any] = look | {"width": 3.0, "label": "link of landmarks"}
-    robots: dict[str, Any] = look | {"width": 5.0, "label": "link to the robot"}
-    return [
-        weighted_segments(between, weights["between"], color=_LINK, **landmarks),
-        weighted_segments(robot, weights["robot"], color=_ROBOT_LINK, **robots),
-        *([segments(cut, label="link cut", **dots)] if any(map(len, cut)) else []),
-    ]
-
-
 def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
     """The robot's position as seen from its estimate: the ellipse, the truth, particles."""
     pose, cov = history.estimate.pose, history.estimate.pose_cov[:, None, :2, :2]
@@ -225,7 +183,8 @@ def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
     if isinstance(history.seen, Cloud):
         layers.insert(0, _particles(history.seen, pose[:, :2], "_"))
         away = np.abs(np.asarray(history.seen.pose)[..., :2] - pose[:, None, :2])
-        reach = max(reach, float(np.quantile(away[np.isfinite(away)], 0.995)))
+        away = np.append(away[np.isfinite(away)], 0.0)
+        reach = max(reach, float(np.quantile(away, 0.995)))
     if path is not None:
         off = path[history.step, None, :2] - pose[:, None, :2]
         known = np.isfinite(off).all(axis=2)
@@ -251,15 +210,10 @@ def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
 def _text(history: History, found: Measured, n_sigma: float) -> Callable[[int], str]:
     """The line above frame k: its step, and what became of the measurements since the last."""
     total = len(history.path)
-    covs = history.estimate.point_covs
-    lost = [
-        int(
-            np.isnan(ellipses(covs[k][there][:, 0] * 0, covs[k][there], n_sigma, 1))
-            .all((1, 2))
-            .sum()
-        )
-        for k, there in enumerate(history.estimate.alive)
-    ]
+    lost = []
+    for covs, alive in zip(history.estimate.point_covs, history.estimate.alive, strict=True):
+        contours = ellipses(np.zeros((alive.sum(), 2)), covs[alive], n_sigma, points=1)
+        lost.append(int(np.isnan(contours).all(axis=(1, 2)).sum()))
 
     def said(k: int) -> str:
         counts = {name: int(of[k]) for name, of in found.counts.items()}
