@@ -111,24 +111,25 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     else:
         written = False
     print(campaign)
-    if written:
-        print(
-            f"\n{out} holds this campaign, finished: nothing was run and nothing written; "
-            f"--runs above {campaign.runs} extends it"
-        )
-    else:
-        if not campaign.first:
-            name = campaign_files.filter_of_run_zero(campaign)
-            first = _run_zero(scenario, filters[name], key, campaign.dtype)
-            campaign = replace(campaign, first={name: first})
-        paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"])
-        print("\nwrote " + ", ".join(map(str, paths)))
-        print(
-            f"results after {took:.1f} s"
-            + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
-        )
     if options.animate:
         write_films(out, scenario, filters, asked["seed"], campaign.dtype)
+    if written:
+        more = "but films" if options.animate else "and nothing written"
+        print(
+            f"\n{out} holds this campaign, finished: nothing was run {more}; "
+            f"--runs above {campaign.runs} extends it"
+        )
+        return 0
+    if not campaign.first:
+        name = campaign_files.filter_of_run_zero(campaign)
+        first = _run_zero(scenario, filters[name], key, campaign.dtype)
+        campaign = replace(campaign, first={name: first})
+    paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"])
+    print("\nwrote " + ", ".join(map(str, paths)))
+    print(
+        f"results after {took:.1f} s"
+        + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
+    )
     return 0
 
 

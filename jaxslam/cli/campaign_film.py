@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 
@@ -11,14 +12,20 @@ from jaxslam.protocols import Candidate
 from jaxslam.results.files import write_files
 from jaxslam.simulation.worlds import Scenario
 
+if TYPE_CHECKING:  # Pillow is slow to load
+    from jaxslam.results.film import Film
+
 
 def write_films(
     out: Path, scenario: Scenario, filters: Mapping[str, Candidate], seed: int, dtype: str
-) -> None:
-    """Write the film of run 0 of every filter, which runs once more, and print what was written."""
+) -> "dict[str, Film]":
+    """Write the film of run 0 of every filter, which runs once more, and print what was written.
+
+    Returns the films by filter.
+    """
     from jaxslam.results import plot  # matplotlib is slow to load
 
-    made = {}
+    made: dict[str, Film] = {}
     for name, candidate in filters.items():
         title = f"{scenario.name}: {name}, run 0 of seed {seed}"
         with Progress(f"{name}: film", "frames") as progress:
@@ -31,3 +38,4 @@ def write_films(
                 progress=progress,
             )
     print("\nwrote " + ", ".join(map(str, write_files(out, film_files(made, suffixed=True)))))
+    return made
