@@ -14,10 +14,10 @@ KINDS = ("mp4", "gif", "html")
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """Frames of one size, as PNG files. A notebook shows the player.
+    """A film: frames of one size, as PNG files. A notebook shows the player.
 
-    film = jaxslam.plot.animate(trace, log, truth)
-    film.save("slam.mp4")
+        film = jaxslam.plot.animate(trace, log, truth)
+        film.save("slam.mp4")
     """
 
     frames: tuple[bytes, ...]
