@@ -157,6 +157,7 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
         metavar="FORMATS",
         help=f"also write each run's averages as runs.csv, …; formats of {','.join(RUN_FORMATS)}",
     )
+    _add_animate(parser)
     earlier = parser.add_mutually_exclusive_group()
     earlier.add_argument(
         "--resume",
@@ -236,6 +237,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         metavar="FORMATS",
         help=f"formats of the figure, of {','.join(FORMATS)}; comma-separated (default: png)",
     )
+    _add_animate(parser)
     cache.add_options(parser)
     parser.add_argument(
         "--dtype",
@@ -247,6 +249,16 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", default=str(OUT), help=f"folder for results (default: {OUT})"
     )
     parser.set_defaults(command=run_dataset)
+
+
+def _add_animate(parser: argparse.ArgumentParser) -> None:
+    """Add the option of films."""
+    parser.add_argument(
+        "--animate",
+        action="store_true",
+        help="also write a film of each filter (consistency: of run 0): film.html to step and "
+        "play, and film.mp4, or film.gif where ffmpeg is missing",
+    )
 
 
 def _add_verify(parser: argparse.ArgumentParser) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 
 from jaxslam.cli import devices, library
+from jaxslam.cli.campaign_film import write_films
 from jaxslam.cli.campaign_folder import (
     BLOCKS,
     TIMES,
@@ -113,9 +114,12 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     else:
         written = False
     print(campaign)
+    if options.animate:
+        write_films(out, scenario, filters, asked["seed"], campaign.dtype)
     if written:
+        more = "but films" if options.animate else "and nothing written"
         print(
-            f"\n{out} holds this campaign, finished: nothing was run and nothing written; "
+            f"\n{out} holds this campaign, finished: nothing was run {more}; "
             f"--runs above {campaign.runs} extends it"
         )
         return 0

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxslam.cli.common import pick
+from jaxslam.cli.dataset_film import film_steps, films, watching
 from jaxslam.cli.dataset_filters import chosen, with_options
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.datasets import READERS, Dataset
@@ -35,7 +36,8 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     data = with_options(data, options)
     filters = chosen(data, options.filters)
     check_writable(options.out)
-    runs = {name: _run(name, filter, data, options) for name, filter in filters.items()}
+    at = film_steps(data) if options.animate else None
+    runs = {name: _run(name, filter, data, options, at) for name, filter in filters.items()}
     last = next(iter(runs.values())).result.last
     summary: dict[str, Any] = {
         "dataset": data.name,
@@ -64,6 +66,8 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
     files["summary.json"] = json_text(summary | {"versions": versions()})
     files |= _figure(data, runs, formats)
+    if at is not None:
+        files |= films(data, {name: run[:2] for name, run in runs.items()}, at)
     written = write_files(options.out, files)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
@@ -77,8 +81,17 @@ class _Run(NamedTuple):
     summary: dict[str, Any]
 
 
-def _run(name: str, filter: Filter, data: Dataset, options: argparse.Namespace) -> _Run:
-    """Run one filter over a data set; its covariance is checked where the state holds P."""
+def _run(
+    name: str,
+    filter: Filter,
+    data: Dataset,
+    options: argparse.Namespace,
+    at: Int[np.ndarray, "F"] | None,
+) -> _Run:
+    """Run one filter over a data set; its covariance is checked where the state holds P.
+
+    at: the steps that a film shows, None without one.
+    """
 
     def check(state: Any) -> bool:
         return positive_definite(np.asarray(state.cov))
@@ -97,6 +110,7 @@ def _run(name: str, filter: Filter, data: Dataset, options: argparse.Namespace) 
             every=options.check_every if has_covariance else 0,
             check=check,
             progress=progress,
+            **({} if at is None else watching(at)),
         )
     seconds = time.perf_counter() - began
     last = result.last

@@ -14,8 +14,8 @@ from jaxslam.types import Estimate, Log
 State: TypeAlias = Any
 """A filter's own state, a pytree."""
 
-Rows: TypeAlias = tuple[jax.Array, ...]
-"""What is kept of each step: arrays with leading T."""
+Rows: TypeAlias = tuple[tuple[jax.Array, ...], Any]
+"""What is kept of each step, and of the steps to watch: arrays with leading T."""
 
 CHECKS = 20
 """Default number of progress updates, and of checks of the state."""
@@ -30,6 +30,7 @@ class PiecewiseRun(NamedTuple):
     path: Estimate
     """pose (T, 3) and pose_cov (T, 3, 3); the fields of the map are ()"""
     status: Int[np.ndarray, "T M"]
+    slot: Int[np.ndarray, "T M"]
     nis: Float[np.ndarray, "T M"]
     dof: Int[np.ndarray, "T M"]
     log_likelihood: Float[np.ndarray, "T"]
@@ -41,6 +42,10 @@ class PiecewiseRun(NamedTuple):
     """the steps, from 1, after which the state was checked"""
     passed: list[bool]
     """the results of these checks"""
+    estimates: Estimate | None = None
+    """the whole estimates (F, …) after the steps to watch, where there are such, and"""
+    watched: Any = None
+    """what `watch` returned of the states there"""
 
 
 def run_in_pieces(
@@ -53,6 +58,8 @@ def run_in_pieces(
     check: Callable[[State], bool],
     progress: Callable[[int, int], object],
     seed: int = 0,
+    at: Int[np.ndarray, "F"] | None = None,
+    watch: Callable[[State], Any] = lambda state: None,
 ) -> PiecewiseRun:
     """Predict and update row by row, as `run` does, for a log whose values have been checked.
 
@@ -65,19 +72,21 @@ def run_in_pieces(
         check: the check, called with the filter's own state.
         progress: called after each piece with the steps done and their total.
         seed: of the random numbers of a particle filter.
+        at: the steps to watch, from 0, in order: the whole estimate after each is kept, and what
+            `watch` makes of the filter's own state. Default none.
     """
     total = log.control.shape[0]
     every = max(1, -(-total // CHECKS)) if every is None else every
     size = min(every or _LONGEST, _LONGEST, total)
     key = jax.random.key(seed)
 
-    def step(state: State, row: Log, number: jax.Array) -> tuple[State, tuple[jax.Array, ...]]:
+    def step(state: State, row: Log, number: jax.Array) -> tuple[State, Rows]:
         to_predict, to_update = jax.random.split(jax.random.fold_in(key, number))
         state = filter.predict(state, row.control, to_predict)
         state, info = filter.update(state, row.scan, to_update)
-        at = filter.estimate(state)
-        kept = info.status, info.nis, info.dof, info.log_likelihood
-        return state, (at.pose, at.pose_cov, *kept)
+        now = filter.estimate(state)
+        kept = info.status, info.slot, info.nis, info.dof, info.log_likelihood
+        return state, ((now.pose, now.pose_cov, *kept), None if at is None else (now, watch(state)))
 
     @jax.jit
     def piece(
@@ -96,25 +105,32 @@ def run_in_pieces(
 
     kind = log.control.dtype
     state = jax.jit(filter.init)(pose.astype(kind), pose_cov.astype(kind))
-    pieces, checked, passed, done = [], [], [], 0
+    pieces, films, checked, passed, done = [], [], [], [], 0
     while done < total:
         until = total if not every else min(total, (done // every + 1) * every)
         until = min(until, done + size)
         rows = jax.tree.map(lambda leaf, a=done, b=until: _padded(leaf[a:b], size), log)
         state, kept, last = piece(state, rows, jnp.asarray(until - done), jnp.asarray(done))
-        pieces.append([np.asarray(part)[: until - done] for part in kept])
+        pieces.append([np.asarray(part)[: until - done] for part in kept[0]])
+        if at is not None:
+            mine = at[(at >= done) & (at < until)] - done
+            films.append(jax.tree.map(lambda leaf, a=mine: np.asarray(leaf)[a], kept[1]))
         done = until
         progress(done, total)
         if every and (done % every == 0 or done == total):
             checked.append(done)
             passed.append(check(state))
-    pose, cov, status, nis, dof, log_likelihood = (
+    pose, cov, status, slot, nis, dof, log_likelihood = (
         np.concatenate(parts) for parts in zip(*pieces, strict=True)
     )
     path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
+    estimates, watched = (
+        jax.tree.map(lambda *parts: np.concatenate(parts), *films) if films else (None, None)
+    )
     return PiecewiseRun(
         path=path,
         status=status,
+        slot=slot,
         nis=nis,
         dof=dof,
         log_likelihood=log_likelihood,
@@ -122,6 +138,8 @@ def run_in_pieces(
         final=state,
         checked=checked,
         passed=passed,
+        estimates=estimates,
+        watched=watched,
     )
 
 

@@ -19,9 +19,11 @@ from jaxslam.results import campaign_files, files
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
 
-def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
-    out = tmp_path / "results"
-    assert cli.main([*QUICK, "--filters", "ekf,ideal", "--seed", "4", "--out", str(out)]) == 0
+def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch):
+    out, filmed = tmp_path / "results", []
+    monkeypatch.setattr(cli.campaign, "write_films", lambda *given: filmed.append(given))
+    asked = ["--filters", "ekf,ideal", "--seed", "4", "--animate", "--out", str(out)]
+    assert cli.main([*QUICK, *asked]) == 0
     printed = capsys.readouterr().out
     assert "verdict" in printed
     assert "published" not in printed  # of 2500 steps, and these are 8
@@ -48,6 +50,13 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys):
     assert (found["runs"], found["steps"], found["seed"]) == (3, 8, 4)
     assert list(found["filters"]) == ["ekf", "ideal"]
     assert found["command"].startswith("jaxslam consistency --scenario circle")
+    ((folder, world, filters, *rest),) = filmed
+    assert (folder, world.name, list(filters), rest) == (
+        out,
+        "circle",
+        ["ekf", "ideal"],
+        [4, "float64"],
+    )
 
 
 def test_the_version_is_told(capsys):

@@ -9,6 +9,7 @@ import pytest
 from jaxslam import cli
 from jaxslam.cli.dataset import positive_definite
 from jaxslam.results import plot
+from jaxslam.results.film import encoding
 
 
 def write_bonn(folder):
@@ -50,6 +51,26 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
     headings = 0.1 * np.arange(3)
     path = 0.1 * np.cumsum([np.cos(headings), np.sin(headings)], axis=1)
     np.testing.assert_allclose(drawn["dead_reckoning"][:, :2], path.T, atol=1e-12)
+
+
+def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(encoding, "ffmpeg", lambda: None)
+    scenes, render = [], plot.render
+    monkeypatch.setattr(plot, "render", lambda scene, **more: scenes.append(scene) or render(scene))
+    data, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
+    filters = ["--filters", "ekf,dead_reckoning", "--check-every", "0"]
+    run = ["run", "--dataset", "bonn", str(data), *filters, "--animate", "--out", str(out)]
+    assert cli.main(run) == 0
+    assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in capsys.readouterr().out
+    for name in ("ekf", "dead_reckoning"):
+        assert (out / f"film-{name}.gif").read_bytes().startswith(b"GIF")
+        assert "jaxslam-film" in (out / f"film-{name}.html").read_text()
+    assert [scene.title for scene in scenes] == ["bonn: ekf", "bonn: dead_reckoning"]
+    assert [scenes[0].said(k).split(": ")[1] for k in range(3)] == [
+        "0 fused, 2 new, 0 dropped",
+        "2 fused, 0 new, 0 dropped",
+        "2 fused, 0 new, 0 dropped",
+    ]
 
 
 @pytest.mark.parametrize(

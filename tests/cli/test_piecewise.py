@@ -82,6 +82,19 @@ def test_a_log_in_pieces_is_the_whole_log(every, looked):
     assert len(traced) <= 2  # its shapes and its program, however many pieces there are
 
 
+@pytest.mark.parametrize("every", [4, 0])
+def test_what_a_film_shows_is_kept_of_the_steps_to_watch_alone(every):
+    at = np.array([0, 3, 4, 4, 10])
+    options = {"every": every, "check": lambda pose: True, "progress": lambda done, total: None}
+    start = np.ones(3), np.zeros((3, 3))
+    done = run_in_pieces(
+        toy([]), log_of(), *start, **options, at=at, watch=lambda pose: {"twice": 2 * pose}
+    )
+    np.testing.assert_array_equal(done.estimates.pose, done.path.pose[at])
+    np.testing.assert_array_equal(done.watched["twice"], 2 * done.path.pose[at])
+    assert done.estimates.points.shape == (5, 1, 2) and done.slot.shape == (STEPS, 2)
+
+
 def test_a_long_log_is_shown_every_500_steps_at_least():
     shown = []
     run_in_pieces(

@@ -13,8 +13,20 @@ from jaxslam.results.plot.campaign import (
 )
 from jaxslam.results.plot.cost import cost_figure
 from jaxslam.results.plot.formats import encode
-from jaxslam.results.plot.maps import ellipse, map_figure, run_map_figure
+from jaxslam.results.plot.geometry import ellipse
+from jaxslam.results.plot.maps import map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
+from jaxslam.results.plot.scene import (
+    History,
+    Layer,
+    Panel,
+    Scene,
+    animate,
+    animate_world,
+    probe,
+    render,
+    run_scene,
+)
 from jaxslam.results.plot.single import errors_figure, run_errors_figure
 from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, png, warm_up
 
@@ -23,6 +35,12 @@ __all__ = [
     "COLUMN",
     "PAGE",
     "Figure",
+    "History",
+    "Layer",
+    "Panel",
+    "Scene",
+    "animate",
+    "animate_world",
     "bound_figure",
     "cost_figure",
     "coverage_figure",
@@ -34,8 +52,11 @@ __all__ = [
     "map_figure",
     "nees_figure",
     "png",
+    "probe",
+    "render",
     "run_errors_figure",
     "run_map_figure",
+    "run_scene",
     "warm_up",
     "whiteness_figure",
 ]

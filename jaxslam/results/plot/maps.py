@@ -11,6 +11,7 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
 from jaxslam.monte_carlo import Campaign
+from jaxslam.results.plot.geometry import ellipses, span, square
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,
@@ -33,31 +34,6 @@ _NEAR = 1.5
 
 _UPRIGHT = 15
 """largest number of landmarks whose names stand side by side"""
-
-
-def ellipse(
-    mean: np.ndarray, cov: np.ndarray, n_sigma: float = 3.0, points: int = 64
-) -> np.ndarray:
-    """The closed contour (points + 1, 2) of Mahalanobis distance n_sigma, Solà (84).
-
-    mean + n L (cos α, sin α) with P = L Lᵀ. n_sigma sets the size and points the smoothness. A
-    positive semi-definite P gives a segment or a point. Raises ValueError if P is not 2×2, not
-    finite or indefinite.
-    """
-    cov = np.asarray(cov, np.float64)
-    if cov.shape != (2, 2) or not np.all(np.isfinite(cov)):
-        raise ValueError(f"ellipse: expected a finite 2×2 covariance, got {cov}")
-    a, b, c = cov[0, 0], cov[1, 0], cov[1, 1]
-    tolerance = 1e-6 * max(abs(a), abs(c))
-    first = np.sqrt(max(a, 0.0))
-    below = b / first if first > 0 else 0.0
-    rest = c - below**2
-    if a < -tolerance or rest < -tolerance or (first == 0 and abs(b) > tolerance):
-        raise ValueError(f"ellipse: expected a positive semi-definite covariance, got {cov}")
-    factor = np.array([[first, 0.0], [below, np.sqrt(max(rest, 0.0))]])
-    around = np.linspace(0.0, 2 * np.pi, points + 1)
-    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
-    return np.asarray(np.asarray(mean) + n_sigma * circle @ factor.T)
 
 
 def map_figure(
@@ -101,13 +77,13 @@ def map_figure(
     if dead_reckoning is not None:
         path = np.asarray(dead_reckoning)[:, :2]
         axes.plot(*path.T, color=FAINT, lw=1.0, ls=(0, (1, 1.2)), label="dead reckoning", zorder=2)
-        shown += [path] if _size([*shown, path]) < _NEAR * _size(shown) else []
+        shown += [path] if span([*shown, path]) < _NEAR * span(shown) else []
     for i, (name, other) in enumerate((others or {}).items(), start=3):
         line = {key: look(i)[key] for key in ("color", "ls")}
         axes.plot(*np.asarray(other.pose)[:, :2].T, lw=1.0, label=plain(name), zorder=2.5, **line)
         points = np.asarray(other.points[-1])[np.asarray(other.alive[-1])]
         axes.plot(*points.T, ".", color=line["color"], ms=3, zorder=4.2)
-    _limits(axes, shown)
+    _limit(axes, shown)
     if names is not None:
         _draw_residuals(axes, panels[1], estimate, np.asarray(true_points), names, n_sigma)
         figure.align_ylabels()
@@ -137,7 +113,7 @@ def run_map_figure(
     for axes, (name, (truth, estimate)) in zip(panels, campaign.first.items(), strict=False):
         shown = _draw_truth(axes, np.asarray(truth.pose), np.asarray(truth.landmarks)[:, :2])
         _draw_estimate(axes, estimate, n_sigma)
-        _limits(axes, shown)
+        _limit(axes, shown)
         titled(axes, plain(name))
     for axes in panels[len(campaign.first) :]:
         axes.set_axis_off()
@@ -174,18 +150,18 @@ def _draw_estimate(axes: Axes, estimate: Estimate, n_sigma: float) -> list[np.nd
     covs = np.asarray(estimate.point_covs[-1])[alive]
     axes.plot(*pose[:, :2].T, color=COLORS[0], lw=1.3, label="estimated path", zorder=3)
     axes.plot(*points.T, ".", color=COLORS[1], ms=4.5, label="estimated landmarks", zorder=5)
-    last = pose[-1, :2], np.asarray(estimate.pose_cov[-1])[:2, :2], COLORS[0], "_"
-    label, refused = f"{n_sigma:g} σ ellipses", 0
-    for mean, cov, color, named in [
-        last,
-        *((point, cov, COLORS[1], label) for point, cov in zip(points, covs, strict=True)),
-    ]:
-        try:
-            contour = ellipse(mean, cov, n_sigma)
-        except ValueError:
-            refused += 1
-            continue
-        axes.plot(*contour.T, color=color, lw=0.9, label=named, zorder=3)
+    label = f"{n_sigma:g} σ ellipses"
+    here, here_cov = pose[-1:, :2], np.asarray(estimate.pose_cov[-1:])[:, :2, :2]
+    refused = 0
+    for means, around, color, named in (
+        (here, here_cov, COLORS[0], "_"),
+        (points, covs, COLORS[1], label),
+    ):
+        contours = ellipses(means, around, n_sigma)
+        good = ~np.isnan(contours).all(axis=(1, 2))
+        refused += int((~good).sum())
+        for contour in contours[good]:
+            axes.plot(*contour.T, color=color, lw=0.9, label=named, zorder=3)
     if refused:
         axes.set_title(f"{refused} without ellipse", loc="right", fontsize=7, color=INK)
     ends: dict[str, Any] = {"ls": "none", "color": INK, "zorder": 6}
@@ -229,21 +205,7 @@ def _draw_residuals(
     axes.set_ylim(bottom=0.0)
 
 
-def _size(clouds: Sequence[np.ndarray]) -> float:
-    """The larger side of the bounding box of some points, or 1 if it is 0."""
-    return float(np.nanmax(np.ptp(_finite(clouds), axis=0))) or 1.0
-
-
-def _finite(clouds: Sequence[np.ndarray]) -> np.ndarray:
-    """The finite ones of some points, the origin if there is none."""
-    every = np.concatenate(clouds)
-    every = every[np.isfinite(every).all(axis=1)]
-    return every if len(every) else np.zeros((1, 2))
-
-
-def _limits(axes: Axes, clouds: Sequence[np.ndarray]) -> None:
-    """Set the limits of a square panel about some points, with a margin."""
-    every = _finite(clouds)
-    middle = (every.min(axis=0) + every.max(axis=0)) / 2
-    half = 0.56 * _size(clouds)
-    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
+def _limit(axes: Axes, clouds: Sequence[np.ndarray]) -> None:
+    """Set the limits of a square panel about some points."""
+    xlim, ylim = square(clouds)
+    axes.set(xlim=xlim, ylim=ylim)

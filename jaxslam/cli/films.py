@@ -1,0 +1,35 @@
+"""The files of films, and what is said of them."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # Pillow is slow to load
+    from jaxslam.results.film import Film
+
+
+def film_files(
+    films: Mapping[str, "Film"], *, suffixed: bool
+) -> dict[str, Callable[[Path], object]]:
+    """What writes each film as MP4, or else GIF, and as a page; by file name.
+
+    Prints in a line how many steps are shown, and why there is no MP4.
+
+    Args:
+        films: by the name of the filter, which the file has where suffixed.
+    """
+    files: dict[str, Callable[[Path], object]] = {}
+    said: dict[str, None] = {}
+    for name, film in films.items():
+        kind, content, why = film.moving()
+        said |= dict.fromkeys(filter(None, (film.note, why)))
+        stem = f"film-{name}" if suffixed else "film"
+        for ending, held in ((kind, content), ("html", film.encoded("html"))):
+            files[f"{stem}.{ending}"] = _writer(held)
+    if said:
+        print("\nfilm: " + "; ".join(said))
+    return files
+
+
+def _writer(content: bytes) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(content)

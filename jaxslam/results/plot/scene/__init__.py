@@ -1,0 +1,23 @@
+"""Scenes, which are rendered to films: panels of layers, each a function that draws frame k."""
+
+from jaxslam.results.plot.scene.animate import animate, animate_world
+from jaxslam.results.plot.scene.history import History, history_of
+from jaxslam.results.plot.scene.probe import Cloud, Links, probe
+from jaxslam.results.plot.scene.render import Draw, Layer, Panel, Scene, render
+from jaxslam.results.plot.scene.run_scene import run_scene
+
+__all__ = [
+    "Cloud",
+    "Draw",
+    "History",
+    "Layer",
+    "Links",
+    "Panel",
+    "Scene",
+    "animate",
+    "animate_world",
+    "history_of",
+    "probe",
+    "render",
+    "run_scene",
+]

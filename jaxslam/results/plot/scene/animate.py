@@ -1,0 +1,107 @@
+"""The film of a run: of a trace, or of a filter in a simulated world."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.typing import DTypeLike
+from numpy.typing import ArrayLike
+
+from jaxslam.monte_carlo.candidates import rounded
+from jaxslam.protocols import Candidate, Filter
+from jaxslam.results.film import MOST, Film
+from jaxslam.results.plot.scene.history import history_of
+from jaxslam.results.plot.scene.probe import probe
+from jaxslam.results.plot.scene.render import render
+from jaxslam.results.plot.scene.run_scene import run_scene
+from jaxslam.results.plot.style import PAGE
+from jaxslam.run import run
+from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.types import Log, Trace, Truth
+from jaxslam.validation import check_record
+
+
+def animate(
+    trace: Trace,
+    log: Log,
+    truth: Truth | None = None,
+    *,
+    true_points: ArrayLike | None = None,
+    true_path: ArrayLike | None = None,
+    time: ArrayLike | None = None,
+    frames: int = MOST,
+    fps: float | None = None,
+    n_sigma: float = 3.0,
+    title: str = "",
+    width: float = PAGE,
+    progress: Callable[[int, int], object] | None = None,
+) -> Film:
+    """The film of a run: the robot with its ellipse, beams to the landmarks that are measured,
+    landmarks with ellipses, the path so far, and the truth in grey.
+
+        film = jaxslam.plot.animate(trace, log, truth)
+        film.save("slam.mp4")  # or .gif, .html
+
+    With a trace of `run(…, probe=jaxslam.plot.probe)` it shows the particles of a particle filter,
+    and the links of an information filter. Of more than `frames` steps so many are shown, evenly in
+    time; a frame has the beams of the steps since the one before. `Film.note` says so.
+
+    Args:
+        trace, log: of `run`, T steps.
+        truth: of a simulated world; or
+        true_points: (N, 2) landmarks [m], and
+        true_path: (T, 3) poses, NaN where unknown, in the frame of the map.
+        time: (T,) of the steps, for frames evenly in time; default evenly in steps.
+        frames: the largest number of frames.
+        fps: frames a second; default so that the film lasts 10 s, at most 25.
+        n_sigma: size of the ellipses. width: [in].
+        progress: called with the frames done and their number.
+    Raises:
+        ValueError: on arrays that do not belong together, or a trace without steps.
+    """
+    history = history_of(trace, log, frames, None if time is None else np.asarray(time))
+    if truth is not None:
+        check_record("animate", "truth", truth, Truth)
+        true_points, true_path = np.asarray(truth.landmarks)[:, :2], truth.pose
+    scene = run_scene(
+        history,
+        true_points=None if true_points is None else np.asarray(true_points),
+        true_path=None if true_path is None else np.asarray(true_path),
+        n_sigma=n_sigma,
+        title=title,
+    )
+    return render(scene, fps=fps, width=width, progress=progress)
+
+
+def animate_world(
+    scenario: Scenario,
+    candidate: Candidate,
+    key: jax.Array,
+    *,
+    number: int = 0,
+    dtype: DTypeLike | None = None,
+    **options: Any,
+) -> Film:
+    """The film of a filter in a simulated world, with its particles or links.
+
+        world = jaxslam.scenarios.cloister()
+        jaxslam.plot.animate_world(world, jaxslam.catalog.variant(world), jax.random.key(0))
+
+    The world and the random numbers of the filter are those of a campaign's run of that number:
+    `jaxslam consistency --seed 0` has key(0), and shows run 0.
+
+    Args:
+        candidate: a filter, or a function of the truth, as `monte_carlo` takes them.
+        key: of the campaign. number: of the run. dtype: of the filter, by default that of JAX.
+        options: of `animate`.
+    """
+    check_record("animate_world", "scenario", scenario, Scenario)
+    of_world, of_filter = jax.random.split(jax.random.fold_in(key, number))
+    truth, log = rounded(simulate(scenario, of_world), dtype)
+    method = candidate if isinstance(candidate, Filter) else candidate(truth)
+    if isinstance(method, Filter):
+        trace = run(method, log, scenario.pose, scenario.pose_cov, of_filter, probe=probe)
+    else:
+        trace = method(log, of_filter)
+    return animate(trace, log, truth, **({"title": scenario.name} | options))

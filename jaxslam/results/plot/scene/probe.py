@@ -1,0 +1,57 @@
+"""What a film shows of a filter's own state: particles, or links of an information matrix."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam.filters.information.eif_slam import CanonicalState
+from jaxslam.filters.information.marginals import information_of
+from jaxslam.filters.information.sparse_state import SparseState
+from jaxslam.filters.particles.pose_state import PoseParticles
+from jaxslam.filters.particles.slam_state import SlamParticles
+
+
+class Cloud(NamedTuple):
+    """Particles, with leading T in a trace."""
+
+    pose: Float[Array, "*T P 3"]
+    weight: Float[Array, "*T P"]
+    """Σ = 1, 0 where not in use"""
+
+
+class Links(NamedTuple):
+    """Links of the robot (row 0) and the landmarks (row 1 + slot), with leading T in a trace."""
+
+    strength: Float[Array, "*T K K"]
+    """‖Ω_ij‖ / √(‖Ω_ii‖ ‖Ω_jj‖) of the blocks of positions, at most 1; 0 without link"""
+
+
+def probe(state: Any) -> Cloud | Links | None:
+    """What `animate` shows of the state of FastSLAM, of a particle filter or an information filter.
+
+        trace = jaxslam.run(filter, log, pose, pose_cov, key, probe=jaxslam.plot.probe)
+
+    None of other filters, whose films need no probe.
+    """
+    if isinstance(state, SlamParticles | PoseParticles):
+        return Cloud(state.pose, jnp.exp(state.log_weight))
+    if isinstance(state, SparseState):
+        every = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
+        return _links(information_of(state, every), 2)
+    if isinstance(state, CanonicalState):
+        return _links(state.omega, state.landmarks.shape[1])
+    return None
+
+
+def _links(omega: Float[Array, "D D"], size: int) -> Links:
+    """The links of Ω of a robot and landmarks of `size` parameters."""
+    # NumPy's arrays are constants, and cost no operation.
+    landmarks = 3 + np.arange((omega.shape[0] - 3) // size)[:, None] * size + np.arange(2)
+    rows = np.concatenate([np.arange(2)[None], landmarks])
+    blocks = omega[rows[:, None, :, None], rows[None, :, None, :]]
+    norm = jnp.sqrt((blocks**2).sum(axis=(2, 3)))
+    own = jnp.sqrt(jnp.diagonal(norm))
+    apart = ~np.eye(len(rows), dtype=bool)
+    return Links(jnp.where(apart, norm / (own[:, None] * own[None, :]), 0.0).astype(jnp.float32))

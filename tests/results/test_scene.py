@@ -1,0 +1,345 @@
+"""Scenes: the numbers that artists have in each frame, what is refused, and that frames differ."""
+
+import io
+import sys
+
+import drawn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+from PIL import Image
+
+from jaxslam import catalog, plot
+from jaxslam.filters.information.eif_slam import CanonicalState
+from jaxslam.filters.information.sparse_state import empty_map
+from jaxslam.filters.particles.slam_state import initial_slam_particles
+from jaxslam.results.film import MOST
+from jaxslam.results.plot.scene import Cloud, Links, history_of, layers
+from jaxslam.results.plot.style import panels_of
+from jaxslam.types import Info, Log, Scan, Status, Trace
+
+STEPS = 3
+# Landmark 2 is new in the last step; a measurement of landmark 1 fails the gate there.
+STATUS = np.array(
+    [[Status.BORN, Status.BORN], [Status.FUSED, Status.EMPTY], [Status.BORN, Status.REJECTED]]
+)
+SLOT = np.array([[0, 1], [1, -1], [2, -1]])
+TAG = np.array([[0, 1], [1, -1], [2, 1]])
+ALIVE = np.array([[1, 1, 0], [1, 1, 0], [1, 1, 1]], bool)
+
+
+def run_of(steps=STEPS, seen=None):
+    """(trace, log, truth) of a drive round a circle, seen in `STATUS`."""
+    truth, estimate = drawn.run_of("ekf", steps)
+    rows = np.arange(steps) % STEPS
+    grown = estimate._replace(
+        alive=ALIVE[rows],
+        tag=np.where(ALIVE[rows], np.arange(3), -1),
+        point_covs=estimate.point_covs * (1.0 + np.arange(steps))[:, None, None, None],
+    )
+    info = Info(*[None] * len(Info._fields))._replace(status=STATUS[rows], slot=SLOT[rows])
+    scan = Scan(np.zeros((steps, 2, 2)), TAG[rows], STATUS[rows] > 0)
+    return Trace(grown, info, None, seen), Log(np.zeros((steps, 2)), scan), truth
+
+
+def scene_of(steps=STEPS, seen=None, frames=MOST, **more):
+    trace, log, truth = run_of(steps, seen)
+    true = {"true_points": truth.landmarks, "true_path": truth.pose} | more
+    return plot.run_scene(history_of(trace, log, frames), **true), trace.estimate, truth
+
+
+def staged(panel):
+    """The axes of a panel, and what sets them to frame k."""
+    _, (axes,) = panels_of(4.0, 4.0, 1)
+    draws = [layer(axes) for layer in panel.layers]
+    return axes, lambda k: [draw(k) for draw in draws]
+
+
+def line(axes, label):
+    (found,) = [each for each in axes.lines if each.get_label() == label]
+    return found.get_xydata()
+
+
+def beams(axes, outcome):
+    return line(axes, f"measured, {outcome}").reshape(-1, 3, 2)[:, :2]
+
+
+def triangles(axes):
+    return [patch.get_xy()[:3] for patch in axes.patches]
+
+
+def test_a_frame_has_the_robot_the_path_so_far_and_the_truth():
+    scene, estimate, truth = scene_of()
+    axes, draw = staged(scene.main)
+    np.testing.assert_array_equal(line(axes, "true landmarks"), truth.landmarks)
+    for k in (0, 2, 1):  # in any order
+        draw(k)
+        np.testing.assert_array_equal(
+            line(axes, "estimate: path, robot"), estimate.pose[: k + 1, :2]
+        )
+        np.testing.assert_array_equal(line(axes, "truth: path, robot"), truth.pose[: k + 1, :2])
+        for corners, (x, y, heading) in zip(
+            triangles(axes), (truth.pose[k], estimate.pose[k]), strict=True
+        ):
+            tip = corners[0] - [x, y]
+            np.testing.assert_allclose(np.arctan2(*tip[::-1]), np.angle(np.exp(1j * heading)))
+            assert np.hypot(*tip) > 1.2 * np.hypot(*(corners[1] - [x, y]))
+
+
+def test_landmarks_have_ellipses_of_three_sigma_that_grow():
+    scene, estimate, _ = scene_of()
+    axes, draw = staged(scene.main)
+    for k in range(STEPS):
+        draw(k)
+        rings = line(axes, "landmark, 3 σ").reshape(int(ALIVE[k].sum()), -1, 2)[:, :-1]
+        for ring, mean in zip(rings, estimate.points[k][ALIVE[k]], strict=True):
+            away = np.hypot(*(ring - mean).T)
+            np.testing.assert_allclose(away, 3 * np.sqrt(0.02 * (k + 1)))
+    ring = ring_of_robot(axes)
+    np.testing.assert_allclose(np.hypot(*(ring - estimate.pose[2, :2]).T), 0.3)
+
+
+def ring_of_robot(axes):
+    """The ellipse of the robot on the map, which has no entry in the legend."""
+    rings = [each.get_xydata() for each in axes.lines if each.get_color() == plot.COLORS[0]]
+    return next(ring[:-1] for ring in rings if len(ring) == 50)
+
+
+def test_beams_go_to_the_landmarks_measured_in_the_step():
+    scene, estimate, _ = scene_of()
+    axes, draw = staged(scene.main)
+    expected = {0: {"new": [0, 1]}, 1: {"fused": [1]}, 2: {"new": [2], "dropped": [1]}}
+    for k, kinds in expected.items():
+        draw(k)
+        for outcome in ("fused", "new", "dropped"):
+            ends = beams(axes, outcome)
+            to = kinds.get(outcome, [])
+            np.testing.assert_array_equal(ends[:, 0], np.tile(estimate.pose[k, :2], (len(to), 1)))
+            np.testing.assert_array_equal(ends[:, 1], estimate.points[k][to])
+    assert [scene.said(k) for k in range(STEPS)] == [
+        "step 1 of 3 · 2 measurements: 0 fused, 2 new, 0 dropped",
+        "step 2 of 3 · 1 measurement: 1 fused, 0 new, 0 dropped",
+        "step 3 of 3 · 2 measurements: 0 fused, 1 new, 1 dropped",
+    ]
+    styles = {
+        tuple(map(str, np.atleast_1d(each._unscaled_dash_pattern[1])))
+        for each in axes.lines
+        if str(each.get_label()).startswith("measured")
+    }
+    assert len(styles) == 3  # told apart without colour
+
+
+def test_a_frame_of_many_steps_has_all_their_beams():
+    """9 steps in 3 frames: steps 0; 1 … 4; 5 … 8."""
+    scene, estimate, _ = scene_of(9, frames=3)
+    assert scene.note == "3 of 9 steps are shown, evenly in time"
+    axes, draw = staged(scene.main)
+    draw(1)
+    # Of step 2 landmark 2, of step 3 landmarks 0 and 1; in frame 1, of step 4, landmark 2 is gone.
+    np.testing.assert_array_equal(beams(axes, "new")[:, 0], estimate.pose[[3, 3], :2])
+    np.testing.assert_array_equal(beams(axes, "new")[:, 1], estimate.points[4][:2])
+    np.testing.assert_array_equal(beams(axes, "fused")[:, 0], estimate.pose[[1, 4], :2])
+    assert scene.said(1) == "step 5 of 9 · 6 measurements: 2 fused, 3 new, 1 dropped"
+    every = scene_of(9)[0]
+    assert every.note == "" and every.frames == 9
+
+
+def test_the_robot_is_shown_from_near_with_the_truth_on_a_fixed_scale():
+    scene, estimate, truth = scene_of()
+    axes, draw = staged(scene.beside)
+    low, high = scene.beside.xlim
+    assert -low == high == pytest.approx(1.08 * 0.3)
+    for k in range(STEPS):
+        draw(k)
+        np.testing.assert_allclose(
+            line(axes, "true position"), truth.pose[[k], :2] - estimate.pose[[k], :2]
+        )
+        np.testing.assert_allclose(np.hypot(*line(axes, "robot, 3 σ")[:-1].T), 0.3)
+    # An error far beyond the ellipse does not set the scale; it is marked at the edge.
+    away = truth.pose + [5.0, 0.0, 0.0]
+    far, _, _ = scene_of(true_path=away)
+    axes, draw = staged(far.beside)
+    draw(0)
+    edge = far.beside.xlim[1]
+    assert edge == pytest.approx(1.08 * 0.9)
+    assert line(axes, "true position beyond")[0, 0] == edge and not len(line(axes, "true position"))
+    assert scene_of(true_path=None)[0].beside.title == "about the estimated position"
+
+
+def test_limits_are_those_of_the_truth_unless_the_estimate_is_near():
+    scene, estimate, truth = scene_of()
+    shown = np.concatenate([truth.landmarks, truth.pose[:, :2], estimate.points[2]])
+    for (low, high), values in zip((scene.main.xlim, scene.main.ylim), shown.T, strict=True):
+        assert low < values.min() and values.max() < high
+    trace, log, truth = run_of()
+    lost = trace._replace(estimate=trace.estimate._replace(pose=trace.estimate.pose * 100))
+    scene = plot.run_scene(history_of(lost, log), true_points=truth.landmarks, true_path=truth.pose)
+    assert np.ptp(scene.main.xlim) < 12
+    assert np.ptp(plot.run_scene(history_of(lost, log)).main.xlim) > 200
+
+
+def test_particles_are_drawn_by_weight():
+    rng = np.random.default_rng(0)
+    seen = Cloud(rng.normal(size=(STEPS, 4, 3)), np.tile([0.5, 0.25, 0.25, 0.0], (STEPS, 1)))
+    scene, estimate, _ = scene_of(seen=seen)
+    for panel, origin in ((scene.main, 0.0), (scene.beside, estimate.pose[1, :2])):
+        axes, draw = staged(panel)
+        draw(1)
+        (dots,) = [each for each in axes.collections if len(each.get_offsets())]
+        np.testing.assert_allclose(dots.get_offsets(), seen.pose[1, :3, :2] - origin)
+        np.testing.assert_allclose(dots.get_sizes(), [8.0, 4.0, 4.0])
+
+
+def test_links_appear_and_are_cut():
+    strength = np.zeros((STEPS, 4, 4))
+    strength[0, 0, 1] = strength[1, 0, 1] = strength[1, 1, 2] = 0.25
+    strength[2, 1, 2] = 1.0
+    scene, estimate, _ = scene_of(seen=Links(strength + np.swapaxes(strength, 1, 2)))
+    axes, draw = staged(scene.main)
+    between, robot = (
+        next(each for each in axes.collections if each.get_label() == label)
+        for label in ("link of landmarks", "link to the robot")
+    )
+    for k, (of_robot, of_landmarks, cut) in enumerate([(1, 0, 0), (1, 1, 0), (0, 1, 1)]):
+        draw(k)
+        here, points = estimate.pose[k, :2], estimate.points[k]
+        np.testing.assert_array_equal(robot.get_segments(), [[here, points[0]]] * of_robot)
+        np.testing.assert_array_equal(
+            between.get_segments(), [[points[0], points[1]]] * of_landmarks
+        )
+        assert len(line(axes, "link cut")) == 3 * cut
+    assert between.get_linewidth()[0] == 3.0
+
+
+# --- frames -------------------------------------------------------------------------------------
+
+
+def test_frames_differ_have_one_palette_and_even_sides_and_need_no_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)  # an import would fail
+    trace, log, truth = run_of()
+    done = []
+    film = plot.animate(
+        trace, log, truth, title="ring", width=3.5, progress=lambda k, n: done.append((k, n))
+    )
+    assert done == [(1, 3), (2, 3), (3, 3)] and film.fps == 2.0 and film.seconds == 1.5
+    assert len(film.said) == len(set(film.frames)) == 3 and film.title == "ring"
+    read = [Image.open(io.BytesIO(frame)) for frame in film.frames]
+    assert len({tuple(each.getpalette()) for each in read}) == 1
+    assert {each.size for each in read} == {film.size} and not any(side % 2 for side in film.size)
+    assert read[0].convert("RGB").getpixel((1, 1)) == (255, 255, 255)
+    assert film._repr_html_() == film.player()
+
+
+def test_another_film_is_another_layer():
+    images = np.stack([np.full((2, 2), k / 2) for k in range(3)])
+
+    def growing(axes):
+        image = axes.imshow(
+            images[0], cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1), animated=True
+        )
+        return lambda k: image.set_data(images[k])
+
+    panel = plot.Panel(
+        [growing, layers.still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1)
+    )
+    film = plot.render(plot.Scene(3, panel), width=2.0, dpi=50, fps=4)
+    middle = [
+        Image.open(io.BytesIO(frame)).convert("RGB").getpixel((30, 35)) for frame in film.frames
+    ]
+    assert film.fps == 4 and film.said == ("frame 1", "frame 2", "frame 3")
+    np.testing.assert_allclose(np.array(middle)[:, 0], [0, 128, 255], atol=20)
+
+
+# --- bad input ----------------------------------------------------------------------------------
+
+
+def test_arrays_that_do_not_belong_together_are_refused():
+    trace, log, truth = run_of()
+    _, longer, _ = run_of(4)
+    for arguments, more, message in (
+        ((trace, longer), {}, r"of 3 steps and measurements \(3, 2\), got 4 steps"),
+        ((trace, log, truth._replace(pose=truth.pose[:2])), {}, r"path of shape \(3, 3\), got"),
+        ((trace, log), {"true_path": np.zeros((3, 2))}, r"path of shape \(3, 3\), got \(3, 2\)"),
+        ((trace, log), {"true_points": np.zeros(2)}, r"points of shape \(N, 2\), got \(2,\)"),
+        ((trace, log), {"frames": 0}, "frames: expected an integer >= 1, got 0"),
+        ((trace, log), {"time": [1.0]}, "expected 3 finite times"),
+        ((trace.estimate, log), {}, "animate: expected .*Trace"),
+        ((trace, truth), {}, "animate: expected .*Log"),
+        ((trace, log, log), {}, "animate: expected .*Truth"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plot.animate(*arguments, **more)
+    nothing = jax.tree.map(lambda leaf: leaf[:0], (trace, log))
+    with pytest.raises(ValueError, match="animate: expected at least one step, got 0"):
+        plot.animate(*nothing)
+    batch = jax.tree.map(lambda leaf: leaf[None], trace)
+    with pytest.raises(
+        ValueError, match=r"the trace of one run, with poses \(T, 3\), got \(1, 3, 3\)"
+    ):
+        plot.animate(batch, log)
+    for more in ({"fps": 0}, {"width": -1.0}):
+        with pytest.raises(ValueError, match=f"render: expected {next(iter(more))} above 0"):
+            plot.animate(trace, log, **more)
+
+
+def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
+    trace, log, truth = run_of()
+    pose, covs = trace.estimate.pose.copy(), trace.estimate.point_covs.copy()
+    pose[2], covs[1, 0] = np.nan, -np.eye(2)
+    broken = trace._replace(estimate=trace.estimate._replace(pose=pose, point_covs=covs))
+    film = plot.animate(broken, log, truth, width=3.5)
+    assert film.said[1].endswith("1 without ellipse") and film.said[2].endswith("pose not finite")
+
+
+# --- what is seen of a filter's state -----------------------------------------------------------
+
+
+def test_of_particles_their_poses_and_weights_are_seen():
+    start = np.ones(3), np.zeros((3, 3))
+    seen = jax.jit(lambda: plot.probe(initial_slam_particles(*map(jnp.asarray, start), 4, 2, 2)))()
+    np.testing.assert_array_equal(seen.pose, np.ones((4, 3)))
+    np.testing.assert_allclose(seen.weight, 0.25)
+    assert plot.probe(np.zeros(3)) is None
+
+
+def test_of_information_the_links_are_seen_dense_and_sparse():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(9, 9))
+    omega = root @ root.T
+    omega[:3, 7:] = omega[7:, :3] = 0.0  # the robot has no link to landmark 2
+    expected = np.zeros((4, 4))
+    rows = [slice(0, 2), slice(3, 5), slice(5, 7), slice(7, 9)]
+    size = np.array([[np.linalg.norm(omega[a, b]) for b in rows] for a in rows])
+    expected = size / np.sqrt(np.outer(np.diag(size), np.diag(size)))
+    np.fill_diagonal(expected, 0.0)
+    dense = CanonicalState(
+        np.zeros(3), np.zeros((3, 2)), omega, np.zeros(9), np.ones(3, bool), np.arange(3), 0
+    )
+    find = jax.jit(plot.probe)
+    np.testing.assert_allclose(find(dense).strength, expected, rtol=1e-5)
+    # Landmarks 0 and 1 are active; 2 is passive, and linked by its list.
+    sparse = empty_map(np.zeros(3), omega[:3, :3], capacity=3, active=2, links=2)._replace(
+        alive=np.ones(3, bool),
+        active=np.array([0, 1]),
+        omega=omega[:7, :7],
+        diagonal=np.stack([np.eye(2), np.eye(2), omega[7:, 7:]]),
+        neighbours=np.array([[2, 3], [2, 3], [0, 1]]),
+        links=np.stack(
+            [
+                [omega[3:5, 7:], np.zeros((2, 2))],
+                [omega[5:7, 7:], np.zeros((2, 2))],
+                [omega[7:, 3:5], omega[7:, 5:7]],
+            ]
+        ),
+    )
+    np.testing.assert_allclose(find(sparse).strength, expected, rtol=1e-5)
+
+
+def test_a_filter_is_filmed_in_a_world_by_itself():
+    world = worlds.ring(4)
+    film = plot.animate_world(world, catalog.BASELINES["dead_reckoning"](world), jax.random.key(0))
+    assert len(set(film.frames)) == 4 and film.title == "ring"
+    assert film.said[0] == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
