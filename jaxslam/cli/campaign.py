@@ -114,8 +114,10 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     else:
         written = False
     print(campaign)
+    film = ""
     if options.animate:
-        write_films(out, scenario, filters, asked["seed"], campaign.dtype)
+        films = write_films(out, scenario, filters, asked["seed"], campaign.dtype)
+        film = next(iter(films.values())).player()
     if written:
         more = "but films" if options.animate else "and nothing written"
         print(
@@ -127,7 +129,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         name = campaign_files.filter_of_run_zero(campaign)
         first = _run_zero(scenario, filters[name], key, campaign.dtype)
         campaign = replace(campaign, first={name: first})
-    paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"])
+    paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"], film)
     paths += [campaign.save_runs(out / f"runs.{kind}") for kind in tables]
     print("\nwrote " + ", ".join(map(str, paths)))
     print(

@@ -16,8 +16,8 @@ KINDS = ("mp4", "gif", "html")
 class Film:
     """A film: frames of one size, as PNG files. A notebook shows the player.
 
-        film = jaxslam.plot.animate(trace, log, truth)
-        film.save("slam.mp4")
+    film = jaxslam.plot.animate(trace, log, truth)
+    film.save("slam.mp4")
     """
 
     frames: tuple[bytes, ...]
