@@ -3,9 +3,8 @@
     python examples/fit_noise.py
     python examples/fit_noise.py --mrclam FOLDER --robot 1 --steps 10000
 
-The likelihood is the filter's own, Σ log N(innovation; 0, S) over the run. `jax.grad` takes its
-derivative through every step, and SciPy's BFGS climbs it in log σ from starts a factor 5 off.
-Standard errors are those of the observed information, the inverse Hessian at the optimum.
+The likelihood is the filter's own, Σ log N(innovation; 0, S) over the run, and
+`calibration.fit_noise` climbs it from starts a factor 5 off, by exact gradients through every step.
 """
 
 import argparse
@@ -13,59 +12,19 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
 
 import jaxslam
+from jaxslam.calibration import NoiseFit, fit_noise
 from jaxslam.datasets.mrclam import ODOMETRY_DENSITY, mrclam, white_noise
+from jaxslam.types import Info
 
 OFF = np.array([5.0, 0.2, 0.2, 5.0])
 """How far from the truth, or the reader's defaults, the four parameters start."""
-
-
-class Fit(NamedTuple):
-    """Parameters (4,) as standard deviations; standard errors are of their logarithms."""
-
-    sigma: np.ndarray
-    error: np.ndarray
-    start: np.ndarray
-    log_likelihood: float
-    log_likelihood_start: float
-    gradient: np.ndarray
-    """of the log-likelihood by log σ at the optimum, in units of its own standard error"""
-    evaluations: int
-
-
-def fit(log_likelihood: Callable[[jax.Array], jax.Array], start: np.ndarray) -> Fit:
-    """Maximize log_likelihood(σ) over σ (4,) > 0, in log σ, from start."""
-    both = jax.jit(jax.value_and_grad(lambda log_sigma: -log_likelihood(jnp.exp(log_sigma))))
-    at_start = float(both(jnp.log(start))[0])
-    scale = 1 / max(abs(at_start), 1.0)  # so that BFGS's first step is a short one
-
-    def objective(log_sigma: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = both(jnp.asarray(log_sigma))
-        return scale * float(value), scale * np.asarray(slope)
-
-    found = minimize(objective, np.log(start), jac=True, method="BFGS", options={"gtol": 1e-7})
-    steps = 1e-3 * np.eye(len(start))
-    slopes = [[both(jnp.asarray(found.x + sign * h))[1] for sign in (1, -1)] for h in steps]
-    hessian = np.array([(np.asarray(a) - np.asarray(b)) / 2e-3 for a, b in slopes])
-    cov = np.linalg.inv((hessian + hessian.T) / 2)
-    error = np.sqrt(np.diagonal(cov))
-    value, slope = both(jnp.asarray(found.x))
-    return Fit(
-        sigma=np.exp(found.x),
-        error=error,
-        start=np.asarray(start),
-        log_likelihood=-float(value),
-        log_likelihood_start=-at_start,
-        gradient=-np.asarray(slope) * error,
-        evaluations=int(found.nfev),
-    )
 
 
 TRUE = np.array([0.02, 0.01, 0.05, np.deg2rad(1.0)])
@@ -73,8 +32,8 @@ SIMULATED = ("forward [m]", "turn [rad]", "range [m]", "bearing [rad]")
 POINTS = np.array([[3.0, 1.0], [-1.0, 4.0], [-3.0, -1.0], [2.0, -3.0]])
 
 
-def simulated(runs: int = 8, steps: int = 200, seed: int = 0) -> Callable[[jax.Array], jax.Array]:
-    """The log-likelihood of independent runs round four landmarks, whose true noise is TRUE."""
+def simulated(runs: int = 8, steps: int = 200, seed: int = 0) -> Callable[[jax.Array], Info]:
+    """The EKF's innovations in runs round four landmarks, whose true noise is TRUE, by σ (4,)."""
 
     def models(sigma: Any) -> tuple[Any, Any]:
         noise = jnp.asarray(sigma) ** 2
@@ -87,49 +46,42 @@ def simulated(runs: int = 8, steps: int = 200, seed: int = 0) -> Callable[[jax.A
     keys = jax.random.split(jax.random.key(seed), runs)
     _, logs = jax.jit(jax.vmap(partial(jaxslam.simulate, world)))(keys)
 
-    def log_likelihood(sigma: jax.Array) -> jax.Array:
+    def info(sigma: jax.Array) -> Info:
         ekf = jaxslam.filters.ekf_slam(*models(sigma), capacity=len(POINTS), update="joint")
 
-        def of_run(log: Any, key: jax.Array) -> jax.Array:
-            trace = jaxslam.run(ekf, log, world.pose, world.pose_cov, key)
-            return trace.info.log_likelihood.sum()
+        def of_run(log: Any, key: jax.Array) -> Info:
+            return jaxslam.run(ekf, log, world.pose, world.pose_cov, key).info
 
-        return jax.vmap(of_run)(logs, keys).sum()
+        return jax.vmap(of_run)(logs, keys)
 
-    return log_likelihood
+    return info
 
 
 RECORDED = ("travel [m/√s]", "heading [rad/√s]", "range [m]", "bearing [rad]")
 
 
-def recorded(data: Any, steps: int) -> Callable[..., Any]:
-    """The log-likelihood of the first rows of a log of `datasets.mrclam`, and NIS/dof beside it."""
+def recorded(data: Any, steps: int) -> Callable[[jax.Array], Info]:
+    """The EKF's innovations in the first rows of a log of `datasets.mrclam`, by σ (4,)."""
     log = jax.tree.map(lambda a: jnp.asarray(a[:steps]), data.log)
 
-    def log_likelihood(sigma: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def info(sigma: jax.Array) -> Info:
         motion = jaxslam.motion.unicycle(white_noise(sigma[0] ** 2, sigma[1] ** 2))
         sensor = jaxslam.sensors.range_bearing(jnp.diag(sigma[2:] ** 2))
         ekf = jaxslam.filters.ekf_slam(motion, sensor, data.capacity, **data.filter_options)
-        key = jax.random.key(0)
-        info = jaxslam.run(ekf, log, data.pose, data.pose_cov, key).info
-        return info.log_likelihood.sum(), info.nis.sum() / jnp.maximum(info.dof.sum(), 1)
+        return jaxslam.run(ekf, log, data.pose, data.pose_cov, jax.random.key(0)).info
 
-    return log_likelihood
+    return info
 
 
-def table(names: tuple[str, ...], result: Fit, reference: np.ndarray, called: str) -> str:
+def table(result: NoiseFit, reference: np.ndarray, called: str) -> str:
     """One line a parameter; z is the distance from the reference in standard errors of log σ."""
-    z = np.log(result.sigma / reference) / result.error
+    z = np.log(result.parameters / reference) / (result.error / result.parameters)
     lines = [f"{'':16}{called:>12}{'start':>12}{'fitted':>12}{'std. error':>12}{'z':>8}"]
-    rows = zip(names, reference, result.start, result.sigma, result.error, z, strict=True)
-    for name, true, start, sigma, error, off in rows:
-        lines.append(
-            f"{name:16}{true:12.5f}{start:12.5f}{sigma:12.5f}{sigma * error:12.5f}{off:8.2f}"
-        )
-    lines.append(
-        f"log-likelihood {result.log_likelihood_start:.1f} -> {result.log_likelihood:.1f}, "
-        f"{result.evaluations} evaluations"
-    )
+    rows = (reference, result.start, result.parameters, result.error, z)
+    for name, true, start, sigma, error, off in zip(result.names, *rows, strict=True):
+        lines.append(f"{name:16}{true:12.5f}{start:12.5f}{sigma:12.5f}{error:12.5f}{off:8.2f}")
+    lines.append("log-likelihood {:.1f} -> {:.1f}".format(*result.log_likelihood))
+    lines.append("NIS/dof {:.3f} -> {:.3f}".format(*result.nis_per_dof))
     return "\n".join(lines)
 
 
@@ -146,16 +98,17 @@ def main() -> int:
         if min(options.runs, options.steps or 1) < 1:
             raise ValueError("expected --runs and --steps of at least 1")
         if options.mrclam is None:
-            result = fit(simulated(options.runs, options.steps or 200), TRUE * OFF)
-            print(table(SIMULATED, result, TRUE, "true"))
+            info, known, called, names = (
+                simulated(options.runs, options.steps or 200),
+                TRUE,
+                "true",
+                SIMULATED,
+            )
         else:
             data = mrclam(options.mrclam, options.robot)
-            defaults = np.sqrt([*ODOMETRY_DENSITY, *np.diag(data.sensor.noise_cov(jnp.zeros(2)))])
-            value = recorded(data, options.steps or 10_000)
-            result = fit(lambda sigma: value(sigma)[0], defaults * OFF)
-            print(table(RECORDED, result, defaults, "default"))
-            start, end = (float(jax.jit(value)(s)[1]) for s in (defaults * OFF, result.sigma))
-            print(f"NIS/dof {start:.3f} -> {end:.3f}")
+            known = np.sqrt([*ODOMETRY_DENSITY, *np.diag(data.sensor.noise_cov(jnp.zeros(2)))])
+            info, called, names = recorded(data, options.steps or 10_000), "default", RECORDED
+        print(table(fit_noise(info, known * OFF, names=names), known, called))
     except (ValueError, OSError) as error:
         print(f"fit_noise: {error}", file=sys.stderr)
         return 2

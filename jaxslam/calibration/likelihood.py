@@ -114,10 +114,13 @@ def fit_noise(
     """
     first, begin, logged, told = _checked(start, guess, names, deviation, iterations, tolerance)
 
-    def at(q: np.ndarray) -> _Point:
+    def tried(q: np.ndarray) -> _Point:
         found = jax.device_get(programs.call(_evaluate, (info,), q, logged, data))
         value, gradient, spread, nis, dof = (np.asarray(part, np.float64) for part in found)
-        point = _Point(q, float(value), gradient, spread, float(nis), int(dof))
+        return _Point(q, float(value), gradient, spread, float(nis), int(dof))
+
+    def at(q: np.ndarray) -> _Point:
+        point = tried(q)
         _check_point(point, logged)
         return point
 
@@ -127,7 +130,9 @@ def fit_noise(
     scale, path = 1.0 / max(abs(here.value), 1.0), [here.q]
 
     def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
-        there = at(q)
+        there = tried(q)
+        if not np.isfinite([there.value, *there.gradient]).all():  # a step too far
+            return 10.0 - 10 * scale * here.value, 0.0 * q
         _check_same(before, there, logged)
         return -scale * there.value, -scale * there.gradient
 

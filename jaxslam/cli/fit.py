@@ -111,6 +111,8 @@ def _summary(data: Dataset, result: DatasetFit) -> dict[str, Any]:
         "log-likelihood": list(found.log_likelihood),
         "NIS / dof": list(found.nis_per_dof),
         "dof": found.dof,
+        "innovation autocorrelation": _finite(result.autocorrelation[0]),
+        "innovation autocorrelation, 95 % band": _finite(result.autocorrelation[1]),
         "steps": len(found.path) - 1,
         "converged": found.converged,
         "rounds of association and gate": result.rounds,
@@ -134,6 +136,9 @@ def _table(data: Dataset, result: DatasetFit) -> str:
     lines.append(["log-likelihood", f"{before:.1f}", f"{after:.1f}", "", ""])
     before, after = found.nis_per_dof
     lines.append(["NIS / dof", f"{before:.3f}", f"{after:.3f}", "", ""])
+    lag, band = result.autocorrelation
+    if np.isfinite(lag):
+        lines.append(["autocorrelation", "", f"{lag:.3f}", f"(± {band:.2g})", ""])
     widths = [max(len(line[i]) for line in lines) for i in range(5)]
     text = [
         "  ".join(
@@ -187,6 +192,12 @@ def _notes(result: DatasetFit) -> list[str]:
         notes.append(
             f"{', '.join(off)}: robust and standard errors differ by over a factor 2, so the "
             "models do not fit"
+        )
+    value, band = result.autocorrelation
+    if abs(value) > max(band, 0.1):
+        notes.append(
+            "successive innovations of a landmark are correlated: errors last, so standard errors "
+            "are too small"
         )
     notes.append(
         "NIS / dof is near 1 after any fit of all noises; test them on another log (jaxslam run)"

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from jaxslam import cli, datasets
+from jaxslam.datasets.noise_fit import autocorrelation
+from jaxslam.types import Info, Status
 
 POINTS = {3: (3.0, 1.0), 5: (-1.0, 4.0), 8: (-3.0, -1.0)}
 SETTINGS = """[motion]
@@ -74,6 +76,9 @@ def test_the_noises_of_a_folder_are_fitted_and_written(tmp_path, capsys):
         assert row["standard error"] < 0.4 * row["after"]
     assert abs(said["NIS / dof"][1] - 1) < 0.01 < abs(said["NIS / dof"][0] - 1)
     assert said["log-likelihood"][1] > said["log-likelihood"][0] + 20
+    assert (
+        abs(said["innovation autocorrelation"]) < 2 * said["innovation autocorrelation, 95 % band"]
+    )
     assert said["converged"] and said["associations settled"]
     written = (tmp_path / "dataset.toml").read_text()
     assert 'model = "velocity"' in written and "# by hand" in written
@@ -104,3 +109,23 @@ def test_a_data_set_with_fixed_noises_or_no_mount_is_refused(tmp_path):
     bare = data.adjustable._replace(mount=None)
     with pytest.raises(ValueError, match="fit: expected a sensor with a mount"):
         datasets.fit(dataclasses.replace(data, adjustable=bare), mount=True)
+
+
+def test_innovations_that_last_are_correlated():
+    """Of two landmarks in changing slots, coloured by w' = 0.8 w + noise, or white; by S they are scaled."""
+    rng = np.random.default_rng(1)
+    steps, slot = 4000, np.array([[0, 1], [1, 0]] * 2000)
+    for factor in (0.8, 0.0):
+        w = rng.normal(size=(steps, 2, 2))
+        for k in range(1, steps):
+            w[k] = factor * w[k - 1] + np.sqrt(1 - factor**2) * w[k]
+        root = np.array([[2.0, 0.0], [1.0, 0.5]])
+        nu = w[np.arange(steps)[:, None], slot] @ root.T
+        nothing = np.zeros((steps, 2))
+        cov = np.broadcast_to(root @ root.T, (steps, 2, 2, 2))
+        info = Info(nothing, nothing, nu, cov, slot, np.full((steps, 2), Status.FUSED), nothing)
+        found, band = autocorrelation(info)
+        np.testing.assert_allclose(band, 1.96 / np.sqrt(4 * (steps - 1)), rtol=1e-4)
+        assert abs(found - factor) < 2 * band
+    empty = info._replace(status=0 * slot)
+    assert np.isnan(autocorrelation(empty)).all()

@@ -59,6 +59,17 @@ def test_a_search_from_elsewhere_ends_there_and_is_compared_with_the_start():
     np.testing.assert_allclose(found.parameters, [X.std(), X.mean()], rtol=1e-4)
 
 
+def fenced(p, x):
+    """Not finite a little beyond the maximum."""
+    return of(x, jnp.where(p[0] < 1.05 * X.std(), p[0], jnp.nan) ** 2 + 0 * x)
+
+
+def test_a_step_to_where_the_likelihood_is_not_finite_is_taken_back():
+    found = fit_noise(fenced, [0.1], X - X.mean(), tolerance=1e-6)
+    np.testing.assert_allclose(found.parameters, X.std(), rtol=1e-4)
+    assert found.converged
+
+
 def added(p, x):
     """A part of the variance is known, and too large for these innovations."""
     return of(x, 5.0 + p[0] ** 2 + 0 * x)
