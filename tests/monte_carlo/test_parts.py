@@ -7,7 +7,6 @@ import threading
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 import worlds
 
@@ -24,17 +23,6 @@ def campaign_of(runs=10, **options):
     """Blocks of four runs."""
     options |= {"block": 4, "devices": jax.devices()[:1]}
     return monte_carlo(WORLD, {"reckoning": RECKONING}, runs, worlds.key(), **options)
-
-
-def assert_same_bits(a, b):
-    assert a.runs == b.runs
-    np.testing.assert_array_equal(a.run_numbers, b.run_numbers)
-    one, other = a.filters["reckoning"], b.filters["reckoning"]
-    assert (one.counts, one.measures) == (other.counts, other.measures)
-    for part in ("per_run", "curves", "coverage"):
-        ours, theirs = getattr(one, part), getattr(other, part)
-        assert ours.keys() == theirs.keys()
-        assert all(ours[name].tobytes() == theirs[name].tobytes() for name in ours)
 
 
 @pytest.fixture(scope="module")
@@ -55,16 +43,16 @@ def test_parts_missing_doubled_and_rerun_sum_up_to_one_go(tmp_path, whole):
     assert last.run_numbers.tolist() == [8, 9, 10, 11, 20, 21]
     assert part(1, 22).runs == 8
     before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    assert_same_bits(part(3), last)  # again: its runs are there
+    worlds.assert_same_bits(part(3), last)  # again: its runs are there
     assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
     assert blocks(tmp_path) == [0, 2, 3, 5]
     heard = []
     found = campaign_of(22, keep=store.resume(tmp_path), progress=lambda *done: heard.append(done))
     assert heard[-1] == (8, 8)  # part 2 alone
-    assert_same_bits(found, whole)
+    worlds.assert_same_bits(found, whole)
     # Two of the same part at once: neither knows of the other's blocks.
     doubled = [store.join(tmp_path / "b", runs=22) for _ in range(2)]
-    assert_same_bits(*(campaign_of(22, keep=keep, part=(2, 3)) for keep in doubled))
+    worlds.assert_same_bits(*(campaign_of(22, keep=keep, part=(2, 3)) for keep in doubled))
 
 
 def test_parts_extend_a_campaign_and_do_not_shorten_it(tmp_path, whole):
@@ -73,7 +61,7 @@ def test_parts_extend_a_campaign_and_do_not_shorten_it(tmp_path, whole):
     for i in (2, 1):
         campaign_of(22, keep=store.join(tmp_path, runs=22), part=(i, 2))
     assert store.resume(tmp_path).runs == 22
-    assert_same_bits(campaign_of(22, keep=store.resume(tmp_path)), whole)
+    worlds.assert_same_bits(campaign_of(22, keep=store.resume(tmp_path)), whole)
     with pytest.raises(ValueError, match="is to have 22 runs: expected at least as many, got 10"):
         store.join(tmp_path, runs=10)
 
