@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.gate import Metric, alone
+from jaxslam.consistency.tally import SHOTS
 
 SHARE = """
 import sys
@@ -29,6 +30,7 @@ jax.config.update("jax_compilation_cache_dir", sys.argv[1])
 runs, stop_at, folder = int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
 soak.share(runs, stop_at, folder)
 """
+FROM_SHOTS = ("noncredibility", "inclination")
 STEADY = 4096
 """runs from which memory is measured: before, programs are compiled, and snapshots kept of runs"""
 
@@ -87,8 +89,10 @@ def finite(campaign: object) -> dict[str, int]:
     for summary in campaign.filters.values():
         declared = np.isin(campaign.run_numbers, summary.not_finite_runs)
         lost += int(declared.sum())
-        for values in summary.per_run.values():
-            nan += int((np.isnan(values) & ~declared).sum())
+        for name, values in summary.per_run.items():
+            # Noncredibility is of the first runs alone.
+            of = ~declared & (campaign.run_numbers < (SHOTS if name in FROM_SHOTS else np.inf))
+            nan += int((np.isnan(values) & of).sum())
             held += values.nbytes
         for part in (summary.coverage, summary.curves):  # at the first step there is no NEES
             nan += sum(int((~np.isfinite(values[1:])).sum()) for values in part.values())
