@@ -25,7 +25,9 @@ from benchmarks import (
     delayed,
     fastslam,
     film,
+    fuzz,
     gradient,
+    kill,
     monte_carlo_localization,
     plain_particles,
     plaza,
@@ -33,9 +35,11 @@ from benchmarks import (
     scaling,
     seif,
     smoothing,
+    soak,
     team,
     verdict,
     victoria_park,
+    wheel,
 )
 from benchmarks.association.__main__ import measure as measure_association
 from benchmarks.consistency import circle, loop, stationary, webmap
@@ -86,6 +90,10 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "scaling": scaling.measure,
         "seif": lambda: seif.measure(4 if quick else 10),
         "comparison": lambda: comparison.measure(8 if quick else 16),
+        "soak": lambda: soak.measure(6_000 if quick else 20_000),
+        "kill": lambda: kill.measure(10 if quick else 100),
+        "fuzz": lambda: fuzz.measure(2 if quick else 20),
+        "wheel": wheel.measure,
         "monte_carlo_localization": lambda: monte_carlo_localization.measure(4 if quick else 12),
     }
 

@@ -10,10 +10,16 @@ from numpy.typing import ArrayLike
 
 from jaxslam import programs
 from jaxslam.protocols import Filter
-from jaxslam.types import Log, Status, Trace
+from jaxslam.types import Log, Scan, Status, Trace
 from jaxslam.validation import check_record, checked_estimate, same_state, state_and_info
 from jaxslam.validation.logs import check_log
-from jaxslam.validation.numbers import check_covariance, check_key, is_concrete, shape_told
+from jaxslam.validation.numbers import (
+    check_covariance,
+    check_key,
+    is_concrete,
+    largest,
+    shape_told,
+)
 
 
 def run(
@@ -31,7 +37,8 @@ def run(
     trace it is compiled once for a structure: another call, with other values or a filter with
     other noises, runs the same program (`programs`). The arithmetic runs in
     the wider dtype of the log's controls and measurements. A valid measurement that is not finite
-    is refused where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse
+    or beyond `validation.numbers.largest` is refused where its value is concrete, and dropped as
+    `Status.REJECTED` under a trace. Reverse
     mode stores one state a step, and recomputes each step in the backward pass.
 
     Args:
@@ -44,8 +51,9 @@ def run(
     Returns:
         Trace with estimates and infos of leading axis T, and the final state.
     Raises:
-        ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN in controls
-            or valid measurements, tags repeated within a scan, or an invalid pose_cov.
+        ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN or too
+            large numbers in controls or valid measurements, tags repeated within a scan, or an
+            invalid pose_cov.
     """
     check_record("run", "filter", filter, Filter)
     check_record("run", "log", log, Log)
@@ -86,16 +94,17 @@ def _drive(
     """The trace of a filter over a checked log."""
     log = jax.tree.map(jnp.asarray, log)
     dtype = jnp.result_type(log.control, log.scan.z)
-    log = Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))
+    tag = log.scan.tag.astype(jnp.int32)  # of any integers, unsigned ones too
+    log = Log(log.control.astype(dtype), Scan(log.scan.z.astype(dtype), tag, log.scan.valid))
     start = filter.init(jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype))
-    name = f"run: {filter.name}"
+    name, most = f"run: {filter.name}", largest(log.control)
     keys = jax.random.split(key, (log.control.shape[0], 2))
 
     def step(state: Any, row: tuple[Log, jax.Array]) -> tuple[Any, Any]:
         (control, scan), (key_predict, key_update) = row
         state = same_state(f"{name}: predict", state, filter.predict(state, control, key_predict))
         # Under jit values are not checked before, and a NaN would spread through the whole state.
-        lost = scan.valid & ~jnp.isfinite(scan.z).all(axis=1)
+        lost = scan.valid & ~(jnp.abs(scan.z) <= most).all(axis=1)
         scan = scan._replace(valid=scan.valid & ~lost)
         found = filter.update(state, scan, key_update)
         state, info = state_and_info(name, state, scan, found)

@@ -47,6 +47,14 @@ BAD_VALUES = {
         changed("z", (0, 0, 1), -np.inf),
         r"log.scan.z: a valid measurement is not finite \(row 0, slot 0\)",
     ),
+    "control beyond": (
+        changed("control", (2, 0), -5e61),
+        r"log.control is beyond ±4.5e\+61 \(row 2\)",
+    ),
+    "z beyond": (
+        changed("z", (1, 2, 0), 1e70),
+        r"log.scan.z: a valid measurement is beyond ±4.5e\+61 \(row 1, slot 2\)",
+    ),
     "tag -2": (changed("tag", (3, 1), -2), r"log.scan.tag: a tag is below -1 \(row 3, slot 1\)"),
     "tag 2**32": (
         good_log()._replace(

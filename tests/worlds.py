@@ -190,3 +190,25 @@ def nees(error, cov):
     cov = np.where(regular[..., None, None], cov, np.eye(cov.shape[-1]))
     square = (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(axis=-1)
     return np.where(regular, square, np.nan)
+
+
+def assert_identical(a, b):
+    """Two summaries to the last bit, run by run and in their sums."""
+    assert (a.counts, a.measures) == (b.counts, b.measures)
+    for part in ("per_run", "curves", "coverage"):
+        ours, theirs = getattr(a, part), getattr(b, part)
+        assert ours.keys() == theirs.keys()
+        for name in ours:
+            assert ours[name].tobytes() == theirs[name].tobytes(), name
+
+
+def assert_same_bits(a, b):
+    """Two campaigns of the same runs and filters to the last bit."""
+    np.testing.assert_array_equal(a.run_numbers, b.run_numbers)
+    assert (a.runs, a.divergence_limit, list(a.filters)) == (
+        b.runs,
+        b.divergence_limit,
+        list(b.filters),
+    )
+    for name, summary in a.filters.items():
+        assert_identical(summary, b.filters[name])

@@ -182,6 +182,12 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
         "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'
     )
     cache.add_options(parser)
+    parser.add_argument(
+        "--part",
+        metavar="I/N",
+        help="compute only part I of N of the runs, as 3/16, in a folder that independent jobs "
+        "share; --resume then sums up, and computes what is missing",
+    )
     others = parser.add_argument_group(
         "several processes", "run the same command in each, with its own --process-id"
     )

@@ -1,6 +1,7 @@
 """The command `jaxslam consistency`: a Monte-Carlo campaign, its table and its files."""
 
 import argparse
+import re
 import shutil
 import sys
 import threading
@@ -24,7 +25,7 @@ from jaxslam.cli.campaign_folder import (
 from jaxslam.cli.common import INTERRUPTED
 from jaxslam.cli.user_objects import UserObjects
 from jaxslam.monte_carlo import Interrupted, Library, monte_carlo
-from jaxslam.monte_carlo.candidates import estimator_of, rounded
+from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
 from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.protocols import Candidate
 from jaxslam.results import campaign_files, run_table, store
@@ -50,7 +51,8 @@ DEFAULTS: dict[str, Any] = {
 
 def consistency(options: argparse.Namespace, command: str) -> int:
     """Run a campaign, print its table and write its files; returns the exit status."""
-    asked, block = _asked(options)
+    asked, settings = _asked(options)
+    part = _part(options)
     out = options.resume or options.out or OUT
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
@@ -68,13 +70,20 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     if options.block is not None:
         check_count("block", options.block)
     check_writable(out)
-    here, key = devices.chosen(options.devices), jax.random.key(asked["seed"])
+    # What is missing of a campaign of parts is computed as the parts would.
+    here = devices.chosen(options.devices, settings.get("devices"))
+    key = jax.random.key(asked["seed"])
     identity, programs = _identity(asked, files, scenario, filters, key, here[0].platform)
-    keep = open_store(options, out, asked, block)
-    earlier = earlier_results(out, keep)
+    if part is not None and options.block is None:
+        options.block = fitting_block(scenario, filters, here[0])
+    if part is not None and (part[0] - 1) * options.block * len(here) >= asked["runs"]:
+        print(f"part {part[0]} of {part[1]} has no block of the {asked['runs']:,} runs")
+        return 0
+    keep = open_store(options, out, asked, settings, part and len(here))
+    earlier = None if part else earlier_results(out, keep)
     names = campaign_files.file_names(formats) + [f"runs.{kind}" for kind in tables]
     written = earlier is not None and all((out / name).exists() for name in names)
-    if not written:
+    if not written and part is None:
         # Matplotlib is loaded while filters run. Not in a daemon thread: such a thread crashes in
         # compiled code when the interpreter exits.
         threading.Thread(target=_prepare_drawing).start()
@@ -90,12 +99,13 @@ def consistency(options: argparse.Namespace, command: str) -> int:
                 bound=asked["bound"],
                 dtype=asked["dtype"],
                 keep=keep,
+                part=part,
                 identity=identity,
                 library=kept,
             )
     except Interrupted as stop:
         if stop.campaign is None:
-            if not keep.spans():  # other processes may have saved some
+            if not keep.spans() and part is None:  # other processes may have saved some
                 shutil.rmtree(keep.folder, ignore_errors=True)
             raise
         if jax.process_index() == 0:
@@ -105,6 +115,13 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     for sentence in keep.set_aside:
         print(f"jaxslam: {sentence}", file=sys.stderr)
     if jax.process_index() > 0:
+        return 0
+    if part is not None:
+        print(
+            f"part {part[0]} of {part[1]} is done, {campaign.runs:,} runs; {keep.folder} holds "
+            f"{keep.done():,} of {asked['runs']:,}; jaxslam consistency --resume {out} computes "
+            "what is missing, and sums up"
+        )
         return 0
     took = campaign.seconds
     ran = took - campaign.compile_seconds if campaign.compile_seconds else 0.0
@@ -139,21 +156,40 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _asked(options: argparse.Namespace) -> tuple[dict[str, Any], int | None]:
-    """The options that define the campaign, and the size of blocks that it began with.
+def _asked(options: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The options that define the campaign, and the settings that a resumed one began with.
 
     They come from the command, the resumed campaign and the defaults, in this order. The options of
     a resumed campaign get its size of blocks unless another is given.
     """
     asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
-    block: int | None = options.block
+    settings: dict[str, Any] = {}
     if options.resume is not None:
         there = store.resume(options.resume / BLOCKS)
         check_same_campaign(options, there, asked)
-        asked = there.settings["asked"] | {"runs": there.runs} | asked
-        block = there.settings.get("block")  # blocks of another size would round differently
-        options.block = block if options.block is None else options.block
-    return DEFAULTS | asked, block
+        settings = there.settings
+        asked = settings["asked"] | {"runs": there.runs} | asked
+        if options.block is None:  # blocks of another size would round differently
+            options.block = settings.get("block")
+    return DEFAULTS | asked, settings
+
+
+def _part(options: argparse.Namespace) -> tuple[int, int] | None:
+    """The part of the runs that is asked for, (i, n); raises ValueError where it is none."""
+    if options.part is None:
+        return None
+    found = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise ValueError(f"--part: expected I/N with 1 <= I <= N, as 3/16, got {options.part!r}")
+    unfit = {
+        "--coordinator": options.coordinator,
+        "--overwrite": options.overwrite,
+        "--again": options.again,
+    }
+    for name, given in unfit.items():
+        if given:
+            raise ValueError(f"--part: expected no {name} with it")
+    return int(found[1]), int(found[2])
 
 
 def _identity(

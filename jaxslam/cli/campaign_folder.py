@@ -55,15 +55,9 @@ def check_same_campaign(
             f"--resume: {folder} holds a campaign that was begun from Python; continue it there, "
             "with monte_carlo(keep=jaxslam.store.resume(folder))"
         )
-    told = there.settings["asked"]
-    differences = [
-        f"--{name} is {_as_option(told[name])} there, {_as_option(value)} here"
-        for name, value in asked.items()
-        if name in told and told[name] != value
-    ]
-    if differences:
+    if differences := _differences(there.settings["asked"], asked):
         raise ValueError(
-            f"--resume: {folder} holds another campaign: {'; '.join(differences)}: leave these "
+            f"--resume: {folder} holds another campaign: {differences}: leave these "
             "options out to continue it, or begin another with --out in another folder"
         )
     if (done := there.done()) > (runs := asked.get("runs", done)):
@@ -73,21 +67,58 @@ def check_same_campaign(
         )
 
 
+def _differences(told: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
+    """Every option that is another in the campaign that was told."""
+    return "; ".join(
+        f"--{name} is {_as_option(told[name])} there, {_as_option(value)} here"
+        for name, value in asked.items()
+        if name in told and told[name] != value
+    )
+
+
 def open_store(
-    options: argparse.Namespace, out: Path, asked: dict[str, Any], block: int | None
+    options: argparse.Namespace,
+    out: Path,
+    asked: dict[str, Any],
+    settings: dict[str, Any],
+    devices_of_part: int | None,
 ) -> store.Store:
     """The store of this campaign's blocks, in a new folder or in that of the resumed campaign.
 
-    block: the size of blocks that the campaign began with.
+    Args:
+        settings: those that a resumed campaign began with; empty for another.
+        devices_of_part: with how many devices a part of it is computed, where it is a part.
     """
     folder, runs = out / BLOCKS, asked["runs"]
     told = {name: value for name, value in asked.items() if name != "runs"}
-    settings = {"asked": told, "block": block}
+    settings = settings or {"asked": told, "block": options.block}
+    if devices_of_part is not None:
+        return _joined(folder, {"devices": devices_of_part} | settings, runs, options)
     if options.resume is None and jax.process_index() == 0:
         _remove_old_blocks(options, out, settings, runs)
         store.create(folder, settings, runs)
     devices.wait_for_all("campaign folder")
     return store.resume(folder, settings, runs)
+
+
+def _joined(
+    folder: Path, settings: dict[str, Any], runs: int, options: argparse.Namespace
+) -> store.Store:
+    """The store of a campaign whose parts independent processes compute."""
+    if (folder / store.MANIFEST).exists():
+        there = store.resume(folder).settings
+        own = {**settings["asked"], "block": options.block, "devices": settings["devices"]}
+        if "asked" in there and (found := _differences({**there["asked"], **there}, own)):
+            raise ValueError(
+                f"--part: {folder.parent} holds another campaign: {found}: give all parts the same "
+                "options, or begin another campaign with --out in another folder"
+            )
+        settings = there if options.resume is not None else settings
+    elif (folder.parent / RESULT).exists():
+        raise ValueError(
+            f"--part: {folder.parent} holds the results of a campaign: choose another folder"
+        )
+    return store.join(folder, settings, runs)
 
 
 def _remove_old_blocks(
@@ -96,7 +127,7 @@ def _remove_old_blocks(
     """Delete the blocks of an earlier campaign; raises ValueError unless the options allow it."""
     folder = out / BLOCKS
     if not (folder / store.MANIFEST).exists():
-        if folder.exists() and any(folder.iterdir()):
+        if folder.exists() and not all(map(store.is_unfinished, folder.iterdir())):
             raise ValueError(
                 f"--out: {folder} holds files that are no campaign's: choose another folder"
             )

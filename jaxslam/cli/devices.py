@@ -60,10 +60,13 @@ def join(options: argparse.Namespace) -> None:
         ) from error
 
 
-def chosen(asked: str) -> list[jax.Device]:
-    """This process's devices by what was asked for: all, their number, or a platform's name."""
+def chosen(asked: str, most: int | None = None) -> list[jax.Device]:
+    """This process's devices by what was asked for: all, their number, or a platform's name.
+
+    most: how many are all.
+    """
     if asked == "all":
-        return list(jax.local_devices())
+        return list(jax.local_devices()[:most])
     if asked.isdecimal():
         there = jax.local_devices()
         if int(asked) > len(there):

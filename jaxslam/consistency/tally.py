@@ -87,7 +87,10 @@ class Tally:
     def __init__(self) -> None:
         self._sums: dict[str, Sum] = {}
         self._blocks: dict[int, dict[str, np.ndarray]] = {}
+        """by first run; blocks that follow each other are joined"""
         self._runs: dict[int, int] = {}
+        self._begins: dict[int, int] = {}
+        """first run of the block that ends at a run"""
 
     def add(self, first: int, runs: int, block: dict[str, np.ndarray]) -> None:
         """Add what `condense` returned of runs first … first + runs - 1."""
@@ -99,14 +102,15 @@ class Tally:
                 self._sums[what] = plus(self._sums[what], new) if what in self._sums else new
             elif kind != "low":
                 kept[name] = value
-        self._blocks[first], self._runs[first] = kept, runs
+        self._place(first, runs, kept)
+        self._join(first)
 
     def merge(self, other: "Tally") -> None:
         """Add the blocks of another tally, of other runs."""
         for name, value in other._sums.items():
             self._sums[name] = plus(self._sums[name], value) if name in self._sums else value
-        self._blocks |= other._blocks
-        self._runs |= other._runs
+        for first, runs in other._runs.items():
+            self._place(first, runs, other._blocks[first])
 
     def packed(self) -> bytes:
         """All of it as the bytes of an npz, for another process to `unpack`."""
@@ -130,10 +134,39 @@ class Tally:
                 if kind == "high":
                     tally._sums[name] = Sum(arrays[label], arrays[f"low/{name}"])
                 elif kind == "runs":
-                    tally._runs[int(name)] = int(arrays[label])
+                    tally._place(int(name), int(arrays[label]), tally._blocks.get(int(name), {}))
                 elif kind != "low":
                     tally._blocks.setdefault(int(kind), {})[name] = arrays[label]
         return tally
+
+    def _place(self, first: int, runs: int, block: dict[str, np.ndarray]) -> None:
+        self._blocks[first], self._runs[first] = block, runs
+        self._begins[first + runs] = first
+
+    def _join(self, first: int) -> None:
+        """Join a block with its neighbours, as long as these have no more runs.
+
+        So arrays are few, each run is copied a logarithm of times, and a campaign keeps about the
+        numbers alone: those of a block of 16 runs are a quarter of what their arrays take.
+        """
+        while True:
+            runs = self._runs[first]
+            left, right = self._begins.get(first), first + runs
+            if left is not None and self._runs[left] <= runs:
+                pair = left, first
+            elif right in self._runs and self._runs[right] <= runs:
+                pair = first, right
+            else:
+                return
+            runs = sum(self._runs.pop(one) for one in pair)
+            one, other = (self._blocks.pop(one) for one in pair)
+            joined = {
+                name: np.concatenate([value, other[name]]) if value.ndim else value
+                for name, value in one.items()
+            }
+            del self._begins[pair[1]]
+            first = pair[0]
+            self._place(first, runs, joined)
 
     @property
     def sums(self) -> dict[str, np.ndarray]:
@@ -141,7 +174,7 @@ class Tally:
         return {name: value.high + value.low for name, value in self._sums.items()}
 
     def pieces(self) -> list[tuple[int, int]]:
-        """(first, runs) of each block, in order."""
+        """(first, runs) of the blocks, in order; blocks that follow each other may be one."""
         return sorted(self._runs.items())
 
     def numbers(self) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.mat_file import read_matrices
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import range_only
@@ -123,23 +124,18 @@ def plaza(
 
 def _read(path: Path) -> dict[str, Float[np.ndarray, "_ _"]]:
     """The tables of a file; raises ValueError on any other content."""
-    import scipy.io  # slow to load, and needed for this data set alone
-
-    try:
-        content = scipy.io.loadmat(path, appendmat=False)
-    except Exception as problem:  # scipy's MatReadError is not public
-        raise ValueError(f"{path}: cannot be read as a .mat file: {problem}") from problem
+    content = read_matrices(path)
     tables = {}
     for name, columns in _TABLES.items():
         if name not in content:
             raise ValueError(f"{path}: no table {name} in the file ({_COLUMNS})")
-        table = np.asarray(content[name])
+        table = content[name]
         if table.ndim != 2 or table.shape[1] != columns or len(table) == 0:
             raise ValueError(
                 f"{path}: expected {name} of shape (at least 1, {columns}), got {table.shape} "
                 f"({_COLUMNS})"
             )
-        if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
+        if not np.all(np.isfinite(table)):
             raise ValueError(f"{path}: {name} has something other than finite numbers")
         tables[name] = table.astype(np.float64)
     return tables

@@ -75,11 +75,10 @@ def table(folder: str | Path) -> Dataset:
     rows, tags, dropped = records.align(
         odometry, seen, motion.controls, sensor.measurements, tuple(survey or ())
     )
-    if survey is not None and len(survey) < len(tags):
-        missing = next(tag for tag in tags if tag not in survey)
-        raise ValueError(
-            f"{folder / 'landmarks.csv'}: expected a line for every tag, got none for {missing}"
-        )
+    known = tags if survey is None else survey
+    for row, tag in enumerate(seen.columns.get(TAG, ())):
+        if tag is not None and tag not in known:
+            raise ValueError(f"{seen.at(row, TAG)}: expected a tag of landmarks.csv, got {tag}")
     truth, covered = _truth(folder / "truth.csv", rows.time)
     start, one_frame = settings.start(), True
     if start is None:
@@ -150,7 +149,7 @@ def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
     covered = (time >= clock[0]) & (time <= clock[-1])
     if not covered.any():
         raise ValueError(
-            f"{path}: expected times within those of the log, {time[0]:.12g} to {time[-1]:.12g}, "
-            f"got {clock[0]:.12g} to {clock[-1]:.12g}"
+            f"{found.at(0, TIME)}: expected times within those of the log, {time[0]:.12g} to "
+            f"{time[-1]:.12g}, got {clock[0]:.12g} to {clock[-1]:.12g}"
         )
     return interpolate_poses(clock, found.values(POSE), time), covered

@@ -23,6 +23,7 @@ def at_truth(truth: Truth) -> Linearizer:
         truth: start, poses (T, 3) and landmarks (N, L), indexed by tag. Tags must be known.
     """
     path = jnp.concatenate([jnp.asarray(truth.start)[None], truth.pose])
+    landmarks = jnp.asarray(truth.landmarks)
 
     def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, Array]:
         old, new = path[here.joint.lin], path[here.joint.lin + 1]
@@ -31,12 +32,12 @@ def at_truth(truth: Truth) -> Linearizer:
         return moved, with_lever_arm(by_pose, new[:2] - ahead[:2]), noise, here.joint.lin + 1
 
     def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        true_landmark = truth.landmarks[jnp.maximum(here.joint.tag[here.slot], 0)]
+        true_landmark = landmarks[jnp.maximum(here.joint.tag[here.slot], 0)]
         return first_order.observe_at(sensor, here, path[here.joint.lin], true_landmark)
 
     def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
         at_pose = path[here.joint.lin]
-        true_z = sensor.observe(at_pose, truth.landmarks[jnp.maximum(tag, 0)])
+        true_z = sensor.observe(at_pose, landmarks[jnp.maximum(tag, 0)])
         return first_order.invert_at(sensor, here.pose, z, at_pose, true_z)
 
     return Linearizer(

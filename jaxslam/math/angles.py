@@ -16,12 +16,14 @@ def wrap(angle: ArrayLike) -> jax.Array:
     """Wrap an angle to (-π, π] by whole turns: a - 2π⌈(a - π)/2π⌉.
 
     Any shape, radians. An angle already inside is returned unchanged, bit for bit. The derivative
-    is 1 everywhere, also at the seam. (Solà's code corrects by one turn only; see ERRATA.)
+    is 1 everywhere, also at the seam. Of an angle so large (10¹⁶ in float64) that rounding leaves
+    nothing of it modulo 2π the result is 0. (Solà's code corrects by one turn only; see ERRATA.)
     """
     a = jnp.asarray(angle)
     w = a - 2 * np.pi * jnp.ceil((a - np.pi) / (2 * np.pi))
     # Rounding of the quotient may leave a whole turn too many or too few beside the seam.
-    return jnp.where(w > np.pi, w - 2 * np.pi, jnp.where(w <= -np.pi, w + 2 * np.pi, w))
+    w = jnp.where(w > np.pi, w - 2 * np.pi, jnp.where(w <= -np.pi, w + 2 * np.pi, w))
+    return jnp.where(jnp.abs(w) > np.pi, 0.0, w)
 
 
 def sinc(x: ArrayLike) -> jax.Array:

@@ -30,7 +30,7 @@ from jaxslam.monte_carlo.candidates import (
     without_noise,
 )
 from jaxslam.monte_carlo.fingerprint import fingerprint
-from jaxslam.monte_carlo.pieces import cores, missing
+from jaxslam.monte_carlo.pieces import check_part, cores, in_part, missing
 from jaxslam.monte_carlo.plan import Plan, Promises
 from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.progress import Progress
@@ -68,6 +68,7 @@ def monte_carlo(
     bound: bool = False,
     dtype: DTypeLike | None = None,
     keep: Keep | None = None,
+    part: tuple[int, int] | None = None,
     progress: Callable[[int, int], None] | Literal[False] | None = None,
     glimpse: Glimpse | None = None,
     library: Library | None = None,
@@ -96,6 +97,11 @@ def monte_carlo(
         keep: blocks are saved there as they finish, and those found there are not run again. It
             holds one campaign: what must agree (key, scenario, models, filters, precision,
             versions) is told by `fingerprint`. More runs than it has extend it.
+        part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
+            campaign returned is of them. So n jobs that know nothing of each other compute a
+            campaign, each with a `keep` from `store.join` on one folder, with the same block and
+            number of devices; without `part` the blocks are summed up, and those that are missing
+            computed.
         progress: called with (runs done, runs) of this process after each block. Default a bar with
             rate and remaining time, on a terminal and in a notebook alone; False: none.
         glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
@@ -112,11 +118,11 @@ def monte_carlo(
         ValueError: on runs, block or workers below 1, no PRNG key, no devices, no filters, a filter
             that does not fit the scenario, or a noise that is no covariance, before anything is
             traced; where `keep` holds another campaign, by every difference, or runs beyond those
-            asked for.
+            asked for; on a part without a block.
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """
-    _check(scenario, filters, runs, key, block, workers, devices, keep, progress)
+    _check(scenario, filters, runs, key, block, workers, devices, keep, part, progress)
     began, runs = time.perf_counter(), int(runs)
     devices = jax.local_devices() if devices is None else list(devices)
     dtype = check_dtype(dtype)
@@ -124,13 +130,20 @@ def monte_carlo(
         workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 1
     names = (*filters, BOUND)
     tallies = {name: Tally() for name in names}
+    size = int(block or fitting_block(scenario, filters, devices[0]))
+    plan = Plan(scenario, filters, key, devices, size, bound, dtype, library)
+    if part is not None and (part[0] - 1) * plan.wide >= runs:
+        raise ValueError(
+            f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
+            f"runs that {runs} runs are, got part {part[0]} of {part[1]}"
+        )
+    done: list[tuple[int, int]] = []
     if keep is not None:
         told = identity or fingerprint(scenario, filters, key, devices[0].platform, bound, dtype)
         keep.claim(told)
-        _add_kept(tallies, keep, runs)
-    size = int(block or fitting_block(scenario, filters, devices[0]))
-    plan = Plan(scenario, filters, key, devices, size, bound, dtype, library)
-    todo = share(missing(tallies[BOUND].pieces(), runs, plan.wide))
+        done = _add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
+    pieces = missing(done, runs, plan.wide)
+    todo = share([piece for piece in pieces if in_part(piece[0], plan.wide, part)])
     work = _Work(workers, keep, progress or None, glimpse, {name: Tally() for name in names})
     try:
         with _shown(work, plan, progress is None):
@@ -157,12 +170,17 @@ def _check(
     workers: int | None,
     devices: Sequence[jax.Device] | None,
     keep: Keep | None,
+    part: object,
     progress: object,
 ) -> None:
     """Raise ValueError on arguments that `monte_carlo` does not take."""
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
         if value is not None:
             check_count(f"monte_carlo: {name}", value)
+    if part is not None:
+        check_part("monte_carlo: part", part)
+        if jax.process_count() > 1:
+            raise ValueError("monte_carlo: part: expected none where jax.distributed divides")
     check_record("monte_carlo", "scenario", scenario, Scenario)
     check_key("monte_carlo", key)
     if not isinstance(filters, Mapping) or not filters:
@@ -346,15 +364,24 @@ def _qualified(found: dict[str, Summary], scenario: Scenario) -> dict[str, Summa
     }
 
 
-def _add_kept(tallies: dict[str, Tally], keep: Keep, runs: int) -> None:
-    """Add the blocks kept; ValueError where there are runs beyond those asked for."""
+def _add_kept(
+    tallies: dict[str, Tally], keep: Keep, runs: int, wanted: Callable[[int], bool]
+) -> list[tuple[int, int]]:
+    """Add the blocks kept whose first run is wanted; (first, runs) of all of them.
+
+    Raises ValueError where there are runs beyond those asked for.
+    """
+    done = []
     for first, count, arrays in keep.blocks():
         if first + count > runs:  # sums over a block cannot be taken apart
             raise ValueError(
                 f"monte_carlo: keep holds {first + count} runs: expected at least as many, got "
                 f"{runs}"
             )
-        _add(tallies, first, count, _by_filter(arrays, tallies))
+        done.append((first, count))
+        if wanted(first):
+            _add(tallies, first, count, _by_filter(arrays, tallies))
+    return done
 
 
 def _add(

@@ -24,6 +24,21 @@ def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tupl
     ]
 
 
+def check_part(name: str, part: object) -> None:
+    """Raise ValueError, which begins with a name, unless part is (i, n) with 1 <= i <= n."""
+    whole = isinstance(part, tuple) and len(part) == 2 and all(type(n) is int for n in part)
+    if not whole or not 1 <= part[0] <= part[1]:  # type: ignore[index]
+        raise ValueError(f"{name}: expected (i, n) with 1 <= i <= n, got {part!r}")
+
+
+def in_part(first: int, block: int, part: tuple[int, int] | None) -> bool:
+    """Whether the block of run `first` is one of part (i, n): blocks i - 1, i - 1 + n, … from 0 on.
+
+    So the parts of a campaign depend neither on what is done nor on how many runs it has.
+    """
+    return part is None or first // block % part[1] == part[0] - 1
+
+
 def cores() -> int:
     """CPU cores this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)

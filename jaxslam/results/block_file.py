@@ -5,6 +5,7 @@ campaign they belong to, and the checksum over all of that.
 """
 
 import contextlib
+import errno
 import hashlib
 import io
 import json
@@ -105,21 +106,45 @@ def block_order(path: Path) -> tuple[int, int, str]:
     return first, -end, path.name
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all, through a hidden file of this process beside it."""
+def write_atomically(path: Path, content: bytes, new: bool = False) -> None:
+    """Write a file completely or not at all, through a hidden file of this process beside it.
+
+    new: raise FileExistsError where the path exists. Of several processes one then writes it; on a
+    file system without hard links, of those that do not begin within microseconds.
+    """
     hidden = path.with_name(f".{path.name}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with open(hidden, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(hidden, path)
+        if new:
+            _link(hidden, path)
+        else:
+            os.replace(hidden, path)
     except OSError as error:
         reason = f"cannot write {len(content):,} bytes, {error.strerror or error}"
         raise OSError(error.errno, reason, str(path)) from error
     finally:
         with contextlib.suppress(OSError):
             hidden.unlink()
+
+
+def is_unfinished(path: Path) -> bool:
+    """Whether a file is one that a process writes, or was killed while it wrote."""
+    return path.name.startswith(".") and path.name.endswith(".tmp")
+
+
+def _link(hidden: Path, path: Path) -> None:
+    """Give a file a second name; raises FileExistsError where there is a file of that name."""
+    try:
+        os.link(hidden, path)
+    except FileExistsError:
+        raise
+    except OSError:  # the file system has no hard links
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from None
+        os.replace(hidden, path)
 
 
 def canonical_json(value: object) -> str:

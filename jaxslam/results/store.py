@@ -23,13 +23,24 @@ from jaxslam.results.block_file import (
     Block,
     block_order,
     canonical_json,
+    is_unfinished,
     read_block,
     runs_of_name,
     write_atomically,
     write_block,
 )
 
-__all__ = ["FORMAT", "MANIFEST", "Block", "Store", "create", "read_manifest", "resume"]
+__all__ = [
+    "FORMAT",
+    "MANIFEST",
+    "Block",
+    "Store",
+    "create",
+    "is_unfinished",
+    "join",
+    "read_manifest",
+    "resume",
+]
 
 FORMAT = 2
 """Format of the folder, written in its manifest; others are refused."""
@@ -43,7 +54,7 @@ _DIGEST = re.compile("[0-9a-f]{16}")
 
 @dataclass(frozen=True)
 class Store:
-    """Finished blocks of a campaign in a folder; make one with `create` or `resume`.
+    """Finished blocks of a campaign in a folder; make one with `create`, `resume` or `join`.
 
     Several processes may save into one folder. Killed processes leave hidden files `.block-….tmp`,
     which are never read.
@@ -65,7 +76,10 @@ class Store:
         names every difference of fingerprints, as "key: … there, … here", and what to do then.
         """
         mine = {str(name): str(value) for name, value in fingerprint.items()}
-        there = resume(self.folder)  # another process may have claimed it since
+        if not (self.folder / MANIFEST).exists():  # of `join`
+            with contextlib.suppress(FileExistsError):
+                _write_manifest(self.folder, self.settings, mine, self.runs, new=True)
+        there = resume(self.folder, self.settings)  # another process may have claimed it since
         if there.campaign and (differences := _differences(there.campaign, mine)):
             raise ValueError(
                 f"{self.folder} holds another campaign: {'; '.join(differences)}; choose another "
@@ -151,14 +165,46 @@ def create(
         ValueError: if the folder holds a campaign.
     """
     folder, own = _folder(folder), _as_stored(settings or {})
-    if (folder / MANIFEST).exists():
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        _write_manifest(folder, own, {}, runs, new=True)
+    except FileExistsError:
         raise ValueError(
             f"store.create: {folder} holds a campaign with {Store(folder, {}).done()} runs done: "
             "store.resume continues it; or choose another folder"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_manifest(folder, own, {}, runs)
+        ) from None
     return Store(folder, own, runs)
+
+
+def join(
+    folder: str | os.PathLike[str],
+    settings: Mapping[str, object] | None = None,
+    runs: int | None = None,
+) -> Store:
+    """The store of a campaign that processes without a coordinator compute, each a part of it.
+
+    The first to claim it makes the manifest, with the fingerprint; the others must have the same
+    settings and the same fingerprint.
+
+    Args:
+        folder: the folder, which is created if needed; all of them see it.
+        settings: as of `create`.
+        runs: number of runs that the campaign is to have; a larger number than before extends it.
+    Raises:
+        ValueError: on any difference of settings, naming all, and where the campaign is to have
+            more runs.
+    """
+    folder, own = _folder(folder), _as_stored(settings or {})
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / MANIFEST).exists():
+        return Store(folder, own, runs)
+    there = resume(folder, own)
+    if runs is not None and there.runs is not None and runs < there.runs:
+        raise ValueError(
+            f"{folder}: the campaign is to have {there.runs} runs: expected at least as many, got "
+            f"{runs}"
+        )
+    return replace(there, runs=there.runs if runs is None else runs)
 
 
 def resume(
@@ -230,13 +276,17 @@ def _folder(folder: str | os.PathLike[str]) -> Path:
 
 
 def _write_manifest(
-    folder: Path, settings: Mapping[str, object], campaign: Mapping[str, str], runs: int | None
+    folder: Path,
+    settings: Mapping[str, object],
+    campaign: Mapping[str, str],
+    runs: int | None,
+    new: bool = False,
 ) -> None:
-    """Write the manifest of a folder."""
+    """Write the manifest of a folder; new: raises FileExistsError where there is one."""
     own = {"settings": settings, "campaign": campaign}
     manifest = {"format": FORMAT, "digest": _digest(own), "runs": runs, **own}
     text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
-    write_atomically(folder / MANIFEST, text.encode())
+    write_atomically(folder / MANIFEST, text.encode(), new)
 
 
 def _as_stored(settings: Mapping[str, object]) -> dict[str, Any]:

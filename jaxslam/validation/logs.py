@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.types import Log, Scan
-from jaxslam.validation.numbers import is_concrete, shape_told
+from jaxslam.validation.numbers import is_concrete, largest, shape_told
 
 
 def check_log(
@@ -19,9 +19,10 @@ def check_log(
 ) -> None:
     """Raise ValueError, naming caller, field and row, unless a log is well formed.
 
-    Shapes and kinds are always checked, values (finite controls, finite valid measurements, tags
-    >= -1, of 32 bits and not repeated within a scan) only where they are concrete. parts: how many
-    measurement slots each sensor has, where there are several; a tag may then occur once with each.
+    Shapes and kinds are always checked, values (controls and valid measurements finite and at most
+    `largest`, tags >= -1, of 32 bits and not repeated within a scan) only where they are concrete.
+    parts: how many measurement slots each sensor has, where there are several; a tag may then occur
+    once with each.
     """
     control, scan = log.control, log.scan
     if not isinstance(scan, Scan):
@@ -46,9 +47,14 @@ def check_log(
     if not is_concrete(log):
         return
     there, tags = np.asarray(valid), np.asarray(tag)
-    _refuse(name, ~np.isfinite(np.asarray(control)).all(axis=1), "log.control is not finite")
-    finite = np.isfinite(np.asarray(z)).all(axis=2)
-    _refuse(name, there & ~finite, "log.scan.z: a valid measurement is not finite")
+    most = largest(control, z)
+    for what, values, used in (
+        ("log.control", control, np.ones(steps, bool)),
+        ("log.scan.z: a valid measurement", z, there),
+    ):
+        size = np.abs(np.asarray(values, np.float64)).max(axis=-1, initial=0.0)
+        _refuse(name, used & ~np.isfinite(size), f"{what} is not finite")
+        _refuse(name, used & (size > most), f"{what} is beyond ±{most:.2g}")
     _refuse(name, there & (tags < -1), "log.scan.tag: a tag is below -1")
     _refuse(name, there & (tags > np.iinfo(np.int32).max), "log.scan.tag: a tag is beyond int32")
     named = np.where(there & (tags >= 0), tags, -1 - np.arange(places))

@@ -14,6 +14,16 @@ def is_concrete(*values: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
+def largest(*values: Any) -> float:
+    """The largest size of a number of a log, by the dtype that these values are computed in.
+
+    The fifth root of the largest number of the dtype, 4e61 (float64) or 5e7 (float32): so a filter
+    can form the products of two covariances.
+    """
+    dtype = jnp.promote_types(jnp.result_type(*values), jnp.float32)
+    return float(float(jnp.finfo(dtype).max) ** 0.2)
+
+
 def shape_told(value: Any) -> str:
     """The shape of an array, or the type of anything else, for an error message."""
     try:

@@ -94,6 +94,26 @@ def test_blocks_of_any_size_in_any_order_give_the_same_bits(cuts, order):
         np.testing.assert_array_equal(a, leaf[each.finite])
 
 
+def test_blocks_that_follow_each_other_are_joined():
+    """In any order: nothing is lost, and a campaign of many blocks keeps a few arrays."""
+    rng = np.random.default_rng(3)
+    for spread in (0, 3, 1000):
+        tally, most = Tally(), 0
+        for number in np.argsort(np.arange(600) + rng.uniform(0, spread, 600)).tolist():
+            run = 2 * number + np.arange(2)
+            tally.add(2 * number, 2, {"finite": run % 7 > 0, "x": run / 3, "limit": np.array(5.0)})
+            most = max(most, len(tally.pieces()))
+        assert most < (20 if spread < 1000 else 300)
+        assert tally.pieces()[0][0] == 0 and sum(runs for _, runs in tally.pieces()) == 1200
+        back = Tally.unpack(tally.packed())
+        back.merge(Tally.unpack(Tally().packed()))
+        for found in (tally, back):
+            np.testing.assert_array_equal(found.numbers(), np.arange(1200))
+            np.testing.assert_array_equal(found.flags("finite"), np.arange(1200) % 7 > 0)
+            np.testing.assert_array_equal(found.flags("x"), np.arange(1200) / 3)
+            assert found.first("limit") == 5
+
+
 def test_merged_tallies_are_one():
     each = scores(20, np.random.default_rng(2))
     whole, parts = tallied(each, [12], [0, 1]), tallied(each, [12], [1])

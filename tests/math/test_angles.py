@@ -42,6 +42,12 @@ def test_wrap_returns_an_angle_already_inside_bit_for_bit(dtype, mode):
     assert wrap(-pi) == pi
 
 
+def test_wrap_of_an_angle_without_a_remainder_is_inside():
+    for dtype, sizes in ((np.float32, [1e8, 4e9, 3e38]), (np.float64, [1e17, 1e30, 1e61, 1e300])):
+        w = np.asarray(wrap(np.array(sizes + [-size for size in sizes], dtype)))
+        assert w.dtype == dtype and (np.abs(w) <= dtype(np.pi)).all()
+
+
 def test_wrap_has_slope_one_everywhere():
     a = around_the_seams(np.float64)
     slope = jax.jit(jax.vmap(jax.grad(wrap)))(a)

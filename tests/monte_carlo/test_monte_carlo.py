@@ -37,17 +37,6 @@ def campaign_of(candidates=None, *, devices=1, block=4, bound=True, **options):
     return monte_carlo(WORLD, candidates, 10, worlds.key(), **options)
 
 
-def identical(a, b):
-    """To the last bit, run by run and in their sums."""
-    assert a.counts == b.counts
-    for part in ("per_run", "curves", "coverage"):
-        ours, theirs = getattr(a, part), getattr(b, part)
-        assert ours.keys() == theirs.keys()
-        for name in ours:
-            assert ours[name].tobytes() == theirs[name].tobytes(), name
-    assert a.measures == b.measures
-
-
 def same(a, b, rtol=1e-9):
     assert a.counts == b.counts
     for name in a.measures.keys() & b.measures.keys():  # a bound is taken in some
@@ -78,7 +67,7 @@ def test_workers_do_not_change_a_bit_and_devices_what_rounding_does(in_fours, de
         workers=workers,
         progress=lambda done, total: heard.append((done, total)),
     )
-    agree = identical if devices == 1 else same
+    agree = worlds.assert_identical if devices == 1 else same
     agree(campaign.filters["ekf"], in_fours.filters["ekf"])
     assert [total for _, total in heard] == [10] * -(-10 // (4 * devices))
     assert sorted(done for done, _ in heard)[-1] == 10
@@ -135,7 +124,7 @@ def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_fours):
 
     third = Spy(store.resume(tmp_path))
     campaign = campaign_of(devices=2, keep=third)
-    identical(campaign.filters["ekf"], in_fours.filters["ekf"])
+    worlds.assert_identical(campaign.filters["ekf"], in_fours.filters["ekf"])
     pieces = sorted(first.saved + second.saved + third.saved)
     assert [run for at, runs in pieces for run in range(at, at + runs)] == list(range(10))
 
@@ -144,7 +133,7 @@ def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_fours):
     assert finished.saved == []
     assert began.compile_seconds == 0
     assert began.divergence_limit == in_fours.divergence_limit
-    identical(began.filters["ekf"], in_fours.filters["ekf"])
+    worlds.assert_identical(began.filters["ekf"], in_fours.filters["ekf"])
 
 
 def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):

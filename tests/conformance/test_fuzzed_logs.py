@@ -1,0 +1,188 @@
+"""Every filter of the catalogue on logs of any numbers: finite, or refused by name; nothing is lost.
+
+One program a filter runs many logs at once, as under `jit` or `vmap`, where values are not checked.
+`python -m benchmarks.fuzz` tries more, and runs the odd shapes, too.
+"""
+
+import dataclasses
+import os
+import zlib
+
+import hypothesis.strategies as st
+import jax
+import numpy as np
+import pytest
+import worlds
+from hypothesis import given, settings
+
+from jaxslam import catalog, run
+from jaxslam.protocols import Filter
+from jaxslam.types import Log, Scan, Status
+from jaxslam.validation.logs import check_log
+from jaxslam.validation.numbers import largest
+
+WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
+STEPS, PLACES, LANDMARKS, LOGS = 4, 3, 4, 48
+WORLD = dataclasses.replace(worlds.ring(STEPS), landmarks=worlds.ring().landmarks[:LANDMARKS])
+MOST = largest(np.float64)
+
+NUMBERS = [0.0, -0.0, 1e-300, 1e-160, 1e-30, 1e-9, -1.0, 1e3, 1e6, 1e20, -1e30, 4e61, -4e61]
+SIGNALS = [np.nan, np.inf, -np.inf, 5e61, 1e160, -1e300]
+
+
+def drawn(rng, shape, usual, unusual, share):
+    """Usual numbers, a share of them replaced."""
+    return np.where(rng.random(shape) < share, rng.choice(unusual, shape), usual)
+
+
+def logs(rng, count=LOGS, steps=STEPS, places=PLACES, dtype=np.float64, wild=True):
+    """Logs whose tags repeat, are unknown, or of no landmark; some without any measurement."""
+    shape = count, steps, places
+    control = rng.normal(0, 0.2, (count, steps, 2))
+    z = np.stack([rng.exponential(3, shape), rng.uniform(-4, 4, shape)], axis=-1)
+    if wild:
+        control = drawn(rng, control.shape, control, NUMBERS, 0.03)
+        z = drawn(rng, z.shape, z, NUMBERS, 0.1)
+        z = drawn(rng, z.shape, z, SIGNALS, 0.05)
+    valid = rng.random(shape) < rng.choice([0.0, 0.3, 1.0], (count, 1, 1))
+    tag = rng.integers(-1, LANDMARKS + 2, shape).astype(np.int32)
+    most = largest(np.zeros((), dtype))
+    with np.errstate(over="ignore"):
+        return Log(np.clip(control, -most, most).astype(dtype), Scan(z.astype(dtype), tag, valid))
+
+
+def made(name, world=WORLD):
+    """A filter of the catalogue, given the true map where it needs one."""
+    candidate = catalog.ALL[name](world)
+    return candidate if isinstance(candidate, Filter) else candidate(worlds.draw(world)[0])
+
+
+def drive(filter):
+    def go(log, key):
+        dtype = np.result_type(log.control, log.scan.z)
+        start = np.zeros(3, dtype), np.diag([0.01, 0.01, 0.001]).astype(dtype)
+        trace = run(filter, log, *start, key)
+        return trace.estimate, trace.info
+
+    return jax.vmap(go)
+
+
+def assert_told(log, estimate, info, tame):
+    """What became of every measurement is said, and said truly.
+
+    tame: numbers are such as sensors give; then the covariance is one as well.
+    """
+    z, valid, status = np.asarray(log.scan.z), np.asarray(log.scan.valid), np.asarray(info.status)
+    np.testing.assert_array_equal(status == Status.EMPTY, ~valid)
+    assert np.isin(status, list(Status)).all()
+    lost = valid & ~(np.abs(z) <= largest(z)).all(axis=-1)
+    assert (status[lost] == Status.REJECTED).all()
+    for leaf in (*estimate, info.nis, info.innovation, info.innovation_cov, info.log_likelihood):
+        assert np.isfinite(leaf).all()
+    dof = np.where(status == Status.FUSED, z.shape[-1], 0)
+    np.testing.assert_array_equal(info.dof, dof)
+    assert (info.slot[(status != Status.FUSED) & (status != Status.BORN)] == -1).all()
+    assert (np.abs(estimate.pose[..., 2]) <= np.float32(np.pi)).all()
+    assert ((estimate.tag >= 0) <= estimate.alive).all()
+    if tame:
+        for cov in (estimate.pose_cov, estimate.point_covs):
+            values = np.linalg.eigvalsh(np.asarray(cov, np.float64))
+            assert (values >= -1e-6 * np.abs(values).max(axis=-1, keepdims=True) - 1e-9).all()
+
+
+SUITE = [
+    *("ekf", "ideal", "oc", "right_invariant", "robocentric", "ukf", "square_root"),
+    *("eif_slam", "seif", "fastslam2", "particle_localization", "localization", "dead_reckoning"),
+]
+"""Of filters that share their steps one is in the suite; programs are what a test here costs."""
+
+
+@pytest.mark.parametrize("name", catalog.ALL if WIDE > 1 else SUITE)
+def test_what_becomes_of_every_measurement_is_said(name):
+    go = jax.jit(drive(made(name)))
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    for number in range(4 * WIDE):
+        log = logs(rng, wild=number % 2 == 0)
+        keys = jax.random.split(jax.random.key(number), LOGS)
+        assert_told(log, *jax.device_get(go(log, keys)), tame=number % 2 == 1)
+
+
+ODD = {
+    "no steps": {"steps": 0},
+    "no places": {"steps": 1, "places": 0},
+    "float32": {"dtype": np.float32},
+}
+
+
+@pytest.mark.parametrize("odd", ODD)
+@pytest.mark.parametrize("name", catalog.ALL if WIDE > 1 else ["ekf", "seif", "fastslam2"])
+def test_logs_of_odd_shapes_are_run(name, odd):
+    """In the suite they are traced alone."""
+    log = logs(np.random.default_rng(0), **ODD[odd])
+    keys = jax.random.split(jax.random.key(0), LOGS)
+    if WIDE == 1:
+        estimate, info = jax.eval_shape(drive(made(name)), log, keys)
+        assert info.status.shape == log.scan.valid.shape
+        assert estimate.pose.dtype == log.control.dtype
+    else:
+        assert_told(log, *jax.device_get(jax.jit(drive(made(name)))(log, keys)), tame=False)
+
+
+@pytest.mark.parametrize(
+    ("tag", "kinds"),
+    [
+        (np.int8, (np.float32, np.float64)),
+        (np.uint32, (np.float64, np.float32)),
+        (np.int64, (np.float16, np.float64)),
+    ],
+)
+def test_kinds_of_numbers_may_be_mixed(tag, kinds):
+    log = logs(np.random.default_rng(0))
+    scan = log.scan._replace(
+        z=np.ones_like(log.scan.z, kinds[1]), tag=np.maximum(log.scan.tag, 0).astype(tag)
+    )
+    mixed = Log(np.ones_like(log.control, kinds[0]), scan)
+    estimate, info = jax.eval_shape(
+        drive(made("ekf")), mixed, jax.random.split(jax.random.key(0), LOGS)
+    )
+    assert estimate.pose.dtype == np.float64
+    assert (estimate.tag.dtype, info.status.dtype) == (np.int32, np.int32)
+
+
+ANY = st.one_of(st.sampled_from(NUMBERS + SIGNALS), st.floats())
+
+
+@settings(max_examples=100 * WIDE, deadline=None, derandomize=WIDE == 1)
+@given(data=st.data())
+def test_outside_a_trace_a_log_is_well_formed_or_refused_by_row_and_slot(data):
+    steps, places = data.draw(st.integers(0, 3)), data.draw(st.integers(0, 3))
+
+    def array(shape, kind, values):
+        flat = data.draw(
+            st.lists(values, min_size=int(np.prod(shape)), max_size=int(np.prod(shape)))
+        )
+        return np.array(flat, kind).reshape(shape)
+
+    kind = data.draw(st.sampled_from([np.float32, np.float64]))
+    with np.errstate(over="ignore"):
+        control = array((steps, 2), kind, ANY)
+        z = array((steps, places, 2), kind, ANY)
+    tag = array(
+        (steps, places), np.int64, st.one_of(st.integers(-3, 3), st.integers(-(2**40), 2**40))
+    )
+    valid = array((steps, places), bool, st.booleans())
+    most = largest(control, z)
+    sane = [(np.abs(control) <= most).all(), (np.abs(z[valid]) <= most).all()]
+    sane += [((tag[valid] >= -1) & (tag[valid] < 2**31)).all()]
+    sane += [
+        all(
+            len(set(row)) == len(row)
+            for row in (t[v & (t >= 0)].tolist() for t, v in zip(tag, valid, strict=True))
+        )
+    ]
+    log = Log(control, Scan(z, tag, valid))
+    if all(sane):
+        check_log("run", log, control_size=2, measurement_size=2)
+        return
+    with pytest.raises(ValueError, match=r"^run: log\.(control|scan\.(z|tag)).* \(row \d+"):
+        check_log("run", log, control_size=2, measurement_size=2)
