@@ -11,6 +11,7 @@ from pathlib import Path
 from jaxslam.datasets.bonn import bonn
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam import mrclam, mrclam_team
+from jaxslam.datasets.mrclam_calibration import MRCLAM_CALIBRATION, Calibration
 from jaxslam.datasets.plaza import plaza
 from jaxslam.datasets.table import table
 from jaxslam.datasets.victoria_park import victoria_park
@@ -40,4 +41,15 @@ READERS: dict[str, Reader] = {
     "victoria_park": partial(_of_one_robot, victoria_park),
 }
 
-__all__ = ["READERS", "Dataset", "bonn", "mrclam", "mrclam_team", "plaza", "table", "victoria_park"]
+__all__ = [
+    "MRCLAM_CALIBRATION",
+    "READERS",
+    "Calibration",
+    "Dataset",
+    "bonn",
+    "mrclam",
+    "mrclam_team",
+    "plaza",
+    "table",
+    "victoria_park",
+]
