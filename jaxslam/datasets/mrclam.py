@@ -55,9 +55,9 @@ def mrclam(
     counted. Tags follow the subject numbers.
 
     With a true path, odometry lines (0, 0) at the end of the file and after it are left out, but
-    for the first (`Dataset.corrections` says how many). If the true pose is known in the first row, the robot
-    starts there, with the covariance `mrclam_truth.START_COV`, and path, survey and map are in one
-    frame.
+    for the first (`Dataset.corrections` says how many). If the true pose is known in the first row,
+    the robot starts there, with the covariance `mrclam_truth.START_COV`, and path, survey and map
+    are in one frame.
 
     The default noise is chosen on robots 1 to 3 of data set 1. Bearings within a scan agree with
     the survey to 0.005 rad; 0.01 allows for errors of the time stamps. Ranges deviate by 0.16 to

@@ -138,7 +138,7 @@ def test_the_noise_of_a_calibration():
 
 
 def test_a_bearing_behind_the_image_plane_is_refused():
-    with pytest.raises(ValueError, match="expected bearings below π/2, got 1.6"):
+    with pytest.raises(ValueError, match=r"expected bearings below π/2, got 1\.6"):
         PLAIN.measurements(np.array([[0.0, 5, 1, 0.5], [0.0, 5, 1, 1.6]]))
 
 
