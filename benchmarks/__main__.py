@@ -44,6 +44,7 @@ from benchmarks import (
 from benchmarks.association.__main__ import measure as measure_association
 from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import Metric, report
+from benchmarks.mrclam.__main__ import measure as measure_mrclam
 from benchmarks.results import measured
 from benchmarks.speed.__main__ import gated
 from benchmarks.speed.__main__ import measure as measure_speed
@@ -78,6 +79,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "stationary": lambda: pictured(stationary, runs=20 if quick else 200),
         "victoria_park": victoria_park.measure,
         "real_data": real_data.measure,
+        "mrclam": measure_mrclam,
         "association": lambda: measure_association(quick),
         "baselines": lambda: baselines.measure(100 if quick else 1000),
         "bearing": lambda: bearing.measure(20 if quick else 100),

@@ -11,6 +11,7 @@ from pathlib import Path
 from jaxslam.datasets.bonn import bonn
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam import mrclam, mrclam_team
+from jaxslam.datasets.mrclam_calibration import MRCLAM_CALIBRATION, Calibration
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza import plaza
 from jaxslam.datasets.table import table
@@ -42,7 +43,9 @@ READERS: dict[str, Reader] = {
 }
 
 __all__ = [
+    "MRCLAM_CALIBRATION",
     "READERS",
+    "Calibration",
     "Dataset",
     "DatasetFit",
     "bonn",

@@ -59,6 +59,11 @@ class Dataset:
     """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown"""
     true_at: Bool[np.ndarray, "T"] | None = None
     """in which rows the true pose is known; None if in all"""
+    true_paths: Float[np.ndarray, "R T 3"] | None = None
+    """true poses of all robots of a log of several, where they are known; `true_path` is the first
+    robot's"""
+    true_paths_at: Bool[np.ndarray, "R T"] | None = None
+    """in which rows those are known; None if in all"""
     one_frame: bool = False
     """whether `pose`, `landmarks` and `true_path` are in one frame; if not, compare after an
     alignment"""

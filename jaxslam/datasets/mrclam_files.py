@@ -1,11 +1,11 @@
-"""The files of MRCLAM as tables: odometry and measurements of a robot, barcodes and survey."""
+"""The files of MRCLAM as tables: what a robot recorded, its true path, barcodes and survey."""
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.datasets.lines import TextFile
+from jaxslam.datasets.lines import TextFile, stored
 
 ROBOTS = range(1, 6)
 """Subjects 1 to 5 are the robots; they carry barcodes like the landmarks, 6 to 20."""
@@ -37,6 +37,14 @@ def read_robot(
         ("time", "barcode", "range", "bearing"),
     )
     return odometry, seen
+
+
+def read_truth(folder: Path, robot: int) -> Float[np.ndarray, "K 4"] | None:
+    """The true poses (t, x, y, θ) of one robot; None where there is no such file."""
+    path = folder / f"Robot{robot}_Groundtruth.dat"
+    if stored(path) is None:
+        return None
+    return _read_in_time(TextFile(path, "#"), ("time", "x", "y", "theta"))
 
 
 def _read_in_time(file: TextFile, names: tuple[str, ...]) -> Float[np.ndarray, "_ _"]:

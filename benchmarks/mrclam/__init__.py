@@ -1,0 +1,1 @@
+"""Is the covariance honest on real data? Five robots of MRCLAM 6 with their true paths."""

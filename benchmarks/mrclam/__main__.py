@@ -1,0 +1,192 @@
+"""Is the covariance honest on real data? Robots of MRCLAM 6 against their true paths.
+
+    python -m benchmarks.mrclam [--fit] [--out FIGURE]
+
+EKF-SLAM and the right-invariant EKF of each robot alone, with the default noise of the reader and
+with `MRCLAM_CALIBRATION`, which is fitted on robot 1; then robots 2 to 5 in one map (`team_slam`),
+without and with their sightings of each other. A run starts at the true pose of the first scan;
+landmarks have no prior. ATE is in that frame, and after the SE(2) motion that fits the path best.
+The gate is 5 σ: some barcodes are misread. `--fit` prints the calibration from robot 1's truth.
+The folder is JAXSLAM_DATA, by default ../shared/data beside the checkout.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxslam
+from benchmarks.gate import Metric, alone
+from benchmarks.mrclam import fit as fitting
+from benchmarks.real_data import DATA
+from jaxslam import datasets, se2
+from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.filters import ekf_slam, team_slam
+from jaxslam.math.stats import sigma_gate
+from jaxslam.team import poses
+from jaxslam.types import Status
+
+FIGURE = Path(__file__).parents[1] / "figures" / "mrclam.png"
+ASKED = 0.15, 6.0
+"""ATE [m] and median pose NEES on robots 2 to 5."""
+HELD = {2: (0.35, 12.0), 3: (0.15, 6.0), 4: (0.5, 12.0), 5: (0.35, 60.0)}
+"""Gates of robots alone, invariant EKF, ATE and median NEES: what was reached, with a margin."""
+SIGHTING = np.diag([0.18, 0.048]) ** 2
+"""Deviations of the innovations of sightings in data set 1 (`python -m benchmarks.team`)."""
+TEAM = (3, 2, 4, 5)
+"""The test robots; the first, whose start is the frame, has most measurements of landmarks."""
+COLUMNS = ("robot", "filter", "noise", "ATE [m]", "aligned [m]", "heading [deg]")
+COLUMNS += ("NEES median", "NEES mean", "NIS/dof", "rejected", "unseen [s]")
+
+
+class Scored(NamedTuple):
+    """Of the rows in which the truth is known and the covariance regular."""
+
+    time: np.ndarray
+    error: np.ndarray
+    sigma: np.ndarray
+    nees: np.ndarray
+    ate: float
+    aligned: float
+
+
+def from_first_scan(data, own=None):
+    """The row of the first scan with a landmark at which the truth is known, and the log from it.
+
+    own: the measurement slots of the robot that starts there; default all.
+    """
+    seen = data.log.scan.valid[:, :own].any(axis=1) & data.true_at
+    row = int(np.argmax(seen))
+    log = jax.tree.map(lambda leaf: leaf[row:], data.log)
+    control = log.control.copy()
+    control[0] = 0.0
+    return row, log._replace(control=control)
+
+
+def scored(time, true, known, pose, cov):
+    """A path against the truth."""
+    true, pose, cov, time = true[known], pose[known], cov[known], time[known]
+    error = pose_error(true, pose)
+    nees, regular = block_nees(pose, error, error, cov)["pose"]
+    frame = se2.align(jnp.asarray(pose[:, :2]), jnp.asarray(true[:, :2]))
+    onto = jax.vmap(se2.from_frame, (None, 0))(frame, jnp.asarray(pose[:, :2]))
+    sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    ate, aligned = (
+        float(np.sqrt((gap**2).sum(axis=1).mean()))
+        for gap in (error[:, :2], np.asarray(onto) - true[:, :2])
+    )
+    kept = (each[regular] for each in (time, error, sigma, nees))
+    return Scored(*map(np.asarray, kept), ate, aligned)
+
+
+def row_of(robot, filter, noise, path, nis, rejected, unseen):
+    heading = np.rad2deg(np.sqrt((path.error[:, 2] ** 2).mean()))
+    cells = [robot, filter, noise, f"{path.ate:.3f}", f"{path.aligned:.3f}", f"{heading:.1f}"]
+    cells += [f"{np.median(path.nees):.2f}", f"{path.nees.mean():.2f}", f"{nis:.2f}"]
+    return "| " + " | ".join(map(str, (*cells, rejected, f"{unseen:.0f}"))) + " |"
+
+
+def nis_of(info, mask=True):
+    fused = (info.status == Status.FUSED) & mask
+    return np.where(fused, info.nis, 0.0).sum() / max(2 * fused.sum(), 1)
+
+
+def longest_unseen(time, seen):
+    """The longest time without a measurement of a landmark [s]."""
+    return float(np.diff(np.concatenate([time[:1], time[seen], time[-1:]])).max())
+
+
+def run_alone(folder, robot, calibration, chart):
+    data = datasets.mrclam(folder, robot, calibration=calibration)
+    row, log = from_first_scan(data)
+    options = data.filter_options | {"gate": sigma_gate(5.0), "chart": chart}
+    filter = ekf_slam(data.motion, data.sensor, data.capacity, **options)
+    start = data.true_path[row], data.pose_cov, jax.random.key(0)
+    trace = jax.device_get(jaxslam.run(filter, log, *start))
+    time = data.time[row:]
+    estimate = trace.estimate
+    truth = data.true_path[row:], data.true_at[row:]
+    path = scored(time, *truth, estimate.pose, estimate.pose_cov)
+    unseen = longest_unseen(time, log.scan.valid.any(axis=1))
+    return path, nis_of(trace.info), int((trace.info.status == Status.REJECTED).sum()), unseen
+
+
+def run_team(folder, sightings):
+    """The path of each robot in turn, from when it is in the map on, and its NIS and rejections."""
+    data = datasets.mrclam_team(
+        folder, TEAM, calibration=datasets.MRCLAM_CALIBRATION, sighting_cov=SIGHTING
+    )
+    places = np.cumsum([sum(robot.sensors.places) for robot in data.robots])
+    row, log = from_first_scan(data, data.robots[0].sensors.places[0])
+    landmark = log.scan.tag < data.capacity
+    if not sightings:
+        log = log._replace(scan=log.scan._replace(valid=log.scan.valid & landmark))
+    filter = team_slam(data.robots, data.capacity, gate=sigma_gate(5.0), **data.filter_options)
+
+    @jax.jit
+    def go(log):
+        start = data.true_path[row], data.pose_cov, jax.random.key(0)
+        trace = jaxslam.run(filter, log, *start, probe=partial(poses, robots=len(TEAM)))
+        return trace.probe, trace.info._replace(innovation_cov=())
+
+    (means, covs, there), info = jax.device_get(go(log))
+    time = data.time[row:]
+    for b, end in enumerate(places):
+        own = slice(end - sum(data.robots[b].sensors.places), end)
+        known = data.true_paths_at[b, row:] & there[:, b]
+        path = scored(time, data.true_paths[b, row:], known, means[:, b], covs[:, b])
+        mine = np.zeros(info.status.shape, bool)
+        mine[:, own] = True
+        rejected = int(((info.status == Status.REJECTED) & mine).sum())
+        seen = (log.scan.valid & landmark)[:, own].any(axis=1)
+        yield TEAM[b], path, nis_of(info, mine), rejected, longest_unseen(time, seen)
+
+
+def measure(fit=False, out=FIGURE):
+    folder = DATA / "mrclam6"
+    if not folder.is_dir():
+        print(f"no folder {folder}")
+        return []
+    metrics = fitting.measure(folder)
+    if fit:
+        return metrics
+    charts = {"EKF": None, "invariant EKF": jaxslam.charts.right_invariant()}
+    noises = {"default": None, "fitted on robot 1": datasets.MRCLAM_CALIBRATION}
+    found = {}
+    print("\n| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS))
+    for robot in range(1, 6):
+        for noise, calibration in noises.items():
+            for name, chart in charts.items():
+                path, *rest = run_alone(folder, robot, calibration, chart)
+                found[robot, name, noise] = path
+                print(row_of(robot, name, noise, path, *rest), flush=True)
+    for name, sightings in (("team EKF, no sightings", False), ("team EKF, sightings", True)):
+        for robot, path, *rest in run_team(folder, sightings):
+            found[robot, name] = path
+            print(row_of(robot, name, "fitted on robot 1", path, *rest), flush=True)
+    for robot, (ate, nees) in HELD.items():
+        path = found[robot, "invariant EKF", "fitted on robot 1"]
+        asked = f"asked: {ASKED[0]} m"
+        metrics.append(Metric(f"ATE of robot {robot} [m]", path.ate, high=ate, note=asked))
+        middle, asked = float(np.median(path.nees)), f"asked: {ASKED[1]:g}"
+        metrics.append(Metric(f"median pose NEES of robot {robot}", middle, high=nees, note=asked))
+    if out is not None:
+        from benchmarks.mrclam.figure import draw
+
+        paths = {r: found[r, "invariant EKF", "fitted on robot 1"] for r in range(1, 6)}
+        draw(paths, Path(out))
+    return metrics
+
+
+if __name__ == "__main__":
+    raise SystemExit(
+        alone(
+            "mrclam",
+            measure,
+            fit={"action": "store_true", "help": "fit the calibration, run no filter"},
+            out={"default": FIGURE, "help": "where to draw the figure"},
+        )
+    )

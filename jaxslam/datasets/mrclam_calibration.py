@@ -1,0 +1,127 @@
+"""Systematic errors and noise of MRCLAM's robots, as a record that the readers apply."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.noise import NoiseCov
+
+
+class Calibration(NamedTuple):
+    """What the odometry and the camera of a robot get wrong, and the noise that is left.
+
+    A recorded velocity (v, ω) at time t moves the robot at time t + delay, by
+
+        v' = forward v - outer |ω|,    ω' = turn ω
+
+    since v is rather the speed of the outer wheel, half a track `outer` from the centre. The camera
+    is at (ahead, 0, yaw) on the robot. Its range r is `depth` times the depth along the optical
+    axis, as the height of a barcode in the image gives it; with the recorded bearing φ the range is
+
+        r' = r / (depth cos φ)
+
+    White noise per second has the variance forward_noise² of travel and turn_noise² +
+    (turn_share ω')² of heading. The range has the standard deviation range_share r', the bearing
+    bearing_noise.
+    """
+
+    delay: float
+    """[s], of odometry after measurements"""
+    forward: float
+    outer: float
+    """[m]"""
+    turn: float
+    depth: float
+    ahead: float
+    """[m]"""
+    yaw: float
+    """[rad]"""
+    forward_noise: float
+    """[m/√s]"""
+    turn_noise: float
+    """[rad/√s]"""
+    turn_share: float
+    """[√s]"""
+    range_share: float
+    bearing_noise: float
+    """[rad]"""
+
+    def odometry(self, recorded: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
+        """The lines (t, v, ω) corrected, at the times when the robot moves."""
+        t, v, omega = recorded.T
+        forward = self.forward * v - self.outer * np.abs(omega)
+        return np.column_stack([t + self.delay, forward, self.turn * omega])
+
+    def measurements(self, recorded: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:
+        """The lines (t, barcode, range, bearing) with ranges corrected.
+
+        Raises ValueError on a bearing beyond a right angle, behind the image plane.
+        """
+        beyond = np.abs(recorded[:, 3]) >= np.pi / 2
+        if beyond.any():
+            bearing = recorded[beyond, 3][0]
+            raise ValueError(f"Calibration: expected bearings below π/2, got {bearing}")
+        corrected = recorded.copy()
+        corrected[:, 2] /= self.depth * np.cos(recorded[:, 3])
+        return corrected
+
+    @property
+    def mount(self) -> Float[np.ndarray, "3"]:
+        """The pose of the camera on the robot."""
+        return np.array([self.ahead, 0.0, self.yaw])
+
+    def odometry_cov(self) -> NoiseCov:
+        """The covariance (2, 2) of (v', ω') over an interval Δt, a function of (pose, u)."""
+
+        def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
+            by_turn = (self.turn_share * u[1]) ** 2
+            forward = self.forward_noise**2 + 0 * by_turn
+            return per_interval(jnp.stack([forward, self.turn_noise**2 + by_turn]), u[2])
+
+        return noise_cov
+
+    def measurement_cov(self) -> NoiseCov:
+        """The covariance (2, 2) of (r', φ), a function of z."""
+
+        def noise_cov(z: jax.Array) -> jax.Array:
+            share = self.range_share * z[0]
+            return jnp.diag(jnp.stack([share, self.bearing_noise + 0 * share]) ** 2)
+
+        return noise_cov
+
+
+MRCLAM_CALIBRATION = Calibration(
+    delay=0.265,
+    forward=1.049,
+    outer=0.098,
+    turn=0.951,
+    depth=1.017,
+    ahead=-0.034,
+    yaw=0.0,
+    forward_noise=0.0091,
+    turn_noise=0.0236,
+    turn_share=0.183,
+    range_share=0.0098,
+    bearing_noise=0.0183,
+)
+"""Fitted on the true path of robot 1 of data set 6 (`python -m benchmarks.mrclam --fit`).
+
+The ranges of that robot deviate from the survey by 0.12 m as recorded, by a function of the
+bearing, and by 1 % of the range once corrected. Errors that last are counted in full: the noise of
+the odometry is that of windows of 8 s, that of the camera of single measurements and the truth."""
+
+
+def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
+    """The diagonal covariance density/Δt of velocities over Δt, zero where Δt = 0."""
+    moving = dt > 0
+    return jnp.diag(density) * jnp.where(moving, 1 / jnp.where(moving, dt, 1.0), 0.0)
+
+
+def recorded(odometry: Any, seen: Any, calibration: Calibration | None) -> tuple[Any, Any]:
+    """The lines of a robot as they are, or corrected."""
+    if calibration is None:
+        return odometry, seen
+    return calibration.odometry(odometry), calibration.measurements(seen)
