@@ -17,6 +17,7 @@ from jaxslam.graphs.factor import (
 )
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.log import of_log
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "check_graph",
     "from_motion",
     "from_sensor",
+    "of_log",
     "prior",
     "read",
     "relative_pose",
