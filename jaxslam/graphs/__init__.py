@@ -18,6 +18,7 @@ from jaxslam.graphs.factor import (
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.log import of_log
+from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Table",
     "bearing",
     "check_graph",
+    "degrees_of_freedom",
     "from_motion",
     "from_sensor",
     "of_log",
@@ -34,6 +36,7 @@ __all__ = [
     "read",
     "relative_pose",
     "relative_position",
+    "squared_residuals",
     "starts",
     "with_gauge",
     "write",

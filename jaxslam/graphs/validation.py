@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.factor import Factor, of_files
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.validation.numbers import is_concrete
 
@@ -156,8 +156,8 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
     told += f", … ({len(members):,} variables)" if len(members) > 3 else ""
     if len(parts.anchored) == 1:
         raise ValueError(
-            f"{name}: the graph has no gauge: fix a pose (fixed_pose, FIX in a file) or give one a "
-            "prior"
+            f"{name}: the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
+            "give one a prior"
         )
     raise ValueError(
         f"{name}: the graph is disconnected: {told} have no measurement that joins them to a fixed "
@@ -165,14 +165,13 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
     )
 
 
-def with_gauge(graph: Graph, factors: Mapping[str, Factor]) -> tuple[Graph, int | None]:
-    """The graph with a gauge, and the index of the pose that was fixed for it.
+def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Graph:
+    """The graph with its first pose fixed, if no variable is and no measurement is of one pose.
 
-    The first pose is fixed where no variable is and no measurement is of one pose alone; else
-    (None) the graph is as it was.
+    Else it is the graph itself: the same object.
     """
-    if not len(graph.poses) or parts_of(graph, factors).anchored.any():
-        return graph, None
+    if not len(graph.poses) or parts_of(graph, factors or of_files()).anchored.any():
+        return graph
     fixed: Any = np.asarray(graph.fixed_pose).copy()
     fixed[0] = True
-    return graph._replace(fixed_pose=fixed), 0
+    return graph._replace(fixed_pose=fixed)
