@@ -7,23 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxslam.datasets.lines import read_bytes
 from jaxslam.records import TAG, UNITS, Table, split_unit, unit_divisor
 
 
 class CsvTable:
     """The cells of a CSV file (UTF-8, separated by commas, any line ends) below its header.
 
-    Every column but `tag` has its unit in the header, as in `v [m/s]`. Raises ValueError where the
+    It is NAME or NAME.gz. Every column but `tag` has its unit in the header, as in `v [m/s]`. Raises ValueError where the
     file cannot be read, has no line below its header, or a line with another number of cells.
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path, data = read_bytes(path)
         try:
-            data = self.path.read_bytes()
             text = data.decode("utf-8-sig")
-        except OSError as problem:
-            raise ValueError(f"{self.path}: cannot be read: {problem.strerror}") from problem
         except UnicodeDecodeError as problem:
             line = data.count(b"\n", 0, problem.start) + 1
             raise ValueError(f"{self.path}:{line}: expected text in UTF-8") from problem

@@ -1,24 +1,43 @@
-"""Text files read line by line, with errors of the form `path:line: reason`."""
+"""Text files, packed by gzip or not, read line by line; errors as `path:line: reason`."""
 
+import gzip
 import math
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 
+def stored(path: str | Path) -> Path | None:
+    """The file NAME, else NAME.gz beside it, else None."""
+    path = Path(path)
+    return next((one for one in (path, Path(f"{path}.gz")) if one.exists()), None)
+
+
+def read_bytes(path: str | Path) -> tuple[Path, bytes]:
+    """The file that is read, NAME or else NAME.gz, and its bytes, unpacked where it ends in .gz.
+
+    Raises ValueError, `path: cannot be read: reason`, where neither can be read, and where a packed
+    file is damaged or ends early.
+    """
+    found = stored(path) or Path(path)
+    try:
+        data = found.read_bytes()
+        return found, gzip.decompress(data) if found.suffix == ".gz" else data
+    except (OSError, EOFError, zlib.error) as problem:
+        reason = getattr(problem, "strerror", None) or f"expected a gzip file, but {problem}"
+        raise ValueError(f"{found}: cannot be read: {reason}") from problem
+
+
 class TextFile:
-    """The lines of a small table in a text file.
+    """The lines of a small table in a text file, NAME or NAME.gz.
 
     Iteration yields (line number from 1, fields split at white space), without blank lines and
     lines that start with `comment`. Raises ValueError where the file cannot be read.
     """
 
     def __init__(self, path: str | Path, comment: str | None = None) -> None:
-        self.path = Path(path)
+        self.path, data = read_bytes(path)
         self.comment = comment
-        try:
-            data = self.path.read_bytes()
-        except OSError as problem:
-            raise ValueError(f"{self.path}: cannot be read: {problem.strerror}") from problem
         try:
             self.lines = data.decode("utf-8").split("\n")
         except UnicodeDecodeError as problem:

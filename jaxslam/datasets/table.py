@@ -7,6 +7,7 @@ import numpy as np
 from jaxslam import records
 from jaxslam.datasets.csv_table import CsvTable
 from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.lines import stored
 from jaxslam.datasets.settings import Settings
 from jaxslam.records import POSE, TAG, TIME
 from jaxslam.streams import interpolate_poses
@@ -40,7 +41,8 @@ def table(folder: str | Path) -> Dataset:
     What is left out has a default, listed in `Dataset.assumed`. The log is `Log.from_records`. The
     noise of the motion is that of a line of odometry; a row that is shorter or longer has white
     noise of the same density. The start is that of the truth, where this covers the first row; then
-    all is in one frame. Other columns are not used, and listed.
+    all is in one frame. Other columns are not used, and listed. A CSV file may be packed by gzip,
+    as `truth.csv.gz`; where both are there the plain one is read.
 
     Args:
         folder: where the files are.
@@ -108,7 +110,7 @@ def table(folder: str | Path) -> Dataset:
 
 def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
     """The position of each tag; None where there is no file."""
-    if not path.exists():
+    if stored(path) is None:
         return None
     found = CsvTable(path).table((TAG, *POSE[:2]), "of landmarks")
     survey: dict[int, tuple[float, float]] = {}
@@ -122,7 +124,7 @@ def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
 
 def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
     """The true pose at each row (T, 3), and in which rows it is known (T,); None without a file."""
-    if not path.exists():
+    if stored(path) is None:
         return None, None
     found = CsvTable(path).table((TIME, *POSE), "of a true path")
     records.check_times(found, strict=True)

@@ -1,9 +1,38 @@
-"""Graphs of poses and points: files, factors, optimization, marginals."""
+"""Graphs of poses and points: files, factors, optimization, marginals.
 
-from jaxslam.graphs.factor import Factor, from_sensor, prior, relative_pose
+The cost of a graph is χ² = Σ eᵀ Ω e over the valid rows of its tables, without a factor ½; of a
+relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without a logarithm.
+"""
+
+from jaxslam.graphs import starts
+from jaxslam.graphs.factor import (
+    REGISTRY,
+    Factor,
+    bearing,
+    from_motion,
+    from_sensor,
+    prior,
+    relative_pose,
+    relative_position,
+)
+from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.validation import check_graph, with_gauge
 
-REGISTRY = {"prior": prior, "relative_pose": relative_pose}
-"""Factories of the factors of files, by the name of their table; none has parameters."""
-
-__all__ = ["REGISTRY", "Factor", "Graph", "Table", "from_sensor", "prior", "relative_pose"]
+__all__ = [
+    "REGISTRY",
+    "Factor",
+    "Graph",
+    "Table",
+    "bearing",
+    "check_graph",
+    "from_motion",
+    "from_sensor",
+    "prior",
+    "read",
+    "relative_pose",
+    "relative_position",
+    "starts",
+    "with_gauge",
+    "write",
+]

@@ -1,9 +1,11 @@
 """Text files line by line: numbers, identities, and errors that say where."""
 
+import gzip
+
 import pytest
 from recordings import assert_error
 
-from jaxslam.datasets.lines import TextFile
+from jaxslam.datasets.lines import TextFile, read_bytes, stored
 
 
 def text_file(path, text, *options):
@@ -53,3 +55,29 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
         TextFile(tmp_path / "f")
     with pytest.raises(ValueError, match="cannot be read"):
         TextFile(tmp_path)
+
+
+def test_a_packed_file_is_read_as_it_is_and_errors_name_it(tmp_path):
+    (tmp_path / "f.gz").write_bytes(gzip.compress(b"1 2\n3 x\n"))
+    assert stored(tmp_path / "f") == tmp_path / "f.gz"
+    for name in ("f", "f.gz"):
+        file = TextFile(tmp_path / name)
+        assert list(file) == [(1, ["1", "2"]), (2, ["3", "x"])]
+        reason = "b is not a finite number: 'x'"
+        read = lambda file=file: file.numbers(2, ["3", "x"], ("a", "b"))  # noqa: E731
+        assert_error(tmp_path / "f.gz", 2, reason, read)
+    (tmp_path / "f").write_bytes(b"plain")
+    assert read_bytes(tmp_path / "f") == (tmp_path / "f", b"plain")
+    assert stored(tmp_path / "g") is None
+
+
+PACKED = gzip.compress(b"1 2\n" * 100)
+
+
+@pytest.mark.parametrize(
+    "damaged", [b"1 2\n", PACKED[:-9], PACKED[:20], b"\x1f\x8b\x08" + b"\xff" * 30]
+)
+def test_a_packed_file_that_is_damaged_is_named(tmp_path, damaged):
+    (tmp_path / "f.gz").write_bytes(damaged)
+    with pytest.raises(ValueError, match=f"{tmp_path}/f.gz: cannot be read: expected a gzip file"):
+        TextFile(tmp_path / "f")

@@ -1,5 +1,8 @@
 """`datasets.table`: little files by hand, settings and their defaults, and errors that say where."""
 
+import gzip
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -92,6 +95,24 @@ def test_windows_lines_degrees_and_other_columns(tmp_path):
     for found, expected in zip(jax.tree.leaves(data.log), jax.tree.leaves(plain.log), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-15)
     assert "column 'note' of measurements.csv is not used" in data.assumed
+
+
+def test_packed_tables_are_read_as_they_are(tmp_path):
+    """The same data set, and an error that names the packed file."""
+    plain = datasets.table(write(tmp_path, OWN | TRUTH))
+    for name in OWN | TRUTH:
+        (tmp_path / f"{name}.gz").write_bytes(gzip.compress((tmp_path / name).read_bytes()))
+        (tmp_path / name).unlink()
+    data = datasets.table(tmp_path)
+    assert (data.tags, data.assumed) == (plain.tags, plain.assumed)
+    for name in ("log", "pose", "landmarks", "true_path"):
+        for pair in zip(*(jax.tree.leaves(getattr(d, name)) for d in (data, plain)), strict=True):
+            np.testing.assert_array_equal(*pair)
+    spoiled = OWN["odometry.csv"].replace("1.2,1.0", "1.2,nan").encode()
+    (tmp_path / "odometry.csv.gz").write_bytes(gzip.compress(spoiled))
+    place = re.escape(f"{tmp_path / 'odometry.csv.gz'}:3: column 2 (v [m/s]): expected a finite")
+    with pytest.raises(ValueError, match=place):
+        datasets.table(tmp_path)
 
 
 def test_the_truth_gives_the_start_and_the_frame(tmp_path):
