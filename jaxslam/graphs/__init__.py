@@ -17,17 +17,30 @@ from jaxslam.graphs.factor import (
 )
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
+from jaxslam.graphs.optimize import Ending, Solution, chi2, optimize
+from jaxslam.graphs.plan import Plan, plan
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [
     "REGISTRY",
+    "Ending",
     "Factor",
     "Graph",
+    "Kernel",
+    "Plan",
+    "Solution",
     "Table",
     "bearing",
+    "cauchy",
     "check_graph",
+    "chi2",
+    "dcs",
     "from_motion",
     "from_sensor",
+    "huber",
+    "optimize",
+    "plan",
     "prior",
     "read",
     "relative_pose",

@@ -4,6 +4,7 @@ Arrays have the batch B as their last axis: matrices of one pattern share every 
 operation runs over contiguous numbers of all of them.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -11,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.graphs.sparse.symbolic import Pattern
 from jaxslam.graphs.sparse.sweeps import (
     TARGETS,
     Sums,
@@ -22,7 +22,9 @@ from jaxslam.graphs.sparse.sweeps import (
     places,
     subtract_products,
     sweep,
+    table,
 )
+from jaxslam.graphs.sparse.symbolic import Pattern
 from jaxslam.math.linalg import total
 
 
@@ -73,18 +75,22 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Int[np.ndarray, "
     factor = sweep(sums, place, place, one[np.append(columns, size)])
     # Columns are sorted by height: those of a level lie side by side.
     first = np.searchsorted(heights, np.arange(heights[-1] + 2)).tolist()
-    chunks = [range(low, high, TARGETS) for low, high in zip(first[:-1], first[1:], strict=True)]
+    chunks = [range(low, high, TARGETS) for low, high in pairwise(first)]
     below = np.flatnonzero(rows > columns)
     downward = Sums(heights, rows[below], below, columns[below])
     upward = Sums(heights[-1] - heights, columns[below], below, rows[below])
-    substitutions = []
-    for sums in (downward, upward):
-        there, at = places(sums)
-        substitutions += [sweep(sums, place, at, one), there.astype(np.int32)]
-    diagonal = place[pattern.first[:-1]].astype(np.int32)
-    pivots = np.cumsum([0, *map(len, chunks)]).astype(np.int32)
-    pivot_base = np.concatenate(chunks).astype(np.int32)
-    return CholeskyTables(factor, diagonal, pivots, pivot_base, *substitutions), order
+    forward_order, forward_place = places(downward)
+    backward_order, backward_place = places(upward)
+    return CholeskyTables(
+        factor,
+        diagonal=table(place[pattern.first[:-1]]),
+        pivots=table(np.cumsum([0, *map(len, chunks)])),
+        pivot_base=table(np.concatenate(chunks)),
+        forward=sweep(downward, place, forward_place, one),
+        forward_order=table(forward_order),
+        backward=sweep(upward, place, backward_place, one),
+        backward_order=table(backward_order),
+    ), order
 
 
 def by_transposed(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -106,9 +112,7 @@ def _transposed_on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
     return total(a[:, m] * x[:, m, None] for m in range(a.shape[2]))
 
 
-def factorize(
-    tables: CholeskyTables, blocks: Float[Array, "M d d B"]
-) -> Factored:
+def factorize(tables: CholeskyTables, blocks: Float[Array, "M d d B"]) -> Factored:
     """The factor of a matrix, from its blocks at their places (lower triangle).
 
     A pivot that rounding may have left of zero, beside the matrix's own diagonal entry, makes its

@@ -1,9 +1,9 @@
 """Sums of rows by target, as gathers: no scatter, and the same order of terms on every device."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from jaxslam.graphs.sparse.sweeps import table
 
 TERMS = 4
 
@@ -17,16 +17,16 @@ def stages(target: Int[np.ndarray, "rows"], size: int) -> Stages:
     """
     used = np.flatnonzero(target >= 0)
     numbers = used[np.argsort(target[used], kind="stable")]
-    absent, owner, out = len(target), target[numbers], []
+    absent, owner, out = len(target), target[numbers], list[Array]()
     while True:
         counts = np.bincount(owner, minlength=size)
         last = counts.max(initial=0) <= TERMS
         groups = np.ones(size, int) if last else -(-counts // TERMS)
         begin, group_begin = np.cumsum(counts) - counts, np.cumsum(groups) - groups
-        table = np.full((groups.sum(), TERMS), absent, np.int32)
+        sums = np.full((groups.sum(), TERMS), absent, np.int32)
         rank = np.arange(len(owner)) - begin[owner]
-        table[group_begin[owner] + rank // TERMS, rank % TERMS] = numbers
-        out.append(table)
+        sums[group_begin[owner] + rank // TERMS, rank % TERMS] = numbers
+        out.append(table(sums))
         if last:
             return tuple(out)
         owner = np.repeat(np.arange(size), groups)
@@ -35,7 +35,7 @@ def stages(target: Int[np.ndarray, "rows"], size: int) -> Stages:
 
 def summed(stages: Stages, rows: Float[Array, "rows *rest"]) -> Float[Array, "size *rest"]:
     """The sums of the rows of each target; zero where it has none."""
-    for table in stages:
-        taken = rows.at[table].get(mode="fill", fill_value=0)
+    for sums in stages:
+        taken = rows.at[sums].get(mode="fill", fill_value=0)
         rows = taken[:, 0] + taken[:, 1] + (taken[:, 2] + taken[:, 3])
     return rows

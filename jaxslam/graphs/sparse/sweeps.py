@@ -53,6 +53,12 @@ class Sweep(NamedTuple):
     """what a target is finished with"""
 
 
+def table(numbers: np.ndarray) -> Array:
+    """A table of integers or flags, on the device."""
+    kept = numbers if numbers.dtype == bool else numbers.astype(np.int32)
+    return jnp.asarray(jax.device_put(kept))
+
+
 def places(sums: Sums) -> tuple[Ints, Ints]:
     """The target at each place (M,), and the place of each target and of no target (M+1,)."""
     count = np.bincount(sums.target, minlength=len(sums.level))
@@ -93,33 +99,32 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
     for low, high in zip(first[:-1].tolist(), first[1:].tolist(), strict=True):
         for shift in range(0, int(count[low]), TERMS):
             stop = low + int(np.count_nonzero(count[low:high] > shift))
-            chunks += [(base, shift, stop) for base in range(low, stop, TARGETS)]
+            chunks += [(first_place, shift, stop) for first_place in range(low, stop, TARGETS)]
         rounds.append(len(chunks))
         end_base += range(low, high, TARGETS)
         ends.append(len(end_base))
-    base, shift, stop = np.array(chunks, int).reshape(-1, 3).T
-    place = base[:, None] + np.arange(TARGETS)
+    bases, shifts, stops = np.array(chunks, int).reshape(-1, 3).T
+    place = bases[:, None] + np.arange(TARGETS)
     there = np.minimum(place, size - 1)[..., None]
-    term = shift[:, None, None] + np.arange(TERMS)
-    real = (place < stop[:, None])[..., None] & (term < count[there])
+    term = shifts[:, None, None] + np.arange(TERMS)
+    real = (place < stops[:, None])[..., None] & (term < count[there])
     product = by_target[np.where(real, begin[there] + term, -1)]
     end_place = np.array(end_base, int)[:, None] + np.arange(TARGETS)
     inside = end_place < np.repeat(first[1:], np.diff(ends))[:, None]
     ending = order[np.minimum(end_place, size - 1)]
 
-    def factors(numbers: Ints, place: Ints) -> Ints:
-        return place[np.where(real, np.append(numbers, 0)[product], -1)]
+    def factors(numbers: Ints, place: Ints) -> Array:
+        return table(place[np.where(real, np.append(numbers, 0)[product], -1)])
 
-    tables = (
-        np.array(rounds),
-        base,
+    return Sweep(
+        table(np.array(rounds)),
+        table(bases),
         factors(sums.left, left),
         factors(sums.right, right),
-        np.array(ends),
-        np.array(end_base, int),
-        end[np.where(inside, ending, -1)],
+        table(np.array(ends)),
+        table(np.array(end_base, int)),
+        table(end[np.where(inside, ending, -1)]),
     )
-    return Sweep(*(table.astype(np.int32) for table in tables))
 
 
 def subtract_products(
@@ -140,7 +145,9 @@ def subtract_products(
             held = held - product(a[:, k], b[:, k])
         return jax.lax.dynamic_update_slice_in_dim(target, held, tables.base[c], 0)
 
-    out: jax.Array = jax.lax.fori_loop(tables.rounds[level], tables.rounds[level + 1], chunk, target)
+    out: jax.Array = jax.lax.fori_loop(
+        tables.rounds[level], tables.rounds[level + 1], chunk, target
+    )
     return out
 
 

@@ -3,6 +3,7 @@
 All of it is NumPy on the host, done once for a pattern of variables and measurements.
 """
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +12,7 @@ from jaxtyping import Int
 
 from jaxslam.graphs.sparse.ordering import minimum_degree
 
-Ints = Int[np.ndarray, "?n"]
+Ints = Int[np.ndarray, "_"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,21 +34,22 @@ class Pattern:
     @cached_property
     def position(self) -> Ints:
         """The column of each variable, (n,)."""
-        out = np.empty_like(self.order)
+        out = np.empty(len(self.order), int)
         out[self.order] = np.arange(len(self.order))
         return out
 
     @cached_property
     def first(self) -> Ints:
         """The first block of each column, its diagonal one, (n+1,); the last is B."""
-        return np.searchsorted(self.columns, np.arange(len(self.order) + 1))
+        out: Ints = np.searchsorted(self.columns, np.arange(len(self.order) + 1))
+        return out
 
     def find(self, rows: Ints, columns: Ints) -> Ints:
         """The blocks at these places, each of which must exist."""
         size = len(self.order)
         keys = self.columns * size + self.rows
         wanted = columns * size + rows
-        found = np.searchsorted(keys, wanted)
+        found: Ints = np.searchsorted(keys, wanted)
         if len(wanted) and (found.max() >= len(keys) or (keys[found] != wanted).any()):
             raise ValueError("graphs: a block is not in the pattern of the plan")
         return found
@@ -80,10 +82,10 @@ def factor_pattern(size: int, first: Ints, second: Ints) -> Pattern:
         if low != high:
             below[low].add(high)
     height = [0] * size
-    for column, rows in enumerate(below):
-        if rows:
-            parent = min(rows)
-            below[parent] |= rows
+    for column, under_it in enumerate(below):
+        if under_it:
+            parent = min(under_it)
+            below[parent] |= under_it
             below[parent].discard(parent)
             height[parent] = max(height[parent], height[column] + 1)
     heights = np.array(height)
@@ -92,10 +94,9 @@ def factor_pattern(size: int, first: Ints, second: Ints) -> Pattern:
     column_of = np.empty(size, int)
     column_of[again] = np.arange(size)
     counts = [len(rows) for rows in below]
-    columns = np.concatenate([np.arange(size), np.repeat(np.arange(size), counts)])
-    rows = np.concatenate(
-        [np.arange(size), np.fromiter((r for rows in below for r in rows), int, sum(counts))]
-    )
-    rows, columns = column_of[rows], column_of[columns]
+    every = np.arange(size)
+    under = np.fromiter(itertools.chain.from_iterable(below), int, sum(counts))
+    columns = column_of[np.concatenate([every, np.repeat(every, counts)])]
+    rows = column_of[np.concatenate([every, under])]
     blocks = np.lexsort((rows, columns))
     return Pattern(order[again], heights[again], rows[blocks], columns[blocks])
