@@ -17,21 +17,34 @@ from jaxslam.graphs.factor import (
 )
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
 from jaxslam.graphs.log import of_log
+from jaxslam.graphs.optimize import Ending, Solution, chi2, optimize
+from jaxslam.graphs.plan import Plan, plan
 from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [
     "REGISTRY",
+    "Ending",
     "Factor",
     "Graph",
+    "Kernel",
+    "Plan",
+    "Solution",
     "Table",
     "bearing",
+    "cauchy",
     "check_graph",
+    "chi2",
+    "dcs",
     "degrees_of_freedom",
     "from_motion",
     "from_sensor",
+    "huber",
     "of_log",
+    "optimize",
+    "plan",
     "prior",
     "read",
     "relative_pose",

@@ -20,10 +20,7 @@ def squared_residuals(
     degrees of freedom. factors: as for `optimize`.
     """
     factors = factors or of_files()
-    found: dict[str, Float[Array, "E"]] = programs.call(
-        _squared, tuple(factors[key] for key in sorted(graph.tables)), graph
-    )
-    return found
+    return programs.call(_squared, tuple(factors[key] for key in sorted(graph.tables)), graph)
 
 
 def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None) -> int:

@@ -1,6 +1,7 @@
 """The figure of a graph before and after its optimization."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -99,10 +100,24 @@ def _draw(
     worst = np.concatenate([np.zeros((0, 2, 2)), *bad])
     if len(worst):
         axes.add_collection(LineCollection(list(worst), colors=COLORS[1], linewidths=1.4, zorder=5))
-        ring = {"ls": "none", "mfc": "none", "mec": COLORS[1], "mew": 0.9, "ms": 5, "zorder": 5}
+        ring: dict[str, Any] = {
+            "ls": "none",
+            "mfc": "none",
+            "mec": COLORS[1],
+            "mew": 0.9,
+            "ms": 5,
+            "zorder": 5,
+        }
         label = f"{len(worst)} largest residuals"
         axes.plot(*worst.mean(axis=1).T, marker="o", label=label, **ring)
-    start = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5, "zorder": 6}
+    start: dict[str, Any] = {
+        "ls": "none",
+        "color": INK,
+        "mfc": "white",
+        "mew": 1.2,
+        "ms": 5,
+        "zorder": 6,
+    }
     axes.plot(*poses[0], marker="o", label="first pose", **start)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.04)
