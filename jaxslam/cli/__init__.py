@@ -18,7 +18,7 @@ from jaxslam.cli.common import INTERRUPTED, as_folders
 from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
-from jaxslam.cli.optimize import CONVENTION, optimize_graph
+from jaxslam.cli.optimize import COST, ERRORS, optimize_graph
 from jaxslam.datasets import READERS
 from jaxslam.datasets.settings import METHODS
 from jaxslam.graphs.kernels import REGISTRY as KERNELS
@@ -98,8 +98,8 @@ def _parser() -> argparse.ArgumentParser:
             help="optimize a pose or landmark graph in a file",
             description="Optimize a graph in a file of g2o or TORO. Prints a table and writes the "
             "poses, the optimized graph, a summary and a figure. The cost is "
-            f"{CONVENTION}. The exit status is 1 if the optimization did not converge, 2 if the "
-            "file cannot be used.",
+            f"{COST} {ERRORS['pose'][1]}. The exit status is 1 if the optimization did not "
+            "converge, 2 if the file cannot be used.",
         )
     )
     _add_verify(
@@ -247,6 +247,7 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
         ("start", "given", STARTS, "where to start"),
         ("method", "levenberg_marquardt", STEPS, "the steps"),
         ("kernel", None, KERNELS, "a robust kernel for all measurements"),
+        ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
     ):
         parser.add_argument(
             f"--{name}",

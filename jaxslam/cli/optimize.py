@@ -19,10 +19,13 @@ from jaxslam.graphs.validation import label, variables_of
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, csv_text, json_text, versions, write_files
 
-CONVENTION = (
-    "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"
-)
-"""The cost that is minimized and printed."""
+ERRORS = {
+    "pose": (graphs.relative_pose, "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),
+    "log": (graphs.relative_pose_log, "e = log(Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ))"),
+}
+"""The residual of a relative pose by its name: g2o's, and GTSAM's."""
+
+COST = "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses"
 
 NOT_CONVERGED = 1
 WORST = 10
@@ -33,9 +36,11 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     """Optimize a graph, print and write the result; returns the exit status, 1 if not converged."""
     start = pick("start", options.start, starts.STARTS)
     kernel = None if options.kernel is None else pick("kernel", options.kernel, kernels.REGISTRY)()
+    relative, equation = pick("error", options.error, ERRORS)
     loaded = g2o.load(options.path)
     check_writable(options.out)
-    factors = {key: of_files()[key] for key in loaded.graph.tables}
+    known = {**of_files(), "relative_pose": relative()}
+    factors = {key: known[key] for key in loaded.graph.tables}
     given = graphs.with_gauge(loaded.graph, factors)
     graphs.check_graph(str(options.path), given, factors)
     begun = start(given, factors)
@@ -58,7 +63,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     summary = {
         "file": str(options.path),
         "command": command,
-        "cost": CONVENTION,
+        "cost": f"{COST} {equation}",
         "poses": len(found.poses),
         "points": len(found.points),
         "edges": {key: int(table.valid.sum()) for key, table in found.tables.items()},

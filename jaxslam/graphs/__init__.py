@@ -13,6 +13,7 @@ from jaxslam.graphs.factor import (
     from_sensor,
     prior,
     relative_pose,
+    relative_pose_log,
     relative_position,
 )
 from jaxslam.graphs.files import read, write
@@ -48,6 +49,7 @@ __all__ = [
     "prior",
     "read",
     "relative_pose",
+    "relative_pose_log",
     "relative_position",
     "squared_residuals",
     "starts",
