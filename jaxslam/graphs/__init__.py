@@ -18,8 +18,9 @@ from jaxslam.graphs.factor import (
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
-from jaxslam.graphs.optimize import Ending, Solution, chi2, optimize
+from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
+from jaxslam.graphs.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [
