@@ -23,6 +23,7 @@ from jaxslam.graphs.log import of_log
 from jaxslam.graphs.optimize import Ending, Solution, chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
 from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
+from jaxslam.graphs.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [

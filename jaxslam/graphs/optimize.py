@@ -2,13 +2,12 @@
 
 import functools
 from collections.abc import Mapping
-from enum import IntEnum
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
@@ -16,55 +15,14 @@ from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.kernels import Kernel
 from jaxslam.graphs.linearized import (
     Model,
-    Variables,
     cost,
     data_of,
-    linearize,
-    retract,
     variables_of,
 )
 from jaxslam.graphs.plan import Plan, factors_of, plan_for
-from jaxslam.graphs.steps import METHODS, damped, dot
+from jaxslam.graphs.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
 from jaxslam.validation.numbers import check_count
-
-FIRST_DAMPING = 1e-4
-"""λ of the first step, as a share of the diagonal."""
-
-
-class Ending(IntEnum):
-    """The reason for the end of the iterations: the `status` of a `Solution`."""
-
-    CONVERGED = 0
-    """The next step lowers χ² by less than the tolerance, and the information is regular."""
-    STALLED = 1
-    """No step lowers χ²: rounding, or a residual whose derivatives are wrong."""
-    DIVERGED = 2
-    """χ² is not finite, or Gauss-Newton ended above its start."""
-    SINGULAR = 3
-    """The measurements do not determine the variable `singular`; where the method damps its steps
-    it went on and χ² is a minimum."""
-    EXHAUSTED = 4
-    """All iterations were made."""
-
-
-class Solution(NamedTuple):
-    """What `optimize` found; leading axes by `vmap`."""
-
-    graph: Graph
-    """with poses and points of the last iterate"""
-    chi2: Float[Array, ""]
-    """χ² = Σ ρ(eᵀ Ω e), without a factor ½"""
-    status: Int[Array, ""]
-    """an `Ending`"""
-    iterations: Int[Array, ""]
-    """steps that were tried"""
-    singular: Int[Array, ""]
-    """the first variable that the measurements do not determine, poses before points; -1: none"""
-    chi2_start: Float[Array, ""]
-    gradient: Float[Array, ""]
-    """length of ½ ∂χ²/∂(increments) at the last iterate"""
-    gradient_start: Float[Array, ""]
 
 
 @functools.lru_cache(maxsize=256)
@@ -170,20 +128,6 @@ def _with_batch(tree: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x)[..., None], tree)
 
 
-class Search(NamedTuple):
-    """The state of the iterations; every array but the variables is (B,)."""
-
-    variables: Variables
-    chi2: Float[Array, "B"]
-    damping: Float[Array, "B"]
-    going: Bool[Array, "B"]
-    ending: Int[Array, "B"]
-    taken: Int[Array, "B"]
-    singular: Int[Array, "B"]
-    refused: Bool[Array, "B"]
-    """no undamped step lowers χ² from here"""
-
-
 def _optimize(
     model: Model, method: str, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
@@ -201,7 +145,7 @@ def _batched(model: Model, method: str) -> Any:
 
     @jax.custom_batching.custom_vmap
     def solve(shared: tuple[Plan, Array, Array], graph: Graph) -> Solution:
-        return _solve(model, method, *shared, graph)
+        return minimize(model, method, *shared, graph)
 
     @solve.def_vmap
     def rule(size: int, batched: Any, shared: Any, graph: Graph) -> tuple[Solution, Any]:
@@ -223,106 +167,3 @@ def _batched(model: Model, method: str) -> Any:
         return out, jax.tree.map(lambda _: True, out)
 
     return solve
-
-
-def _solve(
-    model: Model, method: str, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
-) -> Solution:
-    data = data_of(graph, plan.column)
-    start = variables_of(graph)
-    first = linearize(model, plan, start, data)
-    batch, dtype = first.chi2.shape, first.chi2.dtype
-    eps = float(jnp.finfo(dtype).eps)
-    finite = jnp.isfinite(first.chi2)
-    none = jnp.zeros(batch, jnp.int32)
-    begin = Search(
-        variables=start,
-        chi2=first.chi2,
-        damping=jnp.full(batch, FIRST_DAMPING if method == "levenberg_marquardt" else 0.0, dtype),
-        going=finite,
-        ending=jnp.where(finite, none + Ending.EXHAUSTED, none + Ending.DIVERGED),
-        taken=none,
-        singular=none - 1,
-        refused=jnp.zeros(batch, bool),
-    )
-
-    def again(search: Search) -> Array:
-        return search.going.any()
-
-    def iterate(search: Search) -> Search:
-        system = linearize(model, plan, search.variables, data)
-        step = damped(plan.cholesky, system, plan.on_diagonal, search.damping)
-        moved = retract(search.variables, step.increments, plan)
-        value = cost(model, plan.who, moved, data)
-        regular = step.regular.all(axis=0)
-        culprit = plan.order[jnp.argmin(step.regular, axis=0)].astype(jnp.int32)
-        least = jnp.maximum(tolerance, 32 * eps) * (search.chi2 + 1)
-        small = regular & (step.predicted <= least)
-        finite = jnp.isfinite(value)
-        ratio = (search.chi2 - value) / jnp.where(step.predicted > 0, step.predicted, 1.0)
-        if method == "gauss_newton":
-            good = regular & finite
-            ending = jnp.where(small, Ending.CONVERGED, search.ending)
-            ending = jnp.where(regular, ending, Ending.SINGULAR)
-            ending = jnp.where(regular & ~finite, Ending.DIVERGED, ending)
-            done = small | ~good
-            damping = search.damping
-            singular = jnp.where(regular, search.singular, culprit)
-        else:
-            good = regular & finite & (value <= search.chi2) & (small | (ratio > 1e-3))
-            plain = search.damping == 0
-            known = search.singular >= 0
-            singular = jnp.where(plain & ~regular & ~known, culprit, search.singular)
-            known = singular >= 0
-            done = small & (plain | known | search.refused)
-            ending = jnp.where(small & plain, Ending.CONVERGED, search.ending)
-            ending = jnp.where(small & ~plain & search.refused, Ending.STALLED, ending)
-            ending = jnp.where(small & known, Ending.SINGULAR, ending)
-            lost = ~good & (search.damping > 1e8)
-            ending = jnp.where(lost & ~done, Ending.STALLED, ending)
-            done = done | lost
-            lower = jnp.where(
-                search.damping < 1e-8, jnp.where(known, search.damping, 0.0), search.damping / 30
-            )
-            damping = jnp.where(ratio > 0.5, lower, search.damping)
-            damping = jnp.where(good & (ratio < 0.1), jnp.maximum(3 * search.damping, 0), damping)
-            damping = jnp.where(good, damping, jnp.maximum(10 * search.damping, 1e-4))
-            damping = jnp.where(small & ~known, 0.0, damping)
-        take = search.going & good
-        refused = jnp.where(take, False, search.refused | (~good & regular & (search.damping == 0)))
-        taken = search.taken + search.going
-        spent = taken >= iterations
-        variables = jax.tree.map(
-            lambda new, old: jnp.where(take[None, None], new, old), moved, search.variables
-        )
-        after = Search(
-            variables=variables,
-            chi2=jnp.where(take, value, search.chi2),
-            damping=damping,
-            going=search.going & ~done & ~spent,
-            ending=ending.astype(jnp.int32),
-            taken=taken,
-            singular=singular,
-            refused=refused,
-        )
-        held = jax.tree.map(
-            lambda new, old: jnp.where(search.going, new, old), after[1:], search[1:]
-        )
-        return Search(variables, *held)
-
-    end = jax.lax.while_loop(again, iterate, begin)
-    last = linearize(model, plan, end.variables, data).gradient
-    ending = end.ending
-    if method == "gauss_newton":
-        rose = (ending == Ending.EXHAUSTED) & (end.chi2 > first.chi2)
-        ending = jnp.where(rose, Ending.DIVERGED, ending)
-    return Solution(
-        graph=graph._replace(poses=end.variables.poses, points=end.variables.points),
-        chi2=end.chi2,
-        status=ending,
-        iterations=end.taken,
-        singular=end.singular,
-        chi2_start=first.chi2,
-        gradient=jnp.sqrt(dot(last, last)),
-        gradient_start=jnp.sqrt(dot(first.gradient, first.gradient)),
-    )

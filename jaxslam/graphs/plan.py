@@ -32,6 +32,7 @@ class Plan(NamedTuple):
     gradient: Stages
     """from (row, variable) of all tables to columns"""
     block_column: Int[Array, "M"]
+    block_row: Int[Array, "M"]
     on_diagonal: Bool[Array, "M"]
     cholesky: CholeskyTables
 
@@ -95,6 +96,7 @@ def plan(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Plan:
         information=stages(np.concatenate(blocks), len(order)),
         gradient=stages(np.concatenate([column.ravel() for column in columns]), size),
         block_column=table(block_column),
+        block_row=table(block_row),
         on_diagonal=table(block_row == block_column),
         cholesky=cholesky,
     )

@@ -85,7 +85,7 @@ def dense(graph, steps=15):
     return poses, np.einsum("er,ers,es->", e, table.information, e), hessian, gradient
 
 
-@pytest.mark.parametrize("method", ["levenberg_marquardt", "gauss_newton"])
+@pytest.mark.parametrize("method", ["levenberg_marquardt", "gauss_newton", "dogleg"])
 def test_the_optimum_is_that_of_dense_gauss_newton(method):
     graph = ring()
     poses, chi2, _, _ = dense(graph)
