@@ -22,8 +22,8 @@ from jaxslam.cli.optimize import COST, ERRORS, optimize_graph
 from jaxslam.datasets import READERS
 from jaxslam.datasets.settings import METHODS
 from jaxslam.graphs.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.search import METHODS as STEPS
 from jaxslam.graphs.starts import STARTS
-from jaxslam.graphs.steps import METHODS as STEPS
 from jaxslam.results.campaign_files import FORMATS
 from jaxslam.simulation.scenarios import SCENARIOS
 

@@ -117,7 +117,7 @@ def _status(solution: graphs.Solution, found: Graph) -> str:
     """The status in words, with the variable that is not determined."""
     ending = Ending(int(solution.status))
     if ending != Ending.SINGULAR:
-        return ending.name.lower()
+        return str(ending.name.lower())
     return f"singular: the measurements do not determine {label(found, int(solution.singular))}"
 
 

@@ -20,7 +20,7 @@ from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
 from jaxslam.graphs.log import of_log
-from jaxslam.graphs.optimize import Ending, Solution, chi2, optimize
+from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
 from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
 from jaxslam.graphs.search import Ending, Solution

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam import programs
-from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.plan import factors_of
 
 
 def squared_residuals(
@@ -19,13 +20,13 @@ def squared_residuals(
     Of a row with R residuals, at the truth and with the right Ω, it is χ² distributed with R
     degrees of freedom. factors: as for `optimize`.
     """
-    factors = factors or of_files()
+    factors = factors_of("graphs.squared_residuals", graph, factors)
     return programs.call(_squared, tuple(factors[key] for key in sorted(graph.tables)), graph)
 
 
 def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None) -> int:
     """The residuals of all valid rows minus the free numbers of poses and points."""
-    factors = factors or of_files()
+    factors = factors_of("graphs.degrees_of_freedom", graph, factors)
     residuals = sum(
         int(table.valid.sum()) * len(factors[key].errors) for key, table in graph.tables.items()
     )

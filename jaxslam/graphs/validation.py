@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.plan import factors_of
 from jaxslam.validation.numbers import is_concrete
 
 INDEFINITE = 1e-6
@@ -170,7 +171,8 @@ def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Gra
 
     Else it is the graph itself: the same object.
     """
-    if not len(graph.poses) or parts_of(graph, factors or of_files()).anchored.any():
+    known = factors_of("graphs.with_gauge", graph, factors)
+    if not len(graph.poses) or parts_of(graph, known).anchored.any():
         return graph
     fixed: Any = np.asarray(graph.fixed_pose).copy()
     fixed[0] = True
