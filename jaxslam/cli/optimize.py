@@ -108,7 +108,8 @@ def _gauge(read: Graph, given: Graph) -> str:
     """What holds the graph in place, in words."""
     poses, points = int(given.fixed_pose.sum()), int(given.fixed_point.sum())
     if given is not read:
-        return f"pose {int(given.pose_id[0])} is fixed, since the file fixes none"
+        held = given.pose_id[given.fixed_pose.argmax()]
+        return f"pose {int(held)} is fixed, since the file fixes none"
     told = [f"{poses} poses"] * (poses > 0) + [f"{points} points"] * (points > 0)
     return " and ".join(told) + " fixed by the file" if told else "by priors"
 

@@ -161,19 +161,22 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
             "give one a prior"
         )
     raise ValueError(
-        f"{name}: the graph is disconnected: {told} have no measurement that joins them to a fixed "
-        f"pose or one with a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
+        f"{name}: the graph is disconnected: no measurement joins {told} to a fixed pose or one with "
+        f"a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
     )
 
 
 def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Graph:
-    """The graph with its first pose fixed, if no variable is and no measurement is of one pose.
+    """The graph with a pose fixed, if no variable is and no measurement is of one pose alone.
 
-    Else it is the graph itself: the same object.
+    It is the first pose, of the largest part where the graph is disconnected. A graph that has a
+    gauge is returned as it is: the same object.
     """
     known = factors_of("graphs.with_gauge", graph, factors)
-    if not len(graph.poses) or parts_of(graph, known).anchored.any():
+    parts = parts_of(graph, known)
+    if not len(graph.poses) or parts.anchored.any():
         return graph
     fixed: Any = np.asarray(graph.fixed_pose).copy()
-    fixed[0] = True
+    of_poses = parts.part[: len(graph.poses)]
+    fixed[np.flatnonzero(of_poses == np.bincount(of_poses).argmax())[0]] = True
     return graph._replace(fixed_pose=fixed)

@@ -82,7 +82,7 @@ SPOILS = {
     ),
     "disconnected": (
         loose,
-        "the graph is disconnected: pose 17 have no measurement that joins them",
+        "the graph is disconnected: no measurement joins pose 17 to a fixed pose",
     ),
     "sizes": (
         lambda g: g._replace(tables={"bearing": g.tables["relative_pose"]}),
