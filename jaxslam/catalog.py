@@ -31,6 +31,7 @@ from jaxslam.linearize.observability import observability
 from jaxslam.linearize.unscented import unscented
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario
+from jaxslam.smoothing.fixed_lag import fixed_lag
 from jaxslam.types import Info, Scan, Truth
 
 
@@ -90,6 +91,26 @@ def by_particles_in_a_known_map(scenario: Scenario, **options: Any) -> Callable[
         **mine,
     )
 
+
+def in_a_window(scenario: Scenario, *, first_estimates: bool = False, **options: Any) -> Filter:
+    """The fixed-lag smoother of 5 steps, with those options of `ekf_slam` that it has."""
+    asked = scenario.filter_options | options
+    mine = {name: asked[name] for name in ("gate", "associate", "births") if name in asked}
+    capacity = int(np.shape(scenario.landmarks)[0])
+    false = 0 if scenario.spurious is None else scenario.spurious.places
+    return fixed_lag(
+        scenario.motion,
+        scenario.sensor,
+        capacity,
+        (scenario.places or capacity) + false,
+        window=WINDOW,
+        first_estimates=first_estimates,
+        **mine,
+    )
+
+
+WINDOW = 5
+"""motions and scans in the window of the fixed-lag smoother in the catalog"""
 
 SLAM_PARTICLES = 50
 """number of particles of FastSLAM in the catalog; small, for campaigns of all filters."""
@@ -200,16 +221,23 @@ CANONICAL: dict[str, Callable[..., Candidate]] = {
 }
 """The information filters, exact and sparse; as FILTERS."""
 
+SMOOTHERS: dict[str, Callable[..., Candidate]] = {
+    "fixed_lag": in_a_window,
+    "fixed_lag_fej": lambda world, **more: in_a_window(world, first_estimates=True, **more),
+}
+"""The fixed-lag smoothers; as FILTERS."""
+
 KINDS: dict[str, tuple[str, ...]] = {
     "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
     "consistent Jacobians": ("fej", "oc"),
     "error coordinates": ("right_invariant", "left_invariant", "robocentric"),
     "unscented": ("ukf", "ukf_right", "ukf_left"),
+    "fixed lag": ("fixed_lag", "fixed_lag_fej"),
     "information": ("eif_slam", "seif", "eseif"),
     "particles": ("fastslam1", "fastslam2", "particle_localization"),
     "baselines": ("dead_reckoning", "localization"),
 }
 """The names by kind of filter; figures of many filters are divided so."""
 
-ALL = FILTERS | CANONICAL | PARTICLES | BASELINES
+ALL = FILTERS | SMOOTHERS | CANONICAL | PARTICLES | BASELINES
 """All filters, which the command line knows, and runs for `--filters all`."""

@@ -52,6 +52,7 @@ def chosen(data: Dataset, asked: str) -> dict[str, Filter]:
         sensor=data.sensor,
         landmarks=slots,
         controls=data.log.control,
+        places=data.log.scan.tag.shape[1],
         filter_options=data.filter_options,
     )
     return {name: _filter(name, pick("filter", name, ALL)(world), data) for name in names}

@@ -46,8 +46,9 @@ def block_nees(
 ) -> dict[str, Nees]:
     """The NEES of each block of `DOF`, and of the error in the filter's own coordinates ("own").
 
-    There is none where the claimed covariance is singular, i.e. some direction is known exactly: a
-    pivot of its Cholesky factor is at most 100 n·eps, in units of which x and y have one. And none
+    There is none where the claimed covariance is singular, i.e. some direction is known exactly:
+    1/tr P⁻¹, at most its least eigenvalue and at least a third of it, is at most 100 n·eps where P
+    is scaled to a diagonal of at most 1, x and y by one unit. And none
     where a claimed deviation is what rounding makes of zero: at most `ROUNDING` ulp of the
     coordinate, that is of π for the heading and of max(|x|, |y|) for the position. So particles
     that are copies of one, whose sample covariance is zero but for rounding, have no NEES, instead
@@ -70,11 +71,13 @@ def block_nees(
             squares, known = _whitened(factor, e, unit)
             for block, k in (("position", 2), ("pose", 3)):
                 if name == "pose" or block == "pose":
-                    regular = _above(pivots[:k], 100 * k * eps) & _every(known[:k])
+                    regular = (_least_eigenvalue(factor, pivots, k) > 100 * k * eps) & _every(
+                        known[:k]
+                    )
                     value = np.where(regular, sum(squares[:k]), 0.0)
                     found[block if name == "pose" else name] = Nees(value, regular)
         turn = error[..., 2]
-        regular = _above([scaled[2, 2]], 100 * eps) & np.isfinite(turn)
+        regular = (scaled[2, 2] > 100 * eps) & np.isfinite(turn)
         square = (turn * unit[2]) ** 2 / np.where(regular, scaled[2, 2], 1.0)
         found["heading"] = Nees(np.where(regular, square, 0.0), regular)
     return found
@@ -156,8 +159,20 @@ def _whitened(
     return [row**2 for row in rows], known
 
 
-def _above(pivots: list[np.ndarray], least: float) -> np.ndarray:
-    return _every([pivot > least for pivot in pivots])
+def _least_eigenvalue(
+    factor: dict[tuple[int, int], np.ndarray], pivots: list[np.ndarray], size: int
+) -> np.ndarray:
+    """1/tr (L Lᵀ)⁻¹ of the leading block, between a third of its least eigenvalue and all of it; 0
+    where a pivot is."""
+    positive = _every([pivot > 0 for pivot in pivots[:size]])
+    rows: dict[tuple[int, int], np.ndarray] = {}
+    for i in range(size):
+        own = 1.0 / np.where(factor[i, i] > 0, factor[i, i], 1.0)
+        rows[i, i] = own
+        for j in range(i):
+            rows[i, j] = -own * sum(factor[i, k] * rows[k, j] for k in range(j, i))
+    out: np.ndarray = np.where(positive, 1.0 / sum(row**2 for row in rows.values()), 0.0)
+    return out
 
 
 def _every(flags: list[np.ndarray]) -> np.ndarray:

@@ -35,7 +35,7 @@ def plus(a: Sum, b: Sum) -> Sum:
     return Sum(*_renormalized(high, rest + last))
 
 
-def total(rows: np.ndarray) -> Sum:
+def sum_rows(rows: np.ndarray) -> Sum:
     """The sum over the leading axis, which may be empty."""
     rows = np.asarray(rows, np.float64)
     if len(rows) == 0:
@@ -77,7 +77,7 @@ def condensed_sums(per_run: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The sums over the runs of named arrays, as `Tally.add` takes them."""
     out = {}
     for name, rows in per_run.items():
-        out[f"high/{name}"], out[f"low/{name}"] = total(np.asarray(rows))
+        out[f"high/{name}"], out[f"low/{name}"] = sum_rows(np.asarray(rows))
     return out
 
 

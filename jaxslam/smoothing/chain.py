@@ -99,7 +99,7 @@ class Policy(NamedTuple):
     """the information on the map is positive definite"""
 
 
-class _CostToGo(NamedTuple):
+class CostToGo(NamedTuple):
     """The cost to go ½ aᵀ Λ a - aᵀ y + constant, with a = (δpose, δmap)."""
 
     pose: Float[Array, "3 3"]
@@ -112,30 +112,10 @@ class _CostToGo(NamedTuple):
 
 
 def eliminate(chain: Chain, alive: Bool[Array, "N"]) -> Policy:
-    """The solution of a chain. alive: the landmarks that are measured at all.
-
-    With Λ and y of all terms after motion t, its noise costs min over d of ½ |η̄ + d|² plus
-    ½ (a + G d)ᵀ Λ (a + G d) - (a + G d)ᵀ y: at d = M⁻¹ (Gᵀ y - η̄ - Gᵀ Λ a), M = I + Gᵀ Λ G, which
-    leaves Λ - Λ G M⁻¹ Gᵀ Λ and y - Λ G M⁻¹ (Gᵀ y - η̄); then a = F δx + c is substituted.
-    """
+    """The solution of a chain. alive: the landmarks that are measured at all."""
     capacity, size = alive.shape[0], chain.steps.landmark_rows.shape[3]
     wide, kind = capacity * size, chain.steps.residual.dtype
-
-    def back(carry: tuple[_CostToGo, Array], step: Step) -> tuple[tuple[_CostToGo, Array], Gain]:
-        after, decrement = carry
-        after = _add_measurements(after, step, capacity)
-        after, gain, gained = _eliminate_noise(after, step.by_noise, step.noise)
-        return (_by_pose_before(after, step), decrement + gained), gain
-
-    nothing = _CostToGo(
-        pose=jnp.zeros((3, 3), kind),
-        cross=jnp.zeros((3, wide), kind),
-        map=jnp.zeros((wide, wide), kind),
-        pose_y=jnp.zeros(3, kind),
-        map_y=jnp.zeros(wide, kind),
-    )
-    end = nothing, jnp.zeros((), kind)
-    (to_go, decrement), gains = jax.lax.scan(back, end, chain.steps, reverse=True)
+    to_go, gains, decrement = eliminate_steps(chain.steps, capacity)
     to_go, first, gained = _eliminate_noise(to_go, chain.start.root, chain.start.noise)
     decrement = decrement + gained
     landmarks, factor, regular = to_go.map_y, to_go.map, jnp.asarray(True)
@@ -148,9 +128,37 @@ def eliminate(chain: Chain, alive: Bool[Array, "N"]) -> Policy:
     return Policy(first, gains, landmarks.reshape(capacity, size), factor, decrement, regular)
 
 
-def _by_pose_before(after: _CostToGo, step: Step) -> _CostToGo:
+def eliminate_steps(steps: Step, capacity: int) -> tuple[CostToGo, Gain, Float[Array, ""]]:
+    """The cost of all steps as a function of the first pose and of the map, the gains of their
+    noises, and their terms of λ².
+
+    With Λ and y of all terms after motion t, its noise costs min over d of ½ |η̄ + d|² plus
+    ½ (a + G d)ᵀ Λ (a + G d) - (a + G d)ᵀ y: at d = M⁻¹ (Gᵀ y - η̄ - Gᵀ Λ a), M = I + Gᵀ Λ G, which
+    leaves Λ - Λ G M⁻¹ Gᵀ Λ and y - Λ G M⁻¹ (Gᵀ y - η̄); then a = F δx + c is substituted.
+    """
+    wide, kind = capacity * steps.landmark_rows.shape[3], steps.residual.dtype
+
+    def back(carry: tuple[CostToGo, Array], step: Step) -> tuple[tuple[CostToGo, Array], Gain]:
+        after, decrement = carry
+        after = _add_measurements(after, step, capacity)
+        after, gain, gained = _eliminate_noise(after, step.by_noise, step.noise)
+        return (_by_pose_before(after, step), decrement + gained), gain
+
+    nothing = CostToGo(
+        pose=jnp.zeros((3, 3), kind),
+        cross=jnp.zeros((3, wide), kind),
+        map=jnp.zeros((wide, wide), kind),
+        pose_y=jnp.zeros(3, kind),
+        map_y=jnp.zeros(wide, kind),
+    )
+    end = nothing, jnp.zeros((), kind)
+    (to_go, decrement), gains = jax.lax.scan(back, end, steps, reverse=True)
+    return to_go, gains, decrement
+
+
+def _by_pose_before(after: CostToGo, step: Step) -> CostToGo:
     """The cost to go as a function of the pose before a motion, a = F δx + c."""
-    return _CostToGo(
+    return CostToGo(
         pose=linalg.symmetrize(step.by_pose.T @ after.pose @ step.by_pose),
         cross=linalg.matmul(step.by_pose.T, after.cross),
         map=after.map,
@@ -159,7 +167,7 @@ def _by_pose_before(after: _CostToGo, step: Step) -> _CostToGo:
     )
 
 
-def _add_measurements(to_go: _CostToGo, step: Step, capacity: int) -> _CostToGo:
+def _add_measurements(to_go: CostToGo, step: Step, capacity: int) -> CostToGo:
     """The cost to go plus a scan: Λ + (A B)ᵀ (A B) and y + (A B)ᵀ b, in the rows it involves."""
     a, b, r = step.pose_rows, step.landmark_rows, step.residual
     size = b.shape[2]
@@ -171,7 +179,7 @@ def _add_measurements(to_go: _CostToGo, step: Step, capacity: int) -> _CostToGo:
     cross = by_slot(jnp.einsum("mzi,mzl->mil", a, b)).transpose(1, 0, 2).reshape(3, -1)
     rows = jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
     own = by_slot(jnp.einsum("mzk,mzl->mkl", b, b))
-    return _CostToGo(
+    return CostToGo(
         pose=to_go.pose + jnp.einsum("mzi,mzj->ij", a, a),
         cross=to_go.cross + cross,
         map=to_go.map.at[rows[:, :, None], rows[:, None, :]].add(own),
@@ -181,8 +189,8 @@ def _add_measurements(to_go: _CostToGo, step: Step, capacity: int) -> _CostToGo:
 
 
 def _eliminate_noise(
-    to_go: _CostToGo, by_noise: Float[Array, "3 W"], noise: Float[Array, "W"]
-) -> tuple[_CostToGo, Gain, Float[Array, ""]]:
+    to_go: CostToGo, by_noise: Float[Array, "3 W"], noise: Float[Array, "W"]
+) -> tuple[CostToGo, Gain, Float[Array, ""]]:
     """The cost to go at a + G d minimized over d; the gain of the best d, and its term of λ²."""
     seen = linalg.gram(by_noise, to_go.pose)
     square = linalg.symmetrize(seen @ by_noise)
@@ -190,7 +198,7 @@ def _eliminate_noise(
     pull = linalg.solve_lower(factor, by_noise.T @ to_go.pose_y - noise)
     by_pose = linalg.solve_lower(factor, seen)
     by_map = linalg.solve_lower(factor, linalg.gram(by_noise, to_go.cross))
-    left = _CostToGo(
+    left = CostToGo(
         pose=to_go.pose - linalg.gram(by_pose, by_pose),
         cross=to_go.cross - linalg.gram(by_pose, by_map),
         map=to_go.map - linalg.gram(by_map, by_map),

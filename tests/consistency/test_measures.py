@@ -15,6 +15,7 @@ from jaxslam.consistency.nees import block_nees
 from jaxslam.consistency.score import EVENTS
 from jaxslam.filters.ekf.to_points import ToPoints
 from jaxslam.filters.map_management.merging import Merged
+from jaxslam.filters.particles.moments import weighted_pose_moments
 from jaxslam.filters.particles.particle_info import ParticleInfo
 from jaxslam.filters.reporting import Pruned
 from jaxslam.simulation.worlds import simulate
@@ -312,3 +313,18 @@ def test_every_event_that_is_counted_is_a_field_of_its_record():
     }
     for record, field in EVENTS.values():
         assert field in records[record]._fields
+
+
+def test_poses_on_a_plane_have_no_nees():
+    """Three distinct particles among many: their covariance has rank 2, whatever its null direction."""
+    rng = np.random.default_rng(3)
+    poses = np.array([2.0, -1.0, 1.5]) + 3e-3 * rng.normal(size=(2000, 4, 3))
+    share = np.log(rng.dirichlet(np.full(4, 2.0), 2000))
+    moments = jax.jit(jax.vmap(weighted_pose_moments))
+    for distinct, expected in ((3, 0.0), (4, 1.0)):
+        weight = share[:, :distinct] - np.log(np.exp(share[:, :distinct]).sum(1, keepdims=True))
+        best = weight.argmax(1)
+        mean, cov = map(np.asarray, moments(poses[:, :distinct], weight, best))
+        error = rng.normal(size=(2000, 3))
+        regular = block_nees(mean, error, error, cov)["pose"].regular
+        assert regular.mean() == pytest.approx(expected, abs=0.01)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from jaxslam.consistency import Score, Tally, condense
-from jaxslam.consistency.tally import Sum, plus, total
+from jaxslam.consistency.tally import Sum, plus, sum_rows
 from jaxslam.monte_carlo import missing
 
 
 def test_a_total_is_exact_where_a_plain_sum_is_not():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(77, 5)) * 10.0 ** rng.integers(-12, 12, size=(77, 5))
-    high, low = total(rows)
+    high, low = sum_rows(rows)
     exact = [sum(map(Fraction, rows[:, i].tolist())) for i in range(5)]
     assert any(
         Fraction(plain) != e for plain, e in zip(rows.sum(axis=0).tolist(), exact, strict=True)
@@ -25,7 +25,7 @@ def test_a_total_is_exact_where_a_plain_sum_is_not():
 
 @pytest.mark.parametrize("rows", [np.zeros((0, 3)), np.ones((1, 3))])
 def test_a_total_of_none_or_one(rows):
-    np.testing.assert_array_equal(total(rows).high, rows.sum(axis=0))
+    np.testing.assert_array_equal(sum_rows(rows).high, rows.sum(axis=0))
 
 
 def test_cancellation_leaves_the_small_term():

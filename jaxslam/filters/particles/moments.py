@@ -26,8 +26,9 @@ def weighted_pose_moments(
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     """Mean and covariance of poses x_p with weights Σ w = 1.
 
-    The heading's mean is that of the circle, atan2(Σ w sin θ, Σ w cos θ), and d_p = x_p - mean has
-    its heading wrapped. Then
+    The heading's mean is θ_c + Σ w (θ ⊖ θ_c) with θ_c = atan2(Σ w sin θ, Σ w cos θ), so that
+    the wrapped deviations d_p = x_p - mean sum to zero and few distinct poses have a singular cov
+    (about θ_c it would have a least eigenvalue of order σ⁶). Then
 
         cov = (1 + Σw²)/(1 - Σw²) Σ w_p d_p d_pᵀ
 
@@ -48,6 +49,7 @@ def weighted_pose_moments(
     theta = jnp.where(
         cancel, own, jnp.arctan2(jnp.where(cancel, 0.0, sine), jnp.where(cancel, 1.0, cosine))
     )
+    theta = theta + (w * wrap(pose[:, 2] - theta)).sum()
     mean = jnp.concatenate([xy, wrap(theta)[None]])
     d = pose - mean[None]
     d = jnp.concatenate([d[:, :2], wrap(d[:, 2:])], axis=1)

@@ -1,0 +1,202 @@
+"""The fixed-lag smoother: the last poses and the map are optimized together at every scan."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam import validation
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.math import linalg
+from jaxslam.protocols import Associate, Filter, Motion, Sensor
+from jaxslam.sensors.suite import Suite
+from jaxslam.slots import Joint
+from jaxslam.smoothing.window import (
+    Iterate,
+    Prior,
+    Steps,
+    linearize,
+    marginalize_oldest,
+    moved_by,
+    newest_cov,
+    solve,
+)
+from jaxslam.types import Estimate, Info, Scan, Status
+from jaxslam.validation.numbers import check_count
+
+POINT = ("x [m]", "y [m]")
+
+
+class WindowState(NamedTuple):
+    """The state of `fixed_lag`."""
+
+    joint: Joint
+    """the newest pose and the map"""
+    prior: Prior
+    """of the oldest pose of the window, and of the map before it"""
+    steps: Steps
+    at: Iterate
+    """the path in the window, and the map"""
+
+
+def fixed_lag(
+    motion: Motion,
+    sensor: Sensor,
+    capacity: int,
+    places: int,
+    *,
+    window: int = 5,
+    first_estimates: bool = False,
+    iterations: int = 2,
+    associate: Associate | None = None,
+    gate: float | None = None,
+    births: int | None = None,
+) -> Filter:
+    """Fixed-lag smoothing SLAM: Gauss-Newton over the last `window` motions and scans, and the map.
+
+    At each scan EKF-SLAM predicts, associates, gates and starts landmarks; then the poses of the
+    window, the noises of its motions and the map are optimized together (`window`), and the
+    estimate is the newest pose and the map. The oldest step leaves the window by marginalization:
+    its motion and scan, linearized at the estimates of then, become the prior of the next pose
+    and the map.
+
+    That prior keeps its linearization, while later Jacobians are taken at newer estimates; so the
+    window's linearized system has two unobservable directions instead of three, and the heading
+    becomes certain without reason. With first_estimates Jacobians by a variable of the prior are
+    taken where that was linearized, and there are three (Dong-Si & Mourikis 2011, "Motion tracking
+    with fixed-lag smoothing: algorithm and consistency analysis", ICRA). A window as long as the
+    log marginalizes nothing: then the newest pose and the map are those of `batch_map`.
+
+    A measurement with a singular R is dropped as `Status.SINGULAR`. O(W N²) for the window, and
+    O(N³) for the prior, an iteration.
+
+    Args:
+        motion, sensor: the models; Jacobians come from `jax.jacfwd`. A measurement must determine
+            its landmark and have as many numbers (K = 0, Z = L).
+        capacity: landmark slots N.
+        places: most measurement slots M of a scan; the window stores scans.
+        window: motions and scans W that are optimized.
+        first_estimates: as above; for landmarks that are points (x, y).
+        iterations: Gauss-Newton steps at each scan.
+        associate, gate, births: of the EKF-SLAM, as for `ekf_slam`. NIS is that of its innovations.
+    Raises:
+        ValueError: as `ekf_slam` does; on a sensor of another kind, and on a places, window or
+            iterations below 1; from `update`, on a scan of more measurement slots.
+    """
+    validation.check_models("fixed_lag", motion, sensor)
+    ekf = ekf_slam(
+        motion, sensor, capacity, associate=associate, update="joint", gate=gate, births=births
+    )
+    numbers = len(sensor.measurements), len(sensor.landmark)
+    free = sensor.free.mean.shape[0]
+    if isinstance(sensor, Suite) or sensor.reduced is not None or free or numbers[0] != numbers[1]:
+        raise ValueError(
+            "fixed_lag: expected one sensor whose measurement determines its landmark by as many "
+            f"numbers as it has, got {sensor.name}"
+        )
+    if first_estimates and sensor.landmark != POINT:
+        raise ValueError(
+            f"fixed_lag: expected landmarks (x, y) for first_estimates, got {sensor.landmark}"
+        )
+    for name, value in (("places", places), ("window", window), ("iterations", iterations)):
+        check_count(f"fixed_lag: {name}", value)
+
+    def init(pose: Array, pose_cov: Array) -> WindowState:
+        joint = ekf.init(pose, pose_cov)
+        return empty_window(joint, (len(motion.controls), len(motion.noises)), (window, places))
+
+    def predict(state: WindowState, u: Array, key: Array) -> WindowState:
+        joint = ekf.predict(state.joint, u, key)
+        system = linearize(motion, sensor, state.prior, state.steps, state.at, first_estimates)
+        prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
+        root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
+        steps, at = shift(state.steps, state.at, u, root, joint.pose)
+        return WindowState(joint, prior, steps, at)
+
+    def update(state: WindowState, scan: Scan, key: Array) -> tuple[WindowState, Info]:
+        if scan.z.shape[0] > places:
+            raise ValueError(
+                f"fixed_lag: expected scans of at most {places} measurement slots, as `places` "
+                f"says, got {scan.z.shape[0]}"
+            )
+        # The window weights by R⁻¹.
+        regular = jax.vmap(lambda z: linalg.cholesky(sensor.noise_cov(z))[1])(scan.z)
+        lost = scan.valid & ~regular
+        joint, info = ekf.update(state.joint, scan._replace(valid=scan.valid & regular), key)
+        status = jnp.where(lost, jnp.int32(Status.SINGULAR), info.status)
+        info = info._replace(status=status.astype(info.status.dtype))
+        steps = with_scan(state.steps, scan, info)
+        born = joint.alive & ~state.joint.alive
+        landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
+        at = state.at._replace(landmarks=landmarks)
+        for _ in range(iterations):
+            system = linearize(motion, sensor, state.prior, steps, at, first_estimates)
+            solved = solve(state.prior, system, at, joint.alive)
+            at = moved_by(motion, steps, at, solved)
+        joint = with_newest(joint, at, newest_cov(system, solved))
+        return WindowState(joint, state.prior, steps, at), info
+
+    def estimate(state: WindowState) -> Estimate:
+        return ekf.estimate(state.joint)
+
+    return dataclasses.replace(
+        ekf, name="fixed_lag", init=init, predict=predict, update=update, estimate=estimate
+    )
+
+
+def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -> WindowState:
+    """The state before the first step. sizes: of a control and its noise; shape: W and M."""
+    (control, noise), (window, places), kind = sizes, shape, joint.pose.dtype
+    steps = Steps(
+        there=jnp.zeros(window, bool),
+        control=jnp.zeros((window, control), kind),
+        root=jnp.zeros((window, noise, noise), kind),
+        z=jnp.zeros((window, places, joint.landmarks.shape[1]), kind),
+        slot=jnp.zeros((window, places), jnp.int32),
+        used=jnp.zeros((window, places), bool),
+    )
+    path = jnp.tile(joint.pose, (window + 1, 1))
+    at = Iterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
+    return WindowState(joint, Prior(joint, (joint.pose, joint.landmarks)), steps, at)
+
+
+def shift(
+    steps: Steps, at: Iterate, u: Float[Array, "U"], root: Float[Array, "Q Q"], pose: Array
+) -> tuple[Steps, Iterate]:
+    """The window without its oldest step, and with a new motion to a predicted pose (3,)."""
+
+    def append(rows: Array, new: Array | bool | float) -> Array:
+        return jnp.roll(rows, -1, axis=0).at[-1].set(new)
+
+    after = Steps(
+        there=append(steps.there, True),
+        control=append(steps.control, u),
+        root=append(steps.root, root),
+        z=append(steps.z, 0.0),
+        slot=append(steps.slot, 0),
+        used=append(steps.used, False),
+    )
+    return after, at._replace(path=append(at.path, pose), noise=append(at.noise, 0.0))
+
+
+def with_scan(steps: Steps, scan: Scan, info: Info) -> Steps:
+    """The window with the measurements of its newest scan that were fused or started landmarks."""
+    used = (info.status == Status.FUSED) | (info.status == Status.BORN)
+    z = jnp.where(scan.valid[:, None], scan.z, 0.0)
+    slot, count = jnp.maximum(info.slot, 0), scan.z.shape[0]
+    return steps._replace(
+        z=steps.z.at[-1, :count].set(z),
+        slot=steps.slot.at[-1, :count].set(slot),
+        used=steps.used.at[-1, :count].set(used),
+    )
+
+
+def with_newest(joint: Joint, at: Iterate, cov: Float[Array, "D D"]) -> Joint:
+    """The joint with the newest pose and the map of a window; unit variance at dead slots."""
+    there = jnp.repeat(joint.alive, joint.landmarks.shape[1])
+    there = jnp.concatenate([jnp.ones(3, bool), there])
+    padded = jnp.where(there[:, None] & there[None], cov, jnp.eye(len(there), dtype=cov.dtype))
+    landmarks = jnp.where(joint.alive[:, None], at.landmarks, 0.0)
+    return joint._replace(pose=at.path[-1], landmarks=landmarks, cov=padded)

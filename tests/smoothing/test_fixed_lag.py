@@ -1,0 +1,126 @@
+"""The fixed-lag smoother against the batch solution, the EKF of a linear world, and observability."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world
+
+from jaxslam import motion, run, sensors, simulate
+from jaxslam.filters import ekf_slam
+from jaxslam.simulation.scenarios import stationary
+from jaxslam.smoothing import batch_map, fixed_lag
+from jaxslam.types import Status
+
+TWO = pytest.mark.parametrize("first", [False, True], ids=["standard", "first estimates"])
+
+
+@pytest.fixture(scope="module")
+def short():
+    world = dataclasses.replace(worlds.ring(steps=8), pose_cov=np.diag([0.01, 0.0, 0.003]))
+    return world, simulate(world, KEY)[1]
+
+
+def lag(world, **options):
+    count = len(world.landmarks)
+    return fixed_lag(world.motion, world.sensor, count, count, **options)
+
+
+@TWO
+def test_a_window_as_long_as_the_log_is_the_batch(short, first):
+    world, log = short
+    filter = lag(world, window=8, iterations=5, first_estimates=first)
+    trace = run(filter, log, world.pose, world.pose_cov, KEY)
+    batch = batch_map(*arguments(world))(log, KEY)
+    for name in ("pose", "pose_cov", "points", "point_covs"):
+        ours, theirs = (np.asarray(getattr(t.estimate, name))[-1] for t in (trace, batch))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(trace.final.at.path[0], batch.final.start, atol=1e-8)
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_in_a_linear_world_it_is_the_kalman_filter(window):
+    """What leaves the window is marginalized without loss; landmarks enter at any time."""
+    log = linear_log(steps=9)
+    moves, sees = linear_world()
+    kalman = run(ekf_slam(moves, sees, 4, update="joint"), regular(log), START, P0, KEY)
+    trace = run(fixed_lag(moves, sees, 4, 4, window=window, iterations=1), log, START, P0, KEY)
+    for ours, theirs in zip(trace.estimate, kalman.estimate, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(trace.final.joint.cov, kalman.final.cov, rtol=1e-8, atol=1e-10)
+    exact = np.asarray(log.scan.valid) & ~np.asarray(regular(log).scan.valid)
+    assert exact.sum() == 1
+    assert (np.asarray(trace.info.status)[exact] == Status.SINGULAR).all()
+
+
+def regular(log):
+    """The log without the measurement that claims to be exact."""
+    exact = log.scan.z[:, :, 0] == 5.0
+    return log._replace(scan=log.scan._replace(valid=log.scan.valid & ~exact))
+
+
+@TWO
+def test_a_robot_that_stands_still_learns_no_heading_with_first_estimates(first):
+    """Dong-Si & Mourikis 2011: marginalization at old estimates makes the heading observable."""
+    world = stationary(30)
+    log = simulate(world, jax.random.key(2))[1]
+    trace = run(lag(world, window=2, first_estimates=first), log, world.pose, world.pose_cov, KEY)
+    deviation = np.rad2deg(np.sqrt(np.asarray(trace.estimate.pose_cov)[:, 2, 2]))
+    if first:
+        np.testing.assert_allclose(deviation, 5.0, rtol=1e-6)
+    else:
+        assert deviation[-1] < 4.99
+
+
+def test_float32_and_gradients(short):
+    world, log = short
+    few = jax.tree.map(lambda leaf: np.asarray(leaf)[:3, ...], log)
+
+    def last(sigma, log):
+        made = dataclasses.replace(
+            world,
+            motion=motion.increment(jnp.diag(sigma[:2]) ** 2),
+            sensor=sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
+        )
+        filter = lag(made, window=1, iterations=1, first_estimates=True)
+        return run(filter, log, world.pose, np.zeros((3, 3)), KEY).estimate.pose[-1]
+
+    sigma = np.array([0.01, 0.04, 0.05])
+    double, slope = jax.jit(lambda s: (last(s, few), jax.jacfwd(partial(last, log=few))(s)))(sigma)
+    assert np.isfinite(slope).all()
+    assert np.all(np.abs(slope).max(axis=0) > 0)
+    single = jax.tree.map(lambda leaf: leaf.astype("f4") if leaf.dtype == float else leaf, few)
+    found = jax.jit(partial(last, log=single))(sigma.astype("f4"))
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, double, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"window": 0}, "window"),
+        ({"iterations": 0}, "iterations"),
+        ({"places": 0}, "places"),
+        ({"sensor": sensors.bearing_only(np.eye(1))}, "as many numbers"),
+        ({"sensor": sensors.compass(np.eye(1))}, "as many numbers"),
+        (
+            {"sensor": sensors.range_bearing_signature(np.eye(3)), "first_estimates": True},
+            r"landmarks \(x, y\)",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused(options, why):
+    given = {"motion": worlds.ring().motion, "sensor": worlds.ring().sensor}
+    given |= {"capacity": 3, "places": 3} | options
+    with pytest.raises(ValueError, match=why):
+        fixed_lag(**given)
+
+
+def test_a_scan_that_is_too_large_is_refused(short):
+    world, log = short
+    with pytest.raises(ValueError, match="at most 2 measurement slots"):
+        run(fixed_lag(world.motion, world.sensor, 6, 2), log, world.pose, world.pose_cov, KEY)
