@@ -18,6 +18,7 @@ from jaxslam.graphs.factor import (
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
+from jaxslam.graphs.marginals import Marginals, marginals
 from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
 from jaxslam.graphs.search import Ending, Solution
@@ -29,6 +30,7 @@ __all__ = [
     "Factor",
     "Graph",
     "Kernel",
+    "Marginals",
     "Plan",
     "Solution",
     "Table",
@@ -40,6 +42,7 @@ __all__ = [
     "from_motion",
     "from_sensor",
     "huber",
+    "marginals",
     "optimize",
     "plan",
     "prior",

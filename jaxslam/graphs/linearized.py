@@ -5,7 +5,6 @@ the frame of a pose: X ∘ (dx, dy, dθ); those of a point are added.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.kernels import Kernel
+from jaxslam.graphs.model import Model
 from jaxslam.graphs.plan import Plan
 from jaxslam.graphs.sparse.gathered import summed
 from jaxslam.math import se2
@@ -37,18 +37,6 @@ class Data(NamedTuple):
     valid: dict[str, Bool[Array, "_ B"]]
     free: Bool[Array, "n d B"]
     """which entries of the increments are estimated, by column"""
-
-
-@dataclass(frozen=True)
-class Model:
-    """The functions of a graph: hashable, and the same object for the same functions."""
-
-    factors: tuple[tuple[str, Factor], ...]
-    kernels: tuple[tuple[str, Kernel], ...] = ()
-
-    def kernel(self, table: str) -> Kernel | None:
-        """The kernel of a table."""
-        return dict(self.kernels).get(table)
 
 
 class System(NamedTuple):
