@@ -2,7 +2,9 @@
 
 import functools
 from collections.abc import Callable, Mapping
+from typing import Any, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,6 +13,7 @@ from jaxslam import programs
 from jaxslam.graphs.batch import in_one_dtype, over_batch, with_batch
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.implicit import followed
 from jaxslam.graphs.kernels import Kernel
 from jaxslam.graphs.linearized import cost, data_of, variables_of
 from jaxslam.graphs.model import Model, model_of
@@ -83,10 +86,24 @@ def _optimize(
     model: Model, method: str, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
     graph = in_one_dtype(graph)
-    shared = plan, iterations, tolerance.astype(graph.poses.dtype)
-    return _batched(model, method)(shared, graph)
+    return _solver(model, method)(graph, plan, iterations, tolerance.astype(graph.poses.dtype))
 
 
 @functools.lru_cache(maxsize=256)
-def _batched(model: Model, method: str) -> Callable[..., Solution]:
-    return over_batch("graphs.optimize", functools.partial(minimize, model, method))
+def _solver(model: Model, method: str) -> Callable[..., Solution]:
+    """The solution of one graph, with derivatives, and batched by `vmap`."""
+    solve = over_batch("graphs.optimize", functools.partial(minimize, model, method))
+
+    @jax.custom_jvp
+    def solved(graph: Graph, *shared: Any) -> Solution:
+        return solve(shared, graph)
+
+    @solved.defjvp
+    def slope(primals: Any, tangents: Any) -> tuple[Solution, Any]:
+        graph, plan, *_ = primals
+        found = solved(*primals)
+        return found, jax.jvp(
+            lambda graph: followed(model, plan, graph, found), (graph,), tangents[:1]
+        )[1]
+
+    return cast(Callable[..., Solution], solved)
