@@ -5,6 +5,7 @@ relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without
 """
 
 from jaxslam.graphs import starts
+from jaxslam.graphs.certificate import Certificate, certificate
 from jaxslam.graphs.factor import (
     REGISTRY,
     Factor,
@@ -17,15 +18,17 @@ from jaxslam.graphs.factor import (
 )
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
+from jaxslam.graphs.kernels import KERNELS, Kernel, cauchy, dcs, huber, truncated
 from jaxslam.graphs.marginals import Marginals, marginals
-from jaxslam.graphs.optimize import chi2, optimize
+from jaxslam.graphs.optimize import chi2, optimize, squares
 from jaxslam.graphs.plan import Plan, plan
 from jaxslam.graphs.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [
+    "KERNELS",
     "REGISTRY",
+    "Certificate",
     "Ending",
     "Factor",
     "Graph",
@@ -36,6 +39,7 @@ __all__ = [
     "Table",
     "bearing",
     "cauchy",
+    "certificate",
     "check_graph",
     "chi2",
     "dcs",
@@ -49,7 +53,9 @@ __all__ = [
     "read",
     "relative_pose",
     "relative_position",
+    "squares",
     "starts",
+    "truncated",
     "with_gauge",
     "write",
 ]
