@@ -20,6 +20,7 @@ from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
 from jaxslam.graphs.log import of_log
+from jaxslam.graphs.marginals import Marginals, marginals
 from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
 from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
@@ -32,6 +33,7 @@ __all__ = [
     "Factor",
     "Graph",
     "Kernel",
+    "Marginals",
     "Plan",
     "Solution",
     "Table",
@@ -44,6 +46,7 @@ __all__ = [
     "from_motion",
     "from_sensor",
     "huber",
+    "marginals",
     "of_log",
     "optimize",
     "plan",

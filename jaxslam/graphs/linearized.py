@@ -5,7 +5,6 @@ the frame of a pose: X ∘ (dx, dy, dθ); those of a point are added.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.kernels import Kernel
+from jaxslam.graphs.model import Model
 from jaxslam.graphs.plan import Plan
 from jaxslam.graphs.sparse.gathered import summed
 from jaxslam.math import se2
@@ -37,18 +37,6 @@ class Data(NamedTuple):
     valid: dict[str, Bool[Array, "_ B"]]
     free: Bool[Array, "n d B"]
     """which entries of the increments are estimated, by column"""
-
-
-@dataclass(frozen=True)
-class Model:
-    """The functions of a graph: hashable, and the same object for the same functions."""
-
-    factors: tuple[tuple[str, Factor], ...]
-    kernels: tuple[tuple[str, Kernel], ...] = ()
-
-    def kernel(self, table: str) -> Kernel | None:
-        """The kernel of a table."""
-        return dict(self.kernels).get(table)
 
 
 class System(NamedTuple):
@@ -140,14 +128,44 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
             jacobian[:, r, :, None, :, None] * weighted[:, r, None, :, None, :] for r in range(size)
         )
         blocks.append(product.reshape(rows * len(factor.variables) ** 2, *product.shape[3:]))
-    information = summed(plan.information, jnp.concatenate(blocks))
-    held = plan.on_diagonal[:, None, None] & ~data.free[plan.block_column]
-    unit = jnp.eye(width, dtype=information.dtype)[None, ..., None]
     return System(
         total(chi2),
         summed(plan.gradient, jnp.concatenate(gradients)),
-        information + jnp.where(held[:, None], unit, 0.0),
+        _assembled(plan, blocks, data),
     )
+
+
+def _assembled(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
+    """The blocks of the matrix from those of the rows of each table, (E K K, d, d, B)."""
+    out = summed(plan.information, jnp.concatenate(blocks))
+    held = plan.on_diagonal[:, None, None] & ~data.free[plan.block_column]
+    unit = jnp.eye(out.shape[1], dtype=out.dtype)[None, ..., None]
+    return out + jnp.where(held[:, None], unit, 0.0)
+
+
+def hessian(model: Model, plan: Plan, variables: Variables, data: Data) -> Float[Array, "M d d B"]:
+    """Half the second derivative of χ² by the increments, as `System.blocks`."""
+    width = data.free.shape[1]
+    blocks = []
+    for name, factor in model.factors:
+        kernel, count = model.kernel(name), len(factor.variables)
+
+        def half(steps: Array, own: tuple[Array, ...], z: Array, info: Array) -> Array:
+            e = factor.residual(_moved(factor, steps, own), z)  # noqa: B023
+            s = e @ info @ e
+            return 0.5 * (s if kernel is None else kernel.cost(s))  # noqa: B023
+
+        own = _taken(factor, plan.who[name], variables)
+        still = jnp.zeros((count, width), variables.poses.dtype)
+        second: Array = jax.vmap(
+            jax.vmap(jax.jacfwd(jax.grad(half)), (None, -1, -1, -1), -1), (None, 0, 0, 0)
+        )(still, own, data.z[name], data.information[name])  # (E, K, d, K, d, B)
+        free = data.free[plan.column[_numbers(factor, plan.who[name], variables)]]
+        keep = free[:, :, :, None, None] & free[:, None, None]
+        keep = keep & data.valid[name][:, None, None, None, None]
+        second = jnp.moveaxis(jnp.where(keep, second, 0.0), 3, 2)
+        blocks.append(second.reshape(-1, *second.shape[3:]))
+    return _assembled(plan, blocks, data)
 
 
 def _numbers(factor: Factor, who: Array, variables: Variables) -> Array:
@@ -157,26 +175,27 @@ def _numbers(factor: Factor, who: Array, variables: Variables) -> Array:
     return who + shift
 
 
+def _moved(factor: Factor, steps: Float[Array, "K d"], own: tuple[Array, ...]) -> tuple[Array, ...]:
+    """The variables of a row moved by increments."""
+    return tuple(
+        se2.compose(x, step[:3]) if kind == "pose" else x + step[: len(x)]
+        for kind, x, step in zip(factor.variables, own, steps, strict=True)
+    )
+
+
 def _jacobians(
     factor: Factor, who: Array, variables: Variables, z: Array, width: int
 ) -> tuple[Float[Array, "E R B"], Float[Array, "E R K d B"]]:
     """Residuals of rows, and their derivatives by the increments of each variable."""
 
-    def moved(increments: tuple[Array, ...], own: tuple[Array, ...], z: Array) -> Array:
-        return factor.residual(
-            tuple(
-                se2.compose(x, step) if kind == "pose" else x + step
-                for kind, x, step in zip(factor.variables, own, increments, strict=True)
-            ),
-            z,
-        )
+    def moved(steps: Array, own: tuple[Array, ...], z: Array) -> tuple[Array, Array]:
+        e = factor.residual(_moved(factor, steps, own), z)
+        return e, e
 
     def one(own: tuple[Array, ...], z: Array) -> tuple[Array, Array]:
-        still = tuple(jnp.zeros_like(x) for x in own)
-        e = factor.residual(own, z)
-        parts = jax.jacfwd(moved)(still, own, z)
-        wide = [jnp.pad(part, [(0, 0), (0, width - part.shape[1])]) for part in parts]
-        return e, jnp.stack(wide, axis=1)
+        still = jnp.zeros((len(own), width), z.dtype)
+        by_steps, e = jax.jacfwd(moved, has_aux=True)(still, own, z)
+        return e, by_steps
 
     found: tuple[Array, Array] = _over_rows(one, _taken(factor, who, variables), z)
     return found
@@ -199,7 +218,11 @@ def data_of(graph: Graph, column: Array) -> Data:
     return Data(
         {name: jnp.where(rows.valid[:, None], rows.z, 0.0) for name, rows in tables},
         {
-            name: jnp.where(rows.valid[:, None, None], rows.information, 0.0)
+            name: jnp.where(
+                rows.valid[:, None, None],
+                0.5 * (rows.information + jnp.swapaxes(rows.information, 1, 2)),
+                0.0,
+            )
             for name, rows in tables
         },
         {name: rows.valid for name, rows in tables},

@@ -1,7 +1,7 @@
 """The optimum of a graph: Gauss-Newton and Levenberg-Marquardt on sparse blocks."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import jax
@@ -10,43 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam import programs
+from jaxslam.graphs.batch import in_one_dtype, over_batch, with_batch
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.implicit import followed
 from jaxslam.graphs.kernels import Kernel
-from jaxslam.graphs.linearized import (
-    Model,
-    cost,
-    data_of,
-    variables_of,
-)
-from jaxslam.graphs.plan import Plan, factors_of, plan_for
+from jaxslam.graphs.linearized import cost, data_of, variables_of
+from jaxslam.graphs.model import Model, model_of
+from jaxslam.graphs.plan import Plan, plan_for
 from jaxslam.graphs.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
 from jaxslam.validation.numbers import check_count
-
-
-@functools.lru_cache(maxsize=256)
-def model_of(
-    factors: tuple[tuple[str, Factor], ...], kernels: tuple[tuple[str, Kernel], ...]
-) -> Model:
-    """The model of these functions, one object for the same ones."""
-    return Model(factors, kernels)
-
-
-def kernels_of(
-    name: str, graph: Graph, kernel: Kernel | Mapping[str, Kernel] | None
-) -> dict[str, Kernel]:
-    """The kernel of each table that has one. Raises ValueError beginning with a caller's name."""
-    if kernel is None:
-        return {}
-    if isinstance(kernel, Kernel):
-        return dict.fromkeys(graph.tables, kernel)
-    if lost := sorted(set(kernel) - set(graph.tables)):
-        raise ValueError(
-            f"{name}: kernels of tables that are not in the graph: {', '.join(lost)}; "
-            f"there are: {', '.join(graph.tables)}"
-        )
-    return dict(kernel)
 
 
 def optimize(
@@ -81,11 +55,10 @@ def optimize(
     if method not in METHODS:
         raise ValueError(f"{caller}: no method {method!r}; there are: {', '.join(METHODS)}")
     check_count(f"{caller}: iterations", iterations)
-    known = factors_of(caller, graph, factors)
+    model = model_of(caller, graph, factors, kernel)
+    known = dict(model.factors)
     check_graph(caller, graph, known)
-    kernels = kernels_of(caller, graph, kernel)
     plan = plan_for(caller, graph, known, plan)
-    model = model_of(tuple(known.items()), tuple(kernels.items()))
     limits = np.asarray(iterations), np.asarray(tolerance, float)
     return programs.call(_optimize, (model, method), graph, plan, *limits)
 
@@ -97,73 +70,40 @@ def chi2(
     kernel: Kernel | Mapping[str, Kernel] | None = None,
 ) -> Float[Array, ""]:
     """χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
-    known = factors_of("graphs.chi2", graph, factors)
-    kernels = kernels_of("graphs.chi2", graph, kernel)
-    model = model_of(tuple(known.items()), tuple(kernels.items()))
+    model = model_of("graphs.chi2", graph, factors, kernel)
     return programs.call(_chi2, (model,), graph)
 
 
 def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
     graph = in_one_dtype(graph)
     who = {name: table.who for name, table in graph.tables.items()}
-    batch = _with_batch(graph)
+    batch = with_batch(graph)
     none = jnp.arange(len(graph.poses) + len(graph.points))
     return cost(model, who, variables_of(batch), data_of(batch, none))[0]
-
-
-def in_one_dtype(graph: Graph) -> Graph:
-    """The graph with its numbers in one precision, the highest of them."""
-    numbers = [graph.poses, graph.points]
-    numbers += [x for table in graph.tables.values() for x in (table.z, table.information)]
-    dtype = jnp.result_type(*numbers)
-
-    def one(x: Array) -> Array:
-        x = jnp.asarray(x)
-        return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
-
-    return cast(Graph, jax.tree.map(one, graph))
-
-
-def _with_batch(tree: Any) -> Any:
-    return jax.tree.map(lambda x: jnp.asarray(x)[..., None], tree)
 
 
 def _optimize(
     model: Model, method: str, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
     graph = in_one_dtype(graph)
-    shared = plan, iterations, tolerance.astype(graph.poses.dtype)
-    return cast(
-        Solution,
-        jax.tree.map(lambda x: x[..., 0], _batched(model, method)(shared, _with_batch(graph))),
-    )
+    return _solver(model, method)(graph, plan, iterations, tolerance.astype(graph.poses.dtype))
 
 
 @functools.lru_cache(maxsize=256)
-def _batched(model: Model, method: str) -> Any:
-    """The solution of graphs with a last axis B; under `vmap` the batch becomes larger."""
+def _solver(model: Model, method: str) -> Callable[..., Solution]:
+    """The solution of one graph, with derivatives, and batched by `vmap`."""
+    solve = over_batch("graphs.optimize", functools.partial(minimize, model, method))
 
-    @jax.custom_batching.custom_vmap
-    def solve(shared: tuple[Plan, Array, Array], graph: Graph) -> Solution:
-        return minimize(model, method, *shared, graph)
+    @jax.custom_jvp
+    def solved(graph: Graph, *shared: Any) -> Solution:
+        return solve(shared, graph)
 
-    @solve.def_vmap
-    def rule(size: int, batched: Any, shared: Any, graph: Graph) -> tuple[Solution, Any]:
-        if any(jax.tree.leaves(batched[0])):
-            raise ValueError("graphs.optimize: the plan is one for all graphs of a batch")
+    @solved.defjvp
+    def slope(primals: Any, tangents: Any) -> tuple[Solution, Any]:
+        graph, plan, *_ = primals
+        found = solved(*primals)
+        return found, jax.jvp(
+            lambda graph: followed(model, plan, graph, found), (graph,), tangents[:1]
+        )[1]
 
-        def fold(x: Array, one: bool) -> Array:
-            x = (
-                jnp.moveaxis(x, 0, -2)
-                if one
-                else jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))
-            )
-            return x.reshape(*x.shape[:-2], size * x.shape[-1])
-
-        out = solve(shared, jax.tree.map(fold, graph, batched[1]))
-        out = jax.tree.map(
-            lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, x.shape[-1] // size), -2, 0), out
-        )
-        return out, jax.tree.map(lambda _: True, out)
-
-    return solve
+    return cast(Callable[..., Solution], solved)

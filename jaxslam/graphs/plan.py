@@ -5,11 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Int
+from numpy.typing import ArrayLike
 
-from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.model import factors_of
 from jaxslam.graphs.sparse.cholesky import CholeskyTables, cholesky_tables
 from jaxslam.graphs.sparse.gathered import Stages, stages
+from jaxslam.graphs.sparse.inverse import InverseTables, inverse_tables
 from jaxslam.graphs.sparse.sweeps import table
 from jaxslam.graphs.sparse.symbolic import factor_pattern
 from jaxslam.validation.numbers import is_concrete
@@ -35,9 +38,18 @@ class Plan(NamedTuple):
     block_row: Int[Array, "M"]
     on_diagonal: Bool[Array, "M"]
     cholesky: CholeskyTables
+    inverse: InverseTables | None
+    """None without `marginals`"""
+    pairs: Int[Array, "Q 2"]
 
 
-def plan(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Plan:
+def plan(
+    graph: Graph,
+    factors: Mapping[str, Factor] | None = None,
+    *,
+    marginals: bool = False,
+    pairs: ArrayLike = (),
+) -> Plan:
     """The plan of a graph, made on the host from `who`, which must be concrete.
 
     Give it to `optimize` to solve many graphs of one pattern, under `vmap` or one by one:
@@ -48,6 +60,12 @@ def plan(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Plan:
     Rows that are not valid are in the pattern all the same: which are may differ from graph to
     graph.
 
+    Args:
+        graph: of which only `who` and the numbers of poses and points are read.
+        factors: as in `optimize`.
+        marginals: whether to plan `marginals` as well.
+        pairs: (Q, 2), two variables each, points counted on from the poses, of which `marginals`
+            shall give the joint covariance.
     Raises:
         ValueError: where `who` is traced, or the tables do not fit their factors.
     """
@@ -73,13 +91,18 @@ def plan(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Plan:
             )
         shift = np.array([poses * (kind == "point") for kind in factors[name].variables])
         rows.append(who[name] + shift)
-    pairs = [
+    joined = [
         np.stack([r[:, a], r[:, b]]) for r in rows for a in range(r.shape[1]) for b in range(a)
     ]
-    first, second = np.concatenate([np.zeros((2, 0), int), *pairs], axis=1)
+    wanted = np.asarray(pairs, int).reshape(-1, 2)
+    if ((wanted < 0) | (wanted >= size)).any():
+        raise ValueError(
+            f"graphs.plan: expected pairs of variables from 0 to {size - 1}, got {wanted.tolist()}"
+        )
+    first, second = np.concatenate([wanted.T, *joined], axis=1)
     pattern = factor_pattern(size, first, second)
-    cholesky, order = cholesky_tables(pattern)
-    place = np.argsort(order)
+    cholesky, place = cholesky_tables(pattern)
+    order = np.argsort(place[:-1])
     columns = [pattern.position[r] for r in rows]
     blocks = []
     for column in columns:
@@ -99,32 +122,23 @@ def plan(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Plan:
         block_row=table(block_row),
         on_diagonal=table(block_row == block_column),
         cholesky=cholesky,
+        inverse=inverse_tables(pattern, place, *wanted.T) if marginals else None,
+        pairs=table(wanted),
     )
 
 
-def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
-    """The factor of each table: of the same name, or of the part before a slash.
-
-    Without factors they are those of files. Raises ValueError, which begins with a caller's name.
-    """
-    known = of_files() if factors is None else factors
-    out = {}
-    for key in graph.tables:
-        found = known.get(key, known.get(key.split("/")[0]))
-        if found is None:
-            raise ValueError(
-                f"{name}: table {key!r} has no factor; there are: {', '.join(known) or 'none'}"
-            )
-        out[key] = found
-    if not out:
-        raise ValueError(f"{name}: the graph has no tables")
-    return out
-
-
-def plan_for(name: str, graph: Graph, factors: Mapping[str, Factor], given: Plan | None) -> Plan:
+def plan_for(
+    name: str,
+    graph: Graph,
+    factors: Mapping[str, Factor],
+    given: Plan | None,
+    *,
+    marginals: bool = False,
+    pairs: Int[np.ndarray, "Q 2"] | None = None,
+) -> Plan:
     """The given plan, checked against the graph as far as that is concrete, or a new one."""
     if given is None:
-        return plan(graph, factors)
+        return plan(graph, factors, marginals=marginals, pairs=() if pairs is None else pairs)
     size = len(graph.poses) + len(graph.points)
     same = given.order.shape == (size,) and set(given.who) == set(graph.tables)
     for key, who in given.who.items():
@@ -133,4 +147,12 @@ def plan_for(name: str, graph: Graph, factors: Mapping[str, Factor], given: Plan
             same = bool(np.array_equal(graph.tables[key].who, who))
     if not same:
         raise ValueError(f"{name}: the plan is of another graph: variables or `who` differ")
+    if marginals and given.inverse is None:
+        raise ValueError(f"{name}: the plan is without marginals: `plan(graph, marginals=True)`")
+    if (
+        pairs is not None
+        and len(pairs)
+        and not (is_concrete(given.pairs) and np.array_equal(given.pairs, pairs))
+    ):
+        raise ValueError(f"{name}: the plan is of other pairs: `plan(graph, pairs=…)`")
     return given

@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.linearized import (
-    Model,
     System,
     Variables,
     data_of,
@@ -17,6 +16,7 @@ from jaxslam.graphs.linearized import (
     retract,
     variables_of,
 )
+from jaxslam.graphs.model import Model
 from jaxslam.graphs.plan import Plan
 from jaxslam.graphs.steps import dogleg, dot, marquardt
 

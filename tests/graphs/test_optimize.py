@@ -99,6 +99,22 @@ def test_the_optimum_is_that_of_dense_gauss_newton(method):
     assert found.singular == -1
 
 
+def test_marginals_are_the_blocks_of_the_dense_inverse():
+    graph = ring()
+    pairs = [[3, 4], [9, 2], [7, 19]]  # along an edge, none, none and turned round
+    poses, _, information, _ = dense(graph)
+    found = graphs.marginals(graph._replace(poses=poses), pairs=pairs)
+    cov = np.zeros((SIZE, 3, SIZE, 3))
+    cov[1:, :, 1:] = np.linalg.inv(information).reshape(SIZE - 1, 3, SIZE - 1, 3)
+    scale = np.abs(cov).max()
+    for k in range(SIZE):
+        np.testing.assert_allclose(found.poses[k], cov[k, :, k], atol=1e-8 * scale)
+    for joint, (a, b) in zip(found.pairs, pairs, strict=True):
+        both = [[cov[a, :, a], cov[a, :, b]], [cov[b, :, a], cov[b, :, b]]]
+        np.testing.assert_allclose(joint, np.array(both), atol=1e-8 * scale)
+    assert found.singular == -1
+
+
 def test_a_batch_has_the_optimum_of_each_graph():
     many = [ring(seed) for seed in range(3)]
     plan = graphs.plan(many[0])
@@ -107,3 +123,34 @@ def test_a_batch_has_the_optimum_of_each_graph():
     for k, graph in enumerate(many):
         np.testing.assert_allclose(found.chi2[k], dense(graph)[1], rtol=1e-10)
     assert (found.status == Ending.CONVERGED).all()
+
+
+def test_derivatives_of_the_optimum_are_differences():
+    """By measurements, information and the fixed pose, in reverse and in forward mode."""
+    graph, rng = ring(spread=20.0), np.random.default_rng(1)
+    plan, table = graphs.plan(graph), graph.tables["relative_pose"]
+    look = rng.normal(size=(SIZE, 3))
+    away = rng.normal(size=table.information.shape)
+    tangent = (
+        rng.normal(size=table.z.shape),
+        10 * (away + np.swapaxes(away, 1, 2)),
+        rng.normal(size=3),
+    )
+
+    def seen(z, information, first):
+        found = graphs.optimize(
+            graph._replace(
+                poses=jax.numpy.asarray(graph.poses).at[0].set(first),
+                tables={"relative_pose": table._replace(z=z, information=information)},
+            ),
+            plan=plan,
+        )
+        return (found.graph.poses * look).sum() + found.chi2
+
+    at = table.z, table.information, graph.poses[0]
+    gradient = jax.jit(jax.grad(seen, (0, 1, 2)))(*at)
+    slope = sum((g * t).sum() for g, t in zip(gradient, tangent, strict=True))
+    there = [tuple(x + h * t for x, t in zip(at, tangent, strict=True)) for h in (1e-5, -1e-5)]
+    value = jax.jit(seen)
+    np.testing.assert_allclose(slope, (value(*there[0]) - value(*there[1])) / 2e-5, rtol=1e-6)
+    np.testing.assert_allclose(slope, jax.jit(lambda: jax.jvp(seen, at, tangent)[1])(), rtol=1e-9)

@@ -24,7 +24,7 @@ from jaxslam.graphs.sparse.sweeps import (
     sweep,
     table,
 )
-from jaxslam.graphs.sparse.symbolic import Pattern
+from jaxslam.graphs.sparse.symbolic import Ints, Pattern
 from jaxslam.math.linalg import total
 
 
@@ -55,8 +55,9 @@ class Factored(NamedTuple):
     """whether the pivots of a column are positive"""
 
 
-def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Int[np.ndarray, "M"]]:
-    """The tables of a pattern, and its block at each place of `Factored.blocks`."""
+def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
+    """The tables of a pattern, and the place of each of its blocks, and of none, in
+    `Factored.blocks`."""
     size, heights, columns, rows = (
         len(pattern.order),
         pattern.heights,
@@ -70,7 +71,7 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Int[np.ndarray, "
         right.append(blocks[:, other].ravel())
         target.append(pattern.find(rows[left[-1]], rows[right[-1]]))
     sums = Sums(heights[columns], *map(np.concatenate, (target, left, right)))
-    order, place = places(sums)
+    _, place = places(sums)
     one = np.append(np.arange(size), nothing(size))
     factor = sweep(sums, place, place, one[np.append(columns, size)])
     # Columns are sorted by height: those of a level lie side by side.
@@ -90,7 +91,7 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Int[np.ndarray, "
         forward_order=table(forward_order),
         backward=sweep(upward, place, backward_place, one),
         backward_order=table(backward_order),
-    ), order
+    ), place
 
 
 def by_transposed(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 TARGETS = 8
 """T, targets that are computed together"""
@@ -35,6 +35,8 @@ class Sums(NamedTuple):
     left: Ints
     """its factors, (P,)"""
     right: Ints
+    flip: Bool[np.ndarray, "_"] | None = None
+    """whether the left factor is transposed, (P,)"""
 
 
 class Sweep(NamedTuple):
@@ -51,6 +53,8 @@ class Sweep(NamedTuple):
     end_base: Int[Array, "F"]
     end: Int[Array, "F T"]
     """what a target is finished with"""
+    flip: Bool[Array, "C T K"] | None
+    """whether the left factor is transposed"""
 
 
 def table(numbers: np.ndarray) -> Array:
@@ -124,6 +128,7 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
         table(np.array(ends)),
         table(np.array(end_base, int)),
         table(end[np.where(inside, ending, -1)]),
+        None if sums.flip is None else table(np.append(sums.flip, False)[product]),
     )
 
 
@@ -140,6 +145,8 @@ def subtract_products(
     def chunk(c: jax.Array, target: jax.Array) -> jax.Array:
         a = (target if left is None else left)[tables.left[c]]
         b = (target if right is None else right)[tables.right[c]]
+        if tables.flip is not None:
+            a = jnp.where(tables.flip[c][..., None, None, None], jnp.swapaxes(a, 2, 3), a)
         held = jax.lax.dynamic_slice_in_dim(target, tables.base[c], TARGETS)
         for k in range(TERMS):
             held = held - product(a[:, k], b[:, k])
