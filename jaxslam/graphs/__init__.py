@@ -14,14 +14,18 @@ from jaxslam.graphs.factor import (
     from_sensor,
     prior,
     relative_pose,
+    relative_pose_log,
     relative_position,
 )
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.kernels import KERNELS, Kernel, cauchy, dcs, huber, truncated
+from jaxslam.graphs.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber, truncated
+from jaxslam.graphs.log import of_log
 from jaxslam.graphs.marginals import Marginals, marginals
-from jaxslam.graphs.optimize import chi2, optimize, squares
+from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
+from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
 from jaxslam.graphs.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 
@@ -43,17 +47,20 @@ __all__ = [
     "check_graph",
     "chi2",
     "dcs",
+    "degrees_of_freedom",
     "from_motion",
     "from_sensor",
     "huber",
     "marginals",
+    "of_log",
     "optimize",
     "plan",
     "prior",
     "read",
     "relative_pose",
+    "relative_pose_log",
     "relative_position",
-    "squares",
+    "squared_residuals",
     "starts",
     "truncated",
     "with_gauge",

@@ -63,6 +63,22 @@ def relative_pose() -> Factor:
     )
 
 
+def relative_pose_log() -> Factor:
+    """The factor of a relative pose by its logarithm: e = log(Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ)), a twist.
+
+    The error of GTSAM's `BetweenFactorPose2` (4.3). Its θ is that of `relative_pose`, its (x, y)
+    turned by -θ/2 and shorter by (θ/2)/tan(θ/2): optima differ by the square of the residuals. To
+    take it for a file, give `optimize` {"relative_pose": relative_pose_log()}.
+    """
+
+    def residual(variables: tuple[Array, ...], z: Array) -> Array:
+        first, second = variables
+        return se2.log(se2.between(z, se2.between(first, second)))
+
+    poses = ("pose", "pose")
+    return Factor("relative_pose_log", poses, POSE, POSE, residual, predict=se2.compose)
+
+
 def prior() -> Factor:
     """The factor of a prior of a pose: e = Z⁻¹ ∘ X as (x, y, θ wrapped)."""
 

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.model import factors_of
 from jaxslam.validation.numbers import is_concrete
 
 INDEFINITE = 1e-6
@@ -156,23 +157,26 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
     told += f", … ({len(members):,} variables)" if len(members) > 3 else ""
     if len(parts.anchored) == 1:
         raise ValueError(
-            f"{name}: the graph has no gauge: fix a pose (fixed_pose, FIX in a file) or give one a "
-            "prior"
+            f"{name}: the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
+            "give one a prior"
         )
     raise ValueError(
-        f"{name}: the graph is disconnected: {told} have no measurement that joins them to a fixed "
-        f"pose or one with a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
+        f"{name}: the graph is disconnected: no measurement joins {told} to a fixed pose or one "
+        f"with a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
     )
 
 
-def with_gauge(graph: Graph, factors: Mapping[str, Factor]) -> tuple[Graph, int | None]:
-    """The graph with a gauge, and the index of the pose that was fixed for it.
+def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Graph:
+    """The graph with a pose fixed, if no variable is and no measurement is of one pose alone.
 
-    The first pose is fixed where no variable is and no measurement is of one pose alone; else
-    (None) the graph is as it was.
+    It is the first pose, of the largest part where the graph is disconnected. A graph that has a
+    gauge is returned as it is: the same object.
     """
-    if not len(graph.poses) or parts_of(graph, factors).anchored.any():
-        return graph, None
+    known = factors_of("graphs.with_gauge", graph, factors)
+    parts = parts_of(graph, known)
+    if not len(graph.poses) or parts.anchored.any():
+        return graph
     fixed: Any = np.asarray(graph.fixed_pose).copy()
-    fixed[0] = True
-    return graph._replace(fixed_pose=fixed), 0
+    of_poses = parts.part[: len(graph.poses)]
+    fixed[np.flatnonzero(of_poses == np.bincount(of_poses).argmax())[0]] = True
+    return graph._replace(fixed_pose=fixed)

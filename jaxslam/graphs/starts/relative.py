@@ -11,8 +11,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jaxslam import programs
-from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.model import factors_of
 from jaxslam.math import se2
 
 Factors = Mapping[str, Factor]
@@ -31,9 +32,9 @@ class Relative(NamedTuple):
 
 def relative_poses(graph: Graph, factors: Factors | None) -> Relative:
     """The relative poses that valid rows between two poses measure, of all tables."""
-    found = []
+    found, known = [], factors_of("graphs.starts", graph, factors)
     for key, table in graph.tables.items():
-        factor = (factors or of_files())[key]
+        factor = known[key]
         if factor.variables != ("pose", "pose") or factor.predict is None:
             continue
         valid = np.asarray(table.valid)
@@ -121,9 +122,10 @@ def with_points(
     Points that are fixed or placed already stay, and those without such a measurement.
     """
     points = np.array(graph.points, np.float64)
+    known = factors_of("graphs.starts", graph, factors)
     done = np.asarray(graph.fixed_point) | (False if placed is None else placed)
     for key, table in graph.tables.items():
-        factor = (factors or of_files())[key]
+        factor = known[key]
         if factor.variables != ("pose", "point") or factor.predict is None:
             continue
         who, z = (np.asarray(part)[np.asarray(table.valid)] for part in (table.who, table.z))
