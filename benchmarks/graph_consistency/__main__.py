@@ -62,7 +62,7 @@ def _draws(graph, runs):
 
 def _kernels(graph, runs):
     names = ("none", *kernels.ROBUST)
-    found = kernels.compare(graph, names, runs=runs)
+    found = kernels.compare(graph, names, runs)
     print(f"\n{runs} runs of {len(graph.poses)} poses: robust kernels and false closures")
     for name in names:
         rows = {share: found[name, share] for share in kernels.SHARES}

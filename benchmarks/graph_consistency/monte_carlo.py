@@ -32,33 +32,37 @@ class Draws(NamedTuple):
     """(N - 1,): their least expected values"""
     wrong: np.ndarray
     """whether the chordal start ends in a larger χ²"""
+    certified: np.ndarray
+    """whether the chordal surrogate's optimum beside the second is proved global"""
     failed: np.ndarray
     """whether an optimization did not converge"""
 
 
-def draws(graph, scale, runs, block=8, chordal=True):
+def draws(graph, scale, runs, block=8):
     """The draws of a graph with `scale` times its standard deviations."""
     keys = jax.random.split(jax.random.key(round(10 * scale)), runs)
     one = jax.tree.map(np.asarray, measured(graph, keys[0], scale))
     plan = graphs.plan(one, marginals=True)
     bound = np.asarray(graphs.marginals(one, plan=plan).poses)[1:]
     solve = jax.jit(jax.vmap(partial(_solved, plan=plan)))
+    prove = jax.jit(jax.vmap(lambda graph: graphs.certificate(graph, plan=plan).certified))
     draw = jax.jit(jax.vmap(partial(measured, graph, scale=scale)))
     rows = []
     for begin in range(0, runs, block):
         many = jax.device_get(draw(keys[np.arange(begin, begin + block) % runs]))
         found = jax.device_get(solve(many))
-        again = jax.device_get(solve(_from_chordal(many))) if chordal else found
+        again = jax.device_get(solve(_from_chordal(many)))
+        certified = jax.device_get(prove(many._replace(poses=again[0])))
         error = pose_error(np.asarray(graph.poses), found[0])[:, 1:]
         cov = found[1][:, 1:]
         nees = np.einsum("rni,rni->rn", error, np.linalg.solve(cov, error[..., None])[..., 0])
         square = (error[..., :2] ** 2).sum(axis=-1)
         wrong = again[2] > found[2] * (1 + 1e-6)
-        rows.append((found[2], nees, square, wrong, found[3] | again[3]))
-    chi2, nees, square, wrong, failed = (
+        rows.append((found[2], nees, square, wrong, certified, found[3] | again[3]))
+    chi2, nees, square, *flags = (
         np.concatenate(part)[:runs] for part in zip(*rows, strict=True)
     )
-    return Draws(chi2, nees, square, np.trace(bound[:, :2, :2], axis1=1, axis2=2), wrong, failed)
+    return Draws(chi2, nees, square, np.trace(bound[:, :2, :2], axis1=1, axis2=2), *flags)
 
 
 def _solved(graph, plan):
@@ -92,5 +96,6 @@ def summary(found, dof):
         "χ²: p of Kolmogorov-Smirnov": p,
         "RMSE / bound": rmse,
         "wrong minima from chordal": found.wrong.mean(),
+        "certificate fails": 1 - found.certified.mean(),
         "not converged": found.failed.mean(),
     }

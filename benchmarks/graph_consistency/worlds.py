@@ -1,6 +1,7 @@
 """Graphs with true poses, their noisy measurements, and false loop closures."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -70,25 +71,33 @@ def measured(graph, key, scale=1.0):
     return graph._replace(tables=graph.tables | {name: drawn})
 
 
-def with_false_closures(graph, share, seed):
-    """The graph in two tables, odometry and loops, where `share` of the loops are false: between
-    poses drawn at random, at the relative pose that the true loop had. And which are false."""
+class Mixed(NamedTuple):
+    """A graph in two tables, odometry and loops, some of which are false."""
+
+    graph: Graph
+    loops: str
+    """the table of loops"""
+    false: np.ndarray
+    """(E,) which of them are"""
+
+
+def with_false_closures(graph, share, seed=0):
+    """The graph with false loops, a `share` of all loops: between poses drawn at random, at the
+    relative pose of a true loop."""
     rng = np.random.default_rng(seed)
     (name, table), *_ = graph.tables.items()
     table = Table(*(np.asarray(leaf) for leaf in table))
     follows = table.who[:, 1] - table.who[:, 0] == 1
     odometry, loops = (Table(*(leaf[rows] for leaf in table)) for rows in (follows, ~follows))
-    count = len(loops.who)
-    wanted = round(share / (1 - share) * count)
-    source = rng.integers(count, size=wanted)
-    pairs = rng.integers(len(graph.poses), size=(wanted, 2))
-    pairs[:, 1] = np.where(np.abs(pairs[:, 0] - pairs[:, 1]) < 2, pairs[:, 0] - 3, pairs[:, 1])
-    pairs %= len(graph.poses)
+    count, poses = len(loops.who), len(graph.poses)
+    wanted = int(share / (1 - share) * count)
+    source, first = rng.integers(count, size=wanted), rng.integers(poses, size=wanted)
+    second = (first + rng.integers(5, poses - 5, size=wanted)) % poses
     both = Table(
-        np.concatenate([loops.who, pairs]),
+        np.concatenate([loops.who, np.stack([first, second], axis=1)]),
         np.concatenate([loops.z, loops.z[source]]),
         np.concatenate([loops.information, loops.information[source]]),
         np.ones(count + wanted, bool),
     )
     tables = {f"{name}/odometry": odometry, f"{name}/loops": both}
-    return graph._replace(tables=tables), np.arange(count + wanted) >= count
+    return Mixed(graph._replace(tables=tables), f"{name}/loops", np.arange(len(both.who)) >= count)

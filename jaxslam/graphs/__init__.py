@@ -19,11 +19,11 @@ from jaxslam.graphs.factor import (
 )
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
+from jaxslam.graphs.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber, truncated
 from jaxslam.graphs.log import of_log
-from jaxslam.graphs.kernels import KERNELS, Kernel, cauchy, dcs, huber, truncated
 from jaxslam.graphs.marginals import Marginals, marginals
-from jaxslam.graphs.optimize import chi2, optimize, squares
+from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
 from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
 from jaxslam.graphs.search import Ending, Solution
@@ -51,8 +51,8 @@ __all__ = [
     "from_motion",
     "from_sensor",
     "huber",
-    "of_log",
     "marginals",
+    "of_log",
     "optimize",
     "plan",
     "prior",
@@ -61,7 +61,6 @@ __all__ = [
     "relative_pose_log",
     "relative_position",
     "squared_residuals",
-    "squares",
     "starts",
     "truncated",
     "with_gauge",

@@ -172,6 +172,7 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     first = jnp.stack([jnp.zeros_like(angle)] * 2 + [jnp.cos(angle), jnp.sin(angle)], axis=1)
     first = of_turns * first[..., None]
     first = first / jnp.sqrt((first * first).sum((0, 1)))[None, None]
+    first = jnp.broadcast_to(first, (*first.shape[:2], *shift.shape))
     smallest = jax.lax.fori_loop(0, POWERS, power, (first, jnp.zeros_like(shift)))[1]
     gap = value - bound + poses * shift
     away = found.graph.poses - graph.poses

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.plan import factors_of
+from jaxslam.graphs.model import factors_of
 
 
 def squared_residuals(

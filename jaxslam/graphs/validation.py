@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.plan import factors_of
+from jaxslam.graphs.model import factors_of
 from jaxslam.validation.numbers import is_concrete
 
 INDEFINITE = 1e-6
@@ -161,8 +161,8 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
             "give one a prior"
         )
     raise ValueError(
-        f"{name}: the graph is disconnected: no measurement joins {told} to a fixed pose or one with "
-        f"a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
+        f"{name}: the graph is disconnected: no measurement joins {told} to a fixed pose or one "
+        f"with a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
     )
 
 

@@ -54,7 +54,7 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     worst = summary["worst residuals"]
     assert len(worst) == 10 and worst[0]["between"][0].startswith("pose 1")
 
-    rows = list(csv.DictReader((out / "poses.csv").open()))
+    rows = list(csv.DictReader((out / "poses.csv").read_text().splitlines()))
     assert [int(row["id"]) for row in rows] == list(range(10, 18))
     assert [int(row["fixed"]) for row in rows] == [1] + [0] * 7
     found = np.array([[float(r[k]) for k in ("x [m]", "y [m]", "theta [rad]")] for r in rows])
