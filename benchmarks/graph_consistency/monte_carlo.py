@@ -59,9 +59,7 @@ def draws(graph, scale, runs, block=8):
         square = (error[..., :2] ** 2).sum(axis=-1)
         wrong = again[2] > found[2] * (1 + 1e-6)
         rows.append((found[2], nees, square, wrong, certified, found[3] | again[3]))
-    chi2, nees, square, *flags = (
-        np.concatenate(part)[:runs] for part in zip(*rows, strict=True)
-    )
+    chi2, nees, square, *flags = (np.concatenate(part)[:runs] for part in zip(*rows, strict=True))
     return Draws(chi2, nees, square, np.trace(bound[:, :2, :2], axis1=1, axis2=2), *flags)
 
 

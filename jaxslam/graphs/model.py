@@ -39,17 +39,17 @@ def model_of(
             f"{name}: kernels of tables that are not in the graph: {', '.join(lost)}; "
             f"there are: {', '.join(graph.tables)}"
         )
-    return _same(tuple(known.items()), tuple(kernel.items()) if kernel else ())
+    return _same(tuple(known.items()), tuple(sorted(kernel.items())) if kernel else ())
 
 
 def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
     """The factor of each table: of the same name, or of the part before a slash.
 
-    Without factors they are those of files. Raises ValueError, which begins with a caller's name.
+    In the order of the names, which is that of a graph that has been through `jax.tree.map`. Without factors they are those of files. Raises ValueError, which begins with a caller's name.
     """
     known = of_files() if factors is None else factors
     out = {}
-    for key in graph.tables:
+    for key in sorted(graph.tables):
         found = known.get(key, known.get(key.split("/")[0]))
         if found is None:
             raise ValueError(

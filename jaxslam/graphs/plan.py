@@ -73,7 +73,8 @@ def plan(
     poses, points = len(graph.poses), len(graph.points)
     size = poses + points
     who, rows = {}, []
-    for name, its in graph.tables.items():
+    for name in factors:
+        its = graph.tables[name]
         if not is_concrete(its.who):
             raise ValueError(
                 f"graphs.plan: `who` of the table {name!r} is traced: make the plan of one graph "
