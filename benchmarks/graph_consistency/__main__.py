@@ -2,8 +2,8 @@
 
     python -m benchmarks.graph_consistency [--quick] [--part draws,kernels,filters]
 
-- `draws`: many draws of the Manhattan world at its true poses (a square of 100 poses with --quick or
-  without the data), noise as the file has it, times 1, 3 and 10 (`monte_carlo`);
+- `draws`: many draws of the Manhattan world at its true poses (with --quick, or without the data, a
+  square of 100 poses), noise as the file has it, times 1, 3 and 10 (`monte_carlo`);
 - `kernels`: robust kernels at 0 to 50 % false loop closures (`kernels`);
 - `filters`: filters, the fixed-lag smoother and the graph on the same draws of `circle`, `loop` and
   `webmap` (`filters`).

@@ -45,7 +45,8 @@ def model_of(
 def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
     """The factor of each table: of the same name, or of the part before a slash.
 
-    In the order of the names, which is that of a graph that has been through `jax.tree.map`. Without factors they are those of files. Raises ValueError, which begins with a caller's name.
+    They are in the order of the names, as in a graph that has been through `jax.tree.map`. Without
+    factors they are those of files. Raises ValueError, which begins with a caller's name.
     """
     known = of_files() if factors is None else factors
     out = {}
