@@ -256,7 +256,7 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
             help=f"{text}, one of: {', '.join(known)} (default: {default or 'none'})",
         )
     parser.add_argument(
-        "--iterations", type=int, default=100, help="number of steps at most (default: 100)"
+        "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
     )
     cache.add_options(parser)
     parser.add_argument(
