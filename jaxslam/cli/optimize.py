@@ -13,7 +13,7 @@ from jaxslam import graphs
 from jaxslam.cli.common import pick
 from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.datasets import g2o
-from jaxslam.graphs import Ending, Graph, kernels, starts
+from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
 from jaxslam.graphs.validation import label, variables_of
 from jaxslam.monte_carlo.progress import Progress
@@ -35,7 +35,7 @@ WORST = 10
 def optimize_graph(options: argparse.Namespace, command: str) -> int:
     """Optimize a graph, print and write the result; returns the exit status, 1 if not converged."""
     start = pick("start", options.start, starts.STARTS)
-    kernel = None if options.kernel is None else pick("kernel", options.kernel, kernels.REGISTRY)()
+    kernel = None if options.kernel is None else pick("kernel", options.kernel, graphs.KERNELS)()
     relative, equation = pick("error", options.error, ERRORS)
     loaded = g2o.load(options.path)
     check_writable(options.out)
@@ -58,7 +58,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
             )
             seconds, compiling = clock.seconds, clock.compiling
     found = jax.tree.map(np.asarray, solution.graph)
-    squared = {k: np.asarray(s) for k, s in graphs.squared_residuals(found, factors).items()}
+    squared = {k: np.asarray(s) for k, s in graphs.squares(found, factors).items()}
     converged = int(solution.status) == Ending.CONVERGED
     summary = {
         "file": str(options.path),

@@ -5,6 +5,7 @@ relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without
 """
 
 from jaxslam.graphs import starts
+from jaxslam.graphs.certificate import Certificate, certificate
 from jaxslam.graphs.factor import (
     REGISTRY,
     Factor,
@@ -17,18 +18,20 @@ from jaxslam.graphs.factor import (
     relative_position,
 )
 from jaxslam.graphs.files import read, write
+from jaxslam.graphs.freedom import degrees_of_freedom
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber
+from jaxslam.graphs.kernels import KERNELS, Kernel, cauchy, dcs, huber, truncated
 from jaxslam.graphs.log import of_log
 from jaxslam.graphs.marginals import Marginals, marginals
-from jaxslam.graphs.optimize import chi2, optimize
+from jaxslam.graphs.optimize import chi2, optimize, squares
 from jaxslam.graphs.plan import Plan, plan
-from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
 from jaxslam.graphs.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [
+    "KERNELS",
     "REGISTRY",
+    "Certificate",
     "Ending",
     "Factor",
     "Graph",
@@ -39,6 +42,7 @@ __all__ = [
     "Table",
     "bearing",
     "cauchy",
+    "certificate",
     "check_graph",
     "chi2",
     "dcs",
@@ -55,8 +59,9 @@ __all__ = [
     "relative_pose",
     "relative_pose_log",
     "relative_position",
-    "squared_residuals",
+    "squares",
     "starts",
+    "truncated",
     "with_gauge",
     "write",
 ]

@@ -107,7 +107,7 @@ def cost(
 
 def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> System:
     """The normal equations about the variables."""
-    width = data.free.shape[1]
+    width, poses = data.free.shape[1], len(variables.poses)
     chi2, gradients, blocks = [], [], []
     for name, factor in model.factors:
         e, jacobian = _jacobians(factor, plan.who[name], variables, data.z[name], width)
@@ -116,7 +116,7 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
         chi2.append(jnp.where(valid, s if kernel is None else kernel.cost(s), 0.0).sum(axis=0))
         weight = 1.0 if kernel is None else kernel.weight(s)
         info = info * jnp.where(valid, weight, 0.0)[:, None, None]
-        free = data.free[plan.column[_numbers(factor, plan.who[name], variables)]]
+        free = data.free[plan.column[variable_numbers(factor, plan.who[name], poses)]]
         keep = valid[:, None, None, None] & free[:, None]  # (E, 1, K, d, B)
         jacobian = jnp.where(keep, jacobian, 0.0)
         rows, size = e.shape[0], e.shape[1]
@@ -145,7 +145,7 @@ def _assembled(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d
 
 def hessian(model: Model, plan: Plan, variables: Variables, data: Data) -> Float[Array, "M d d B"]:
     """Half the second derivative of χ² by the increments, as `System.blocks`."""
-    width = data.free.shape[1]
+    width, poses = data.free.shape[1], len(variables.poses)
     blocks = []
     for name, factor in model.factors:
         kernel, count = model.kernel(name), len(factor.variables)
@@ -160,7 +160,7 @@ def hessian(model: Model, plan: Plan, variables: Variables, data: Data) -> Float
         second: Array = jax.vmap(
             jax.vmap(jax.jacfwd(jax.grad(half)), (None, -1, -1, -1), -1), (None, 0, 0, 0)
         )(still, own, data.z[name], data.information[name])  # (E, K, d, K, d, B)
-        free = data.free[plan.column[_numbers(factor, plan.who[name], variables)]]
+        free = data.free[plan.column[variable_numbers(factor, plan.who[name], poses)]]
         keep = free[:, :, :, None, None] & free[:, None, None]
         keep = keep & data.valid[name][:, None, None, None, None]
         second = jnp.moveaxis(jnp.where(keep, second, 0.0), 3, 2)
@@ -168,9 +168,8 @@ def hessian(model: Model, plan: Plan, variables: Variables, data: Data) -> Float
     return _assembled(plan, blocks, data)
 
 
-def _numbers(factor: Factor, who: Array, variables: Variables) -> Array:
-    """The variables of rows, points counted on from the poses."""
-    poses = len(variables.poses)
+def variable_numbers(factor: Factor, who: Array, poses: int) -> Array:
+    """The variables of rows, points counted on from so many poses."""
     shift = np.array([[poses * (kind == "point") for kind in factor.variables]], np.int32)
     return who + shift
 

@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 from jaxslam import programs
 from jaxslam.graphs.batch import in_one_dtype, over_batch, with_batch
 from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.gnc import graduated
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.implicit import followed
 from jaxslam.graphs.kernels import Kernel
-from jaxslam.graphs.linearized import cost, data_of, variables_of
+from jaxslam.graphs.linearized import cost, data_of, row_costs, variables_of
 from jaxslam.graphs.model import Model, model_of
 from jaxslam.graphs.plan import Plan, plan_for
 from jaxslam.graphs.search import METHODS, Solution, minimize
@@ -43,7 +44,8 @@ def optimize(
         factors: the factor of each table; those of files by default. A table "name/part" takes the
             factor "name".
         method: "levenberg_marquardt", "gauss_newton" (λ = 0, every step is taken) or "dogleg".
-        kernel: robust kernels, one for all tables or by table.
+        kernel: robust kernels, one for all tables or by table. With `truncated` the iterations are
+            rounds of graduated non-convexity (`gnc`), and `iterations` is the limit of each.
         iterations: steps at most.
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
             predicts, and at least by rounding.
@@ -74,6 +76,27 @@ def chi2(
     return programs.call(_chi2, (model,), graph)
 
 
+def squares(
+    graph: Graph, factors: Mapping[str, Factor] | None = None
+) -> dict[str, Float[Array, "E"]]:
+    """s = eᵀ Ω e of each row of each table, zero where it is not valid.
+
+    The weight that a robust kernel gives a row is `kernel.weight(s)`.
+    """
+    return programs.call(_squares, (model_of("graphs.squares", graph, factors),), graph)
+
+
+def _squares(model: Model, graph: Graph) -> dict[str, Float[Array, "E"]]:
+    batch = with_batch(in_one_dtype(graph))
+    data = data_of(batch, jnp.arange(len(graph.poses) + len(graph.points)))
+    out = {}
+    for name, factor in model.factors:
+        who, z, info = graph.tables[name].who, data.z[name], data.information[name]
+        s = row_costs(factor, None, who, variables_of(batch), z, info)[1]
+        out[name] = jnp.where(data.valid[name], s, 0.0)[:, 0]
+    return out
+
+
 def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
     graph = in_one_dtype(graph)
     who = {name: table.who for name, table in graph.tables.items()}
@@ -92,7 +115,8 @@ def _optimize(
 @functools.lru_cache(maxsize=256)
 def _solver(model: Model, method: str) -> Callable[..., Solution]:
     """The solution of one graph, with derivatives, and batched by `vmap`."""
-    solve = over_batch("graphs.optimize", functools.partial(minimize, model, method))
+    search = graduated if any(k.limit is not None for _, k in model.kernels) else minimize
+    solve = over_batch("graphs.optimize", functools.partial(search, model, method))
 
     @jax.custom_jvp
     def solved(graph: Graph, *shared: Any) -> Solution:

@@ -126,7 +126,7 @@ def test_a_batch_has_the_optimum_of_each_graph():
 
 
 def test_derivatives_of_the_optimum_are_differences():
-    """By measurements, information and the fixed pose, in reverse and in forward mode."""
+    """By measurements, information and the fixed pose."""
     graph, rng = ring(spread=20.0), np.random.default_rng(1)
     plan, table = graphs.plan(graph), graph.tables["relative_pose"]
     look = rng.normal(size=(SIZE, 3))
@@ -137,20 +137,61 @@ def test_derivatives_of_the_optimum_are_differences():
         rng.normal(size=3),
     )
 
+    start = jax.numpy.asarray(graph.poses)
+
     def seen(z, information, first):
-        found = graphs.optimize(
-            graph._replace(
-                poses=jax.numpy.asarray(graph.poses).at[0].set(first),
-                tables={"relative_pose": table._replace(z=z, information=information)},
-            ),
-            plan=plan,
-        )
+        tables = {"relative_pose": table._replace(z=z, information=information)}
+        moved = graph._replace(poses=start.at[0].set(first), tables=tables)
+        found = graphs.optimize(moved, plan=plan)
         return (found.graph.poses * look).sum() + found.chi2
 
     at = table.z, table.information, graph.poses[0]
     gradient = jax.jit(jax.grad(seen, (0, 1, 2)))(*at)
     slope = sum((g * t).sum() for g, t in zip(gradient, tangent, strict=True))
-    there = [tuple(x + h * t for x, t in zip(at, tangent, strict=True)) for h in (1e-5, -1e-5)]
-    value = jax.jit(seen)
-    np.testing.assert_allclose(slope, (value(*there[0]) - value(*there[1])) / 2e-5, rtol=1e-6)
-    np.testing.assert_allclose(slope, jax.jit(lambda: jax.jvp(seen, at, tangent)[1])(), rtol=1e-9)
+    high, low = (
+        seen(*(x + h * t for x, t in zip(at, tangent, strict=True))) for h in (1e-5, -1e-5)
+    )
+    np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
+
+
+def falsified(graph, false=((2, 12), (6, 15))):
+    """The graph with false loop closures in a table of their own, which agree with each other."""
+    table = graph.tables["relative_pose"]
+    who = np.array(false, np.int32)
+    z = between(graph.poses[who[:, 0]], graph.poses[who[:, 1]]) + [3.0, -2.0, 0.5]
+    many = np.array([np.concatenate([who, table.who[SIZE:]])])[0]
+    loops = Table(
+        many,
+        np.concatenate([z, table.z[SIZE:]]),
+        np.concatenate([table.information[: len(who)], table.information[SIZE:]]),
+        np.ones(len(many), bool),
+    )
+    odometry = Table(*(field[:SIZE] for field in table))
+    return graph._replace(
+        tables={"relative_pose": odometry, "relative_pose/loops": loops}
+    ), graph._replace(poses=graph.poses)
+
+
+@pytest.mark.parametrize("name", ["dcs", "truncated"])
+def test_a_redescending_kernel_leaves_false_loop_closures_out(name):
+    graph, clean = falsified(ring())
+    poses, _, _, _ = dense(clean)
+    kernel = graphs.KERNELS[name]()
+    found = graphs.optimize(graph, kernel={"relative_pose/loops": kernel})
+    s = graphs.squares(found.graph)["relative_pose/loops"]
+    weights = np.asarray(kernel.weight(s))
+    assert found.status == Ending.CONVERGED
+    assert (weights[:2] < 1e-3).all()
+    if name == "truncated":  # binary: the others' own optimum
+        assert (weights[2:] == 1).all()
+        np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(graphs.KERNELS))
+def test_the_weight_of_a_kernel_is_the_slope_of_its_cost(name):
+    kernel, s, h = graphs.KERNELS[name](), np.array([0.0, 0.3, 2.0, 9.0, 40.0, 1e4]), 1e-6
+    slope = (np.asarray(kernel.cost(s + h)) - np.asarray(kernel.cost(np.maximum(s - h, 0)))) / (
+        s + h - np.maximum(s - h, 0)
+    )
+    np.testing.assert_allclose(kernel.weight(s), slope, atol=1e-5)
+    np.testing.assert_allclose(kernel.cost(np.array([0.0, 1e-3])), [0, 1e-3], rtol=1e-3)
