@@ -258,6 +258,12 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
     )
+    parser.add_argument(
+        "--certificate",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
+    )
     cache.add_options(parser)
     parser.add_argument(
         "--dtype",

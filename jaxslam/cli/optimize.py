@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -83,6 +84,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "gradient / at the start": _finite(solution.gradient / solution.gradient_start),
         "seconds to compile": round(compiling, 3),
         "seconds to run": round(seconds - compiling, 3),
+        **(_certificate(found, converged, kernel is None) if options.certificate else {}),
     }
     print(_table(summary))
     worst = _worst(found, squared, factors)
@@ -120,6 +122,28 @@ def _status(solution: graphs.Solution, found: Graph) -> str:
     if ending != Ending.SINGULAR:
         return str(ending.name.lower())
     return f"singular: the measurements do not determine {label(found, int(solution.singular))}"
+
+
+def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, Any]:
+    """What is proved of the optimum: entries of the summary."""
+    if not converged or not plain:
+        why = "of a robust cost nothing is proved" if converged else "there is no optimum"
+        return {"certificate": f"none: {why}"}
+    began = time.perf_counter()
+    try:
+        proof = jax.block_until_ready(graphs.certificate(found))
+    except ValueError as error:
+        return {"certificate": f"none: {str(error).removeprefix('graphs.certificate: ')}"}
+    return {
+        "certificate": "the chordal optimum next to it is global"
+        if proof.certified
+        else "not certified: another optimum of the chordal cost may be lower",
+        "chordal chi2": _finite(proof.chi2),
+        "lower by at most": _finite(proof.gap),
+        "distance of the two optima [m]": _finite(proof.position),
+        "distance of the two optima [rad]": _finite(proof.heading),
+        "seconds of the certificate": round(time.perf_counter() - began, 3),
+    }
 
 
 def _finite(value: Any) -> float | None:

@@ -52,6 +52,8 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     assert summary["status"] == "converged" and summary["skipped lines"] == {"comments": 1}
     assert summary["chi2"] < summary["chi2 at the start"]
     worst = summary["worst residuals"]
+    assert summary["certificate"] == "the chordal optimum next to it is global"
+    assert summary["distance of the two optima [m]"] < 1.0
     assert len(worst) == 10 and worst[0]["between"][0].startswith("pose 1")
 
     rows = list(csv.DictReader((out / "poses.csv").read_text().splitlines()))
