@@ -35,11 +35,11 @@ def of_log(
 ) -> tuple[Graph, dict[str, Factor]]:
     """The graph of a log of T steps, and its factors: its optimum is that of `batch_map`.
 
-    | table | factor | rows |
-    |---|---|---|
-    | `"prior"` | `prior` of the pose before the first control | 1; none where P0 = 0 |
-    | `"motion"` | `from_motion(motion)`, z = u, Ω = Q⁻¹; or `nominal_motion` | T |
-    | `"sensor"` | `from_sensor(sensor)`, Ω = R⁻¹ | T·M, valid where the scan is |
+    Its tables, their factors, and the number of their rows:
+
+        prior    prior() of the pose before the first control              1; none where P0 = 0
+        motion   from_motion(motion), z = u, Ω = Q⁻¹; or nominal_motion    T
+        sensor   from_sensor(sensor), Ω = R⁻¹                              T·M
 
     χ² of the graph is twice the cost of `smoothing.batch_map`, and `pose_id` t is the pose after t
     controls. Poses start along the nominal motion, points at their first measurement, where Q and R
