@@ -42,7 +42,8 @@ def read(path: str | Path) -> Graph:
 def write(path: str | Path, graph: Graph) -> None:
     """Write a graph as a file of g2o that `read` reads as the same graph, number by number.
 
-    Poses, points, `FIX`, then the tables in their order; rows that are not valid are left out.
+    Poses, points, `FIX`, then the tables in their order; rows that are not valid are left out. A
+    table "name/part" is written as the table "name", and read as part of it.
 
     Raises ValueError on a table that g2o has no line for, points of other than two numbers, and an
     id of both a pose and a point.
