@@ -246,7 +246,7 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
     for name, default, known, text in (
         ("start", "given", STARTS, "where to start"),
         ("method", "levenberg_marquardt", STEPS, "the steps"),
-        ("kernel", None, KERNELS, "a robust kernel for all measurements"),
+        ("kernel", None, KERNELS, "a robust kernel for loop edges and measurements of points"),
         ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
     ):
         parser.add_argument(

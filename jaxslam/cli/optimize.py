@@ -28,6 +28,9 @@ ERRORS = {
 
 COST = "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses"
 
+TRUSTED = ("relative_pose", "prior")
+"""Tables without a robust kernel: relative poses of successive poses, and priors."""
+
 NOT_CONVERGED = 1
 WORST = 10
 """Number of rows with the largest residuals in the summary and the figure."""
@@ -42,9 +45,12 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     check_writable(options.out)
     known = {**of_files(), "relative_pose": relative()}
     factors = {key: known[key] for key in loaded.graph.tables}
-    given = graphs.with_gauge(loaded.graph, factors)
-    graphs.check_graph(str(options.path), given, factors)
+    held = graphs.with_gauge(loaded.graph, factors)
+    graphs.check_graph(str(options.path), held, factors)
+    given = held if kernel is None else graphs.with_loops_apart(held)
+    factors = {key: known[key.split("/")[0]] for key in given.tables}
     begun = start(given, factors)
+    doubted = {key: kernel for key in given.tables if key not in TRUSTED} if kernel else None
     with Progress(Path(options.path).name, "steps") as progress:
         progress.say("compiling and solving …")
         with CompileClock() as clock:
@@ -53,7 +59,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
                     begun,
                     factors,
                     method=options.method,
-                    kernel=kernel,
+                    kernel=doubted,
                     iterations=options.iterations,
                 )
             )
@@ -70,7 +76,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "edges": {key: int(table.valid.sum()) for key, table in found.tables.items()},
         "skipped lines": loaded.skipped,
         "placed along the edges": loaded.placed,
-        "gauge": _gauge(loaded.graph, given),
+        "gauge": _gauge(loaded.graph, held),
         "start": options.start,
         "method": options.method,
         "kernel": options.kernel or "none",

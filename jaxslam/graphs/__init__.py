@@ -23,6 +23,7 @@ from jaxslam.graphs.freedom import degrees_of_freedom
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.kernels import KERNELS, Kernel, cauchy, dcs, huber, truncated
 from jaxslam.graphs.log import of_log
+from jaxslam.graphs.loops import with_loops_apart
 from jaxslam.graphs.marginals import Marginals, marginals
 from jaxslam.graphs.optimize import chi2, optimize, squares
 from jaxslam.graphs.plan import Plan, plan
@@ -65,5 +66,6 @@ __all__ = [
     "starts",
     "truncated",
     "with_gauge",
+    "with_loops_apart",
     "write",
 ]
