@@ -21,7 +21,7 @@ from jaxslam.cli.models import verify_models
 from jaxslam.cli.optimize import COST, ERRORS, optimize_graph
 from jaxslam.datasets import READERS
 from jaxslam.datasets.settings import METHODS
-from jaxslam.graphs.kernels import KERNELS
+from jaxslam.graphs.kernels import REGISTRY as KERNELS
 from jaxslam.graphs.search import METHODS as STEPS
 from jaxslam.graphs.starts import STARTS
 from jaxslam.results.campaign_files import FORMATS

@@ -65,7 +65,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
             )
             seconds, compiling = clock.seconds, clock.compiling
     found = jax.tree.map(np.asarray, solution.graph)
-    squared = {k: np.asarray(s) for k, s in graphs.squares(found, factors).items()}
+    squared = {k: np.asarray(s) for k, s in graphs.squared_residuals(found, factors).items()}
     converged = int(solution.status) == Ending.CONVERGED
     summary = {
         "file": str(options.path),

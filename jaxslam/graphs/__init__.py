@@ -19,14 +19,15 @@ from jaxslam.graphs.factor import (
     relative_position,
 )
 from jaxslam.graphs.files import read, write
-from jaxslam.graphs.freedom import degrees_of_freedom
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.kernels import KERNELS, Kernel, cauchy, dcs, huber, truncated
+from jaxslam.graphs.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber, truncated
 from jaxslam.graphs.log import of_log
 from jaxslam.graphs.loops import with_loops_apart
 from jaxslam.graphs.marginals import Marginals, marginals
-from jaxslam.graphs.optimize import chi2, optimize, squares
+from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
+from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
 from jaxslam.graphs.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 
@@ -62,7 +63,7 @@ __all__ = [
     "relative_pose",
     "relative_pose_log",
     "relative_position",
-    "squares",
+    "squared_residuals",
     "starts",
     "truncated",
     "with_gauge",

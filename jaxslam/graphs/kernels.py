@@ -77,5 +77,5 @@ def truncated(limit: float = 3.37) -> Kernel:
     )
 
 
-KERNELS = {"huber": huber, "cauchy": cauchy, "dcs": dcs, "truncated": truncated}
+REGISTRY = {"huber": huber, "cauchy": cauchy, "dcs": dcs, "truncated": truncated}
 """Factories of kernels by name."""

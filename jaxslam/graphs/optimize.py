@@ -16,7 +16,7 @@ from jaxslam.graphs.gnc import graduated
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.implicit import followed
 from jaxslam.graphs.kernels import Kernel
-from jaxslam.graphs.linearized import cost, data_of, row_costs, variables_of
+from jaxslam.graphs.linearized import cost, data_of, variables_of
 from jaxslam.graphs.model import Model, model_of
 from jaxslam.graphs.plan import Plan, plan_for
 from jaxslam.graphs.search import METHODS, Solution, minimize
@@ -37,7 +37,7 @@ def optimize(
     """The graph at a minimum of χ² = Σ ρ(eᵀ Ω e), from the variables it has.
 
     Each step solves (H + λD) δ = -g with H = Σ Jᵀ ρ' Ω J and g = Σ Jᵀ ρ' Ω e, J by increments δ in
-    the frame of a pose, X ∘ (dx, dy, dθ), and D = diag H.
+    the frame of a pose, X ∘ exp(δ) as in `se2.boxplus`, and D = diag H.
 
     Args:
         graph: outside of a trace it is checked.
@@ -74,27 +74,6 @@ def chi2(
     """χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
     model = model_of("graphs.chi2", graph, factors, kernel)
     return programs.call(_chi2, (model,), graph)
-
-
-def squares(
-    graph: Graph, factors: Mapping[str, Factor] | None = None
-) -> dict[str, Float[Array, "E"]]:
-    """s = eᵀ Ω e of each row of each table, zero where it is not valid.
-
-    The weight that a robust kernel gives a row is `kernel.weight(s)`.
-    """
-    return programs.call(_squares, (model_of("graphs.squares", graph, factors),), graph)
-
-
-def _squares(model: Model, graph: Graph) -> dict[str, Float[Array, "E"]]:
-    batch = with_batch(in_one_dtype(graph))
-    data = data_of(batch, jnp.arange(len(graph.poses) + len(graph.points)))
-    out = {}
-    for name, factor in model.factors:
-        who, z, info = graph.tables[name].who, data.z[name], data.information[name]
-        s = row_costs(factor, None, who, variables_of(batch), z, info)[1]
-        out[name] = jnp.where(data.valid[name], s, 0.0)[:, 0]
-    return out
 
 
 def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:

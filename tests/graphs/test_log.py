@@ -148,7 +148,7 @@ def test_its_shapes_and_names():
     np.testing.assert_allclose(rows.information[0], np.diag(SIGMA_Z**-2.0), rtol=1e-12)
     graphs.check_graph("graph", graph, factors)
     # Each point has no residual at its first measurement.
-    squared = np.asarray(graphs.squares(graph, factors)["sensor"])
+    squared = np.asarray(graphs.squared_residuals(graph, factors)["sensor"])
     first = np.unique(np.where(rows.valid, rows.who[:, 1], 99), return_index=True)[1][:6]
     np.testing.assert_allclose(squared[first], 0, atol=1e-18)
 

@@ -42,7 +42,7 @@ def graph_figure(
 
     Args:
         before, after: the same graph with different values.
-        squared: eᵀ Ω e of each row after, of `graphs.squares`.
+        squared: eᵀ Ω e of each row after, of `graphs.squared_residuals`.
         factors: of the tables; by default those of files.
         worst: so many rows are marked in both panels: those of the largest eᵀ Ω e for its size.
         subtitles: of the panels. width: [in].

@@ -1,4 +1,4 @@
-"""Squares of rows and degrees of freedom against plain NumPy."""
+"""Squared residuals and degrees of freedom against plain NumPy."""
 
 import numpy as np
 import small_graphs
@@ -7,11 +7,11 @@ from reference import graph as plain
 from jaxslam import graphs
 
 
-def test_squares_are_those_of_the_equations():
+def test_squared_residuals_are_those_of_the_equations():
     graph = small_graphs.drawn(noise=0.5)
     table = graph.tables["relative_pose"]._replace(valid=np.arange(10) != 4)
     graph = graph._replace(tables=graph.tables | {"relative_pose": table})
-    found = graphs.squares(graph)
+    found = graphs.squared_residuals(graph)
     assert {key: len(rows) for key, rows in found.items()} == {
         key: len(table.z) for key, table in graph.tables.items()
     }
