@@ -246,7 +246,7 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
     for name, default, known, text in (
         ("start", "given", STARTS, "where to start"),
         ("method", "levenberg_marquardt", STEPS, "the steps"),
-        ("kernel", None, KERNELS, "a robust kernel for all measurements"),
+        ("kernel", None, KERNELS, "a robust kernel for loop edges and measurements of points"),
         ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
     ):
         parser.add_argument(
@@ -256,7 +256,13 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
             help=f"{text}, one of: {', '.join(known)} (default: {default or 'none'})",
         )
     parser.add_argument(
-        "--iterations", type=int, default=100, help="number of steps at most (default: 100)"
+        "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
+    )
+    parser.add_argument(
+        "--certificate",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
     )
     cache.add_options(parser)
     parser.add_argument(

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from jaxslam import graphs
 from jaxslam.cli.common import pick
 from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.datasets import g2o
-from jaxslam.graphs import Ending, Graph, kernels, starts
+from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
 from jaxslam.graphs.validation import label, variables_of
 from jaxslam.monte_carlo.progress import Progress
@@ -27,6 +28,9 @@ ERRORS = {
 
 COST = "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses"
 
+TRUSTED = ("relative_pose", "prior")
+"""Tables without a robust kernel: relative poses of successive poses, and priors."""
+
 NOT_CONVERGED = 1
 WORST = 10
 """Number of rows with the largest residuals in the summary and the figure."""
@@ -35,15 +39,18 @@ WORST = 10
 def optimize_graph(options: argparse.Namespace, command: str) -> int:
     """Optimize a graph, print and write the result; returns the exit status, 1 if not converged."""
     start = pick("start", options.start, starts.STARTS)
-    kernel = None if options.kernel is None else pick("kernel", options.kernel, kernels.REGISTRY)()
+    kernel = None if options.kernel is None else pick("kernel", options.kernel, graphs.KERNELS)()
     relative, equation = pick("error", options.error, ERRORS)
     loaded = g2o.load(options.path)
     check_writable(options.out)
     known = {**of_files(), "relative_pose": relative()}
     factors = {key: known[key] for key in loaded.graph.tables}
-    given = graphs.with_gauge(loaded.graph, factors)
-    graphs.check_graph(str(options.path), given, factors)
+    held = graphs.with_gauge(loaded.graph, factors)
+    graphs.check_graph(str(options.path), held, factors)
+    given = held if kernel is None else graphs.with_loops_apart(held)
+    factors = {key: known[key.split("/")[0]] for key in given.tables}
     begun = start(given, factors)
+    doubted = {key: kernel for key in given.tables if key not in TRUSTED} if kernel else None
     with Progress(Path(options.path).name, "steps") as progress:
         progress.say("compiling and solving …")
         with CompileClock() as clock:
@@ -52,7 +59,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
                     begun,
                     factors,
                     method=options.method,
-                    kernel=kernel,
+                    kernel=doubted,
                     iterations=options.iterations,
                 )
             )
@@ -69,7 +76,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "edges": {key: int(table.valid.sum()) for key, table in found.tables.items()},
         "skipped lines": loaded.skipped,
         "placed along the edges": loaded.placed,
-        "gauge": _gauge(loaded.graph, given),
+        "gauge": _gauge(loaded.graph, held),
         "start": options.start,
         "method": options.method,
         "kernel": options.kernel or "none",
@@ -83,6 +90,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "gradient / at the start": _finite(solution.gradient / solution.gradient_start),
         "seconds to compile": round(compiling, 3),
         "seconds to run": round(seconds - compiling, 3),
+        **(_certificate(found, converged, kernel is None) if options.certificate else {}),
     }
     print(_table(summary))
     worst = _worst(found, squared, factors)
@@ -120,6 +128,28 @@ def _status(solution: graphs.Solution, found: Graph) -> str:
     if ending != Ending.SINGULAR:
         return str(ending.name.lower())
     return f"singular: the measurements do not determine {label(found, int(solution.singular))}"
+
+
+def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, Any]:
+    """What is proved of the optimum: entries of the summary."""
+    if not converged or not plain:
+        why = "of a robust cost nothing is proved" if converged else "there is no optimum"
+        return {"certificate": f"none: {why}"}
+    began = time.perf_counter()
+    try:
+        proof = jax.block_until_ready(graphs.certificate(found))
+    except ValueError as error:
+        return {"certificate": f"none: {str(error).removeprefix('graphs.certificate: ')}"}
+    return {
+        "certificate": "the chordal optimum next to it is global"
+        if proof.certified
+        else "not certified: another optimum of the chordal cost may be lower",
+        "chordal chi2": _finite(proof.chi2),
+        "lower by at most": _finite(proof.gap),
+        "distance of the two optima [m]": _finite(proof.position),
+        "distance of the two optima [rad]": _finite(proof.heading),
+        "seconds of the certificate": round(time.perf_counter() - began, 3),
+    }
 
 
 def _finite(value: Any) -> float | None:

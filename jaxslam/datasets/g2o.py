@@ -125,12 +125,13 @@ def text_of(graph: Graph) -> str:
     lines += [f"FIX {one}" for one in held]
     written = {edge.table: (name, edge) for name, edge in reversed(EDGES.items())}
     for key, table in graph.tables.items():
-        if key not in written:
+        base = key.split("/")[0]
+        if base not in written:
             raise ValueError(
                 f"graphs.write: g2o has no line for table {key!r}; it has some for "
                 f"{', '.join(written)}"
             )
-        name, edge = written[key]
+        name, edge = written[base]
         valid = np.asarray(table.valid)
         information = np.asarray(table.information)[valid]
         entries = np.stack([information[:, i, j] for i, j in edge.entries], axis=1)

@@ -12,6 +12,7 @@ from jaxslam.graphs.factor import (
     bearing,
     from_motion,
     from_sensor,
+    nominal_motion,
     prior,
     relative_pose,
     relative_pose_log,
@@ -22,6 +23,7 @@ from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.kernels import REGISTRY as KERNELS
 from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber, truncated
 from jaxslam.graphs.log import of_log
+from jaxslam.graphs.loops import with_loops_apart
 from jaxslam.graphs.marginals import Marginals, marginals
 from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.plan import Plan, plan
@@ -52,6 +54,7 @@ __all__ = [
     "from_sensor",
     "huber",
     "marginals",
+    "nominal_motion",
     "of_log",
     "optimize",
     "plan",
@@ -64,5 +67,6 @@ __all__ = [
     "starts",
     "truncated",
     "with_gauge",
+    "with_loops_apart",
     "write",
 ]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam import programs
 from jaxslam.graphs.batch import in_one_dtype, over_batch
-from jaxslam.graphs.dual import FACTORS, ROWS, dual, weights_of
+from jaxslam.graphs.dual import FACTORS, dual, weights_of
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.linearized import data_of, variables_of
@@ -86,24 +86,32 @@ def certificate(
     caller = "graphs.certificate"
     model = model_of(caller, graph, factors)
     for name, factor in model.factors:
-        if factor.name not in ROWS and factor.name != "prior":
+        if factor.name not in FACTORS:
             raise ValueError(
                 f"{caller}: the table {name!r} has no chordal cost: its factor is {factor.name}, "
-                f"and there are {', '.join(ROWS)}"
+                f"and there are {', '.join(FACTORS)}"
             )
     check_graph(caller, graph, dict(model.factors))
     plan = plan_for(caller, graph, dict(model.factors), plan)
-    if is_concrete(graph) and (held := int(np.sum(_held(model, plan, graph)))) != 1:
-        raise ValueError(
-            f"{caller}: expected one pose that is fixed or has a prior, got {held}; the dual is of "
-            "a graph that is free but for that"
-        )
+    if is_concrete(graph):
+        # NumPy, since each operation on a new shape would be a program.
+        held = np.array(graph.fixed_pose)
+        for name, factor in model.factors:
+            if factor.name == "prior":
+                held[
+                    np.asarray(graph.tables[name].who)[np.asarray(graph.tables[name].valid), 0]
+                ] = True
+        if held.sum() != 1:
+            raise ValueError(
+                f"{caller}: expected one pose that is fixed or has a prior, got {held.sum()}; the "
+                "dual is of a graph that is free but for that"
+            )
     return programs.call(_certificate, (model,), graph, plan)
 
 
 def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
     """The poses that are fixed or have a prior."""
-    held = jnp.asarray(graph.fixed_pose)
+    held = graph.fixed_pose
     for name, factor in model.factors:
         if factor.name == "prior":
             held = held.at[plan.who[name][:, 0]].max(graph.tables[name].valid)
@@ -126,7 +134,7 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     tables = {}
     for name, factor in model.factors:
         table = graph.tables[name]
-        weights = weights_of(factor.name, table.information)
+        weights = weights_of(FACTORS[factor.name].name, table.information)
         unit = jnp.eye(weights.shape[1], dtype=dtype)[None, ..., None]
         tables[name] = table._replace(information=unit * weights[:, None])
     chordal = Model(tuple((name, FACTORS[factor.name]) for name, factor in model.factors))

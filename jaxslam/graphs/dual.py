@@ -33,8 +33,11 @@ def _chordal(
     return Factor(name, who, (), ("",) * errors, residual)
 
 
+_POSE = _chordal("relative_pose", ("pose", "pose"), 4, _pose_error)
+
 FACTORS = {
-    "relative_pose": _chordal("relative_pose", ("pose", "pose"), 4, _pose_error),
+    "relative_pose": _POSE,
+    "relative_pose_log": _POSE,
     "relative_position": _chordal("relative_position", ("pose", "point"), 2, _point_error),
     "prior": _chordal("prior", ("pose",), 1, _no_error),
 }

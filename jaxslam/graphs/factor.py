@@ -136,13 +136,13 @@ def from_motion(motion: Motion) -> Factor:
     a change of the poses, so derivatives up to the third are those of w. Where ∂step/∂w is
     singular (a robot that stands still, with `odometry`) a step is not taken.
 
-    Raises ValueError unless the noise has three components, which the two poses determine.
+    Raises ValueError unless the noise has three components, which the two poses determine; see
+    `nominal_motion`.
     """
     if len(motion.noises) != 3:
         raise ValueError(
             f"graphs.from_motion: expected a motion whose noise has 3 components, which two poses "
-            f"determine, got {motion.name} with {len(motion.noises)}: {', '.join(motion.noises)}. "
-            "Two poses that such a motion does not join would have no finite cost"
+            f"determine, got {motion.name} with {len(motion.noises)}: {', '.join(motion.noises)}"
         )
 
     def newton(w: Array, first: Array, second: Array, u: Array) -> Array:
@@ -168,6 +168,26 @@ def from_motion(motion: Motion) -> Factor:
 
     poses = ("pose", "pose")
     return Factor(motion.name, poses, motion.controls, motion.noises, residual, predict=predict)
+
+
+def nominal_motion(motion: Motion) -> Factor:
+    """The factor of a motion model between two poses: the error of the motion without noise.
+
+        e = step(x, u, 0)⁻¹ ∘ x', z = u
+
+    Its covariance is G Q Gᵀ to first order in the noise, G = ∂e/∂w, which a table must have as its
+    information (`of_log`): exactly where e is affine in w, as for `unicycle` and `increment`.
+    """
+
+    def residual(variables: tuple[Array, ...], z: Array) -> Array:
+        first, second = variables
+        return se2.between(predict(first, z), second)
+
+    def predict(pose: Array, z: Array) -> Array:
+        return motion.step(pose, z, jnp.zeros(len(motion.noises), z.dtype))
+
+    poses = ("pose", "pose")
+    return Factor(motion.name, poses, motion.controls, POSE, residual, predict=predict)
 
 
 REGISTRY: dict[str, Callable[[], Factor]] = {

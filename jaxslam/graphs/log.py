@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import programs, validation
 from jaxslam.derivatives import motion_jacobians
-from jaxslam.graphs.factor import Factor, from_motion, from_sensor, of_files
+from jaxslam.graphs.factor import Factor, from_motion, from_sensor, nominal_motion, of_files
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.math import linalg, se2
 from jaxslam.protocols import Motion, Sensor
@@ -29,20 +29,27 @@ def of_log(
     pose: ArrayLike,
     pose_cov: ArrayLike,
     *,
+    slack: float | None = None,
     tags: ArrayLike | None = None,
     capacity: int | None = None,
 ) -> tuple[Graph, dict[str, Factor]]:
     """The graph of a log of T steps, and its factors: its optimum is that of `batch_map`.
 
-    | table | factor | rows |
-    |---|---|---|
-    | `"prior"` | `prior` of the pose before the first control | 1; none where P0 = 0 |
-    | `"motion"` | `from_motion(motion)`, z = u, Ω = Q⁻¹ | T |
-    | `"sensor"` | `from_sensor(sensor)`, Ω = R⁻¹ | T·M, valid where the scan is |
+    Its tables, their factors, and the number of their rows:
+
+        prior    prior() of the pose before the first control              1; none where P0 = 0
+        motion   from_motion(motion), z = u, Ω = Q⁻¹; or nominal_motion    T
+        sensor   from_sensor(sensor), Ω = R⁻¹                              T·M
 
     χ² of the graph is twice the cost of `smoothing.batch_map`, and `pose_id` t is the pose after t
     controls. Poses start along the nominal motion, points at their first measurement, where Q and R
     are evaluated: as data of the graph they are fixed.
+
+    A noise of other than three components is not determined by two poses. Then, and where `slack` s
+    is given, the factor of the motion is `nominal_motion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
+    components (`unicycle`, `increment`, `ackermann`) the motion is a constraint, which s > 0, the
+    standard deviation of each coordinate [m, m, rad], makes soft: the optimum differs from that of
+    `batch_map` by the order of s², and the condition of the problem is worse by s⁻².
 
     With `capacity` a tag is the number of its point, and all shapes are known, so that logs may be
     traced and batched; points that no scan saw are fixed at the origin. Without, the points are the
@@ -51,10 +58,11 @@ def of_log(
 
     Args:
         log: row t of the scans was taken at pose t + 1.
-        motion: its noise has three components, which determine the pose (`from_motion`).
+        motion: the model; without `slack` its noise has at least three components.
         sensor: of landmarks, or an absolute one; not a suite. Landmark parameters that it does not
             measure start at the mean of its `free`; that prior is not in the graph.
         pose, pose_cov: (3,) and (3, 3) of the robot before the first control; zero fixes it.
+        slack: see above.
         tags: (T, M) identities from an association, -1 where a measurement is left out; by default
             those of the scans, which must be known.
         capacity: number of points.
@@ -69,7 +77,10 @@ def of_log(
         raise ValueError(
             f"{name}: expected one sensor of landmarks that stay what they are, got {sensor.name}"
         )
-    factors = {"motion": from_motion(motion), "sensor": from_sensor(sensor)}
+    exact = len(motion.noises) == 3 and slack is None
+    _check_slack(name, motion, slack)
+    of_motion = from_motion(motion) if exact else nominal_motion(motion)
+    factors = {"motion": of_motion, "sensor": from_sensor(sensor)}
     validation.check_covariance(f"{name}: pose_cov", pose_cov, 3)
     size_u, size_z = len(motion.controls), len(sensor.measurements)
     validation.check_log(name, log, control_size=size_u, measurement_size=size_z)
@@ -78,7 +89,8 @@ def of_log(
     known = is_concrete(pose_cov) and not np.any(np.asarray(pose_cov))
     index, valid, ids = _points_of(name, log, sensor, tags, capacity)
     arguments = jnp.asarray(pose), jnp.asarray(pose_cov), index, valid, ids
-    graph, noise = programs.call(_graph_of, (motion, sensor, known), log, *arguments)
+    soft = None if exact else np.asarray(slack or 0.0)
+    graph, noise = programs.call(_graph_of, (motion, sensor, known), log, *arguments, soft)
     _check_noise(name, noise, motion, sensor, valid, known)
     if not known:
         factors["prior"] = of_files()["prior"]
@@ -93,6 +105,17 @@ class _Noise(NamedTuple):
     sensor: Bool[Array, "T M"]
     moving: Bool[Array, "T"]
     """whether the noise moves the pose in all directions"""
+
+
+def _check_slack(name: str, motion: Motion, slack: float | None) -> None:
+    """Raise ValueError on a slack that is negative or lacking."""
+    if slack is not None and not 0 <= slack < np.inf:
+        raise ValueError(f"{name}: expected slack to be a finite number >= 0, got {slack}")
+    if not slack and len(motion.noises) < 3:
+        raise ValueError(
+            f"{name}: {motion.name} has {len(motion.noises)} noises, which do not move the pose in "
+            "all directions: give slack, the standard deviation of a soft constraint, as slack=1e-3"
+        )
 
 
 def _points_of(
@@ -143,8 +166,12 @@ def _graph_of(
     index: Int[Array, "T M"],
     valid: Bool[Array, "T M"],
     ids: Int[Array, "P"],
+    slack: Float[Array, ""] | None,
 ) -> tuple[Graph, _Noise]:
-    """The graph, each measurement at the point of its index. known: the first pose is fixed."""
+    """The graph, each measurement at the point of its index. known: the first pose is fixed.
+
+    slack: None for the exact factor of the motion.
+    """
     kind = jnp.result_type(log.control, log.scan.z)
     control, pose = log.control.astype(kind), pose.astype(kind)
     z = jnp.where(valid[:, :, None], log.scan.z.astype(kind), 0.0)
@@ -157,6 +184,11 @@ def _graph_of(
     path = jnp.concatenate([pose[None], jax.lax.scan(move, pose, control)[1]])
     of_motion = jax.vmap(motion.noise_cov)(path[:-1], control)
     by_noise = jax.vmap(lambda x, u: motion_jacobians(motion, x, u)[1])(path[:-1], control)
+    moving = jnp.ones(len(control), bool)
+    if slack is None:
+        moving = _moving(by_noise)
+    else:
+        of_motion = jax.vmap(_local, (0, 0, 0, None))(path[1:], by_noise, of_motion, slack)
     of_sensor = jax.vmap(jax.vmap(sensor.noise_cov))(z)
     # The prior's error is turned into the frame of its mean, in which the factor has it.
     turned = jnp.eye(3, dtype=kind).at[:2, :2].set(se2.rotation(pose[2]))
@@ -184,7 +216,21 @@ def _graph_of(
         first = jnp.zeros((1, 1), count.dtype)
         tables["prior"] = Table(first, path[:1], p[None], jnp.ones(1, bool))
     graph = Graph(path, points, tables, (count == 0) & known, ~seen, count, ids)
-    return graph, _Noise(p_regular, q_regular, r_regular, _moving(by_noise))
+    return graph, _Noise(p_regular, q_regular, r_regular, moving)
+
+
+def _local(
+    pose: Float[Array, "3"],
+    by_noise: Float[Array, "3 W"],
+    noise_cov: Float[Array, "W W"],
+    slack: Float[Array, ""],
+) -> Float[Array, "3 3"]:
+    """G Q Gᵀ + s² I in the frame of a pose that the motion led to."""
+    turned = jnp.eye(3, dtype=pose.dtype).at[:2, :2].set(se2.rotation(pose[2]))
+    local = turned.T @ by_noise
+    return local @ noise_cov @ local.T + slack.astype(pose.dtype) ** 2 * jnp.eye(
+        3, dtype=pose.dtype
+    )
 
 
 def _moving(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:

@@ -37,7 +37,7 @@ def optimize(
     """The graph at a minimum of χ² = Σ ρ(eᵀ Ω e), from the variables it has.
 
     Each step solves (H + λD) δ = -g with H = Σ Jᵀ ρ' Ω J and g = Σ Jᵀ ρ' Ω e, J by increments δ in
-    the frame of a pose, X ∘ (dx, dy, dθ), and D = diag H.
+    the frame of a pose, X ∘ exp(δ) as in `se2.boxplus`, and D = diag H.
 
     Args:
         graph: outside of a trace it is checked.

@@ -22,8 +22,8 @@ from jaxslam.graphs.steps import dogleg, dot, marquardt
 
 METHODS = ("levenberg_marquardt", "gauss_newton", "dogleg")
 
-FIRST_DAMPING = 1e-4
-"""λ after the first undamped step that fails, as a share of the diagonal."""
+FIRST_DAMPING = 1e-7
+"""λ after an undamped step that fails, as a share of the diagonal."""
 
 
 class Ending(IntEnum):
@@ -82,6 +82,10 @@ class Search(NamedTuple):
     singular: Int[Array, "B"]
     refused: Bool[Array, "B"]
     """the undamped step from the iterate does not lower χ²"""
+    careful: Bool[Array, "B"]
+    """the last step was refused"""
+    former: Float[Array, "B"]
+    """χ² of the iterate before"""
 
 
 def minimize(
@@ -109,6 +113,8 @@ def minimize(
         taken=none - 1,
         singular=none - 1,
         refused=no,
+        careful=no,
+        former=zero,
     )
 
     def iterate(carry: tuple[Search, Array, Array]) -> tuple[Search, Array, Array]:
@@ -130,7 +136,13 @@ def minimize(
             good = finite
             bound = search.bound
         else:
-            good = finite & (began | ((gain >= 0) & (ratio > 1e-3)))
+            # A step hardly damped may go uphill, as far as the iterate before: it crosses curved
+            # valleys along which damped steps crawl (Grippo, Lampariello and Lucidi 1986, "A
+            # nonmonotone line search technique for Newton's method", SIAM J. Num. Analysis 23(4)).
+            above = jnp.maximum(search.former - search.system.chi2, 0.0)
+            plain = (search.bound <= FIRST_DAMPING) & (method == "levenberg_marquardt")
+            slack = jnp.where(plain, above, 0.0)
+            good = finite & (began | (gain + slack > 1e-3 * search.predicted))
             bound = (radius if method == "dogleg" else damping)(search, good, ratio)
         asked = search.going & search.stepped
         take = asked & good
@@ -148,14 +160,20 @@ def minimize(
             ending=jnp.where(lost, Ending.DIVERGED, search.ending).astype(jnp.int32),
             taken=search.taken + asked,
             refused=refused,
+            careful=jnp.where(asked, ~good, search.careful),
+            former=jnp.where(take & ~began, search.system.chi2, search.former),
         )
 
     def damping(search: Search, good: Array, ratio: Array) -> Array:
-        """λ after a step: less after a good one, down to none; more after a refused one."""
+        """λ after a step: less after good ones, down to none; more after refused ones.
+
+        The first good step after a refused one leaves it as it is.
+        """
         known = search.singular >= 0
-        less = jnp.where(search.bound < 1e-7, jnp.where(known, 1e-8, 0.0), search.bound / 30)
-        kept = jnp.where(ratio > 0.25, less, jnp.where(ratio > 0.1, 1.0, 3.0) * search.bound)
-        return jnp.where(good, kept, jnp.maximum(10 * search.bound, FIRST_DAMPING))
+        less = jnp.where(search.bound < 1e-10, jnp.where(known, 1e-10, 0.0), search.bound / 10)
+        kept = jnp.where((ratio > 0.25) & ~search.careful, less, search.bound)
+        more = jnp.where(search.careful, 100.0, 10.0) * search.bound
+        return jnp.where(good, kept, jnp.maximum(more, FIRST_DAMPING))
 
     def radius(search: Search, good: Array, ratio: Array) -> Array:
         """The trust region's radius after a step (Nocedal and Wright 2006, algorithm 4.1)."""

@@ -101,7 +101,7 @@ def test_the_round_trip_is_exact(tmp_path):
 def test_rows_that_are_not_valid_are_not_written(tmp_path):
     graph = graphs.read(wrote(tmp_path, SMALL))
     table = graph.tables["relative_pose"]._replace(valid=np.array([False, True]))
-    text = g2o.text_of(graph._replace(tables={"relative_pose": table}))
+    text = g2o.text_of(graph._replace(tables={"relative_pose/loops": table}))
     assert text.count("EDGE") == 1 and "EDGE_SE2 3 7 -1.0 0.0 0.1 1.0" in text
 
 

@@ -101,6 +101,39 @@ def test_it_has_the_optimum_of_scipy():
     np.testing.assert_allclose(solution.graph.points, points, atol=1e-6)
 
 
+def test_a_motion_of_two_noises_is_a_soft_constraint():
+    """The optimum comes to that of the batch by the square of the slack."""
+    here = worlds.ring(STEPS)
+    log = jax.device_get(simulate(here, KEY)[1])
+    models = here.motion, here.sensor
+    batch = batch_map(*models, 6, here.pose, np.zeros((3, 3)), tolerance=1e-9)(log, KEY)
+    off = []
+    for slack in (1e-3, 1e-4):
+        made = graphs.of_log(log, *models, here.pose, np.zeros((3, 3)), slack=slack)
+        solution = graphs.optimize(*made, tolerance=1e-16)
+        off.append(np.abs(solution.graph.poses[1:] - batch.estimate.pose).max())
+    assert off[0] < 1e-3
+    assert 0.5 < off[0] / off[1] / 100 < 1.5
+
+
+def test_more_noises_than_three_are_those_of_their_sum():
+    """Of two substeps of a motion without turns, which are affine: e has the covariance of both."""
+    single = motion.pose_increment(np.diag([0.1, 0.2, 0.3]) ** 2)
+    twice = motion.substeps(single, 2)
+    scan = Scan(np.full((1, 1, 1), 0.1), np.full((1, 1), -1), np.ones((1, 1), bool))
+    log = Log(np.tile([0.5, 0.0, 0.0], (1, 2)), scan)
+    models = twice, sensors.compass([[0.01]])
+    graph, factors = graphs.of_log(log, *models, np.zeros(3), np.zeros((3, 3)))
+    by_heading = np.array(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]
+    )  # y by the first turn
+    first = np.eye(3) + by_heading
+    q = np.diag([0.1, 0.2, 0.3]) ** 2
+    expected = np.linalg.inv(first @ q @ first.T + q)
+    np.testing.assert_allclose(graph.tables["motion"].information[0], expected, rtol=1e-10)
+    assert factors["motion"].errors == ("x [m]", "y [m]", "theta [rad]")
+
+
 def test_its_shapes_and_names():
     here, log, graph, factors, _ = solved()
     assert list(graph.tables) == ["motion", "prior", "sensor"]
@@ -165,7 +198,8 @@ def _log(**change):
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        ({}, {"motion": motion.unicycle(np.eye(2))}, "3 components.*got unicycle with 2"),
+        ({"control": np.ones((STEPS, 2))}, {"motion": motion.increment(np.eye(2))}, "give slack"),
+        ({}, {"slack": -1.0}, "expected slack to be a finite number >= 0, got -1.0"),
         ({}, {"motion": motion.odometry(np.diag([1.0, 0, 1]))}, "odometry is singular at row 0"),
         ({"control": np.tile([0.1, 0, 0.1], (STEPS, 1))}, {}, "all directions at row 0"),
         ({}, {"sensor": sensors.range_bearing(np.diag([1.0, 0]))}, "range_bearing is singular"),

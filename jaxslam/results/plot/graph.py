@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from jaxslam.graphs import Factor, Graph
-from jaxslam.graphs.factor import of_files
+from jaxslam.graphs.model import factors_of
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,
@@ -47,7 +47,7 @@ def graph_figure(
         worst: so many rows are marked in both panels: those of the largest eᵀ Ω e for its size.
         subtitles: of the panels. width: [in].
     """
-    factors = factors or of_files()
+    factors = factors_of("graph_figure", after, factors)
     figure, panels = panels_of(width, 0.52 * width, 1, 2, share=(False, False))
     marked = _worst(after, squared, factors, worst)
     for axes, graph, text in zip(panels, (before, after), subtitles, strict=True):

@@ -52,6 +52,8 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     assert summary["status"] == "converged" and summary["skipped lines"] == {"comments": 1}
     assert summary["chi2"] < summary["chi2 at the start"]
     worst = summary["worst residuals"]
+    assert summary["certificate"] == "the chordal optimum next to it is global"
+    assert summary["distance of the two optima [m]"] < 1.0
     assert len(worst) == 10 and worst[0]["between"][0].startswith("pose 1")
 
     rows = list(csv.DictReader((out / "poses.csv").read_text().splitlines()))
@@ -82,6 +84,34 @@ def test_too_few_steps_are_no_success(file, tmp_path, capsys):
     assert cli.main(run) == 1
     assert "exhausted" in capsys.readouterr().err
     assert json.loads((tmp_path / "summary.json").read_text())["status"] == "exhausted"
+
+
+def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monkeypatch):
+    asked, solve = {}, graphs.optimize
+
+    def optimize(graph, factors, **options):
+        asked.update(options, tables=list(graph.tables))
+        return solve(graph, factors, **options)
+
+    monkeypatch.setattr(graphs, "optimize", optimize)
+    run = ["optimize", str(file), "--kernel", "huber", "--out", str(tmp_path)]
+    assert cli.main(run) == 0
+    assert asked["tables"] == ["relative_pose", "relative_pose/loops", "relative_position"]
+    assert list(asked["kernel"]) == ["relative_pose/loops", "relative_position"]
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["robust cost"] <= summary["chi2"]
+    assert summary["certificate"].startswith("none: of a robust cost")
+    assert len(graphs.read(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
+    apart = graphs.with_loops_apart(small())
+    assert apart.tables["relative_pose/loops"].who.tolist() == [[7, 0], [2, 6], [5, 1]]
+    np.testing.assert_allclose(plain.chi2(graphs.read(file)), small_chi2(apart), rtol=1e-14)
+
+
+def small_chi2(graph):
+    return sum(
+        plain.chi2(graph._replace(tables={key.split("/")[0]: table}))
+        for key, table in graph.tables.items()
+    )
 
 
 @pytest.mark.parametrize(
