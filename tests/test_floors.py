@@ -25,8 +25,9 @@ FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.spl
 ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
 
 # Methods of these modules may import what is above, when they are called: `print(campaign)` and
-# `campaign.save(folder)` are where a user looks for them, and results are drawn and written above.
-WITHIN_CALLS = {"monte_carlo.record": "results"}
+# `campaign.save(folder)` are where a user looks for them, and results are drawn and written above;
+# so is `graphs.read(path)`, and files are read above.
+WITHIN_CALLS = {"graphs.files": "datasets", "monte_carlo.record": "results"}
 
 # What only these modules may touch.
 KEPT = {

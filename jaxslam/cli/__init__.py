@@ -18,8 +18,12 @@ from jaxslam.cli.common import INTERRUPTED, as_folders
 from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.cli.dataset import run_dataset
 from jaxslam.cli.models import verify_models
+from jaxslam.cli.optimize import COST, ERRORS, optimize_graph
 from jaxslam.datasets import READERS
 from jaxslam.datasets.settings import METHODS
+from jaxslam.graphs.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.search import METHODS as STEPS
+from jaxslam.graphs.starts import STARTS
 from jaxslam.results.campaign_files import FORMATS
 from jaxslam.results.run_table import FORMATS as RUN_FORMATS
 from jaxslam.simulation.scenarios import SCENARIOS
@@ -33,8 +37,8 @@ PIPE_CLOSED = 141  # 128 + SIGPIPE, as a shell reports it
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status.
 
-    0 on success, 1 for a wrong model, 2 on bad input, 130 if interrupted, 141 if the reader of its
-    output has gone.
+    0 on success, 1 for a wrong model or an optimization that did not converge, 2 on bad input, 130
+    if interrupted, 141 if the reader of its output has gone.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
@@ -98,6 +102,16 @@ def _parser() -> argparse.ArgumentParser:
             "table and writes fit.json and fit.toml, lines for dataset.toml.",
         ),
         OUT,
+    )
+    _add_optimize(
+        commands.add_parser(
+            "optimize",
+            help="optimize a pose or landmark graph in a file",
+            description="Optimize a graph in a file of g2o or TORO. Prints a table and writes the "
+            "poses, the optimized graph, a summary and a figure. The cost is "
+            f"{COST} {ERRORS['pose'][1]}. The exit status is 1 if the optimization did not "
+            "converge, 2 if the file cannot be used.",
+        )
     )
     _add_verify(
         commands.add_parser(
@@ -265,6 +279,43 @@ def _add_animate(parser: argparse.ArgumentParser) -> None:
         help="also write a film of each filter (consistency: of run 0): film.html to step and "
         "play, and film.mp4, or film.gif where ffmpeg is missing",
     )
+
+
+def _add_optimize(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam optimize`."""
+    parser.add_argument("path", metavar="FILE", help="a graph in the format of g2o or TORO")
+    for name, default, known, text in (
+        ("start", "given", STARTS, "where to start"),
+        ("method", "levenberg_marquardt", STEPS, "the steps"),
+        ("kernel", None, KERNELS, "a robust kernel for loop edges and measurements of points"),
+        ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
+    ):
+        parser.add_argument(
+            f"--{name}",
+            metavar="NAME",
+            default=default,
+            help=f"{text}, one of: {', '.join(known)} (default: {default or 'none'})",
+        )
+    parser.add_argument(
+        "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
+    )
+    parser.add_argument(
+        "--certificate",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
+    )
+    cache.add_options(parser)
+    parser.add_argument(
+        "--dtype",
+        default="float64",
+        choices=["float32", "float64"],
+        help="floating-point type (default: float64)",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", default=str(OUT), help=f"folder for results (default: {OUT})"
+    )
+    parser.set_defaults(command=optimize_graph)
 
 
 def _add_verify(parser: argparse.ArgumentParser) -> None:

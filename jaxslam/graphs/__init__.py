@@ -1,9 +1,72 @@
-"""Graphs of poses and points: files, factors, optimization, marginals."""
+"""Graphs of poses and points: files, factors, optimization, marginals.
 
-from jaxslam.graphs.factor import Factor, from_sensor, prior, relative_pose
+The cost of a graph is χ² = Σ eᵀ Ω e over the valid rows of its tables, without a factor ½; of a
+relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without a logarithm.
+"""
+
+from jaxslam.graphs import starts
+from jaxslam.graphs.certificate import Certificate, certificate
+from jaxslam.graphs.factor import (
+    REGISTRY,
+    Factor,
+    bearing,
+    from_motion,
+    from_sensor,
+    nominal_motion,
+    prior,
+    relative_pose,
+    relative_pose_log,
+    relative_position,
+)
+from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber, truncated
+from jaxslam.graphs.log import of_log
+from jaxslam.graphs.loops import with_loops_apart
+from jaxslam.graphs.marginals import Marginals, marginals
+from jaxslam.graphs.optimize import chi2, optimize
+from jaxslam.graphs.plan import Plan, plan
+from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
+from jaxslam.graphs.search import Ending, Solution
+from jaxslam.graphs.validation import check_graph, with_gauge
 
-REGISTRY = {"prior": prior, "relative_pose": relative_pose}
-"""Factories of the factors of files, by the name of their table; none has parameters."""
-
-__all__ = ["REGISTRY", "Factor", "Graph", "Table", "from_sensor", "prior", "relative_pose"]
+__all__ = [
+    "KERNELS",
+    "REGISTRY",
+    "Certificate",
+    "Ending",
+    "Factor",
+    "Graph",
+    "Kernel",
+    "Marginals",
+    "Plan",
+    "Solution",
+    "Table",
+    "bearing",
+    "cauchy",
+    "certificate",
+    "check_graph",
+    "chi2",
+    "dcs",
+    "degrees_of_freedom",
+    "from_motion",
+    "from_sensor",
+    "huber",
+    "marginals",
+    "nominal_motion",
+    "of_log",
+    "optimize",
+    "plan",
+    "prior",
+    "read",
+    "relative_pose",
+    "relative_pose_log",
+    "relative_position",
+    "squared_residuals",
+    "starts",
+    "truncated",
+    "with_gauge",
+    "with_loops_apart",
+    "write",
+]

@@ -30,13 +30,13 @@ class Graph(NamedTuple):
     """
 
     poses: Float[Array, "N 3"]
-    """(x, y, θ), θ wrapped"""
+    """(x, y, θ); θ is wrapped where it was computed, and as it stands in a file"""
     points: Float[Array, "P L"]
     tables: dict[str, Table]
     fixed_pose: Bool[Array, "N"]
     """poses that optimization does not move"""
     fixed_point: Bool[Array, "P"]
     pose_id: Int[Array, "N"]
-    """identity in a file, or row of a log"""
+    """identity in a file, or in a log the number of controls before it"""
     point_id: Int[Array, "P"]
     """identity in a file, or tag in a log"""

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.graphs import Factor
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify.claims import Claim
 from jaxslam.verify.lengths import LONGEST, MOST_UNKNOWN, Deduced, deduce_lengths
@@ -96,6 +97,35 @@ def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
             sensor.observe_jacobians,
         ),
         Function("invert", sensor.invert, inverse, sensor.landmark, sensor.invert_jacobians),
+    )
+
+
+def factor_function(factor: Factor) -> Function:
+    """The residual of a factor of a graph by its variables and its measurement.
+
+    A point has two coordinates.
+    """
+    known = {"pose": POSE, "point": POINT}
+    counts = {kind: factor.variables.count(kind) for kind in known}
+    arguments = [
+        Argument(kind if counts[kind] == 1 else f"{kind} {k + 1}", known[kind])
+        for k, kind in enumerate(factor.variables)
+    ]
+    hand = factor.jacobians
+
+    def call(*values: jax.Array) -> jax.Array:
+        return factor.residual(values[:-1], values[-1])
+
+    def claim(*values: jax.Array) -> tuple[jax.Array | None, ...]:
+        assert hand is not None
+        return (*hand(values[:-1], values[-1]), None)
+
+    return Function(
+        "residual",
+        call,
+        (*arguments, Argument("measurement", factor.measurements)),
+        factor.errors,
+        None if hand is None else claim,
     )
 
 

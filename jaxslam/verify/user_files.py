@@ -11,6 +11,7 @@ from types import ModuleType
 
 from numpy.typing import ArrayLike
 
+from jaxslam.graphs import Factor
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.claims import Claim
@@ -70,10 +71,11 @@ def recorded_prints() -> Iterator[PrintRecorder]:
 def load(target: str) -> list[Target]:
     """The models and functions that `file.py` or `file.py:name` defines, in the order of the file.
 
-    These are objects of the types `Motion` and `Sensor`; factories annotated to return one, whose
-    only required parameter is a noise covariance; and functions f with a function f_jacobian (or
-    f_jacobians), whose entries may be named as f_arguments = {"pose": ("x [m]", …), …} and
-    f_outputs = ("range [m]", …), and their states given as f_states = (array (S, n), …).
+    These are objects of the types `Motion`, `Sensor` and `graphs.Factor`; factories annotated to
+    return a motion or a sensor, whose only required parameter is a noise covariance; and functions
+    f with a function f_jacobian (or f_jacobians), whose entries may be named as
+    f_arguments = {"pose": ("x [m]", …), …} and f_outputs = ("range [m]", …), and their states given
+    as f_states = (array (S, n), …).
 
     Raises:
         UnusableFile: with the line, if the file is missing, does not import, or defines none.
@@ -85,8 +87,8 @@ def load(target: str) -> list[Target]:
     if name:
         if not found and keys:
             raise UnusableFile(
-                f"{path.name}: expected {name} to be a Motion, a Sensor, a factory of one, or a "
-                f"function with its Jacobian, and there is no {name}{CLAIMS[0]}"
+                f"{path.name}: expected {name} to be a Motion, a Sensor, a Factor, a factory of "
+                f"one, or a function with its Jacobian, and there is no {name}{CLAIMS[0]}"
             )
         if not found:
             names = ", ".join(
@@ -98,8 +100,8 @@ def load(target: str) -> list[Target]:
             raise UnusableFile(f"{path.name}: there is no {name} to verify{there}")
     if not found:
         raise UnusableFile(
-            f"{path.name}: defines nothing to verify: no Motion, no Sensor, no function f with an "
-            "f_jacobian, no factory whose result is annotated as -> Motion or -> Sensor"
+            f"{path.name}: defines nothing to verify: no Motion, no Sensor, no Factor, no function "
+            "f with an f_jacobian, no factory whose result is annotated as -> Motion or -> Sensor"
         )
     return found
 
@@ -185,7 +187,7 @@ def import_file(path: Path) -> ModuleType:
 def _target(module: ModuleType, name: str) -> Target | None:
     """What a name of the module stands for, or None where there is nothing to verify."""
     value = getattr(module, name)
-    if isinstance(value, Motion | Sensor):
+    if isinstance(value, Motion | Sensor | Factor):
         return Target(name, value)
     if not callable(value) or isinstance(value, type):
         return None

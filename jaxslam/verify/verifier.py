@@ -11,6 +11,7 @@ import jax.experimental
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.graphs import Factor
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties, samples
@@ -21,6 +22,7 @@ from jaxslam.verify.functions import (
     Function,
     at_state,
     example_line,
+    factor_function,
     makes_a_model,
     motion_functions,
     plain_function,
@@ -31,7 +33,7 @@ from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 from jaxslam.verify.record import Check, Report
 from jaxslam.verify.samples import Samples
 
-Model: TypeAlias = Motion | Sensor | Callable[..., jax.Array]
+Model: TypeAlias = Motion | Sensor | Factor | Callable[..., jax.Array]
 
 MOUNT = (0.4, -0.3, 0.9)
 """The mount of a sensor made by `build`: off the robot's centre, so that all terms contribute."""
@@ -72,7 +74,7 @@ def verify_jacobians(
     reported with the line in its file, and the remaining checks are run.
 
     Args:
-        model: a `Motion`, a `Sensor`, or a pure function of vectors.
+        model: a `Motion`, a `Sensor`, a `graphs.Factor` or a pure function of vectors.
         jacobian: of a function, its hand-derived Jacobian. Called with the function's arguments it
             returns a tuple of one (m, n_k) array an argument (None: no claim), or one array: by the
             first argument, or by all of them side by side. Models bring their own.
@@ -105,12 +107,16 @@ def verify_jacobians(
         raise ValueError(f"verify_jacobians: expected count >= 2, got {count}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"verify_jacobians: expected a seed between 0 and 2³²-1, got {seed}")
-    if not (isinstance(model, Motion | Sensor) or callable(model)):
+    if not (isinstance(model, Motion | Sensor | Factor) or callable(model)):
         raise ValueError(
-            "verify_jacobians: expected a Motion, a Sensor or a function of vectors, got "
+            "verify_jacobians: expected a Motion, a Sensor, a Factor or a function of vectors, got "
             f"{type(model).__name__}"
         )
-    if not isinstance(model, Motion | Sensor) and jacobian is None and makes_a_model(model):
+    if (
+        not isinstance(model, Motion | Sensor | Factor)
+        and jacobian is None
+        and makes_a_model(model)
+    ):
         factory = getattr(model, "__name__", "factory")
         raise ValueError(
             f"verify_jacobians: expected a Motion or a Sensor, got the factory {factory} of one: "
@@ -123,6 +129,8 @@ def verify_jacobians(
     if isinstance(model, Motion | Sensor):
         kind, name = "motion" if isinstance(model, Motion) else "sensor", model.name
         functions = functions_of(model)
+    elif isinstance(model, Factor):
+        kind, name, functions = "factor", model.name, (factor_function(model),)
     else:
         with _float64():
             functions = (plain_function(model, jacobian, arguments, outputs, name, states),)

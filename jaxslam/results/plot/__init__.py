@@ -14,6 +14,7 @@ from jaxslam.results.plot.campaign import (
 from jaxslam.results.plot.cost import cost_figure
 from jaxslam.results.plot.formats import encode
 from jaxslam.results.plot.geometry import ellipse
+from jaxslam.results.plot.graph import graph_figure
 from jaxslam.results.plot.maps import map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
 from jaxslam.results.plot.scene import (
@@ -49,6 +50,7 @@ __all__ = [
     "encode",
     "errors_figure",
     "gained_figure",
+    "graph_figure",
     "map_figure",
     "nees_figure",
     "png",

@@ -1,0 +1,1 @@
+"""Is a graph honest about its own covariance?"""

@@ -1,0 +1,99 @@
+"""Many draws of one graph: NEES of the marginals, χ² of the optimum, RMSE over its bound.
+
+Where does honesty end as the noise grows, by linearization or by wrong minima? Every draw is solved
+from the truth and from a chordal start. A χ² of the chordal one that is larger is a wrong minimum.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import scipy.stats
+
+from benchmarks.graph_consistency.worlds import measured
+from jaxslam import graphs
+from jaxslam.consistency.nees import pose_error
+from jaxslam.math import stats
+
+SCALES = (1.0, 3.0, 10.0)
+
+
+class Draws(NamedTuple):
+    """What came of the draws at one noise, a row each."""
+
+    chi2: np.ndarray
+    """at the optimum from the truth"""
+    nees: np.ndarray
+    """(runs, N - 1) of the poses, 3 degrees of freedom"""
+    square: np.ndarray
+    """(runs, N - 1): squared position errors"""
+    bound: np.ndarray
+    """(N - 1,): their least expected values"""
+    wrong: np.ndarray
+    """whether the chordal start ends in a larger χ²"""
+    certified: np.ndarray
+    """whether the chordal surrogate's optimum beside the second is proved global"""
+    failed: np.ndarray
+    """whether an optimization did not converge"""
+
+
+def draws(graph, scale, runs, block=8):
+    """The draws of a graph with `scale` times its standard deviations."""
+    keys = jax.random.split(jax.random.key(round(10 * scale)), runs)
+    one = jax.tree.map(np.asarray, measured(graph, keys[0], scale))
+    plan = graphs.plan(one, marginals=True)
+    bound = np.asarray(graphs.marginals(one, plan=plan).poses)[1:]
+    solve = jax.jit(jax.vmap(partial(_solved, plan=plan)))
+    prove = jax.jit(jax.vmap(lambda graph: graphs.certificate(graph, plan=plan).certified))
+    draw = jax.jit(jax.vmap(partial(measured, graph, scale=scale)))
+    rows = []
+    for begin in range(0, runs, block):
+        many = jax.device_get(draw(keys[np.arange(begin, begin + block) % runs]))
+        found = jax.device_get(solve(many))
+        again = jax.device_get(solve(_from_chordal(many)))
+        certified = jax.device_get(prove(many._replace(poses=again[0])))
+        error = pose_error(np.asarray(graph.poses), found[0])[:, 1:]
+        cov = found[1][:, 1:]
+        nees = np.einsum("rni,rni->rn", error, np.linalg.solve(cov, error[..., None])[..., 0])
+        square = (error[..., :2] ** 2).sum(axis=-1)
+        wrong = again[2] > found[2] * (1 + 1e-6)
+        rows.append((found[2], nees, square, wrong, certified, found[3] | again[3]))
+    chi2, nees, square, *flags = (np.concatenate(part)[:runs] for part in zip(*rows, strict=True))
+    return Draws(chi2, nees, square, np.trace(bound[:, :2, :2], axis1=1, axis2=2), *flags)
+
+
+def _solved(graph, plan):
+    """Poses, their covariances and χ² at the optimum, and whether it was not reached."""
+    solution = graphs.optimize(graph, plan=plan)
+    cov = graphs.marginals(solution.graph, plan=plan).poses
+    return solution.graph.poses, cov, solution.chi2, solution.status != graphs.Ending.CONVERGED
+
+
+def _from_chordal(many):
+    """The graphs at their chordal starts."""
+    each = [
+        graphs.starts.chordal(jax.tree.map(lambda leaf, k=k: leaf[k], many))
+        for k in range(len(many.poses))
+    ]
+    return many._replace(poses=np.stack([np.asarray(graph.poses) for graph in each]))
+
+
+def summary(found, dof):
+    """The figures of merit of the draws, by name."""
+    good = ~found.failed
+    mean = found.nees[good].mean(axis=1)
+    half = stats.t_quantile(0.975, max(len(mean) - 1, 1)) * mean.std(ddof=1) / len(mean) ** 0.5
+    rmse = np.sqrt(found.square[good].mean() / found.bound.mean())
+    p = scipy.stats.kstest(found.chi2[good], scipy.stats.chi2(dof).cdf).pvalue
+    return {
+        "pose NEES": mean.mean(),
+        "its 95 % interval ±": half,
+        "poses within 95 %": (found.nees[good] < stats.chi2_quantile(0.95, 3)).mean(),
+        "χ² / dof": found.chi2[good].mean() / dof,
+        "χ²: p of Kolmogorov-Smirnov": p,
+        "RMSE / bound": rmse,
+        "wrong minima from chordal": found.wrong.mean(),
+        "certificate fails": 1 - found.certified.mean(),
+        "not converged": found.failed.mean(),
+    }

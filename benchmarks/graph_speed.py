@@ -1,0 +1,183 @@
+"""Time of an optimization beside GTSAM's, and by poses: `python -m benchmarks.graph_speed`.
+
+`input_M3500_g2o` and `city10000`, one graph at a time, from the file's own start, by
+Levenberg-Marquardt; and 256 graphs of the pattern of `ring` in one batch, by Gauss-Newton, its
+measurements drawn again about its true relative poses with the file's information. (A batch takes
+as many steps as its slowest graph, and Levenberg-Marquardt takes 70 for one in thirty of these.)
+
+Both libraries minimize the same cost, of the logarithm of the error. GTSAM stops, by its defaults,
+after a step that lowered χ² by less than 1e-5 of it, and ours before one that would lower it by
+less than 1e-6, so that both have χ² to 1e-6. Compilation and plan are apart, as is the building of
+GTSAM's graph. Both are timed in turns; a time is the median, in seconds of the processor.
+
+The exponent is that of one step, linearization, factor and χ², over the first 500 to 10,000 poses
+of `city10000`, which have 1.2 to 2.1 edges a pose. The files are looked for in the folder
+JAXSLAM_DATA, by default ../shared/data.
+"""
+
+import resource
+import time
+
+import gtsam
+import jax
+import numpy as np
+
+from benchmarks.gate import Metric, alone
+from benchmarks.real_data import DATA
+from jaxslam import graphs
+
+FACTORS = {"relative_pose": graphs.relative_pose_log()}
+TOLERANCE = 1e-6
+MANY = 256
+SIZES = (500, 1000, 2000, 5000, 10000)
+
+
+def processor_seconds(work) -> tuple[float, object]:
+    began = time.process_time()
+    out = jax.block_until_ready(work())
+    return time.process_time() - began, out
+
+
+def of_gtsam(graph, method=gtsam.LevenbergMarquardtOptimizer):
+    """A function that solves the graph by GTSAM, and returns (χ², iterations)."""
+    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    table = graph.tables["relative_pose"]
+    for (i, j), z, information in zip(table.who, table.z, table.information, strict=True):
+        noise = gtsam.noiseModel.Gaussian.Information(information)
+        factors.add(gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*z), noise))
+    for k, pose in enumerate(graph.poses):
+        start.insert(k, gtsam.Pose2(*pose))
+    held = int(np.argmax(graph.fixed_pose))
+    exact = gtsam.noiseModel.Constrained.All(3)
+    factors.add(gtsam.PriorFactorPose2(held, gtsam.Pose2(*graph.poses[held]), exact))
+    parameters = {
+        gtsam.LevenbergMarquardtOptimizer: gtsam.LevenbergMarquardtParams,
+        gtsam.GaussNewtonOptimizer: gtsam.GaussNewtonParams,
+    }[method]
+
+    def solve():
+        solver = method(factors, start, parameters())
+        began = time.process_time()
+        solver.optimize()
+        return time.process_time() - began, 2 * solver.error(), solver.iterations()
+
+    return solve
+
+
+def one_graph(name: str, high: float, repeats: int) -> list[Metric]:
+    graph = graphs.with_gauge(graphs.read(DATA / "graphs" / f"{name}.g2o"))
+    planning, plan = processor_seconds(lambda: graphs.plan(graph, FACTORS))
+
+    def ours():
+        return graphs.optimize(graph, FACTORS, plan=plan, tolerance=TOLERANCE)
+
+    first, _ = processor_seconds(ours)
+    theirs = {
+        "LM": of_gtsam(graph),
+        "GN": of_gtsam(graph, gtsam.GaussNewtonOptimizer),
+    }
+    rows = [
+        (processor_seconds(ours), {key: solve() for key, solve in theirs.items()})
+        for _ in range(repeats)
+    ]
+    own = np.median([mine[0] for mine, _ in rows])
+    found = rows[-1][0][1]
+    print(f"{name}: plan {planning:.2f} s, first call {first:.2f} s")
+    told = (
+        f"  jaxslam {1e3 * own:8.1f} ms, {int(found.iterations)} steps, χ² {float(found.chi2):.6f}"
+    )
+    print(told)
+    metrics = []
+    for key in theirs:
+        seconds = np.median([other[key][0] for _, other in rows])
+        _, chi2, steps = rows[-1][1][key]
+        print(f"  GTSAM {key} {1e3 * seconds:6.1f} ms, {steps} steps, χ² {chi2:.6f}")
+        metrics.append(Metric(f"{name}: time / GTSAM's {key}", own / seconds, high=high))
+        off = float(found.chi2) / chi2 - 1
+        metrics.append(Metric(f"{name}: χ² / GTSAM's {key} - 1", off, high=1e-6))
+    return metrics
+
+
+def many_graphs(repeats: int) -> list[Metric]:
+    graph = graphs.with_gauge(graphs.read(DATA / "graphs" / "ring.g2o"))
+    truth = graphs.read(DATA / "graphs" / "ring_groundTruth.g2o")
+    table, random = graph.tables["relative_pose"], np.random.default_rng(0)
+    root = np.linalg.cholesky(np.linalg.inv(table.information))
+    exact = np.asarray(truth.tables["relative_pose"].z)
+    noise = np.einsum("eij,nej->nei", root, random.normal(size=(MANY, *exact.shape)))
+    batch = jax.tree.map(lambda x: np.broadcast_to(x, (MANY, *np.shape(x))), graph)
+    z = exact + noise
+    batch = batch._replace(tables={"relative_pose": batch.tables["relative_pose"]._replace(z=z)})
+    plan = graphs.plan(graph, FACTORS)
+
+    @jax.jit
+    def ours(batch):
+        return jax.vmap(lambda one: graphs.optimize(one, FACTORS, plan=plan, tolerance=TOLERANCE))(
+            batch
+        )
+
+    batch = jax.device_put(batch)
+    first, found = processor_seconds(lambda: ours(batch))
+    single = [graph._replace(tables={"relative_pose": table._replace(z=rows)}) for rows in z]
+    theirs = [of_gtsam(one, gtsam.GaussNewtonOptimizer) for one in single]
+    own, other, off = [], [], []
+    for _ in range(repeats):
+        own.append(processor_seconds(lambda: ours(batch))[0])
+        solved = [solve() for solve in theirs]
+        other.append(sum(row[0] for row in solved))
+        off.append(np.max(np.asarray(found.chi2) / [row[1] for row in solved] - 1))
+    print(f"ring: {MANY} graphs, first call {first:.2f} s, statuses {np.bincount(found.status)}")
+    print(f"  jaxslam {MANY / np.median(own):8.0f} graphs a second and core")
+    print(f"  GTSAM GN {MANY / np.median(other):7.0f} graphs a second and core")
+    gained = np.median(np.array(other) / own)
+    return [
+        Metric("ring: graphs a second and core / GTSAM's", gained, low=5.0),
+        Metric("ring: greatest χ² / GTSAM's - 1", float(np.max(off)), high=1e-6),
+    ]
+
+
+def first_poses(graph, size: int):
+    """The graph of the first poses, and of the edges between them."""
+    table = graph.tables["relative_pose"]
+    inside = (np.asarray(table.who) < size).all(axis=1)
+    kept = type(table)(*(np.asarray(field)[inside] for field in table))
+    return graph._replace(
+        poses=graph.poses[:size],
+        fixed_pose=graph.fixed_pose[:size],
+        pose_id=graph.pose_id[:size],
+        tables={"relative_pose": kept},
+    )
+
+
+def growth(repeats: int) -> list[Metric]:
+    whole = graphs.with_gauge(graphs.read(DATA / "graphs" / "city10000.g2o"))
+    times = []
+    for size in SIZES:
+        graph = first_poses(whole, size)
+        plan = graphs.plan(graph, FACTORS)
+        go = jax.jit(lambda g: graphs.optimize(g, FACTORS, plan=plan, iterations=3, tolerance=0.0))
+        graph = jax.device_put(graph)
+        jax.block_until_ready(go(graph))
+        seconds = np.median([processor_seconds(lambda: go(graph))[0] for _ in range(repeats)])
+        times.append(seconds / 4)
+        edges = len(graph.tables["relative_pose"].z)
+        print(f"  {size:6} poses, {edges:6} edges: {1e3 * times[-1]:8.2f} ms a step")
+    power = float(np.polyfit(np.log(SIZES), np.log(times), 1)[0])
+    return [Metric("city10000's first poses: step as a power of them", power, high=1.2)]
+
+
+def measure(repeats: int = 5) -> list[Metric]:
+    """Nothing where the files are absent."""
+    if not (DATA / "graphs").is_dir():
+        print(f"{DATA / 'graphs'} is not there")
+        return []
+    metrics = one_graph("input_M3500_g2o", 1.0, repeats)
+    metrics += one_graph("city10000", 1.5, repeats)
+    metrics += many_graphs(repeats)
+    metrics += growth(repeats)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return [*metrics, Metric("peak memory of the process [GB]", peak)]
+
+
+if __name__ == "__main__":
+    raise SystemExit(alone("graph_speed", measure, repeats={"type": int, "default": 5}))

@@ -1,0 +1,232 @@
+"""The command `jaxslam optimize`: the optimum of a graph in a file."""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxslam import graphs
+from jaxslam.cli.common import pick
+from jaxslam.cli.compile_clock import CompileClock
+from jaxslam.datasets import g2o
+from jaxslam.graphs import Ending, Graph, starts
+from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.validation import label, variables_of
+from jaxslam.monte_carlo.progress import Progress
+from jaxslam.results.files import check_writable, csv_text, json_text, versions, write_files
+
+ERRORS = {
+    "pose": (graphs.relative_pose, "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),
+    "log": (graphs.relative_pose_log, "e = log(Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ))"),
+}
+"""The residual of a relative pose by its name: g2o's, and GTSAM's."""
+
+COST = "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses"
+
+TRUSTED = ("relative_pose", "prior")
+"""Tables without a robust kernel: relative poses of successive poses, and priors."""
+
+NOT_CONVERGED = 1
+WORST = 10
+"""Number of rows with the largest residuals in the summary and the figure."""
+
+
+def optimize_graph(options: argparse.Namespace, command: str) -> int:
+    """Optimize a graph, print and write the result; returns the exit status, 1 if not converged."""
+    start = pick("start", options.start, starts.STARTS)
+    kernel = None if options.kernel is None else pick("kernel", options.kernel, graphs.KERNELS)()
+    relative, equation = pick("error", options.error, ERRORS)
+    loaded = g2o.load(options.path)
+    check_writable(options.out)
+    known = {**of_files(), "relative_pose": relative()}
+    factors = {key: known[key] for key in loaded.graph.tables}
+    held = graphs.with_gauge(loaded.graph, factors)
+    graphs.check_graph(str(options.path), held, factors)
+    given = held if kernel is None else graphs.with_loops_apart(held)
+    factors = {key: known[key.split("/")[0]] for key in given.tables}
+    begun = start(given, factors)
+    doubted = {key: kernel for key in given.tables if key not in TRUSTED} if kernel else None
+    with Progress(Path(options.path).name, "steps") as progress:
+        progress.say("compiling and solving …")
+        with CompileClock() as clock:
+            solution = jax.block_until_ready(
+                graphs.optimize(
+                    begun,
+                    factors,
+                    method=options.method,
+                    kernel=doubted,
+                    iterations=options.iterations,
+                )
+            )
+            seconds, compiling = clock.seconds, clock.compiling
+    found = jax.tree.map(np.asarray, solution.graph)
+    squared = {k: np.asarray(s) for k, s in graphs.squared_residuals(found, factors).items()}
+    converged = int(solution.status) == Ending.CONVERGED
+    summary = {
+        "file": str(options.path),
+        "command": command,
+        "cost": f"{COST} {equation}",
+        "poses": len(found.poses),
+        "points": len(found.points),
+        "edges": {key: int(table.valid.sum()) for key, table in found.tables.items()},
+        "skipped lines": loaded.skipped,
+        "placed along the edges": loaded.placed,
+        "gauge": _gauge(loaded.graph, held),
+        "start": options.start,
+        "method": options.method,
+        "kernel": options.kernel or "none",
+        "chi2 of the file": _finite(graphs.chi2(given, factors)),
+        "chi2 at the start": _finite(graphs.chi2(begun, factors)),
+        "chi2": _finite(sum(s.sum() for s in squared.values())),
+        "degrees of freedom": graphs.degrees_of_freedom(found, factors),
+        **({} if kernel is None else {"robust cost": _finite(solution.chi2)}),
+        "status": _status(solution, found),
+        "iterations": int(solution.iterations),
+        "gradient / at the start": _finite(solution.gradient / solution.gradient_start),
+        "seconds to compile": round(compiling, 3),
+        "seconds to run": round(seconds - compiling, 3),
+        **(_certificate(found, converged, kernel is None) if options.certificate else {}),
+    }
+    print(_table(summary))
+    worst = _worst(found, squared, factors)
+    files: dict[str, str | Callable[[Path], object]] = {
+        "summary.json": json_text(
+            summary | {"worst residuals": worst, "versions": versions()},
+        ),
+        "poses.csv": _csv(("x", "y", "theta"), found.pose_id, found.poses, found.fixed_pose),
+        "optimized.g2o": g2o.text_of(found),
+        "graph.png": _figure(options, begun, found, squared, summary),
+    }
+    if len(found.points):
+        files["points.csv"] = _csv(("x", "y"), found.point_id, found.points, found.fixed_point)
+    written = write_files(options.out, files)
+    print("\nwrote " + ", ".join(str(path) for path in written))
+    if converged:
+        return 0
+    print(f"jaxslam: {summary['status']}", file=sys.stderr)
+    return NOT_CONVERGED
+
+
+def _gauge(read: Graph, given: Graph) -> str:
+    """What holds the graph in place, in words."""
+    poses, points = int(given.fixed_pose.sum()), int(given.fixed_point.sum())
+    if given is not read:
+        held = given.pose_id[given.fixed_pose.argmax()]
+        return f"pose {int(held)} is fixed, since the file fixes none"
+    told = [f"{poses} poses"] * (poses > 0) + [f"{points} points"] * (points > 0)
+    return " and ".join(told) + " fixed by the file" if told else "by priors"
+
+
+def _status(solution: graphs.Solution, found: Graph) -> str:
+    """The status in words, with the variable that is not determined."""
+    ending = Ending(int(solution.status))
+    if ending != Ending.SINGULAR:
+        return str(ending.name.lower())
+    return f"singular: the measurements do not determine {label(found, int(solution.singular))}"
+
+
+def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, Any]:
+    """What is proved of the optimum: entries of the summary."""
+    if not converged or not plain:
+        why = "of a robust cost nothing is proved" if converged else "there is no optimum"
+        return {"certificate": f"none: {why}"}
+    began = time.perf_counter()
+    try:
+        proof = jax.block_until_ready(graphs.certificate(found))
+    except ValueError as error:
+        return {"certificate": f"none: {str(error).removeprefix('graphs.certificate: ')}"}
+    return {
+        "certificate": "the chordal optimum next to it is global"
+        if proof.certified
+        else "not certified: another optimum of the chordal cost may be lower",
+        "chordal chi2": _finite(proof.chi2),
+        "lower by at most": _finite(proof.gap),
+        "distance of the two optima [m]": _finite(proof.position),
+        "distance of the two optima [rad]": _finite(proof.heading),
+        "seconds of the certificate": round(time.perf_counter() - began, 3),
+    }
+
+
+def _finite(value: Any) -> float | None:
+    """A number, or None where JSON has none."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _worst(
+    graph: Graph, squared: Mapping[str, np.ndarray], factors: Mapping[str, Factor]
+) -> list[dict[str, object]]:
+    """The rows with the largest eᵀ Ω e for their size, largest first."""
+    rows = [
+        (float(value) / len(factors[key].errors), key, row)
+        for key, values in squared.items()
+        for row, value in enumerate(values)
+    ]
+    found = []
+    for _, key, row in sorted(rows, key=lambda entry: -entry[0])[:WORST]:
+        one = graph.tables[key]._replace(valid=np.arange(len(squared[key])) == row)
+        between = variables_of(graph, one, factors[key])[0]
+        found.append(
+            {
+                "table": key,
+                "row": row,
+                "between": [label(graph, int(variable)) for variable in between],
+                "squared residual": _finite(squared[key][row]),
+            }
+        )
+    return found
+
+
+def _csv(names: tuple[str, ...], ids: Any, values: Any, fixed: Any) -> str:
+    """Poses or points as a table, numbers by repr."""
+    rows = [
+        [str(int(one)), *map(repr, np.asarray(row, float).tolist()), str(int(held))]
+        for one, row, held in zip(ids, values, fixed, strict=True)
+    ]
+    return csv_text(
+        ["id", *(f"{n} [{'rad' if n == 'theta' else 'm'}]" for n in names), "fixed"], rows
+    )
+
+
+def _figure(
+    options: argparse.Namespace,
+    before: Graph,
+    after: Graph,
+    squared: Mapping[str, np.ndarray],
+    summary: Mapping[str, Any],
+) -> Callable[[Path], object]:
+    """What draws the graph before and after."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    title = Path(options.path).name
+    figure = plot.graph_figure(
+        before,
+        after,
+        squared,
+        worst=WORST,
+        subtitles=(
+            f"start ({options.start}): χ² = {_shown(summary['chi2 at the start'])}",
+            f"{summary['status'].split(':')[0]}: χ² = {_shown(summary['chi2'])}",
+        ),
+        title=f"{title}: {summary['poses']:,} poses, {sum(summary['edges'].values()):,} edges",
+    )
+    return lambda path: path.write_bytes(plot.png(figure))
+
+
+def _table(summary: Mapping[str, Any]) -> str:
+    """The summary, a line an entry."""
+    wide = max(map(len, summary))
+    return "\n".join(f"{key.ljust(wide)}  {_shown(value)}" for key, value in summary.items())
+
+
+def _shown(value: object) -> str:
+    """A value as it is printed; numbers with nine digits, so that optima can be compared."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "none"
+    if value is None:
+        return "not finite"
+    return f"{value:.9g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,53 @@
+"""Graphs in files: the public names of the reader and the writer, which `datasets.g2o` has."""
+
+from pathlib import Path
+
+from jaxslam.graphs.graph import Graph
+
+
+def read(path: str | Path) -> Graph:
+    """The graph in a file of g2o or TORO, packed by gzip or not; arrays are NumPy's, of float64.
+
+    The lines, their fields, and where they are in the graph:
+
+        VERTEX_SE2, VERTEX2  id x y θ                                  poses
+        VERTEX_XY            id x y                                    points
+        FIX                  ids                                       fixed_pose, fixed_point
+        EDGE_SE2             i j x y θ I11 I12 I13 I22 I23 I33         relative_pose
+        EDGE2 (TORO)         a b f s r I_ff I_fs I_ss I_rr I_fr I_sr   relative_pose
+        EDGE_PRIOR_SE2       i x y θ, and Ω as EDGE_SE2 has it         prior
+        EDGE_SE2_XY          i l x y I11 I12 I22                       relative_position
+        EDGE_BEARING_SE2_XY  i l bearing I11                           bearing
+
+    Poses and points are in the order of the file; the last five name tables.
+    Numbers are those of the file. Comments (`#`) and scans (`ROBOTLASER1`) are skipped;
+    `datasets.g2o.load` counts them. In a file without vertices, poses and points have the order of
+    their ids and are placed along the edges, `starts.odometry`. The cost of what is read is
+    χ² = Σ eᵀ Ω e, with e as `graphs.REGISTRY` has it and no factor ½.
+
+    Kümmerle et al. 2011, "g2o: A general framework for graph optimization", ICRA; Grisetti et al.
+    2007, "A tree parameterization for efficiently computing maximum likelihood maps using gradient
+    descent", RSS (TORO).
+
+    Raises:
+        ValueError: `path:line: reason` for an unknown or malformed line, a vertex that occurs
+            twice, an edge to a vertex that is nowhere or from one to itself, and an information
+            that is not positive semidefinite.
+    """
+    from jaxslam.datasets import g2o
+
+    return g2o.load(path).graph
+
+
+def write(path: str | Path, graph: Graph) -> None:
+    """Write a graph as a file of g2o that `read` reads as the same graph, number by number.
+
+    Poses, points, `FIX`, then the tables in their order; rows that are not valid are left out. A
+    table "name/part" is written as the table "name", and read as part of it.
+
+    Raises ValueError on a table that g2o has no line for, points of other than two numbers, and an
+    id of both a pose and a point.
+    """
+    from jaxslam.datasets import g2o
+
+    g2o.save(path, graph)

@@ -1,0 +1,112 @@
+"""The optimum of a graph: Gauss-Newton and Levenberg-Marquardt on sparse blocks."""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam import programs
+from jaxslam.graphs.batch import in_one_dtype, over_batch, with_batch
+from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.gnc import graduated
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.implicit import followed
+from jaxslam.graphs.kernels import Kernel
+from jaxslam.graphs.linearized import cost, data_of, variables_of
+from jaxslam.graphs.model import Model, model_of
+from jaxslam.graphs.plan import Plan, plan_for
+from jaxslam.graphs.search import METHODS, Solution, minimize
+from jaxslam.graphs.validation import check_graph
+from jaxslam.validation.numbers import check_count
+
+
+def optimize(
+    graph: Graph,
+    factors: Mapping[str, Factor] | None = None,
+    *,
+    method: str = "levenberg_marquardt",
+    kernel: Kernel | Mapping[str, Kernel] | None = None,
+    iterations: int = 100,
+    tolerance: float = 1e-12,
+    plan: Plan | None = None,
+) -> Solution:
+    """The graph at a minimum of χ² = Σ ρ(eᵀ Ω e), from the variables it has.
+
+    Each step solves (H + λD) δ = -g with H = Σ Jᵀ ρ' Ω J and g = Σ Jᵀ ρ' Ω e, J by increments δ in
+    the frame of a pose, X ∘ exp(δ) as in `se2.boxplus`, and D = diag H.
+
+    Args:
+        graph: outside of a trace it is checked.
+        factors: the factor of each table; those of files by default. A table "name/part" takes the
+            factor "name".
+        method: "levenberg_marquardt", "gauss_newton" (λ = 0, every step is taken) or "dogleg".
+        kernel: robust kernels, one for all tables or by table. With `truncated` the iterations are
+            rounds of graduated non-convexity (`gnc`), and `iterations` is the limit of each.
+        iterations: steps at most.
+        tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
+            predicts, and at least by rounding.
+        plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced.
+    Raises:
+        ValueError: on what `check_graph` refuses, and on unknown methods or tables.
+    """
+    caller = "graphs.optimize"
+    if method not in METHODS:
+        raise ValueError(f"{caller}: no method {method!r}; there are: {', '.join(METHODS)}")
+    check_count(f"{caller}: iterations", iterations)
+    model = model_of(caller, graph, factors, kernel)
+    known = dict(model.factors)
+    check_graph(caller, graph, known)
+    plan = plan_for(caller, graph, known, plan)
+    limits = np.asarray(iterations), np.asarray(tolerance, float)
+    return programs.call(_optimize, (model, method), graph, plan, *limits)
+
+
+def chi2(
+    graph: Graph,
+    factors: Mapping[str, Factor] | None = None,
+    *,
+    kernel: Kernel | Mapping[str, Kernel] | None = None,
+) -> Float[Array, ""]:
+    """χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
+    model = model_of("graphs.chi2", graph, factors, kernel)
+    return programs.call(_chi2, (model,), graph)
+
+
+def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
+    graph = in_one_dtype(graph)
+    who = {name: table.who for name, table in graph.tables.items()}
+    batch = with_batch(graph)
+    none = jnp.arange(len(graph.poses) + len(graph.points))
+    return cost(model, who, variables_of(batch), data_of(batch, none))[0]
+
+
+def _optimize(
+    model: Model, method: str, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
+) -> Solution:
+    graph = in_one_dtype(graph)
+    return _solver(model, method)(graph, plan, iterations, tolerance.astype(graph.poses.dtype))
+
+
+@functools.lru_cache(maxsize=256)
+def _solver(model: Model, method: str) -> Callable[..., Solution]:
+    """The solution of one graph, with derivatives, and batched by `vmap`."""
+    search = graduated if any(k.limit is not None for _, k in model.kernels) else minimize
+    solve = over_batch("graphs.optimize", functools.partial(search, model, method))
+
+    @jax.custom_jvp
+    def solved(graph: Graph, *shared: Any) -> Solution:
+        return solve(shared, graph)
+
+    @solved.defjvp
+    def slope(primals: Any, tangents: Any) -> tuple[Solution, Any]:
+        graph, plan, *_ = primals
+        found = solved(*primals)
+        return found, jax.jvp(
+            lambda graph: followed(model, plan, graph, found), (graph,), tangents[:1]
+        )[1]
+
+    return cast(Callable[..., Solution], solved)

@@ -1,0 +1,195 @@
+"""The Cholesky factor of a block-sparse matrix, and solutions by it, for a batch of matrices.
+
+Arrays have the batch B as their last axis: matrices of one pattern share every index, and each
+operation runs over contiguous numbers of all of them.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.graphs.sparse.sweeps import (
+    TARGETS,
+    Sums,
+    Sweep,
+    finish,
+    nothing,
+    padded,
+    places,
+    subtract_products,
+    sweep,
+    table,
+)
+from jaxslam.graphs.sparse.symbolic import Ints, Pattern
+from jaxslam.math.linalg import total
+
+
+class CholeskyTables(NamedTuple):
+    """What the factorization of a pattern of n columns and M blocks needs."""
+
+    factor: Sweep
+    diagonal: Int[Array, "n"]
+    """the place of each column's diagonal block"""
+    pivots: Int[Array, "levels+1"]
+    """the first chunk of columns of each level"""
+    pivot_base: Int[Array, "chunks"]
+    """the first column of each chunk"""
+    forward: Sweep
+    forward_order: Int[Array, "n"]
+    """the column at each place of the forward substitution"""
+    backward: Sweep
+    backward_order: Int[Array, "n"]
+
+
+class Factored(NamedTuple):
+    """A Cholesky factor L of n columns."""
+
+    blocks: Float[Array, "M+T+1 d d B"]
+    inverses: Float[Array, "n+T+1 d d B"]
+    """L_jj⁻¹; the last is the identity"""
+    regular: Bool[Array, "n B"]
+    """whether the pivots of a column are positive"""
+
+
+def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
+    """The tables of a pattern, and the place of each of its blocks, and of none, in
+    `Factored.blocks`."""
+    size, heights, columns, rows = (
+        len(pattern.order),
+        pattern.heights,
+        pattern.columns,
+        pattern.rows,
+    )
+    target, left, right = [], [], []
+    for _, blocks in pattern.below():
+        one, other = np.tril_indices(blocks.shape[1])
+        left.append(blocks[:, one].ravel())
+        right.append(blocks[:, other].ravel())
+        target.append(pattern.find(rows[left[-1]], rows[right[-1]]))
+    sums = Sums(heights[columns], *map(np.concatenate, (target, left, right)))
+    _, place = places(sums)
+    one = np.append(np.arange(size), nothing(size))
+    factor = sweep(sums, place, place, one[np.append(columns, size)])
+    # Columns are sorted by height: those of a level lie side by side.
+    first = np.searchsorted(heights, np.arange(heights[-1] + 2)).tolist()
+    chunks = [range(low, high, TARGETS) for low, high in pairwise(first)]
+    below = np.flatnonzero(rows > columns)
+    downward = Sums(heights, rows[below], below, columns[below])
+    upward = Sums(heights[-1] - heights, columns[below], below, rows[below])
+    forward_order, forward_place = places(downward)
+    backward_order, backward_place = places(upward)
+    return CholeskyTables(
+        factor,
+        diagonal=table(place[pattern.first[:-1]]),
+        pivots=table(np.cumsum([0, *map(len, chunks)])),
+        pivot_base=table(np.concatenate(chunks)),
+        forward=sweep(downward, place, forward_place, one),
+        forward_order=table(forward_order),
+        backward=sweep(upward, place, backward_place, one),
+        backward_order=table(backward_order),
+    ), place
+
+
+def by_transposed(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A Bᵀ of blocks (T, d, d, B)."""
+    return total(a[:, :, None, m] * b[:, None, :, m] for m in range(a.shape[2]))
+
+
+def by(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A B of blocks (T, d, d, B)."""
+    return total(a[:, :, m, None] * b[:, None, m] for m in range(a.shape[2]))
+
+
+def _on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
+    """A x of blocks (T, d, d, B) and vectors (T, d, B)."""
+    return total(a[:, :, m] * x[:, None, m] for m in range(a.shape[2]))
+
+
+def _transposed_on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
+    return total(a[:, m] * x[:, m, None] for m in range(a.shape[2]))
+
+
+def factorize(tables: CholeskyTables, blocks: Float[Array, "M d d B"]) -> Factored:
+    """The factor of a matrix, from its blocks at their places (lower triangle).
+
+    A pivot that rounding may have left of zero, beside the matrix's own diagonal entry, makes its
+    column irregular; its inverse is then taken as zero, so that all numbers stay finite.
+    """
+    size, width = len(tables.diagonal), blocks.shape[1]
+    own = jnp.diagonal(blocks[tables.diagonal], axis1=1, axis2=2)  # (n, B, d)
+    least = 32 * float(jnp.finfo(blocks.dtype).eps) * jnp.moveaxis(own, 2, 1)
+    least = jnp.pad(least, [(0, TARGETS), (0, 0), (0, 0)])
+    one = jnp.broadcast_to(jnp.eye(width, dtype=blocks.dtype)[..., None], blocks.shape[1:])
+    inverses = padded(jnp.zeros((size, *blocks.shape[1:]), blocks.dtype)).at[-1].set(one)
+    regular = jnp.ones((size + TARGETS, blocks.shape[-1]), bool)
+    diagonal = jnp.pad(tables.diagonal, (0, TARGETS))
+
+    def level(i: jax.Array, state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        blocks, inverses, regular = state
+        blocks = subtract_products(tables.factor, i, blocks, None, None, by_transposed)
+
+        def pivots(c: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            inverses, regular = state
+            base = tables.pivot_base[c]
+            here = blocks[jax.lax.dynamic_slice_in_dim(diagonal, base, TARGETS)]
+            inverse, good = _inverse_factor(
+                here, jax.lax.dynamic_slice_in_dim(least, base, TARGETS)
+            )
+            return (
+                jax.lax.dynamic_update_slice_in_dim(inverses, inverse, base, 0),
+                jax.lax.dynamic_update_slice_in_dim(regular, good, base, 0),
+            )
+
+        inverses, regular = jax.lax.fori_loop(
+            tables.pivots[i], tables.pivots[i + 1], pivots, (inverses, regular)
+        )
+        return finish(tables.factor, i, blocks, inverses, by_transposed), inverses, regular
+
+    levels = len(tables.pivots) - 1
+    state = jax.lax.fori_loop(0, levels, level, (padded(blocks), inverses, regular))
+    return Factored(state[0], state[1], state[2][:size])
+
+
+def _inverse_factor(
+    matrix: Float[Array, "T d d B"], least: Float[Array, "T d B"]
+) -> tuple[Float[Array, "T d d B"], Bool[Array, "T B"]]:
+    """L⁻¹ of L Lᵀ = A, and whether each pivot is above its least; as `linalg.whitener`."""
+    width = matrix.shape[1]
+    zero = jnp.zeros_like(matrix[:, 0, 0])
+    factor = [[zero] * width for _ in range(width)]
+    rows = [[zero] * width for _ in range(width)]
+    regular = jnp.ones(zero.shape, bool)
+    for j in range(width):
+        pivot = matrix[:, j, j] - total([zero, *(factor[j][k] ** 2 for k in range(j))])
+        good = pivot > least[:, j]
+        regular = regular & good
+        rows[j][j] = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        for k in range(j):
+            rows[j][k] = -rows[j][j] * total(factor[j][i] * rows[i][k] for i in range(k, j))
+        for i in range(j + 1, width):
+            rest = matrix[:, i, j] - total([zero, *(factor[i][k] * factor[j][k] for k in range(j))])
+            factor[i][j] = rest * rows[j][j]
+    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1), regular
+
+
+def substitute(
+    tables: CholeskyTables, factored: Factored, rhs: Float[Array, "n d B"]
+) -> Float[Array, "n d B"]:
+    """A⁻¹ b, by columns."""
+    x = rhs
+    for tables_of, order, on in (
+        (tables.forward, tables.forward_order, _on_vector),
+        (tables.backward, tables.backward_order, _transposed_on_vector),
+    ):
+
+        def level(i: jax.Array, x: jax.Array) -> jax.Array:
+            x = subtract_products(tables_of, i, x, factored.blocks, None, on)  # noqa: B023
+            return finish(tables_of, i, x, factored.inverses, lambda x, a: on(a, x))  # noqa: B023
+
+        done = jax.lax.fori_loop(0, len(tables_of.rounds) - 1, level, padded(x[order]))
+        x = jnp.zeros_like(rhs).at[order].set(done[: len(order)], unique_indices=True)
+    return x

@@ -1,0 +1,41 @@
+"""Sums of rows by target, as gathers: no scatter, and the same order of terms on every device."""
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxslam.graphs.sparse.sweeps import table
+
+TERMS = 4
+
+Stages = tuple[Int[Array, "_ terms"], ...]
+
+
+def stages(target: Int[np.ndarray, "rows"], size: int) -> Stages:
+    """The tables of sums of rows into so many targets; a target of -1 drops its row.
+
+    Each stage sums up to four rows; it gives its targets in order, until each has one row.
+    """
+    used = np.flatnonzero(target >= 0)
+    numbers = used[np.argsort(target[used], kind="stable")]
+    absent, owner, out = len(target), target[numbers], list[Array]()
+    while True:
+        counts = np.bincount(owner, minlength=size)
+        last = counts.max(initial=0) <= TERMS
+        groups = np.ones(size, int) if last else -(-counts // TERMS)
+        begin, group_begin = np.cumsum(counts) - counts, np.cumsum(groups) - groups
+        sums = np.full((groups.sum(), TERMS), absent, np.int32)
+        rank = np.arange(len(owner)) - begin[owner]
+        sums[group_begin[owner] + rank // TERMS, rank % TERMS] = numbers
+        out.append(table(sums))
+        if last:
+            return tuple(out)
+        owner = np.repeat(np.arange(size), groups)
+        numbers, absent = np.arange(len(owner)), len(owner)
+
+
+def summed(stages: Stages, rows: Float[Array, "rows *rest"]) -> Float[Array, "size *rest"]:
+    """The sums of the rows of each target; zero where it has none."""
+    for sums in stages:
+        taken = rows.at[sums].get(mode="fill", fill_value=0)
+        rows = taken[:, 0] + taken[:, 1] + (taken[:, 2] + taken[:, 3])
+    return rows

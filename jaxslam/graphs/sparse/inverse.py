@@ -1,0 +1,90 @@
+"""Blocks of the inverse of a block-sparse matrix, from its Cholesky factor."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.graphs.sparse.cholesky import Factored, by
+from jaxslam.graphs.sparse.sweeps import (
+    Sums,
+    Sweep,
+    finish,
+    nothing,
+    places,
+    subtract_products,
+    sweep,
+    table,
+)
+from jaxslam.graphs.sparse.symbolic import Ints, Pattern
+
+
+class InverseTables(NamedTuple):
+    """What the selected inversion of a pattern of n columns and M blocks needs."""
+
+    sweep: Sweep
+    diagonal: Int[Array, "n"]
+    """the place of each column's diagonal block"""
+    pairs: Int[Array, "Q"]
+    """the place of the block of each pair of variables"""
+    turned: Bool[Array, "Q"]
+    """whether that block is of the second variable's rows and the first one's columns"""
+
+
+def inverse_tables(
+    pattern: Pattern, cholesky_places: Ints, first: Ints, second: Ints
+) -> InverseTables:
+    """The tables of a pattern, and of pairs of its variables whose blocks it has.
+
+    cholesky_places: of each block in `Factored.blocks`, and of none.
+    """
+    size, rows, columns = len(pattern.order), pattern.rows, pattern.columns
+    target, left, right, flip = [], [], [], []
+    for column, blocks in pattern.below():
+        own = rows[blocks]  # (C, m)
+        # The rows of a column, its own included, by the rows below its diagonal.
+        every = np.concatenate([column[:, None], own], axis=1)
+        one, other = np.broadcast_arrays(every[:, :, None], own[:, None, :])
+        at = np.concatenate([pattern.first[column][:, None], blocks], axis=1)
+        target.append(np.broadcast_to(at[:, :, None], one.shape).ravel())
+        left.append(pattern.find(np.maximum(one, other).ravel(), np.minimum(one, other).ravel()))
+        flip.append((one < other).ravel())
+        right.append(np.broadcast_to(blocks[:, None, :], one.shape).ravel())
+    depth = pattern.heights[-1] - pattern.heights
+    # The diagonal block of a column comes after those below it, of which it is a sum.
+    level = 2 * depth[columns] + (rows == columns)
+    sums = Sums(level, *map(np.concatenate, (target, left, right, flip)))
+    _, place = places(sums)
+    end = np.append(columns, nothing(size))
+    one, other = pattern.position[first], pattern.position[second]
+    pairs = place[pattern.find(np.maximum(one, other), np.minimum(one, other))]
+    return InverseTables(
+        sweep(sums, place, cholesky_places, end),
+        table(place[pattern.first[:-1]]),
+        table(pairs),
+        table(one < other),
+    )
+
+
+def selected_inverse(tables: InverseTables, factored: Factored) -> Float[Array, "places d d B"]:
+    """The blocks of A⁻¹ where L has blocks.
+
+        Z_ij = (δ_ij L_jjᵀ⁻¹ - Σ_k Z_ik L_kj) L_jj⁻¹, k the rows of L below the diagonal of column j
+
+    from the last column to the first (Takahashi, Fagan and Chin 1973; Erisman and Tinney 1975, "On
+    computing certain elements of the inverse of a sparse matrix", Comm. ACM 18(3)).
+    """
+    size = len(tables.diagonal)
+    count = len(factored.blocks)
+    own = jnp.swapaxes(factored.inverses[:size], 1, 2)
+    start = jnp.zeros((count, *own.shape[1:]), own.dtype).at[tables.diagonal].set(own)
+
+    def level(i: jax.Array, blocks: jax.Array) -> jax.Array:
+        blocks = subtract_products(tables.sweep, i, blocks, None, factored.blocks, by)
+        return finish(tables.sweep, i, blocks, factored.inverses, by)
+
+    levels = len(tables.sweep.rounds) - 1
+    out: jax.Array = jax.lax.fori_loop(0, levels, level, start)
+    return out

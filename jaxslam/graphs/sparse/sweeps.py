@@ -1,0 +1,172 @@
+"""Sums of products of blocks, as loops over tables of fixed shape.
+
+A factorization, a substitution and a selected inversion have one form: target blocks, from each of
+which a sum of products of finished blocks is subtracted before it is finished. Targets that do not
+depend on each other make a level. A level is done in rounds: round r subtracts the products rK to
+rK + K - 1 of each target that has so many. The targets of a level are sorted by their number of
+products, so that those of a round are the first of the level and lie side by side in memory: no
+scatter is needed, and the size of the compiled program does not depend on that of the graph.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+TARGETS = 8
+"""T, targets that are computed together"""
+TERMS = 2
+"""K, products of a target that are computed together"""
+
+Ints = Int[np.ndarray, "_"]
+Product = Callable[[Array, Array], Array]
+
+
+class Sums(NamedTuple):
+    """M targets, and P products that are subtracted from them."""
+
+    level: Ints
+    """of each target, from 0, (M,)"""
+    target: Ints
+    """of each product, (P,)"""
+    left: Ints
+    """its factors, (P,)"""
+    right: Ints
+    flip: Bool[np.ndarray, "_"] | None = None
+    """whether the left factor is transposed, (P,)"""
+
+
+class Sweep(NamedTuple):
+    """The tables of a sweep: C chunks of products and F chunks of finished targets."""
+
+    rounds: Int[Array, "levels+1"]
+    """the first chunk of products of each level"""
+    base: Int[Array, "C"]
+    """the first place of each chunk"""
+    left: Int[Array, "C T K"]
+    right: Int[Array, "C T K"]
+    ends: Int[Array, "levels+1"]
+    """the first chunk of finished targets of each level"""
+    end_base: Int[Array, "F"]
+    end: Int[Array, "F T"]
+    """what a target is finished with"""
+    flip: Bool[Array, "C T K"] | None
+    """whether the left factor is transposed"""
+
+
+def table(numbers: np.ndarray) -> Array:
+    """A table of integers or flags, on the device."""
+    kept = numbers if numbers.dtype == bool else numbers.astype(np.int32)
+    return jnp.asarray(jax.device_put(kept))
+
+
+def places(sums: Sums) -> tuple[Ints, Ints]:
+    """The target at each place (M,), and the place of each target and of no target (M+1,)."""
+    count = np.bincount(sums.target, minlength=len(sums.level))
+    order = np.lexsort((-count, sums.level))
+    place = np.empty(len(order) + 1, int)
+    place[order] = np.arange(len(order))
+    place[-1] = nothing(len(order))
+    return order, place
+
+
+def nothing(size: int) -> int:
+    """The place of an array of so many targets that is always zero (or the identity)."""
+    return size + TARGETS
+
+
+def padded(array: jax.Array) -> jax.Array:
+    """The array (M, …) with zeros for the overhang of the last chunk, and at `nothing`."""
+    return jnp.pad(array, [(0, TARGETS + 1)] + [(0, 0)] * (array.ndim - 1))
+
+
+def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
+    """The tables of a sweep.
+
+    left, right: the place of each factor, and of none, by its number. end: what each target is
+    finished with, and what leaves a target as it is.
+    """
+    size = len(sums.level)
+    order, _ = places(sums)
+    counts = np.bincount(sums.target, minlength=size)
+    begin = (np.cumsum(counts) - counts)[order]
+    count = counts[order]
+    by_target = np.append(np.argsort(sums.target, kind="stable"), 0)
+    levels = int(sums.level.max(initial=-1)) + 1
+    first = np.searchsorted(sums.level[order], np.arange(levels + 1))
+    # (first place, first product of a target, end of the round's targets) of each chunk
+    chunks: list[tuple[int, int, int]] = []
+    rounds, ends, end_base = [0], [0], list[int]()
+    for low, high in zip(first[:-1].tolist(), first[1:].tolist(), strict=True):
+        for shift in range(0, int(count[low]), TERMS):
+            stop = low + int(np.count_nonzero(count[low:high] > shift))
+            chunks += [(first_place, shift, stop) for first_place in range(low, stop, TARGETS)]
+        rounds.append(len(chunks))
+        end_base += range(low, high, TARGETS)
+        ends.append(len(end_base))
+    bases, shifts, stops = np.array(chunks, int).reshape(-1, 3).T
+    place = bases[:, None] + np.arange(TARGETS)
+    there = np.minimum(place, size - 1)[..., None]
+    term = shifts[:, None, None] + np.arange(TERMS)
+    real = (place < stops[:, None])[..., None] & (term < count[there])
+    product = by_target[np.where(real, begin[there] + term, -1)]
+    end_place = np.array(end_base, int)[:, None] + np.arange(TARGETS)
+    inside = end_place < np.repeat(first[1:], np.diff(ends))[:, None]
+    ending = order[np.minimum(end_place, size - 1)]
+
+    def factors(numbers: Ints, place: Ints) -> Array:
+        return table(place[np.where(real, np.append(numbers, 0)[product], -1)])
+
+    return Sweep(
+        table(np.array(rounds)),
+        table(bases),
+        factors(sums.left, left),
+        factors(sums.right, right),
+        table(np.array(ends)),
+        table(np.array(end_base, int)),
+        table(end[np.where(inside, ending, -1)]),
+        None if sums.flip is None else table(np.append(sums.flip, False)[product]),
+    )
+
+
+def subtract_products(
+    tables: Sweep,
+    level: jax.Array,
+    target: jax.Array,
+    left: jax.Array | None,
+    right: jax.Array | None,
+    product: Product,
+) -> jax.Array:
+    """The targets (M, …) after the rounds of a level; a factor of None is a target itself."""
+
+    def chunk(c: jax.Array, target: jax.Array) -> jax.Array:
+        a = (target if left is None else left)[tables.left[c]]
+        b = (target if right is None else right)[tables.right[c]]
+        if tables.flip is not None:
+            a = jnp.where(tables.flip[c][..., None, None, None], jnp.swapaxes(a, 2, 3), a)
+        held = jax.lax.dynamic_slice_in_dim(target, tables.base[c], TARGETS)
+        for k in range(TERMS):
+            held = held - product(a[:, k], b[:, k])
+        return jax.lax.dynamic_update_slice_in_dim(target, held, tables.base[c], 0)
+
+    out: jax.Array = jax.lax.fori_loop(
+        tables.rounds[level], tables.rounds[level + 1], chunk, target
+    )
+    return out
+
+
+def finish(
+    tables: Sweep, level: jax.Array, target: jax.Array, by: jax.Array, product: Product
+) -> jax.Array:
+    """The targets (M, …) after those of a level are multiplied."""
+
+    def chunk(c: jax.Array, target: jax.Array) -> jax.Array:
+        held = jax.lax.dynamic_slice_in_dim(target, tables.end_base[c], TARGETS)
+        held = product(held, by[tables.end[c]])
+        return jax.lax.dynamic_update_slice_in_dim(target, held, tables.end_base[c], 0)
+
+    out: jax.Array = jax.lax.fori_loop(tables.ends[level], tables.ends[level + 1], chunk, target)
+    return out

@@ -1,0 +1,30 @@
+"""Starts of the optimization: each a pure function from a graph to one with other values.
+
+They are computed on the host with NumPy and SciPy, for concrete graphs. Fixed variables stay where
+they are. A part of the graph without a fixed pose is held at the pose of its first prior (a table
+"prior"), or else at its first pose as it is. The start decides which minimum is found; it has no
+other influence on the optimum.
+"""
+
+from collections.abc import Callable
+
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.starts.chordal import chordal
+from jaxslam.graphs.starts.relative import Factors
+from jaxslam.graphs.starts.tree import odometry, spanning_tree
+
+
+def given(graph: Graph, factors: Factors | None = None) -> Graph:
+    """The graph as it is."""
+    return graph
+
+
+STARTS: dict[str, Callable[..., Graph]] = {
+    "given": given,
+    "odometry": odometry,
+    "spanning_tree": spanning_tree,
+    "chordal": chordal,
+}
+"""The starts by name, for the command line."""
+
+__all__ = ["STARTS", "chordal", "given", "odometry", "spanning_tree"]

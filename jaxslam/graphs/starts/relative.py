@@ -1,0 +1,144 @@
+"""What all starts share: relative poses of all tables, anchors, and the placing of points."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from jaxslam import programs
+from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.model import factors_of
+from jaxslam.math import se2
+
+Factors = Mapping[str, Factor]
+
+
+class Relative(NamedTuple):
+    """The relative poses of all tables between two poses, E of them."""
+
+    first: Int[np.ndarray, "E"]
+    second: Int[np.ndarray, "E"]
+    pose: Float[np.ndarray, "E 3"]
+    """the second in the frame of the first"""
+    information: Float[np.ndarray, "E 3 3"]
+    """of e = pose⁻¹ ∘ (xᵢ⁻¹ ∘ xⱼ), to first order"""
+
+
+def relative_poses(graph: Graph, factors: Factors | None) -> Relative:
+    """The relative poses that valid rows between two poses measure, of all tables."""
+    found, known = [], factors_of("graphs.starts", graph, factors)
+    for key, table in graph.tables.items():
+        factor = known[key]
+        if factor.variables != ("pose", "pose") or factor.predict is None:
+            continue
+        valid = np.asarray(table.valid)
+        who, z, information = (
+            np.asarray(part)[valid] for part in (table.who, table.z, table.information)
+        )
+        if factor.predict is not se2.compose:
+            z, by_error = map(np.asarray, programs.call(_measured, (factor,), z))
+            information = np.einsum("eri,ers,esj->eij", by_error, information, by_error)
+        found.append(Relative(who[:, 0], who[:, 1], z, information))
+    nothing = Relative(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    return Relative(*map(np.concatenate, zip(*found, strict=True))) if found else nothing
+
+
+def _measured(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The relative poses of rows, and the derivatives of the residual by an error of them."""
+
+    def one(z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        origin = jnp.zeros(3, z.dtype)
+        assert factor.predict is not None
+        relative = factor.predict(origin, z)
+
+        def residual(error: jax.Array) -> jax.Array:
+            return factor.residual((origin, se2.compose(relative, error)), z)
+
+        return relative, jax.jacfwd(residual)(origin)
+
+    return jax.vmap(one)(z)
+
+
+def anchors_of(
+    name: str, graph: Graph, relative: Relative
+) -> tuple[Bool[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+    """Which poses hold their part of the graph, and all poses, with those where they are held.
+
+    Raises ValueError, which begins with the name of the start, if a part has none.
+    """
+    poses = np.array(graph.poses, np.float64)
+    anchors = np.asarray(graph.fixed_pose).copy()
+    count = len(poses)
+    joined = coo_array(
+        (np.ones(len(relative.first)), (relative.first, relative.second)), shape=(count, count)
+    )
+    parts, part = connected_components(joined, directed=False)
+    held = np.bincount(part, anchors, minlength=parts) > 0
+    if "prior" in graph.tables:
+        table = graph.tables["prior"]
+        for (pose,), z in zip(
+            np.asarray(table.who)[np.asarray(table.valid)],
+            np.asarray(table.z)[np.asarray(table.valid)],
+            strict=True,
+        ):
+            if not held[part[pose]]:
+                anchors[pose] = held[part[pose]] = True
+                poses[pose] = z
+    if not held.any() and count:
+        anchors[0] = held[part[0]] = True
+    if not held.all():
+        lost = int(np.flatnonzero(~held[part])[0])
+        raise ValueError(
+            f"{name}: pose {int(graph.pose_id[lost])} is not connected to a fixed pose by relative "
+            "poses"
+        )
+    return anchors, poses
+
+
+def with_poses(graph: Graph, poses: Float[np.ndarray, "N 3"]) -> Graph:
+    """The graph at other poses, angles wrapped; fixed ones stay as they are, to the bit."""
+    poses[:, 2] = np.pi - np.mod(np.pi - poses[:, 2], 2 * np.pi)
+    fixed = np.asarray(graph.fixed_pose)
+    poses[fixed] = np.asarray(graph.poses)[fixed]
+    return graph._replace(poses=as_before(graph.poses, poses))
+
+
+def as_before(before: Any, values: np.ndarray) -> Any:
+    """The values in the type of those before."""
+    return values.astype(np.asarray(before).dtype)
+
+
+def with_points(
+    graph: Graph, factors: Factors | None, placed: Bool[np.ndarray, "P"] | None = None
+) -> Graph:
+    """The graph with each point placed by its first measurement from a pose that can.
+
+    Points that are fixed or placed already stay, and those without such a measurement.
+    """
+    points = np.array(graph.points, np.float64)
+    known = factors_of("graphs.starts", graph, factors)
+    done = np.asarray(graph.fixed_point) | (False if placed is None else placed)
+    for key, table in graph.tables.items():
+        factor = known[key]
+        if factor.variables != ("pose", "point") or factor.predict is None:
+            continue
+        who, z = (np.asarray(part)[np.asarray(table.valid)] for part in (table.who, table.z))
+        found, at = np.unique(who[:, 1], return_index=True)
+        at = at[~done[found]]
+        if len(at):
+            poses = np.asarray(graph.poses)[who[at, 0]]
+            points[who[at, 1]] = programs.call(_predicted, (factor,), poses, z[at])
+            done[who[at, 1]] = True
+    return graph._replace(points=as_before(graph.points, points))
+
+
+def _predicted(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
+    """The second variables that rows measure."""
+    assert factor.predict is not None
+    return jax.vmap(factor.predict)(poses, z)

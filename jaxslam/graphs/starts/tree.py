@@ -1,0 +1,90 @@
+"""Starts along a tree of relative poses: the path of the odometry, or the fewest edges."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.starts.relative import (
+    Factors,
+    Relative,
+    anchors_of,
+    relative_poses,
+    with_points,
+    with_poses,
+)
+
+
+def odometry(graph: Graph, factors: Factors | None = None) -> Graph:
+    """The graph with its poses placed along consecutive edges, the path of the odometry.
+
+    The tree that is followed prefers the edges between poses of the nearest indices: it is the
+    minimum spanning tree by |i - j|. Points are placed by the first measurement of each that tells
+    where it is.
+
+    Args:
+        factors: as for `optimize`; by default those of the tables of files.
+    Raises:
+        ValueError: if some pose is not connected to an anchor by relative poses.
+    """
+    relative = relative_poses(graph, factors)
+    weights = np.abs(relative.second - relative.first).astype(float)
+    return with_points(_along_a_tree("odometry", graph, relative, weights), factors)
+
+
+def spanning_tree(graph: Graph, factors: Factors | None = None) -> Graph:
+    """The graph with its poses placed along a tree of as few edges as possible from the anchor.
+
+    Arguments, points and errors are those of `odometry`.
+    """
+    relative = relative_poses(graph, factors)
+    placed = _along_a_tree("spanning_tree", graph, relative, None)
+    return with_points(placed, factors)
+
+
+def _along_a_tree(
+    name: str, graph: Graph, relative: Relative, weights: Float[np.ndarray, "E"] | None
+) -> Graph:
+    """The graph with poses composed along a tree from the anchors.
+
+    weights: of the edges, of which the tree has the least sum; None for the fewest edges to each.
+    """
+    anchors, poses = anchors_of(name, graph, relative)
+    count, (first, second) = len(poses), relative[:2]
+    # A node more, from which every anchor is reached.
+    roots = np.flatnonzero(anchors)
+    ends = np.concatenate([first, np.full(len(roots), count)]), np.concatenate([second, roots])
+    low, high = np.minimum(*ends), np.maximum(*ends)
+    edges, at = np.unique(np.stack([low, high], axis=1), axis=0, return_index=True)
+    cost = np.ones(len(ends[0]))
+    if weights is not None:
+        cost[: len(first)] += weights
+    tree = coo_array((cost[at], tuple(edges.T)), shape=(count + 1, count + 1)).tocsr()
+    if weights is not None:
+        tree = minimum_spanning_tree(tree)
+    order, before = breadth_first_order(tree, count, directed=False)
+    row_of = {(int(i), int(j)): int(row) for (i, j), row in zip(edges, at, strict=True)}
+    rows = relative.pose.tolist()
+    placed = poses.tolist()
+    for node in order.tolist():
+        parent = int(before[node])
+        if node == count or anchors[node] or parent == count:
+            continue
+        row = row_of[min(node, parent), max(node, parent)]
+        forward = first[row] == parent
+        step = rows[row] if forward else _inverse(rows[row])
+        placed[node] = _compose(placed[parent], step)
+    return with_poses(graph, np.array(placed).reshape(-1, 3))
+
+
+def _compose(a: list[float], b: list[float]) -> list[float]:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return [a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]]
+
+
+def _inverse(a: list[float]) -> list[float]:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return [-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]]

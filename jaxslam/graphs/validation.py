@@ -1,0 +1,182 @@
+"""What a graph must be before it is solved; each error is a line that names row or variable."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.model import factors_of
+from jaxslam.validation.numbers import is_concrete
+
+INDEFINITE = 1e-6
+"""An eigenvalue of an information above minus this share of its largest entry is one of rounding:
+files have about six digits."""
+
+
+class Parts(NamedTuple):
+    """The connected parts of a graph; variables are the N poses, then the P points."""
+
+    part: Int[np.ndarray, "V"]
+    """of each variable, from 0"""
+    anchored: Bool[np.ndarray, "parts"]
+    """whether a part has a gauge: a fixed pose, two fixed points or a measurement of one pose
+    alone"""
+
+
+def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
+    """Raise ValueError, which begins with a caller's name, unless a graph can be solved.
+
+    Refused are tables without a factor or of other sizes than their factor's, numbers that are not
+    finite, an id twice, a measurement of a variable that is nowhere or of one variable twice, an
+    information that is not symmetric or not positive semidefinite, no measurement at all, and parts
+    that neither a fixed variable nor a measurement of one pose holds in place: a disconnected
+    graph, or no gauge. Within a trace only what shapes tell is checked.
+    """
+    for key, table in graph.tables.items():
+        if key not in factors:
+            raise ValueError(
+                f"{name}: table {key!r} has no factor; there are: {', '.join(factors) or 'none'}"
+            )
+        _check_sizes(f"{name}: table {key!r}", table, factors[key])
+    if not is_concrete(graph):
+        return
+    _check_variables(name, graph)
+    for key, table in graph.tables.items():
+        _check_rows(name, graph, key, table, factors[key])
+    if not any(np.asarray(table.valid).any() for table in graph.tables.values()):
+        raise ValueError(f"{name}: the graph has no measurement")
+    _check_gauge(name, graph, factors)
+
+
+def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
+    """The connected parts of a graph, and which have a gauge."""
+    poses, points = len(graph.poses), len(graph.points)
+    pairs = [np.zeros((0, 2), int)]
+    held = np.asarray(graph.fixed_pose).copy()
+    for key, table in graph.tables.items():
+        who = variables_of(graph, table, factors[key])
+        pairs += [who[:, [0, k]] for k in range(1, who.shape[1])]
+        if factors[key].variables == ("pose",):
+            held[who[:, 0]] = True
+    first, second = np.concatenate(pairs).T
+    joined = coo_array((np.ones(len(first)), (first, second)), shape=(poses + points,) * 2)
+    count, part = connected_components(joined, directed=False)
+    anchored = np.bincount(part[:poses], held, minlength=count) > 0
+    fixed = np.bincount(part[poses:], np.asarray(graph.fixed_point), minlength=count)
+    return Parts(part, anchored | (fixed > 1))
+
+
+def variables_of(graph: Graph, table: Table, factor: Factor) -> Int[np.ndarray, "rows K"]:
+    """The variables of the valid rows of a table, points counted on from the poses."""
+    shift = [0 if kind == "pose" else len(graph.poses) for kind in factor.variables]
+    return np.asarray(np.asarray(table.who)[np.asarray(table.valid)] + np.array(shift, int))
+
+
+def indefinite(information: Float[np.ndarray, "E R R"]) -> Bool[np.ndarray, "E"]:
+    """Which informations are not positive semidefinite, beyond the rounding of a file."""
+    if information.size == 0:
+        return np.zeros(len(information), bool)
+    scale = np.abs(information).max(axis=(1, 2))
+    return np.asarray(np.linalg.eigvalsh(information)[:, 0] < -INDEFINITE * scale)
+
+
+def label(graph: Graph, variable: int) -> str:
+    """A variable, counted as in `Parts`, by its kind and id."""
+    poses = len(graph.poses)
+    if variable < poses:
+        return f"pose {int(graph.pose_id[variable])}"
+    return f"point {int(graph.point_id[variable - poses])}"
+
+
+def _check_sizes(what: str, table: Table, factor: Factor) -> None:
+    rows = np.shape(table.who)[0]
+    k, z, r = (len(part) for part in (factor.variables, factor.measurements, factor.errors))
+    wanted = {"who": (rows, k), "z": (rows, z), "information": (rows, r, r), "valid": (rows,)}
+    for field, shape in wanted.items():
+        if (got := np.shape(getattr(table, field))) != shape:
+            raise ValueError(f"{what}: expected {field} of shape {shape}, got {got}")
+
+
+def _check_variables(name: str, graph: Graph) -> None:
+    kinds = (("pose", graph.poses, graph.pose_id), ("point", graph.points, graph.point_id))
+    for kind, values, ids in kinds:
+        names = np.asarray(ids)
+        bad = ~np.isfinite(np.asarray(values)).all(axis=1)
+        if bad.any():
+            raise ValueError(f"{name}: {kind} {names[bad.argmax()]} is not finite")
+        found, count = np.unique(names, return_counts=True)
+        if (count > 1).any():
+            raise ValueError(f"{name}: {kind} {found[count.argmax()]} occurs twice")
+
+
+def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor) -> None:
+    valid, who = np.asarray(table.valid), np.asarray(table.who)
+    z, information = np.asarray(table.z), np.asarray(table.information)
+    for k, kind in enumerate(factor.variables):
+        count = len(graph.poses if kind == "pose" else graph.points)
+        lost = valid & ((who[:, k] < 0) | (who[:, k] >= count))
+        if lost.any():
+            row = int(lost.argmax())
+            raise ValueError(
+                f"{name}: {key}, row {row}: {kind} number {who[row, k]} is nowhere, "
+                f"the graph has {count}"
+            )
+    of = variables_of(graph, table, factor)
+    twice = np.zeros(len(valid), bool)
+    twice[valid] = (np.sort(of, axis=1)[:, 1:] == np.sort(of, axis=1)[:, :-1]).any(axis=1)
+    scale = np.abs(information).max(axis=(1, 2), initial=0.0)
+    finite = np.isfinite(information).all(axis=(1, 2))
+    skew = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2), initial=0.0)
+    clean = np.where(finite[:, None, None], information, 0.0)
+    for bad, why in (
+        (twice, "joins a variable to itself"),
+        (~np.isfinite(z).all(axis=1), "z is not finite"),
+        (~finite, "the information is not finite"),
+        (finite & (skew > INDEFINITE * scale), "the information is not symmetric"),
+        (indefinite(clean), "the information is not positive semidefinite"),
+    ):
+        if (bad & valid).any():
+            row = int((bad & valid).argmax())
+            here = variables_of(graph, table._replace(valid=np.arange(len(valid)) == row), factor)
+            between = ", ".join(label(graph, int(variable)) for variable in here[0])
+            raise ValueError(f"{name}: {key}, row {row} ({between}): {why}")
+
+
+def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
+    parts = parts_of(graph, factors)
+    if parts.anchored.all():
+        return
+    loose = np.flatnonzero(~parts.anchored)
+    members = np.flatnonzero(parts.part == loose[0])
+    told = ", ".join(label(graph, int(variable)) for variable in members[:3])
+    told += f", … ({len(members):,} variables)" if len(members) > 3 else ""
+    if len(parts.anchored) == 1:
+        raise ValueError(
+            f"{name}: the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
+            "give one a prior"
+        )
+    raise ValueError(
+        f"{name}: the graph is disconnected: no measurement joins {told} to a fixed pose or one "
+        f"with a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
+    )
+
+
+def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Graph:
+    """The graph with a pose fixed, if no variable is and no measurement is of one pose alone.
+
+    It is the first pose, of the largest part where the graph is disconnected. A graph that has a
+    gauge is returned as it is: the same object.
+    """
+    known = factors_of("graphs.with_gauge", graph, factors)
+    parts = parts_of(graph, known)
+    if not len(graph.poses) or parts.anchored.any():
+        return graph
+    fixed: Any = np.asarray(graph.fixed_pose).copy()
+    of_poses = parts.part[: len(graph.poses)]
+    fixed[np.flatnonzero(of_poses == np.bincount(of_poses).argmax())[0]] = True
+    return graph._replace(fixed_pose=fixed)

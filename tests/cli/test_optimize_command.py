@@ -1,0 +1,155 @@
+"""`jaxslam optimize`: its files and its table, the optimum, and bad input."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import small_graphs
+from reference import graph as plain
+
+from jaxslam import cli, graphs
+from jaxslam.results import plot
+
+
+def small():
+    """A noisy graph without a gauge; ids of points beside those of poses."""
+    graph = small_graphs.drawn(noise=0.1, fixed_pose=np.zeros(8, bool))
+    graph = graph._replace(point_id=np.arange(3, dtype=np.int32))
+    return small_graphs.only(graph, "relative_pose", "relative_position")
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("graphs") / "small.g2o"
+    graphs.write(path, small())
+    path.write_text("# by hand\n" + path.read_text())
+    return path
+
+
+def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
+    drawn = {}
+    draw = plot.graph_figure
+
+    def graph_figure(before, after, squared, **more):
+        drawn.update(before=before, after=after, **more)
+        return draw(before, after, squared, **more)
+
+    monkeypatch.setattr(plot, "graph_figure", graph_figure)
+    out = tmp_path / "out"
+    assert cli.main(["optimize", str(file), "--start", "chordal", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    fixed = small()._replace(fixed_pose=np.arange(8) == 0)
+    poses, points, chi2 = plain.optimum(fixed)
+
+    assert {path.name for path in out.iterdir()} == {
+        *("summary.json", "poses.csv", "points.csv", "optimized.g2o", "graph.png")
+    }
+    summary = json.loads((out / "summary.json").read_text())
+    np.testing.assert_allclose(summary["chi2"], chi2, rtol=1e-9)
+    np.testing.assert_allclose(summary["chi2 of the file"], plain.chi2(fixed), rtol=1e-12)
+    assert summary["degrees of freedom"] == 30 + 32 - 21 - 6
+    assert summary["status"] == "converged" and summary["skipped lines"] == {"comments": 1}
+    assert summary["chi2"] < summary["chi2 at the start"]
+    worst = summary["worst residuals"]
+    assert summary["certificate"] == "the chordal optimum next to it is global"
+    assert summary["distance of the two optima [m]"] < 1.0
+    assert len(worst) == 10 and worst[0]["between"][0].startswith("pose 1")
+
+    rows = list(csv.DictReader((out / "poses.csv").read_text().splitlines()))
+    assert [int(row["id"]) for row in rows] == list(range(10, 18))
+    assert [int(row["fixed"]) for row in rows] == [1] + [0] * 7
+    found = np.array([[float(r[k]) for k in ("x [m]", "y [m]", "theta [rad]")] for r in rows])
+    np.testing.assert_allclose(found[:, :2], poses[:, :2], atol=1e-6)
+    np.testing.assert_allclose(plain.wrap(found[:, 2] - poses[:, 2]), 0, atol=1e-6)
+    again = graphs.read(out / "optimized.g2o")
+    np.testing.assert_array_equal(again.poses, found)
+    np.testing.assert_allclose(again.points, points, atol=1e-6)
+    np.testing.assert_array_equal(drawn["after"].poses, found)
+    assert "converged: χ² = " in drawn["subtitles"][1]
+
+    for part in (
+        "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)",
+        "pose 10 is fixed, since the file fixes none",
+        f"{summary['chi2']:.9g}",
+        "comments 1",
+        "to compile",
+    ):
+        assert part in printed
+
+
+def test_too_few_steps_are_no_success(file, tmp_path, capsys):
+    """By the program of the test above: numbers are its arguments."""
+    run = ["optimize", str(file), "--iterations", "1", "--out", str(tmp_path)]
+    assert cli.main(run) == 1
+    assert "exhausted" in capsys.readouterr().err
+    assert json.loads((tmp_path / "summary.json").read_text())["status"] == "exhausted"
+
+
+def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monkeypatch):
+    asked, solve = {}, graphs.optimize
+
+    def optimize(graph, factors, **options):
+        asked.update(options, tables=list(graph.tables))
+        return solve(graph, factors, **options)
+
+    monkeypatch.setattr(graphs, "optimize", optimize)
+    run = ["optimize", str(file), "--kernel", "huber", "--out", str(tmp_path)]
+    assert cli.main(run) == 0
+    assert asked["tables"] == ["relative_pose", "relative_pose/loops", "relative_position"]
+    assert list(asked["kernel"]) == ["relative_pose/loops", "relative_position"]
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["robust cost"] <= summary["chi2"]
+    assert summary["certificate"].startswith("none: of a robust cost")
+    assert len(graphs.read(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
+    apart = graphs.with_loops_apart(small())
+    assert apart.tables["relative_pose/loops"].who.tolist() == [[7, 0], [2, 6], [5, 1]]
+    np.testing.assert_allclose(plain.chi2(graphs.read(file)), small_chi2(apart), rtol=1e-14)
+
+
+def small_chi2(graph):
+    return sum(
+        plain.chi2(graph._replace(tables={key.split("/")[0]: table}))
+        for key, table in graph.tables.items()
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("# by hand", "VERTEX_SE3 1", "small.g2o:1: unknown kind 'VERTEX_SE3'"),
+        ("VERTEX_SE2 17", "VERTEX_SE2 16", "small.g2o:9: vertex 16 occurs twice"),
+        ("# by hand", "VERTEX_SE2 99 0 0 0", "disconnected: no measurement joins pose 99 to"),
+        ("# by hand", "VERTEX_SE2 99 0 0", "small.g2o:1: expected 4 fields (id x y theta), got 3"),
+    ],
+)
+def test_a_bad_graph_exits_with_2_and_writes_nothing(file, tmp_path, refused, old, new, message):
+    text = file.read_text()
+    assert old in text
+    spoiled = tmp_path / "small.g2o"
+    spoiled.write_text(text.replace(old, new, 1))
+    out = tmp_path / "out"
+    refused(["optimize", spoiled, "--out", out], message)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (
+            ["--start", "moon"],
+            "unknown start 'moon'; known: given, odometry, spanning_tree, chordal",
+        ),
+        (["--kernel", "moon"], "unknown kernel 'moon'; known: huber"),
+        (["--error", "moon"], "unknown error 'moon'; known: pose, log"),
+        (["--method", "moon"], "no method 'moon'"),
+        (["--iterations", "0"], "iterations: expected an integer >= 1, got 0"),
+    ],
+)
+def test_unknown_options_are_refused(file, tmp_path, refused, option, message):
+    refused(["optimize", file, "--out", tmp_path / "out", *option], message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_that_is_not_there(tmp_path, refused):
+    refused(["optimize", tmp_path / "none.g2o"], "none.g2o: cannot be read")

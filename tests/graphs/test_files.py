@@ -1,0 +1,204 @@
+"""Graphs in files: small ones by hand, the round trip, errors that say where, and real files."""
+
+import gzip
+import re
+
+import numpy as np
+import pytest
+from recordings import DATA
+
+from jaxslam import graphs
+from jaxslam.datasets import g2o
+
+SMALL = """# by hand
+VERTEX_SE2 7 0.5 -1.25 0.1
+VERTEX_SE2 3 1.5 0 3.5
+VERTEX_XY 9 2 2
+FIX 7
+EDGE_SE2 7 3 1 0.25 -0.5 4 1 0.5 5 0.25 6
+EDGE_SE2_XY 3 9 0.5 1 2 0.5 3
+
+EDGE_SE2 3 7 -1 0 0.1 1 0 0 1 0 1
+EDGE_BEARING_SE2_XY 7 9 0.3333333333333333 25
+EDGE_PRIOR_SE2 3 1 0 0 1 0 0 2 0 3
+"""
+
+
+def wrote(folder, text, name="graph.g2o"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def assert_same(a, b):
+    """Numbers to the bit, types, and the order of rows."""
+    assert list(a.tables) == list(b.tables)
+    for key in a.tables:
+        for mine, other in zip(a.tables[key], b.tables[key], strict=True):
+            np.testing.assert_array_equal(mine, other, strict=True)
+    for mine, other in zip(a._replace(tables=0), b._replace(tables=0), strict=True):
+        np.testing.assert_array_equal(mine, other, strict=True)
+
+
+def test_a_file_by_hand(tmp_path):
+    loaded = g2o.load(wrote(tmp_path, SMALL))
+    graph = loaded.graph
+    assert loaded.skipped == {"comments": 1} and loaded.placed == 0
+    np.testing.assert_array_equal(graph.pose_id, [7, 3])
+    np.testing.assert_array_equal(graph.poses, [[0.5, -1.25, 0.1], [1.5, 0, 3.5]])
+    np.testing.assert_array_equal(graph.point_id, [9])
+    np.testing.assert_array_equal(graph.points, [[2, 2]])
+    np.testing.assert_array_equal(graph.fixed_pose, [True, False])
+    np.testing.assert_array_equal(graph.fixed_point, [False])
+    relative = graph.tables["relative_pose"]
+    np.testing.assert_array_equal(relative.who, [[0, 1], [1, 0]])
+    np.testing.assert_array_equal(relative.z, [[1, 0.25, -0.5], [-1, 0, 0.1]])
+    np.testing.assert_array_equal(
+        relative.information, [[[4, 1, 0.5], [1, 5, 0.25], [0.5, 0.25, 6]], np.eye(3)]
+    )
+    np.testing.assert_array_equal(
+        graph.tables["relative_position"].information, [[[2, 0.5], [0.5, 3]]]
+    )
+    np.testing.assert_array_equal(graph.tables["bearing"].who, [[0, 0]])
+    np.testing.assert_array_equal(graph.tables["bearing"].information, [[[25]]])
+    np.testing.assert_array_equal(graph.tables["prior"].who, [[1]])
+    assert list(graph.tables) == ["relative_pose", "relative_position", "bearing", "prior"]
+
+
+def test_toro_has_another_order(tmp_path):
+    text = "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 11 12 200 300 13 23\n"
+    same = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 11 12 13 200 23 300\n"
+    toro, plain = (graphs.read(wrote(tmp_path, t)) for t in (text, same))
+    assert_same(toro, plain)
+    np.testing.assert_array_equal(
+        toro.tables["relative_pose"].information, [[[11, 12, 13], [12, 200, 23], [13, 23, 300]]]
+    )
+
+
+def test_the_round_trip_is_exact(tmp_path):
+    random = np.random.default_rng(0)
+    graph = graphs.read(wrote(tmp_path, SMALL))
+    relative = graph.tables["relative_pose"]
+    root = random.normal(size=(2, 3, 3))
+    graph = graph._replace(
+        poses=random.normal(size=(2, 3)) * [[1e5, 1e-7, 1]],
+        tables=graph.tables
+        | {
+            "relative_pose": relative._replace(
+                z=random.normal(size=(2, 3)), information=root @ np.swapaxes(root, 1, 2)
+            )
+        },
+    )
+    path = tmp_path / "new" / "again.g2o"
+    graphs.write(path, graph)
+    assert_same(graphs.read(path), graph)
+    assert [file.name for file in path.parent.iterdir()] == ["again.g2o"]
+    packed = tmp_path / "packed.g2o.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    assert_same(graphs.read(packed), graph)
+
+
+def test_rows_that_are_not_valid_are_not_written(tmp_path):
+    graph = graphs.read(wrote(tmp_path, SMALL))
+    table = graph.tables["relative_pose"]._replace(valid=np.array([False, True]))
+    text = g2o.text_of(graph._replace(tables={"relative_pose/loops": table}))
+    assert text.count("EDGE") == 1 and "EDGE_SE2 3 7 -1.0 0.0 0.1 1.0" in text
+
+
+def test_a_file_without_vertices_is_placed_along_its_edges(tmp_path):
+    """A square of unit steps, its edges in another order, one of them backwards."""
+    quarter = np.pi / 2
+    edges = [(12, 13, 1), (10, 11, 1), (12, 11, -1), (13, 10, 1)]
+    lines = []
+    for i, j, way in edges:
+        z = f"1 0 {quarter}" if way == 1 else f"0 1 {-quarter}"  # the inverse of the same step
+        lines.append(f"EDGE_SE2 {i} {j} {z} 1 0 0 1 0 1")
+    text = "\n".join([*lines, "EDGE_SE2_XY 11 4 1 2 1 0 1", "FIX 10"])
+    loaded = g2o.load(wrote(tmp_path, text))
+    graph = loaded.graph
+    assert loaded.placed == 5
+    np.testing.assert_array_equal(graph.pose_id, [10, 11, 12, 13])
+    expected = [[0, 0, 0], [1, 0, quarter], [1, 1, 2 * quarter], [0, 1, -quarter]]
+    np.testing.assert_allclose(graph.poses, expected, atol=1e-15)
+    np.testing.assert_allclose(graph.points, [[-1, 1]], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "reason"),
+    [
+        ("FIX 7", "FIX", 5, "expected at least 1 field (id), got 0"),
+        ("FIX 7", "FIX 8", 5, "vertex 8 is nowhere in the file"),
+        ("VERTEX_XY 9", "VERTEX_XY 7", 4, "vertex 7 occurs twice"),
+        ("VERTEX_XY 9 2 2", "VERTEX_XY 9 2", 4, "expected 3 fields (id x y), got 2"),
+        ("VERTEX_XY 9", "VERTEX_YX 9", 4, "unknown kind 'VERTEX_YX'; known: VERTEX_SE2, "),
+        ("VERTEX_XY 9", "VERTEX_XY 3000000000", 4, "id is above 2147483647"),
+        ("0.1\n", "nan\n", 2, "theta is not a finite number: 'nan'"),
+        ("EDGE_SE2 7 3", "EDGE_SE2 7 8", 6, "vertex 8 is nowhere in the file"),
+        ("EDGE_SE2 7 3", "EDGE_SE2 7 9", 6, "vertex 9 is no pose"),
+        ("EDGE_SE2 7 3", "EDGE_SE2 7 7", 6, "an edge from vertex 7 to itself"),
+        ("EDGE_SE2 7 3", "EDGE_SE2 -1 3", 6, "i is not a whole number >= 0: '-1'"),
+        ("4 1 0.5 5 0.25 6", "4 1 0.5 5 0.25", 6, "expected 11 fields (i j x y theta I11 I12 I13"),
+        ("4 1 0.5 5 0.25 6", "4 1 0.5 5 x 6", 6, "I23 is not a finite number: 'x'"),
+        ("4 1 0.5 5 0.25 6", "4 5 0.5 5 0.25 6", 6, "the information is not positive semidefinite"),
+        ("2 0.5 3", "2 3 3", 7, "the information is not positive semidefinite"),
+        ("0.333", "1e999", 10, "bearing is not a finite number"),
+    ],
+)
+def test_errors_say_where(tmp_path, old, new, line, reason):
+    assert old in SMALL
+    path = wrote(tmp_path, SMALL.replace(old, new, 1))
+    with pytest.raises(ValueError, match=re.escape(f"{path}:{line}: {reason}")):
+        graphs.read(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", ":1: no edge in the file"),
+        ("VERTEX_SE2 0 0 0 0\n", ":1: no edge in the file"),
+        ("EDGE_SE2_XY 1 2 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n", ":2: vertex 2 is a p"),
+        (
+            "EDGE2 0 1 1 0 0 1 0 0 1 0 5\n",
+            ":1: the information is not positive semidefinite; EDGE2",
+        ),
+    ],
+)
+def test_files_that_are_no_graph(tmp_path, text, reason):
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        graphs.read(wrote(tmp_path, text))
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(ValueError, match="cannot be read"):
+        graphs.read(tmp_path / "none.g2o")
+
+
+def test_what_g2o_cannot_hold_is_refused(tmp_path):
+    graph = graphs.read(wrote(tmp_path, SMALL))
+    for change, message in (
+        ({"point_id": np.array([3])}, "3 is the id of a pose and of a point"),
+        ({"points": np.zeros((1, 4))}, "expected points"),
+        ({"tables": {"odometry": graph.tables["prior"]}}, "no line for table 'odometry'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            graphs.write(tmp_path / "out.g2o", graph._replace(**change))
+    assert not (tmp_path / "out.g2o").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "poses", "edges", "skipped"),
+    [
+        ("graphs/ring.g2o", 434, 459, {}),
+        ("graphs/CSAIL.g2o", 1045, 1172, {}),
+        ("laser_graphs/mit-cscail.log.gz", 1051, 1189, {"laser scans": 1051, "comments": 2}),
+    ],
+)
+def test_real_files(tmp_path, name, poses, edges, skipped):
+    if not (DATA / name).exists():
+        pytest.skip(f"{DATA / name} is not there")
+    loaded = g2o.load(DATA / name)
+    graph = loaded.graph
+    assert len(graph.poses) == poses and len(graph.tables["relative_pose"].z) == edges
+    assert loaded.skipped == skipped
+    graphs.write(tmp_path / "again.g2o", graph)
+    assert_same(graphs.read(tmp_path / "again.g2o"), graph)

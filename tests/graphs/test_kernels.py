@@ -1,0 +1,51 @@
+"""Robust kernels: their own equations, and what they leave out."""
+
+import numpy as np
+import pytest
+from pose_rings import SIZE, between, dense, ring
+
+from jaxslam import graphs
+from jaxslam.graphs import Ending, Table
+
+
+def falsified(graph, false=((2, 12), (6, 15))):
+    """The graph with false loop closures in a table of their own, which agree with each other."""
+    table = graph.tables["relative_pose"]
+    who = np.array(false, np.int32)
+    z = between(graph.poses[who[:, 0]], graph.poses[who[:, 1]]) + [3.0, -2.0, 0.5]
+    many = np.array([np.concatenate([who, table.who[SIZE:]])])[0]
+    loops = Table(
+        many,
+        np.concatenate([z, table.z[SIZE:]]),
+        np.concatenate([table.information[: len(who)], table.information[SIZE:]]),
+        np.ones(len(many), bool),
+    )
+    odometry = Table(*(field[:SIZE] for field in table))
+    return graph._replace(
+        tables={"relative_pose": odometry, "relative_pose/loops": loops}
+    ), graph._replace(poses=graph.poses)
+
+
+@pytest.mark.parametrize("name", ["dcs", "truncated"])
+def test_a_redescending_kernel_leaves_false_loop_closures_out(name):
+    graph, clean = falsified(ring())
+    poses, _, _, _ = dense(clean)
+    kernel = graphs.KERNELS[name]()
+    found = graphs.optimize(graph, kernel={"relative_pose/loops": kernel})
+    s = graphs.squared_residuals(found.graph)["relative_pose/loops"]
+    weights = np.asarray(kernel.weight(s))
+    assert found.status == Ending.CONVERGED
+    assert (weights[:2] < 1e-3).all()
+    if name == "truncated":  # binary: the others' own optimum
+        assert (weights[2:] == 1).all()
+        np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(graphs.KERNELS))
+def test_the_weight_of_a_kernel_is_the_slope_of_its_cost(name):
+    kernel, s, h = graphs.KERNELS[name](), np.array([0.0, 0.3, 2.0, 9.0, 40.0, 1e4]), 1e-6
+    slope = (np.asarray(kernel.cost(s + h)) - np.asarray(kernel.cost(np.maximum(s - h, 0)))) / (
+        s + h - np.maximum(s - h, 0)
+    )
+    np.testing.assert_allclose(kernel.weight(s), slope, atol=1e-5)
+    np.testing.assert_allclose(kernel.cost(np.array([0.0, 1e-3])), [0, 1e-3], rtol=1e-3)

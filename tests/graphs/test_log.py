@@ -1,0 +1,225 @@
+"""The graph of a log: the optimum of `batch_map`, that of SciPy, and what is refused."""
+
+import dataclasses
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+import scipy.optimize
+import worlds
+from reference import ekf_slam
+from reference import graph as plain
+
+from jaxslam import graphs, motion, sensors, simulate
+from jaxslam.graphs import Ending
+from jaxslam.smoothing import batch_map
+from jaxslam.types import Log, Scan
+
+KEY = jax.random.key(0)
+STEPS = 8
+SIGMA_W, SIGMA_Z = np.array([0.02, 0.03, 0.02]), np.array([0.05, 0.02])
+START, START_COV = (
+    (0.2, -0.1, 0.7),
+    np.array([[0.02, 0.01, 0.0], [0.01, 0.03, 0.002], [0, 0.002, 0.01]]),
+)
+
+
+def world():
+    """Turning robot among six posts; a noise that bends (odometry), and P0 that is not diagonal."""
+    return dataclasses.replace(
+        worlds.ring(),
+        motion=motion.odometry(np.diag(SIGMA_W) ** 2),
+        sensor=sensors.range_bearing(np.diag(SIGMA_Z) ** 2),
+        controls=np.tile([0.2, 0.6, 0.2], (STEPS, 1)),
+        pose=START,
+        pose_cov=START_COV,
+    )
+
+
+@cache
+def drawn():
+    """The world and a log of it."""
+    return world(), jax.device_get(simulate(world(), KEY)[1])
+
+
+@cache
+def solved(known=False):
+    """World, log, graph, factors and solution; known: the start is."""
+    here, log = drawn()
+    cov = np.zeros((3, 3)) if known else START_COV
+    graph, factors = graphs.of_log(log, here.motion, here.sensor, START, cov)
+    solution = graphs.optimize(graph, factors, tolerance=1e-16)
+    return here, log, jax.device_get(graph), factors, solution
+
+
+def test_it_has_the_optimum_of_the_batch():
+    """With a known start; `test_it_has_the_optimum_of_scipy` has another."""
+    here, log, graph, _, solution = solved(known=True)
+    assert solution.status == Ending.CONVERGED and list(graph.tables) == ["motion", "sensor"]
+    batch = batch_map(here.motion, here.sensor, 6, START, np.zeros((3, 3)), tolerance=1e-9)(
+        log, KEY
+    )
+    np.testing.assert_allclose(solution.chi2, 2 * batch.final.cost, rtol=1e-10)
+    off = np.array(solution.graph.poses)[1:] - batch.estimate.pose
+    np.testing.assert_allclose(off[:, :2], 0, atol=1e-8)
+    np.testing.assert_allclose(plain.wrap(off[:, 2]), 0, atol=1e-8)
+    np.testing.assert_array_equal(solution.graph.poses[0], START)
+    points, alive, tag = (
+        np.asarray(part)[-1]
+        for part in (batch.estimate.points, batch.estimate.alive, batch.estimate.tag)
+    )
+    mine = np.asarray(solution.graph.points)[np.searchsorted(graph.point_id, tag[alive])]
+    np.testing.assert_allclose(mine, points[alive], atol=1e-8)
+
+
+def test_it_has_the_optimum_of_scipy():
+    """Over noises and points, as in the batch, but from the equations in NumPy."""
+    _, log, graph, _, solution = solved()
+    root = np.linalg.cholesky(START_COV)
+
+    def residuals(x):
+        pose, out = START + root @ x[:3], [x]
+        noise, points = x[3 : 3 + 3 * STEPS].reshape(-1, 3), x[3 + 3 * STEPS :].reshape(-1, 2)
+        out = [x[: 3 + 3 * STEPS]]
+        for t, (u, w) in enumerate(zip(log.control, SIGMA_W * noise, strict=True)):
+            rot1, trans, rot2 = u + w
+            h = pose[2] + rot1
+            pose = np.array([pose[0] + trans * np.cos(h), pose[1] + trans * np.sin(h), h + rot2])
+            for z, tag, there in zip(*(part[t] for part in log.scan), strict=True):
+                if there:
+                    off = z - ekf_slam.range_bearing(pose, points[tag])[0]
+                    out.append(np.array([off[0], plain.wrap(off[1])]) / SIGMA_Z)
+        return np.concatenate(out)
+
+    start = np.concatenate([np.zeros(3 + 3 * STEPS), graph.points.ravel()])
+    found = scipy.optimize.least_squares(
+        residuals, start, "3-point", ftol=1e-15, xtol=1e-15, gtol=1e-12
+    )
+    np.testing.assert_allclose(solution.chi2, 2 * found.cost, rtol=1e-10)
+    points = found.x[3 + 3 * STEPS :].reshape(-1, 2)
+    np.testing.assert_allclose(solution.graph.points, points, atol=1e-6)
+
+
+def test_a_motion_of_two_noises_is_a_soft_constraint():
+    """The optimum comes to that of the batch by the square of the slack."""
+    here = worlds.ring(STEPS)
+    log = jax.device_get(simulate(here, KEY)[1])
+    models = here.motion, here.sensor
+    batch = batch_map(*models, 6, here.pose, np.zeros((3, 3)), tolerance=1e-9)(log, KEY)
+    off = []
+    for slack in (1e-3, 1e-4):
+        made = graphs.of_log(log, *models, here.pose, np.zeros((3, 3)), slack=slack)
+        solution = graphs.optimize(*made, tolerance=1e-16)
+        off.append(np.abs(solution.graph.poses[1:] - batch.estimate.pose).max())
+    assert off[0] < 1e-3
+    assert 0.5 < off[0] / off[1] / 100 < 1.5
+
+
+def test_more_noises_than_three_are_those_of_their_sum():
+    """Of two substeps of a motion without turns, which are affine: e has the covariance of both."""
+    single = motion.pose_increment(np.diag([0.1, 0.2, 0.3]) ** 2)
+    twice = motion.substeps(single, 2)
+    scan = Scan(np.full((1, 1, 1), 0.1), np.full((1, 1), -1), np.ones((1, 1), bool))
+    log = Log(np.tile([0.5, 0.0, 0.0], (1, 2)), scan)
+    models = twice, sensors.compass([[0.01]])
+    graph, factors = graphs.of_log(log, *models, np.zeros(3), np.zeros((3, 3)))
+    by_heading = np.array(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]
+    )  # y by the first turn
+    first = np.eye(3) + by_heading
+    q = np.diag([0.1, 0.2, 0.3]) ** 2
+    expected = np.linalg.inv(first @ q @ first.T + q)
+    np.testing.assert_allclose(graph.tables["motion"].information[0], expected, rtol=1e-10)
+    assert factors["motion"].errors == ("x [m]", "y [m]", "theta [rad]")
+
+
+def test_its_shapes_and_names():
+    here, log, graph, factors, _ = solved()
+    assert list(graph.tables) == ["motion", "prior", "sensor"]
+    np.testing.assert_array_equal(graph.pose_id, np.arange(STEPS + 1))
+    np.testing.assert_array_equal(graph.point_id, np.unique(log.scan.tag[log.scan.valid]))
+    np.testing.assert_array_equal(graph.tables["motion"].z, log.control)
+    rows = graph.tables["sensor"]
+    np.testing.assert_array_equal(rows.valid, log.scan.valid.ravel())
+    np.testing.assert_array_equal(
+        graph.point_id[rows.who[rows.valid, 1]], log.scan.tag[log.scan.valid]
+    )
+    np.testing.assert_allclose(rows.information[0], np.diag(SIGMA_Z**-2.0), rtol=1e-12)
+    graphs.check_graph("graph", graph, factors)
+    # Each point has no residual at its first measurement.
+    squared = np.asarray(graphs.squared_residuals(graph, factors)["sensor"])
+    first = np.unique(np.where(rows.valid, rows.who[:, 1], 99), return_index=True)[1][:6]
+    np.testing.assert_allclose(squared[first], 0, atol=1e-18)
+
+
+def test_logs_are_batched_with_a_capacity():
+    here, log, graph, _, _ = solved()
+
+    def poses_and_points(z):
+        moved = Log(log.control, log.scan._replace(z=z))
+        made = graphs.of_log(moved, here.motion, here.sensor, START, START_COV, capacity=7)[0]
+        return made.poses, made.points, made.fixed_point
+
+    z = np.stack([log.scan.z, log.scan.z + 0.1])
+    poses, points, fixed = jax.jit(jax.vmap(poses_and_points))(z)
+    np.testing.assert_allclose(poses[0], graph.poses, atol=1e-14)
+    np.testing.assert_allclose(points[0][graph.point_id], graph.points, atol=1e-14)
+    assert fixed[0].tolist() == [tag not in graph.point_id for tag in range(7)]
+    assert np.abs(points[1][:6] - points[0][:6]).max() > 0.01
+
+
+def test_an_association_stands_in_for_tags():
+    here, log, graph, _, _ = solved()
+    unknown = Log(log.control, log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
+    tags = np.where(log.scan.tag == 2, -1, log.scan.tag + 10)
+    made, _ = graphs.of_log(unknown, here.motion, here.sensor, START, START_COV, tags=tags)
+    expected = [tag + 10 for tag in graph.point_id if tag != 2]
+    np.testing.assert_array_equal(made.point_id, expected)
+    used = log.scan.valid & (log.scan.tag != 2)
+    assert int(made.tables["sensor"].valid.sum()) == used.sum()
+
+
+def test_an_absolute_sensor_has_no_points():
+    steps = 3
+    scan = Scan(np.full((steps, 1, 1), 0.1), np.full((steps, 1), -1), np.ones((steps, 1), bool))
+    log = Log(np.tile([0.5, 0.0, 0.1], (steps, 1)), scan)
+    models = motion.pose_increment(np.eye(3)), sensors.compass([[0.01]])
+    graph, factors = graphs.of_log(log, *models, np.zeros(3), np.eye(3))
+    assert graph.points.shape == (0, 0) and factors["sensor"].variables == ("pose",)
+    np.testing.assert_array_equal(graph.tables["sensor"].who, [[1], [2], [3]])
+
+
+def _log(**change):
+    log = drawn()[1]
+    return Log(change.pop("control", log.control), log.scan._replace(**change))
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        ({"control": np.ones((STEPS, 2))}, {"motion": motion.increment(np.eye(2))}, "give slack"),
+        ({}, {"slack": -1.0}, "expected slack to be a finite number >= 0, got -1.0"),
+        ({}, {"motion": motion.odometry(np.diag([1.0, 0, 1]))}, "odometry is singular at row 0"),
+        ({"control": np.tile([0.1, 0, 0.1], (STEPS, 1))}, {}, "all directions at row 0"),
+        ({}, {"sensor": sensors.range_bearing(np.diag([1.0, 0]))}, "range_bearing is singular"),
+        ({}, {"pose_cov": np.diag([1.0, 0, 1])}, "pose_cov is singular; expected zero"),
+        ({}, {"pose": np.zeros(2)}, r"expected a pose of shape \(3,\), got \(2,\)"),
+        ({}, {"capacity": 3}, "expected tags below 3, the capacity, got 3"),
+        ({}, {"tags": np.zeros((2, 2), int)}, r"expected tags of shape \(8, 6\)"),
+        ({"tag": np.full((STEPS, 6), -1)}, {}, "has no identity: give tags="),
+        ({"valid": np.zeros((STEPS, 6), bool)}, {}, "no measurement of a landmark"),
+        (
+            {},
+            {"sensor": sensors.suite((sensors.range_bearing(np.eye(2)), 6))},
+            "expected one sensor",
+        ),
+    ],
+)
+def test_bad_input_is_refused(change, options, message):
+    here = world()
+    given = {"motion": here.motion, "sensor": here.sensor, "pose": START, "pose_cov": START_COV}
+    given |= options
+    models = [given.pop(key) for key in ("motion", "sensor", "pose", "pose_cov")]
+    with pytest.raises(ValueError, match=message):
+        graphs.of_log(_log(**change), *models, **given)

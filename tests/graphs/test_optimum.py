@@ -1,0 +1,81 @@
+"""The optimum of small graphs, against a dense Gauss-Newton in NumPy."""
+
+import jax
+import numpy as np
+import pytest
+from pose_rings import SIZE, dense, ring, wrap
+
+from jaxslam import graphs
+from jaxslam.graphs import Ending
+
+
+@pytest.mark.parametrize("method", ["levenberg_marquardt", "gauss_newton", "dogleg"])
+def test_the_optimum_is_that_of_dense_gauss_newton(method):
+    graph = ring()
+    poses, chi2, _, _ = dense(graph)
+    found = graphs.optimize(graph, method=method)
+    assert found.status == Ending.CONVERGED
+    np.testing.assert_allclose(found.chi2, chi2, rtol=1e-10)
+    np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+    np.testing.assert_allclose(wrap(found.graph.poses[:, 2] - poses[:, 2]), 0, atol=1e-7)
+    np.testing.assert_allclose(graphs.chi2(found.graph), chi2, rtol=1e-10)
+    assert found.gradient < 1e-6 * found.gradient_start
+    assert found.singular == -1
+
+
+def test_a_batch_has_the_optimum_of_each_graph():
+    many = [ring(seed) for seed in range(3)]
+    plan = graphs.plan(many[0])
+    batch = jax.tree.map(lambda *rows: np.stack(rows), *many)
+    found = jax.jit(jax.vmap(lambda g: graphs.optimize(g, plan=plan)))(batch)
+    for k, graph in enumerate(many):
+        np.testing.assert_allclose(found.chi2[k], dense(graph)[1], rtol=1e-10)
+    assert (found.status == Ending.CONVERGED).all()
+
+
+def test_a_plan_serves_tables_in_any_order():
+    """`jax.tree.map` sorts the names of a dictionary, which those of a file need not be."""
+    graph = ring()
+    table = graph.tables["relative_pose"]
+    parts = {
+        f"relative_pose/{name}": table._replace(
+            valid=table.valid & (np.arange(len(table.z)) % 2 == k)
+        )
+        for name, k in (("second", 1), ("first", 0))
+    }
+    split = graph._replace(tables=parts)
+    plan = graphs.plan(split)
+    batch = jax.tree.map(lambda leaf: np.stack([leaf] * 2), split)
+    found = jax.jit(jax.vmap(lambda g: graphs.optimize(g, plan=plan)))(batch)
+    np.testing.assert_allclose(found.chi2, graphs.optimize(graph).chi2, rtol=1e-10)
+    assert (found.status == Ending.CONVERGED).all()
+
+
+def test_derivatives_of_the_optimum_are_differences():
+    """By measurements, information and the fixed pose."""
+    graph, rng = ring(spread=5.0), np.random.default_rng(1)
+    plan, table = graphs.plan(graph), graph.tables["relative_pose"]
+    look = rng.normal(size=(SIZE, 3))
+    away = rng.normal(size=table.information.shape)
+    tangent = (
+        rng.normal(size=table.z.shape),
+        10 * (away + np.swapaxes(away, 1, 2)),
+        rng.normal(size=3),
+    )
+
+    start = jax.numpy.asarray(graph.poses)
+
+    def seen(z, information, first):
+        tables = {"relative_pose": table._replace(z=z, information=information)}
+        moved = graph._replace(poses=start.at[0].set(first), tables=tables)
+        found = graphs.optimize(moved, plan=plan)
+        poses = found.graph.poses
+        return (poses[:, :2] * look[:, :2]).sum() + jax.numpy.sin(poses[:, 2]).sum() + found.chi2
+
+    at = table.z, table.information, graph.poses[0]
+    gradient = jax.jit(jax.grad(seen, (0, 1, 2)))(*at)
+    slope = sum((g * t).sum() for g, t in zip(gradient, tangent, strict=True))
+    high, low = (
+        seen(*(x + h * t for x, t in zip(at, tangent, strict=True))) for h in (1e-5, -1e-5)
+    )
+    np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)

@@ -1,0 +1,126 @@
+"""Starts of the optimization against the truth, and against dense NumPy."""
+
+import numpy as np
+import pytest
+import small_graphs
+from recordings import DATA
+from reference import graph as plain
+
+from jaxslam import graphs, motion, sensors
+from jaxslam.graphs import starts
+
+PLACING = ("odometry", "spanning_tree", "chordal")
+
+
+def scattered(graph):
+    """The graph with its free variables elsewhere."""
+    random = np.random.default_rng(9)
+    free, points = ~graph.fixed_pose[:, None], graph.points
+    poses = graph.poses + free * random.normal(size=graph.poses.shape)
+    return graph._replace(poses=poses, points=points + random.normal(size=points.shape))
+
+
+def assert_close(graph, truth, atol=1e-12):
+    off = graph.poses - truth.poses
+    np.testing.assert_allclose(off[:, :2], 0, atol=atol)
+    np.testing.assert_allclose(plain.wrap(off[:, 2]), 0, atol=atol)
+    assert (np.abs(graph.poses[:, 2]) <= np.pi).all()
+
+
+@pytest.mark.parametrize("name", PLACING)
+def test_without_noise_every_start_is_the_truth(name):
+    truth = small_graphs.drawn()
+    found = starts.STARTS[name](scattered(truth))
+    assert_close(found, truth)
+    np.testing.assert_allclose(found.points, truth.points, atol=1e-12)
+    np.testing.assert_array_equal(found.poses[0], truth.poses[0])
+
+
+@pytest.mark.parametrize("name", PLACING)
+def test_a_prior_holds_where_no_pose_is_fixed(name):
+    truth = small_graphs.drawn(fixed_pose=np.zeros(8, bool))
+    assert_close(starts.STARTS[name](scattered(truth)), truth)
+
+
+def test_given_is_the_graph():
+    graph = small_graphs.drawn()
+    assert starts.given(graph) is graph
+
+
+def test_odometry_follows_the_path_and_the_tree_the_fewest_edges():
+    graph = small_graphs.only(small_graphs.drawn(noise=0.1), "relative_pose")
+    z = graph.tables["relative_pose"].z
+    path, tree = [graph.poses[0]], {}
+    for step in z[:7]:
+        path.append(plain.composed(path[-1], step))
+    np.testing.assert_allclose(starts.odometry(graph).poses, path, atol=1e-12)
+    backwards = plain.between(z[7], [0.0, 0.0, 0.0])
+    tree[7] = plain.composed(graph.poses[0], backwards)
+    tree[6] = plain.composed(tree[7], plain.between(z[6], [0.0, 0.0, 0.0]))
+    found = starts.spanning_tree(graph).poses
+    np.testing.assert_allclose(found[[7, 6]], [tree[7], tree[6]], atol=1e-12)
+
+
+def test_chordal_is_two_linear_problems():
+    """Headings by dense complex least squares; at them χ² has no slope by any position."""
+    graph = small_graphs.only(small_graphs.drawn(noise=0.3), "relative_pose", "relative_position")
+    found = starts.chordal(graph)
+    table = graph.tables["relative_pose"]
+    root = np.sqrt(table.information[:, 2, 2])
+    rows = np.zeros((len(root), 8), complex)
+    for k, (i, j) in enumerate(table.who):
+        rows[k, j], rows[k, i] = root[k], -root[k] * np.exp(1j * table.z[k, 2])
+    held = np.exp(1j * graph.poses[0, 2])
+    rest = np.linalg.lstsq(rows[:, 1:], -rows[:, 0] * held, rcond=None)[0]
+    np.testing.assert_allclose(found.poses[1:, 2], np.angle(rest), atol=1e-12)
+
+    def cost(x):
+        poses, points = found.poses.copy(), x[14:].reshape(3, 2)
+        poses[1:, :2] = x[:14].reshape(7, 2)
+        return plain.chi2(found._replace(poses=poses, points=points))
+
+    best = np.concatenate([found.poses[1:, :2].ravel(), found.points.ravel()])
+    slope = [
+        (cost(best + step) - cost(best - step)) / 2e-3 for step in 1e-3 * np.eye(len(best))
+    ]  # exact for a quadratic
+    np.testing.assert_allclose(slope, 0, atol=1e-9 * cost(best + 1))
+
+
+@pytest.mark.parametrize("name", PLACING)
+def test_a_pose_that_nothing_reaches_is_named(name):
+    graph = small_graphs.only(small_graphs.drawn(), "relative_pose")
+    table = graph.tables["relative_pose"]
+    cut = table._replace(valid=(table.who != 4).all(axis=1))
+    with pytest.raises(ValueError, match=f"{name}: pose 14 is not connected to a fixed pose"):
+        starts.STARTS[name](graph._replace(tables={"relative_pose": cut}))
+
+
+def test_factors_of_models_start_as_those_of_files():
+    """The relative poses of a motion are those of its nominal step, and so are their weights."""
+    truth = small_graphs.only(small_graphs.drawn(noise=0.2), "relative_pose", "relative_position")
+    table = truth.tables["relative_pose"]
+    factors = {
+        "relative_pose": graphs.from_motion(motion.pose_increment(np.eye(3))),
+        "relative_position": graphs.from_sensor(sensors.relative_position(np.eye(2))),
+    }
+    # e of the model is additive in z, that of the file in the frame of z.
+    c, s = np.cos(table.z[:, 2]), np.sin(table.z[:, 2])
+    turn = np.zeros((len(c), 3, 3))
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, -s, s, c, 1
+    turned = table._replace(information=turn @ table.information @ np.swapaxes(turn, 1, 2))
+    other = truth._replace(tables=truth.tables | {"relative_pose": turned})
+    for name in PLACING:
+        mine, theirs = starts.STARTS[name](truth), starts.STARTS[name](other, factors)
+        assert_close(theirs, mine, atol=1e-10)
+        np.testing.assert_allclose(theirs.points, mine.points, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("name", "best", "share"), [("CSAIL", 40.55088, 1.02), ("intel", 45.00423, 1.06)]
+)
+def test_chordal_lies_close_to_the_optimum_of_real_graphs(name, best, share):
+    path = DATA / "graphs" / f"{name}.g2o"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    found = plain.chi2(starts.chordal(graphs.read(path)))
+    assert best < found < share * best

@@ -1,0 +1,130 @@
+"""What is refused before a graph is solved, each with the row or the variable."""
+
+import numpy as np
+import pytest
+import small_graphs
+
+from jaxslam import graphs
+from jaxslam.graphs.factor import of_files
+
+
+def spoiled(graph, table, field, at, value):
+    """The graph with one number of a table changed."""
+    whole = np.array(getattr(graph.tables[table], field))
+    whole[at] = value
+    changed = graph.tables[table]._replace(**{field: whole})
+    return graph._replace(tables=graph.tables | {table: changed})
+
+
+def at(graph, field, at, value):
+    whole = np.array(getattr(graph, field))
+    whole[at] = value
+    return graph._replace(**{field: whole})
+
+
+def loose(graph, fixed=False):
+    """Pose 17 in no row, and either it or pose 10 fixed; no prior."""
+    graph = small_graphs.only(graph, "relative_pose")
+    table = graph.tables["relative_pose"]
+    table = table._replace(valid=(table.who != 7).all(axis=1))
+    graph = graph._replace(tables={"relative_pose": table}, points=np.zeros((0, 2)))
+    graph = graph._replace(fixed_point=np.zeros(0, bool), point_id=np.zeros(0, np.int32))
+    return at(graph, "fixed_pose", 7, fixed)
+
+
+SPOILS = {
+    "twice": (
+        lambda g: at(g, "pose_id", 3, 12),
+        "pose 12 occurs twice",
+    ),
+    "pose": (lambda g: at(g, "poses", (4, 1), np.nan), "pose 14 is not finite"),
+    "point": (lambda g: at(g, "points", (2, 0), np.inf), "point 2 is not finite"),
+    "z": (
+        lambda g: spoiled(g, "bearing", "z", (3, 0), np.nan),
+        r"bearing, row 3 \(pose 11, point 2\): z is not finite",
+    ),
+    "information": (
+        lambda g: spoiled(g, "relative_pose", "information", (2, 0, 0), np.nan),
+        r"relative_pose, row 2 \(pose 12, pose 13\): the information is not finite",
+    ),
+    "indefinite": (
+        lambda g: spoiled(g, "relative_pose", "information", (1, 0, 0), -1.0),
+        r"relative_pose, row 1 \(pose 11, pose 12\): the information is not positive semidefinite",
+    ),
+    "skew": (
+        lambda g: spoiled(g, "relative_position", "information", (0, 0, 1), 99.0),
+        r"row 0 \(pose 10, point 0\): the information is not symmetric",
+    ),
+    "nowhere": (
+        lambda g: spoiled(g, "relative_position", "who", (2, 1), 3),
+        "relative_position, row 2: point number 3 is nowhere, the graph has 3",
+    ),
+    "itself": (
+        lambda g: spoiled(g, "relative_pose", "who", (2, 1), 2),
+        r"relative_pose, row 2 \(pose 12, pose 12\): joins a variable to itself",
+    ),
+    "no edge": (
+        lambda g: g._replace(
+            tables={k: t._replace(valid=np.zeros(len(t.z), bool)) for k, t in g.tables.items()}
+        ),
+        "the graph has no measurement",
+    ),
+    "one vertex": (
+        lambda g: g._replace(
+            tables={},
+            **{field: getattr(g, field)[:1] for field in ("poses", "fixed_pose", "pose_id")},
+        ),
+        "the graph has no measurement",
+    ),
+    "no gauge": (
+        lambda g: at(small_graphs.only(g, "relative_pose", "bearing"), "fixed_pose", 0, False),
+        "the graph has no gauge: fix a pose",
+    ),
+    "disconnected": (
+        loose,
+        "the graph is disconnected: no measurement joins pose 17 to a fixed pose",
+    ),
+    "sizes": (
+        lambda g: g._replace(tables={"bearing": g.tables["relative_pose"]}),
+        r"table 'bearing': expected z of shape \(10, 1\), got \(10, 3\)",
+    ),
+    "factor": (
+        lambda g: g._replace(tables={"odometer": g.tables["prior"]}),
+        "table 'odometer' has no factor; there are: bearing, prior",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SPOILS)
+def test_what_is_refused(name):
+    spoil, message = SPOILS[name]
+    graph = small_graphs.drawn()
+    graphs.check_graph("optimize", graph, of_files())
+    with pytest.raises(ValueError, match=f"optimize: .*{message}"):
+        graphs.check_graph("optimize", spoil(graph), of_files())
+
+
+def test_what_is_not_valid_is_not_judged():
+    graph = spoiled(small_graphs.drawn(), "relative_pose", "information", (9, 0, 0), -1.0)
+    graph = spoiled(graph, "relative_pose", "who", 9, -7)
+    graph = spoiled(graph, "relative_pose", "valid", 9, False)
+    graphs.check_graph("optimize", graph, of_files())
+
+
+def test_parts_with_a_gauge_each_are_a_graph():
+    graphs.check_graph("optimize", loose(small_graphs.drawn(), fixed=True), of_files())
+
+
+def test_rounding_of_a_file_is_not_indefinite():
+    graph = small_graphs.drawn()
+    flat = np.diag([1e4, 1e4, -1e-3])
+    graph = spoiled(graph, "relative_pose", "information", 0, flat)
+    graphs.check_graph("optimize", graph, of_files())
+
+
+def test_the_first_pose_is_fixed_where_nothing_is():
+    free = at(small_graphs.drawn(), "fixed_pose", 0, False)
+    held = graphs.with_gauge(small_graphs.only(free, "relative_pose"))
+    assert held.fixed_pose.tolist() == [True] + [False] * 7
+    for graph in (free, small_graphs.only(small_graphs.drawn(), "relative_pose")):
+        assert graphs.with_gauge(graph) is graph  # a prior; a fixed pose

@@ -1,0 +1,82 @@
+"""A ring of poses, and its optimum by a dense Gauss-Newton: plain NumPy, from the equations."""
+
+import numpy as np
+
+from jaxslam.graphs import Graph, Table
+
+SIZE = 20
+
+
+def compose(a, b):
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    return np.stack([x, y, wrap(a[..., 2] + b[..., 2])], -1)
+
+
+def between(a, b):
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    return np.stack([c * dx + s * dy, -s * dx + c * dy, wrap(b[..., 2] - a[..., 2])], -1)
+
+
+def wrap(angle):
+    return np.pi - (np.pi - angle) % (2 * np.pi)
+
+
+def ring(seed=0, spread=1.0):
+    """A ring of 20 poses with 4 chords, the first pose fixed, started along its edges."""
+    rng = np.random.default_rng(seed)
+    turn = 2 * np.pi * np.arange(SIZE) / SIZE
+    truth = np.stack([10 * np.cos(turn), 10 * np.sin(turn), wrap(turn + np.pi / 2)], -1)
+    first = np.r_[np.arange(SIZE), [0, 3, 5, 17]]
+    second = np.r_[(np.arange(SIZE) + 1) % SIZE, [10, 14, 18, 8]]
+    root = rng.normal(size=(len(first), 3, 3)) + 4 * np.eye(3)
+    information = 40 * root @ np.swapaxes(root, 1, 2)
+    noise = np.linalg.solve(
+        np.linalg.cholesky(information).transpose(0, 2, 1), rng.normal(size=(len(first), 3, 1))
+    )
+    z = compose(between(truth[first], truth[second]), spread * noise[..., 0])
+    poses = [truth[0]]
+    for row in z[: SIZE - 1]:
+        poses.append(compose(poses[-1], row))
+    fixed = np.arange(SIZE) == 0
+    table = Table(
+        np.stack([first, second], 1).astype(np.int32), z, information, np.ones(len(first), bool)
+    )
+    return Graph(
+        np.array(poses),
+        np.zeros((0, 2)),
+        {"relative_pose": table},
+        fixed,
+        np.zeros(0, bool),
+        np.arange(SIZE),
+        np.zeros(0, int),
+    )
+
+
+def dense(graph, steps=15):
+    """(poses, χ², H, g) by Gauss-Newton on dense matrices; H, g by (x, y, θ) of the free poses."""
+    table, poses = graph.tables["relative_pose"], np.array(graph.poses)
+    i, j = np.asarray(table.who).T
+    for step in range(steps + 1):
+        e = between(table.z, between(poses[i], poses[j]))
+        jacobian = np.zeros((len(i), 3, len(poses), 3))
+        for k in range(len(i)):
+            h = 1e-6
+            for who in (i[k], j[k]):
+                for c in range(3):
+                    low, high = poses.copy(), poses.copy()
+                    low[who, c] -= h
+                    high[who, c] += h
+                    up = between(table.z[k], between(high[i[k]], high[j[k]]))
+                    down = between(table.z[k], between(low[i[k]], low[j[k]]))
+                    slope = up - down
+                    slope[2] = wrap(slope[2])
+                    jacobian[k, :, who, c] = slope / (2 * h)
+        jacobian = jacobian[:, :, 1:].reshape(len(i), 3, -1)
+        hessian = np.einsum("era,ers,esb->ab", jacobian, table.information, jacobian)
+        gradient = np.einsum("era,ers,es->a", jacobian, table.information, e)
+        if step < steps:
+            poses[1:] -= np.linalg.solve(hessian, gradient).reshape(-1, 3)
+    return poses, np.einsum("er,ers,es->", e, table.information, e), hessian, gradient

@@ -1,0 +1,30 @@
+"""A factor of a graph is verified as models are."""
+
+import dataclasses
+
+from verified import failed
+
+from jaxslam import graphs, verify_jacobians
+from jaxslam.verify import user_files
+
+
+def test_a_wrong_entry_of_a_factor_is_named():
+    right = graphs.relative_pose()
+
+    def jacobians(variables, z):
+        by_first, by_second = right.jacobians(variables, z)
+        return by_first, by_second.at[1, 0].multiply(-1.0)
+
+    report = verify_jacobians(dataclasses.replace(right, jacobians=jacobians), count=4)
+    assert report.kind == "factor"
+    assert failed(report) == ["residual by pose 2"]
+    assert [f.name for f in report.findings] == [
+        f"residual by {name}" for name in ("pose 1", "pose 2", "measurement")
+    ]
+    assert "entry (y [m], x [m]): hand disagrees" in str(report)
+
+
+def test_factors_of_a_file_are_found(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text("from jaxslam import graphs\nmine = graphs.prior()\n")
+    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [("mine", "prior")]
