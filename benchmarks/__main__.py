@@ -46,6 +46,7 @@ from benchmarks import (
 from benchmarks.association.__main__ import measure as measure_association
 from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import Metric, report
+from benchmarks.graph_consistency.__main__ import measure as measure_graphs
 from benchmarks.mrclam.__main__ import measure as measure_mrclam
 from benchmarks.results import measured
 from benchmarks.speed.__main__ import gated
@@ -90,6 +91,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "plaza": plaza.measure,
         "smoothing": lambda: smoothing.measure(10 if quick else 100),
         "graph_files": graph_files.measure,
+        "graph_consistency": lambda: measure_graphs(quick),
         "graph_speed": lambda: graph_speed.measure(3 if quick else 9),
         "fastslam": lambda: fastslam.measure(4 if quick else 20, (10, 100)),
         "plain_particles": lambda: plain_particles.measure(8 if quick else 20),

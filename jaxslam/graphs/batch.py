@@ -5,10 +5,15 @@ from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam.graphs.graph import Graph
 
 _T = TypeVar("_T")
+
+GROUP = 16
+"""Graphs of a batch that are computed together; groups follow each other. 256 of 434 poses at once
+are a tenth as fast on a CPU, since their arrays leave its caches, and all wait for the slowest."""
 Array = jax.Array
 
 
@@ -33,6 +38,19 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[Any, Any], _
     def rule(size: int, batched: Any, shared: Any, own: Any) -> tuple[_T, Any]:
         if any(jax.tree.leaves(batched[0])):
             raise ValueError(f"{name}: expected one plan and one set of limits for a batch")
+
+        if size > GROUP:
+            groups = -(-size // GROUP)
+            rows = np.arange(groups * GROUP) % size  # the last group is filled up with the first
+
+            def parted(x: Array, one: bool) -> Array:
+                x = x if one else jnp.broadcast_to(x[None], (size, *x.shape))
+                return x[rows].reshape(groups, GROUP, *x.shape[1:])
+
+            together = jax.vmap(lambda own: whole(shared, own))
+            out = jax.lax.map(together, jax.tree.map(parted, own, batched[1]))
+            out = jax.tree.map(lambda x: x.reshape(groups * GROUP, *x.shape[2:])[:size], out)
+            return out, jax.tree.map(lambda _: True, out)
 
         def fold(x: Array, one: bool) -> Array:
             wide = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))

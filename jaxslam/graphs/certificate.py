@@ -178,7 +178,7 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
 
     angle = jnp.arange(len(plan.order), dtype=dtype) ** 2
     first = jnp.stack([jnp.zeros_like(angle)] * 2 + [jnp.cos(angle), jnp.sin(angle)], axis=1)
-    first = of_turns * first[..., None]
+    first = jnp.broadcast_to(of_turns * first[..., None], (*first.shape, *value.shape))
     first = first / jnp.sqrt((first * first).sum((0, 1)))[None, None]
     first = jnp.broadcast_to(first, (*first.shape[:2], *shift.shape))
     smallest = jax.lax.fori_loop(0, POWERS, power, (first, jnp.zeros_like(shift)))[1]

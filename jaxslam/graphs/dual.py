@@ -71,7 +71,7 @@ def weights_of(name: str, information: Float[Array, "E R R B"]) -> Float[Array, 
 
 def dual(
     chordal: Model, plan: Plan, variables: Variables, data: Data
-) -> tuple[Float[Array, "M 4 4 B"], Float[Array, "N B"], Float[Array, "M 4 4 B"]]:
+) -> tuple[Float[Array, "M 4 4 B"], Float[Array, "N B"], Float[Array, "M 4 4 1"]]:
     """The blocks of M - diag(0, λ), with the position of the held pose removed; λ of each pose; and
     where the blocks have the diagonal of a u."""
     poses, dtype = len(variables.poses), variables.poses.dtype
