@@ -39,6 +39,7 @@ from benchmarks import (
 from benchmarks.association.__main__ import measure as measure_association
 from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import Metric, report
+from benchmarks.grids.__main__ import measure as measure_grids
 from benchmarks.results import measured
 from benchmarks.speed.__main__ import gated
 from benchmarks.speed.__main__ import measure as measure_speed
@@ -81,6 +82,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "smoothing": lambda: smoothing.measure(10 if quick else 100),
         "fastslam": lambda: fastslam.measure(4 if quick else 20, (10, 100)),
         "plain_particles": lambda: plain_particles.measure(8 if quick else 20),
+        "grids": measure_grids,
         "scaling": scaling.measure,
         "seif": lambda: seif.measure(4 if quick else 10),
         "comparison": lambda: comparison.measure(8 if quick else 16),

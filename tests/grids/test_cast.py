@@ -102,8 +102,8 @@ def rooms():
 
 
 def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():
-    """Beams whose exact range is steady under a shift of half a cell to either side: none of those
-    that pass an edge, or go along a wall, where range is no property of a place."""
+    """Beams whose exact range is steady under a shift of a cell to either side: none of those that
+    pass an edge, which the grid rounds, or go along a wall."""
     world, cell = rooms(), 0.05
     rays = grids.ray_map(rasterize(world, cell, yaw=0.3))
     rng = np.random.default_rng(1)
@@ -120,15 +120,13 @@ def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():
 
     def shifted(side):
         heading = pose[:, 2, None] + ANGLES
-        shift = (
-            side * cell / 2 * np.stack([-np.sin(heading), np.cos(heading), 0 * heading], axis=-1)
-        )
+        shift = side * cell * np.stack([-np.sin(heading), np.cos(heading), 0 * heading], axis=-1)
         return np.asarray(exact_of(pose[:, None] + shift))
 
     left, exact, right = (shifted(side) for side in (1, 0, -1))
-    steady = (np.maximum(np.abs(left - exact), np.abs(right - exact)) < 1.5 * cell) & (exact < 5)
+    steady = (np.maximum(np.abs(left - exact), np.abs(right - exact)) < 2 * cell) & (exact < 5)
     error = np.abs(found - exact)[steady] / cell
-    assert steady.mean() > 0.75
+    assert steady.mean() > 0.7
     assert error.max() < 0.5
     assert np.median(error) < 0.1
     # The ends of all other beams lie on a wall as well, or the exact range was cut.

@@ -13,6 +13,7 @@ from jaxslam.results.plot.campaign import (
 )
 from jaxslam.results.plot.cost import cost_figure
 from jaxslam.results.plot.formats import encode
+from jaxslam.results.plot.grids import grid_figure
 from jaxslam.results.plot.maps import ellipse, map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
 from jaxslam.results.plot.single import errors_figure, run_errors_figure
@@ -31,6 +32,7 @@ __all__ = [
     "encode",
     "errors_figure",
     "gained_figure",
+    "grid_figure",
     "map_figure",
     "nees_figure",
     "png",
