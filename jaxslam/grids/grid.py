@@ -7,6 +7,7 @@ of the grid, whose pose in the world is `origin`: row 0 is at the bottom. Contin
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -34,7 +35,7 @@ class Grid(NamedTuple):
     @property
     def probability(self) -> Float[Array, "H W"]:
         """The probability p = 1/(1 + exp(-log-odds)) that a cell is occupied; ½ if unknown."""
-        return 1.0 / (1.0 + jnp.exp(-self.log_odds))
+        return jax.nn.sigmoid(self.log_odds)
 
     @property
     def known(self) -> Bool[Array, "H W"]:

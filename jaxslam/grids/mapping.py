@@ -38,17 +38,20 @@ def count(
     beams: Beams,
     *,
     max_range: float,
+    no_return: float | None = None,
     mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> Counts:
     """The hits and misses of a map of (H, W) cells by T scans at known poses.
 
     A beam misses each cell that it crosses, in order (Amanatides & Woo 1987), before the one in
-    which it ends, which it hits. One of max_range or more ends there without a hit. What is off the
-    map is not counted. Sums of integers: the order of the scans does not matter, and the counts of
-    two logs add.
+    which it ends, which it hits. One of max_range or more hits nothing, and misses the cells up to
+    no_return; where that is 0 it says nothing. What is off the map is not counted. The counts are
+    sums of integers: the order of the scans does not matter, and those of two logs add.
 
     Args:
         origin, resolution: of the map, as in `Grid`.
+        no_return: [m] how far a beam of max_range is free; None for max_range. A laser that misses
+            black or wet walls needs less.
         poses: of the robot. beams: with leading T. max_range: [m].
         mount: (3,) pose of the laser on the robot.
     Raises:
@@ -57,10 +60,13 @@ def count(
     """
     check_frame("count", origin, resolution)
     _check_scans(poses, beams, max_range)
+    free = max_range if no_return is None else no_return
+    if not 0 <= free <= max_range:
+        raise ValueError(f"count: expected no_return from 0 to {max_range}, got {no_return}")
     frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
     eye = jnp.asarray(mount, float)
     return programs.call(
-        _count, (_shape(*shape),), *frame, jnp.asarray(poses), beams, max_range, eye
+        _count, (_shape(*shape),), *frame, jnp.asarray(poses), beams, max_range, free, eye
     )
 
 
@@ -96,6 +102,7 @@ def _count(
     poses: Array,
     beams: Beams,
     max_range: Array,
+    free: Array,
     mount: Array,
 ) -> Counts:
     height, width = shape
@@ -107,13 +114,13 @@ def _count(
         usable = usable_beams(scan)
         eye = se2.compose(pose, mount)
         far = scan.range >= max_range
-        length = jnp.where(usable, jnp.minimum(scan.range, max_range), 0.0)
+        length = jnp.where(far, free, jnp.where(usable, scan.range, 0.0))
         heading = eye[2] + scan.angle
         e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
         ends = to_cells(origin, resolution, eye[None, :2] + length[:, None] * e)
         start = to_cells(origin, resolution, eye[:2])
         inside = (start >= 0).all() & (start[0] < width) & (start[1] < height)
-        live = usable & inside
+        live = usable & inside & ~(far & (free <= 0))
         misses, last = _cross(misses, start, ends, live, shape)
         on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
         at = jnp.where(live & on_map, last, nowhere)

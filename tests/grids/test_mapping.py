@@ -29,7 +29,7 @@ def scans(seed=0, steps=20, beams=11):
     return poses, Beams(ranges, angles, rng.random((steps, beams)) < 0.9)
 
 
-def reference_counts(poses, beams, max_range, mount):
+def reference_counts(poses, beams, max_range, free, mount):
     """Each beam cut at every line of the table that it crosses; the middle of a piece is in its cell."""
     hits, misses = np.zeros(SHAPE, int), np.zeros(SHAPE, int)
     c, s = np.cos(0.3), np.sin(0.3)
@@ -45,8 +45,10 @@ def reference_counts(poses, beams, max_range, mount):
             if not (0 <= a[0] < SHAPE[1] and 0 <= a[1] < SHAPE[0]):
                 outside += 1
                 continue
+            if r >= max_range and free == 0:
+                continue
             h = pose[2] + mount[2] + angle - 0.3
-            b = a + min(r, max_range) / CELL * np.array([np.cos(h), np.sin(h)])
+            b = a + (r if r < max_range else free) / CELL * np.array([np.cos(h), np.sin(h)])
             cuts = [0.0, 1.0]
             for k in (0, 1):
                 lines = np.arange(np.ceil(min(a[k], b[k])), np.floor(max(a[k], b[k])) + 1)
@@ -61,14 +63,17 @@ def reference_counts(poses, beams, max_range, mount):
     return hits, misses, outside, unusable
 
 
-def counted(poses, beams, mount=(0.1, -0.05, 0.4)):
-    return grids.count(SHAPE, ORIGIN, CELL, poses, beams, max_range=2.5, mount=mount)
+def counted(poses, beams, mount=(0.1, -0.05, 0.4), free=None):
+    return grids.count(
+        SHAPE, ORIGIN, CELL, poses, beams, max_range=2.5, no_return=free, mount=mount
+    )
 
 
-def test_hits_and_misses_are_those_of_each_beam_alone():
+@pytest.mark.parametrize("free", [2.5, 0.7, 0.0])
+def test_hits_and_misses_are_those_of_each_beam_alone(free):
     poses, beams = scans()
-    found = counted(poses, beams)
-    hits, misses, outside, unusable = reference_counts(poses, beams, 2.5, (0.1, -0.05, 0.4))
+    found = counted(poses, beams, free=free)
+    hits, misses, outside, unusable = reference_counts(poses, beams, 2.5, free, (0.1, -0.05, 0.4))
     np.testing.assert_array_equal(found.hits, hits)
     np.testing.assert_array_equal(found.misses, misses)
     assert (int(found.outside), int(found.unusable)) == (outside, unusable)
@@ -143,6 +148,8 @@ def test_bad_numbers_are_refused():
         grids.count(SHAPE, ORIGIN, 0.0, poses, beams, max_range=1.0)
     with pytest.raises(ValueError, match="count: expected an origin"):
         grids.count(SHAPE, ORIGIN[:2], 0.1, poses, beams, max_range=1.0)
+    with pytest.raises(ValueError, match=r"count: expected no_return from 0 to 2\.5"):
+        counted(poses, beams, free=3.0)
     found = counted(poses, beams)
     with pytest.raises(ValueError, match="occupancy: expected 0 < miss"):
         grids.occupancy(found, hit=0.4)

@@ -49,16 +49,17 @@ def grid_figure(
     if beams is not None and (path is None or path.shape[1] != 3):
         raise ValueError("grid_figure: beams are from the last of poses (x, y, θ)")
     values = np.asarray(grid[0])
-    height = width * values.shape[0] / values.shape[1] + 0.75
-    figure, (axes,) = panels_of(width, min(height, 9.0), 1)
-    axes.grid(visible=False)
     frame = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
     rows, columns = (np.arange(n + 1) for n in values.shape)
     x, y = _world(*frame, columns[None, :] + 0.0 * rows[:, None], rows[:, None] + 0.0 * columns)
+    inner = width - (0.6 if isinstance(grid, Grid) else 1.3)
+    height = inner * np.ptp(y) / np.ptp(x) + 0.8
+    figure, (axes,) = panels_of(width, min(height, 9.0), 1)
+    axes.grid(visible=False)
     if isinstance(grid, Grid):
-        shades = LinearSegmentedColormap.from_list("occupancy", ["white", "black"])
+        shades: Any = LinearSegmentedColormap.from_list("occupancy", ["white", "black"])
         shades = shades.with_extremes(bad=_UNKNOWN)
-        shown = np.ma.masked_array(1 / (1 + np.exp(-values)), mask=values == 0)
+        shown = np.ma.masked_array(0.5 * (1 + np.tanh(values / 2)), mask=values == 0)
         axes.pcolormesh(x, y, shown, cmap=shades, vmin=0, vmax=1, rasterized=True)
         handles = [
             Patch(fc="black", ec=INK, label="occupied"),
