@@ -107,9 +107,9 @@ def cast(
         found exactly: along a ray, p is a parabola in each square of four centres. Where p is the
         share of a cell that is solid (`simulation.walls.rasterize` makes such grids), this line is
         the wall to a fraction of a cell: the range of a beam less than 63° from the normal, and one
-        and a half cells from an edge or more, is wrong by less than half a cell, in the median by
-        less than a tenth (`python -m benchmarks.grids`). Edges are rounded: beside one a beam may
-        hit or miss wrongly. In a trinary map the line is the border between an
+        and a half cells from edges and corners, is wrong by less than half a cell, in the median by
+        less than a tenth (`python -m benchmarks.grids`). These are rounded: beside an edge a beam
+        may hit or miss wrongly. In a trinary map the line is the border between an
         occupied and a free cell, with corners cut.
 
     The derivative by the pose is that of the range to a straight wall through the hit,
