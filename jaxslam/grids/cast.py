@@ -205,7 +205,8 @@ def _derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return length, jnp.where(hit, -rate * (normal * moved).sum(axis=-1), tangents[3])
 
 
-def _hits(grid: RayMap, start: Array, direction: Array, limit: Array) -> tuple[Array, Array]:
+def _hits(grid: RayMap, start: Array, direction: Array, limit: Array) -> Any:
+    """The lengths, and whether something is hit."""
     if grid.ahead.shape[0] == grid.solid.shape[0] + 2:  # its squares are cells
         return march(grid.ahead, None, start, direction, limit)
     corners = jnp.pad(grid.solid, 1, mode="edge")

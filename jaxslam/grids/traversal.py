@@ -1,5 +1,7 @@
 """Rays through a table of squares: every square that a ray crosses, or long steps where it may."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -7,10 +9,12 @@ from jaxtyping import Array, Bool, Float
 STOP, OFF = -1.0, -2.0
 """Squares in which a ray may end, and squares off the map."""
 
-CHUNK = 8192
-"""Rays that are advanced together: so many stay in the cache, and wait for their longest."""
+CHUNK = 32
+"""Rays that a CPU advances together. A loop runs until the longest ray of a chunk ends, so the
+fewer the better; 32 fill its vectors."""
 
 
+@jax.custom_batching.custom_vmap
 def march(
     ahead: Float[Array, "H W"],
     corners: Float[Array, "H2 W2"] | None,
@@ -22,10 +26,33 @@ def march(
 
     ahead has a border of `OFF` around the squares; start (x, y) counts from the corner of the first
     square within. corners None: a ray ends where it enters a square that is `STOP`. Else it ends in
-    such a square where the bilinear interpolation of its four corners is 0, if it is.
+    such a square where the bilinear interpolation of its four corners is 0, if it is. Rays of a
+    batch under `vmap` are as many rays of one call.
     """
+    return _march(ahead, corners, start, direction, limit)
+
+
+@march.def_vmap
+def _over_batch(size: int, batched: Any, *arguments: Any) -> tuple[Any, Any]:
+    ahead, corners, *rays, limit = arguments
+    on_rays = batched[2:4]
+    if any(jax.tree.leaves((batched[:2], batched[4]))):  # maps vary
+        axes = jax.tree.map(lambda on: 0 if on else None, tuple(batched))
+        return jax.vmap(_march, in_axes=axes)(*arguments), (True, True)
+    each = [
+        x if on else jnp.broadcast_to(x, (size, *x.shape))
+        for x, on in zip(rays, on_rays, strict=True)
+    ]
+    flat = [x.reshape(-1, 2) for x in each]
+    found = march(ahead, corners, *flat, limit)
+    return jax.tree.map(lambda x: x.reshape(size, -1), found), (True, True)
+
+
+def _march(
+    ahead: Array, corners: Array | None, start: Array, direction: Array, limit: Array
+) -> tuple[Array, Array]:
     count = start.shape[0]
-    if count <= CHUNK:
+    if count <= CHUNK or jax.default_backend() != "cpu":
         return _together(ahead, corners, start, direction, limit)
     parts = -(-count // CHUNK)
     padded = parts * CHUNK - count

@@ -77,6 +77,22 @@ def test_many_rays_are_as_few(blocks):
     np.testing.assert_array_equal(many, np.tile(few, (2, 10, 3)))
 
 
+def test_poses_under_vmap_are_a_batch_of_poses_and_maps_may_vary(blocks):
+    grid, _, _, pose = blocks
+    rays = grids.ray_map(grid)
+    batch = grids.cast(rays, pose, ANGLES, 1.5)
+    each = jax.jit(jax.vmap(lambda p: grids.cast(rays, p, ANGLES, 1.5)))(pose)
+    np.testing.assert_allclose(each, batch, rtol=0, atol=1e-12)
+    moved = jax.tree.map(lambda x: np.stack([x, x]), rays)._replace(
+        origin=np.stack([grid.origin, grid.origin + [0.1, 0, 0]])
+    )
+    two = jax.jit(jax.vmap(lambda r, p: grids.cast(r, p, ANGLES, 1.5)))(
+        moved, np.stack([pose, pose + [0.1, 0, 0]])
+    )
+    np.testing.assert_allclose(two, np.stack([batch, batch]), atol=1e-9)
+    np.testing.assert_allclose(two[0], batch, rtol=0, atol=1e-12)
+
+
 def test_rays_along_the_axes_through_corners_and_from_borders_end():
     log_odds = np.full((6, 8), -2.0)
     log_odds[2, 5] = 2.0
