@@ -93,13 +93,14 @@ def measure() -> list[Metric]:
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     metrics = []
     for name, value in json.loads(done.stdout.splitlines()[-1]).items():
-        fastest = name.startswith(("cells, skipping", "C++ / cells, skipping"))
-        low = 0.5 if name.startswith("C++ /") and fastest else -np.inf
-        low = 6.0 if name.startswith("cells, skipping, turtlebot") else low
-        off = abs(value) if name.startswith("mean range") else 0.0
-        metrics.append(
-            Metric(name, value, low=low if not off else -1e-3, high=1e-3 if off else np.inf)
-        )
+        low, high = -np.inf, np.inf
+        if name.startswith("cells, skipping"):
+            low = 6.0  # of CDDT: Walsh & Karaman 2018, "CDDT: fast approximate 2D ray casting"
+        elif name.startswith("C++ / cells, skipping"):
+            low = 0.5
+        elif name.startswith("mean range"):
+            low, high = -1e-3, 1e-3
+        metrics.append(Metric(name, value, low, high))
     return metrics + accuracy() + distance()
 
 

@@ -187,7 +187,8 @@ def _lengths(
     grid: RayMap, start: Float[Array, "R 2"], direction: Float[Array, "R 2"], limit: Array
 ) -> Float[Array, "R"]:
     """The lengths [cells] of rays from start (x, y) [cells]."""
-    return _hits(grid, start, direction, limit)[0]
+    length: Array = _hits(grid, start, direction, limit)[0]
+    return length
 
 
 @_lengths.defjvp
