@@ -47,6 +47,7 @@ from benchmarks.association.__main__ import measure as measure_association
 from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import Metric, report
 from benchmarks.graph_consistency.__main__ import measure as measure_graphs
+from benchmarks.grids.__main__ import measure as measure_grids
 from benchmarks.mrclam.__main__ import measure as measure_mrclam
 from benchmarks.results import measured
 from benchmarks.speed.__main__ import gated
@@ -95,6 +96,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "graph_speed": lambda: graph_speed.measure(3 if quick else 9),
         "fastslam": lambda: fastslam.measure(4 if quick else 20, (10, 100)),
         "plain_particles": lambda: plain_particles.measure(8 if quick else 20),
+        "grids": measure_grids,
         "scaling": scaling.measure,
         "seif": lambda: seif.measure(4 if quick else 10),
         "comparison": lambda: comparison.measure(8 if quick else 16),

@@ -208,3 +208,15 @@ class Trace(NamedTuple):
     """the filter's own state at the end."""
     probe: Any
     """results of the caller's probe after each update, leading T; None without one."""
+
+
+class Beams(NamedTuple):
+    """A scan of a laser: B beams, in the frame of its mount."""
+
+    range: Float[Array, "B"]
+    """[m]; any finite number where not valid"""
+    angle: Float[Array, "B"]
+    """direction of each beam [rad], counter-clockwise from the x axis"""
+    valid: Bool[Array, "B"]
+    """false for a beam that says nothing: a dropout, NaN, or padding. A beam that met nothing has
+    the laser's maximum range, and is valid."""

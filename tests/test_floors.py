@@ -17,7 +17,7 @@ FLOORS = [
     "math programs",
     "types protocols slots validation noise derivatives streams records",
     "motion sensors charts linearize association resampling life team",
-    "run filters smoothing graphs simulation",
+    "run filters smoothing graphs grids simulation",
     "consistency monte_carlo verify catalog calibration",
     "datasets results cli __main__",
 ]
@@ -26,8 +26,12 @@ ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
 
 # Methods of these modules may import what is above, when they are called: `print(campaign)` and
 # `campaign.save(folder)` are where a user looks for them, and results are drawn and written above;
-# so is `graphs.read(path)`, and files are read above.
-WITHIN_CALLS = {"graphs.files": "datasets", "monte_carlo.record": "results"}
+# so are `graphs.read(path)` and `grids.read_map(path)`, and files are read above.
+WITHIN_CALLS = {
+    "graphs.files": "datasets",
+    "grids.files": "datasets",
+    "monte_carlo.record": "results",
+}
 
 # What only these modules may touch.
 KEPT = {

@@ -29,6 +29,7 @@ INTRODUCED = {
     "jaxslam.resampling": "Resampling",
     "jaxslam.smoothing": "Smoothing and batch estimation",
     "jaxslam.graphs": "Graphs of poses and points",
+    "jaxslam.grids": "Occupancy grids and rays",
     "jaxslam.team": "Several robots",
     "jaxslam.simulation": "Simulated worlds",
     "jaxslam.monte_carlo": "Monte-Carlo campaigns",

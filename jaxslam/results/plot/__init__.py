@@ -15,6 +15,7 @@ from jaxslam.results.plot.cost import cost_figure
 from jaxslam.results.plot.formats import encode
 from jaxslam.results.plot.geometry import ellipse
 from jaxslam.results.plot.graph import graph_figure
+from jaxslam.results.plot.grids import grid_figure
 from jaxslam.results.plot.maps import map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
 from jaxslam.results.plot.scene import (
@@ -51,6 +52,7 @@ __all__ = [
     "errors_figure",
     "gained_figure",
     "graph_figure",
+    "grid_figure",
     "map_figure",
     "nees_figure",
     "png",

@@ -6,6 +6,7 @@ from jaxslam.simulation.scenarios.circle import circle
 from jaxslam.simulation.scenarios.cloister import cloister, cloister_landmarks, cloister_noisy
 from jaxslam.simulation.scenarios.explore import explore
 from jaxslam.simulation.scenarios.loop import loop, loop_bearing, loop_landmarks
+from jaxslam.simulation.scenarios.rooms import ROOMS, circular_room, corridor, office, square
 from jaxslam.simulation.scenarios.stationary import stationary
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.scenarios.webmap import webmap
@@ -24,16 +25,21 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
 """By name; each takes the number of steps, and has the published one as default."""
 
 __all__ = [
+    "ROOMS",
     "SCENARIOS",
     "between_ranges",
     "circle",
+    "circular_room",
     "cloister",
     "cloister_landmarks",
     "cloister_noisy",
+    "corridor",
     "explore",
     "loop",
     "loop_bearing",
     "loop_landmarks",
+    "office",
+    "square",
     "stationary",
     "webmap",
 ]

@@ -1,0 +1,1 @@
+"""Speed and accuracy of rays in grids: see `__main__`."""

@@ -1,0 +1,108 @@
+"""Grids: `python -m benchmarks.grids`.
+
+Rays a second on one core beside a traversal in C++ (`rays.py`), the error of ranges against exact
+walls, and the distance field of 4 million cells beside SciPy's.
+"""
+
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import ndimage
+
+from benchmarks.gate import Metric, alone
+from benchmarks.speed.timing import together
+from jaxslam import grids
+from jaxslam.simulation.scenarios import ROOMS
+from jaxslam.simulation.walls import exact_ranges, rasterize
+
+CELL = 0.05
+
+
+def distance() -> list[Metric]:
+    rng = np.random.default_rng(0)
+    cells = rng.random((2000, 2000)) < 5e-4
+    cells[::200] = cells[:, ::250] = True
+    grid = grids.Grid(jnp.where(cells, 2.0, -2.0), jnp.zeros(3), jnp.asarray(1.0))
+    actions = {
+        "ours": lambda: grids.distance_field(grid).values.block_until_ready(),
+        "SciPy": lambda: ndimage.distance_transform_edt(~cells),
+    }
+    error = np.abs(actions["ours"]() - actions["SciPy"]()).max()
+    seconds = together(actions)
+    return [
+        Metric("distance field, 4 million cells [s]", seconds["ours"], high=0.5),
+        Metric("distance field, 4 million cells, SciPy [s]", seconds["SciPy"]),
+        Metric("distance field, largest difference from SciPy [cells]", error, high=1e-9),
+    ]
+
+
+def accuracy() -> list[Metric]:
+    """Errors in cells over beams whose exact range changes by less than three cells under a shift
+    of one and a half to either side, so none that passes an edge, or more than 63° from the normal
+    of a wall; the share of these beams. Gates are for those that end one and a half cells or more
+    from the corners of the room as well, which the grid rounds.
+    """
+    metrics = []
+    for name, make in ROOMS.items():
+        world = make(90)
+        angles, far = jnp.asarray(world.laser.angles), world.laser.max_range
+        rng = np.random.default_rng(2)
+        coarse = rasterize(world.walls, 0.4)  # spots half a coarse cell or more from the walls
+        spots = np.asarray(grids.centers(coarse))[np.asarray(coarse.probability) < 0.01]
+        spots = spots[rng.integers(len(spots), size=400)] + rng.uniform(-0.1, 0.1, (400, 2))
+        pose = np.column_stack([spots, rng.uniform(-3, 3, len(spots))])
+        heading = pose[:, 2, None] + np.asarray(angles)
+        across = 1.5 * CELL * np.stack([-np.sin(heading), np.cos(heading), 0 * heading], axis=-1)
+
+        def one(pose, angle, walls=world.walls, far=far):
+            return exact_ranges(walls, pose, angle[None], far)[0]
+
+        of_beams = jax.jit(lambda poses: jax.lax.map(lambda row: jax.vmap(one)(row, angles), poses))
+        left, middle, right = (
+            np.asarray(of_beams(pose[:, None] + side * across)) for side in (1.0, 0.0, -1.0)
+        )
+        steady = (np.maximum(abs(left - middle), abs(right - middle)) < 3 * CELL) & (middle < far)
+        unit = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        ends = pose[:, None, :2] + middle[..., None] * unit
+        corners = world.walls.segments[:, 0]
+        apart = np.full(middle.shape, np.inf)
+        for corner in corners:
+            apart = np.minimum(apart, np.linalg.norm(ends - corner, axis=-1))
+        plain = steady & (apart > 1.5 * CELL)
+        for method in ("surface", "cells"):
+            rays = grids.ray_map(rasterize(world.walls, CELL, yaw=0.3), method=method)
+            found = np.asarray(grids.cast(rays, pose, angles, far))
+            error = np.abs(found - middle) / CELL
+            most, median = (0.5, 0.1) if method == "surface" else (np.inf, np.inf)
+            what = f"{method}, {name} [cells]"
+            metrics += [
+                Metric(f"largest error of a range, {what}", error[plain].max(), high=most),
+                Metric(f"median error of a range, {what}", np.median(error[plain]), high=median),
+                Metric(f"largest error, corners too, {what}", error[steady].max()),
+            ]
+        metrics.append(Metric(f"share of beams counted, {name}", plain.mean()))
+    return metrics
+
+
+def measure() -> list[Metric]:
+    command = [sys.executable, "-m", "benchmarks.grids.rays"]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    metrics = []
+    for name, value in json.loads(done.stdout.splitlines()[-1]).items():
+        low, high = -np.inf, np.inf
+        if name.startswith("cells, skipping"):
+            low = 6.0  # of CDDT: Walsh & Karaman 2018, "CDDT: fast approximate 2D ray casting"
+        elif name.startswith("C++ / cells, skipping"):
+            low = 0.5
+        elif name.startswith("mean range"):
+            low, high = -1e-3, 1e-3
+        metrics.append(Metric(name, value, low, high))
+    return metrics + accuracy() + distance()
+
+
+if __name__ == "__main__":
+    raise SystemExit(alone("grids", measure))

@@ -1,0 +1,104 @@
+"""Rays a second on one core beside C++: `python -m benchmarks.grids.rays`; one line of JSON.
+
+The same maps, poses and beams for `limit.cpp` and for each method of `grids.cast`, in float32, in
+turns; the fastest pass of each counts.
+"""
+
+# ruff: noqa: E402
+import json
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from benchmarks.speed.timing import pin, together
+
+pin()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.real_data import DATA
+from jaxslam import grids
+
+POSES, BEAMS = 1000, 360
+METHODS = {
+    "cells": ("cells", False),
+    "cells, skipping": ("cells", True),
+    "surface": ("surface", True),
+}
+
+
+def maps():
+    """Grids with the maximum range of a laser [m] by name."""
+    rng = np.random.default_rng(0)
+    cells = rng.random((2000, 2000)) < 1e-4
+    for low in range(0, 2000, 250):  # rooms of 12.5 m with doors
+        cells[low : low + 3] = cells[:, low : low + 3] = True
+    for low in range(100, 2000, 250):
+        cells[low : low + 30] = cells[:, low : low + 30] = False
+    log_odds = np.where(cells, 4.0, -4.0)
+    found = {"2000 × 2000": (grids.Grid(log_odds, np.zeros(3), np.float64(0.05)), 30.0)}
+    real = DATA / "maps" / "turtlebot3_world.yaml"
+    if real.exists():
+        found["turtlebot3_world"] = (grids.read_map(real), 3.5)
+    return found
+
+
+def measure(name, grid, max_range):
+    rng = np.random.default_rng(1)
+    free = np.argwhere(np.asarray(grid.log_odds) < 0)
+    cells = free[rng.integers(len(free), size=POSES)][:, ::-1] + rng.random((POSES, 2))
+    heading = rng.uniform(-np.pi, np.pi, POSES)
+    angles = 2 * np.pi * np.arange(BEAMS) / BEAMS
+    position = grid.origin[:2] + grid.resolution * cells
+    pose = jnp.asarray(np.column_stack([position, heading]), jnp.float32)
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), grid)
+    beams = jnp.asarray(angles, jnp.float32)
+    actions, means = {}, {}
+    for method, (kind, skip) in METHODS.items():
+        rays = grids.ray_map(single, method=kind, skip=skip)
+        actions[method] = lambda r=rays: grids.cast(r, pose, beams, max_range).block_until_ready()
+        means[method] = float(jnp.mean(actions[method]()))
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [str(Path(folder) / part) for part in ("limit", "map", "rays")]
+        if shutil.which("g++"):
+            source = Path(__file__).with_name("limit.cpp")
+            flags = ["-O3", "-march=native", "-ffast-math"]
+            subprocess.run(["g++", *flags, str(source), "-o", paths[0]], check=True)
+            (np.asarray(grid.log_odds) > 0).astype(np.uint8).tofile(paths[1])
+            each = np.column_stack(
+                [np.repeat(cells, BEAMS, axis=0), (heading[:, None] + angles).ravel()]
+            )
+            each.tofile(paths[2])
+            height, width = grid.log_odds.shape
+            limit = max_range / float(grid.resolution)
+            numbers = [str(n) for n in (width, height)], [str(n) for n in (len(each), limit, 1)]
+            inside = []
+
+            def cpp():
+                command = [paths[0], paths[1], *numbers[0], paths[2], *numbers[1]]
+                out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+                inside.append([float(word) for word in out.split()])
+
+            actions["C++"] = cpp
+        seconds = together(actions)
+    found = {
+        f"{method}, {name} [million rays/s]": POSES * BEAMS / 1e6 / seconds[method]
+        for method in METHODS
+    }
+    if "C++" in actions:
+        best, mean = min(row[0] for row in inside), float(grid.resolution) * inside[0][1]
+        found[f"C++, {name} [million rays/s]"] = POSES * BEAMS / 1e6 / best
+        for method in METHODS:
+            found[f"C++ / {method}, time, {name}"] = best / seconds[method]
+        found[f"mean range by C++ - cells, {name} [m]"] = mean - means["cells"]
+    return found
+
+
+if __name__ == "__main__":
+    numbers = {}
+    for name, (grid, max_range) in maps().items():
+        numbers |= measure(name, grid, max_range)
+    print(json.dumps(numbers))

@@ -1,0 +1,47 @@
+"""Occupancy grids: the map and its files, distance fields, rays, beam models, mapping."""
+
+from jaxslam.grids.beam_models import (
+    BeamModel,
+    Mixture,
+    fit,
+    likelihood_field,
+    log_likelihood,
+    ray_cast,
+)
+from jaxslam.grids.cast import RayMap, cast, ray_map
+from jaxslam.grids.distance import distance_field, gradient
+from jaxslam.grids.files import read_map, write_map
+from jaxslam.grids.grid import Field, Grid, centers, check_grid, to_cells
+from jaxslam.grids.interpolation import interpolate
+from jaxslam.grids.mapping import Counts, count, entropy, occupancy, reflection
+from jaxslam.grids.resampling import correlation, crop, resample
+
+__all__ = [
+    "BeamModel",
+    "Counts",
+    "Field",
+    "Grid",
+    "Mixture",
+    "RayMap",
+    "cast",
+    "centers",
+    "check_grid",
+    "correlation",
+    "count",
+    "crop",
+    "distance_field",
+    "entropy",
+    "fit",
+    "gradient",
+    "interpolate",
+    "likelihood_field",
+    "log_likelihood",
+    "occupancy",
+    "ray_cast",
+    "ray_map",
+    "read_map",
+    "reflection",
+    "resample",
+    "to_cells",
+    "write_map",
+]

@@ -1,0 +1,82 @@
+"""The record of a beam model, and the log-likelihood of a scan under it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.grids.grid import Grid
+from jaxslam.types import Beams
+from jaxslam.validation.numbers import is_concrete, shape_told
+
+
+@dataclass(frozen=True, eq=False)
+class BeamModel:
+    """A density of the range of each beam, given pose and map."""
+
+    name: str
+    prepare: Callable[[Grid], Any]
+    """(grid) -> what the model needs of the map, once for all scans: a pytree of arrays"""
+    each: Callable[[Any, Array, Beams], Array]
+    """(prepared, pose (3,) of the robot, beams) -> (B,) log-densities, finite also where a beam is
+    not valid"""
+
+
+def log_likelihood(
+    model: BeamModel,
+    prepared: Any,
+    pose: Float[Array, "3"],
+    beams: Beams,
+    *,
+    every: int = 1,
+    exponent: ArrayLike = 1.0,
+) -> Float[Array, ""]:
+    """The log-likelihood of a scan at a pose: exponent · Σ log p(z_k) over its valid beams.
+
+    Beams that are not valid, of NaN or of a range below 0 add nothing. The beams of a scan are
+    taken to be independent given the pose, which they are not: what the map lacks, or a pose
+    between two cells, spoils many of them in the same way. `every` takes each n-th beam alone, and
+    an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
+    exponent; `jax.vmap` it over poses.
+
+    Raises ValueError on beams that `check_beams` refuses, and on every below 1.
+    """
+    check_beams("log_likelihood", beams)
+    if every < 1:
+        raise ValueError(f"log_likelihood: expected every >= 1, got {every}")
+    taken = Beams(*(jnp.asarray(part)[::every] for part in beams))
+    usable = usable_beams(taken)
+    clean = Beams(jnp.where(usable, taken.range, 1.0), taken.angle, usable)
+    each = model.each(prepared, pose, clean)
+    return jnp.asarray(exponent) * jnp.where(usable, each, 0.0).sum()
+
+
+def usable_beams(beams: Beams) -> Bool[Array, "B"]:
+    """Which beams say something: valid ones with a range that is a number and not below 0.
+
+    An infinite range is that of a beam that met nothing, and is usable.
+    """
+    return beams.valid & (beams.range >= 0)
+
+
+def check_beams(name: str, beams: Any) -> None:
+    """Raise ValueError, which begins with a caller's name, unless beams are one scan.
+
+    Ranges, angles and masks must be as many, and outside a trace at least one beam must be usable.
+    """
+    if not isinstance(beams, Beams):
+        raise ValueError(f"{name}: expected Beams, got {type(beams).__name__}")
+    shapes = [np.shape(part) for part in beams]
+    if len(shapes[0]) != 1 or len(set(shapes)) != 1:
+        told = ", ".join(shape_told(part) for part in beams)
+        raise ValueError(f"{name}: expected as many ranges, angles and masks, got {told}")
+    if not is_concrete(beams):
+        return
+    if not np.all(np.isfinite(beams.angle)):
+        raise ValueError(f"{name}: expected finite angles")
+    if not np.any(np.asarray(beams.valid) & (np.asarray(beams.range) >= 0)):
+        raise ValueError(f"{name}: the scan of {shapes[0][0]} beams has no valid beam")

@@ -1,0 +1,66 @@
+"""Beam end-points against the distance to the nearest obstacle."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxslam.grids.beam_models.beam_model import BeamModel
+from jaxslam.grids.beam_models.ray_cast import check_weights
+from jaxslam.grids.distance import distance_field
+from jaxslam.grids.grid import Field, Grid
+from jaxslam.grids.interpolation import interpolate
+from jaxslam.math import se2
+from jaxslam.types import Beams
+
+
+def likelihood_field(
+    sigma: ArrayLike = 0.1,
+    *,
+    max_range: float,
+    hit: ArrayLike = 0.9,
+    random: ArrayLike = 0.1,
+    maximum: ArrayLike = 0.0,
+    truncate: float | None = 2.0,
+    mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> BeamModel:
+    """The beam end-point model: log(hit · N(d; 0, σ²) + random/max_range), or log of maximum.
+
+    d [m] is the distance from the end of the beam to the nearest obstacle, interpolated between
+    centres of cells. A beam of max_range or more has maximum alone; where that is 0, nothing is
+    said of it (log 1). No ray is cast, so a beam through a wall costs nothing, and the density does
+    not integrate to 1 over the range. Differentiable by pose, σ and weights; off the map the
+    distance is that at the border.
+
+    Thrun, Burgard & Fox 2005, "Probabilistic robotics", section 6.4.
+
+    Args:
+        sigma: [m]. max_range: [m].
+        hit, random, maximum: weights, of sum 1.
+        truncate: largest distance [m], None for no limit.
+        mount: (3,) pose of the laser on the robot.
+    """
+    check_weights("likelihood_field", {"hit": hit, "random": random, "maximum": maximum})
+
+    def prepare(grid: Grid) -> Field:
+        return distance_field(grid, truncate=truncate)
+
+    def each(field: Any, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
+        far = beams.range >= max_range
+        ranges = jnp.where(far, 0.0, beams.range)
+        heading = eye[2] + beams.angle
+        ends = jnp.stack(
+            [eye[0] + ranges * jnp.cos(heading), eye[1] + ranges * jnp.sin(heading)], -1
+        )
+        d = interpolate(field, ends)
+        near = hit * jnp.exp(-0.5 * (d / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+        least = jnp.finfo(d.dtype).tiny
+        log_near = jnp.log(jnp.maximum(near + random / max_range, least))
+        silent = jnp.asarray(maximum) == 0
+        log_far = jnp.where(silent, 0.0, jnp.log(jnp.where(silent, 1.0, maximum)))
+        return jnp.where(far, log_far, log_near)
+
+    return BeamModel("likelihood_field", prepare, each)

@@ -1,0 +1,103 @@
+"""The range of a beam against the one that the map predicts: a mixture of four components."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxslam.grids.beam_models.beam_model import BeamModel
+from jaxslam.grids.cast import RayMap, cast, ray_map
+from jaxslam.grids.grid import Grid
+from jaxslam.math import se2
+from jaxslam.types import Beams
+from jaxslam.validation.numbers import is_concrete
+
+
+class Mixture(NamedTuple):
+    """The parameters of `ray_cast`."""
+
+    hit: ArrayLike
+    """share of beams that end at the obstacle of the map, with Gaussian noise"""
+    short: ArrayLike
+    """share that ends earlier, at what the map does not have"""
+    maximum: ArrayLike
+    """share that returns nothing, and so max_range"""
+    random: ArrayLike
+    """share of any range"""
+    sigma: ArrayLike
+    """standard deviation of a hit [m]"""
+    rate: ArrayLike
+    """rate λ of the exponential density of short ones [1/m]"""
+
+
+USUAL = Mixture(0.75, 0.1, 0.05, 0.1, 0.1, 0.5)
+"""Parameters of a laser in a building whose map is good."""
+
+
+def mixture_log_density(
+    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: float
+) -> Float[Array, "*n"]:
+    """The log-density of ranges z given those expected: a density below max_range, a mass there.
+
+    Below max_range: hit · N(z; z*, σ²)/Φ + short · λ exp(-λ z)/(1 - exp(-λ z*)) [z <= z*]
+    + random/max_range, Φ the mass of the normal within [0, max_range]. At max_range: maximum, and
+    with it the hit where max_range is expected, since there is nothing to hit. Integral and mass
+    sum to 1.
+
+    Thrun, Burgard & Fox 2005, "Probabilistic robotics", (6.4) to (6.12).
+    """
+    hit, short, maximum, random, sigma, rate = (jnp.asarray(value) for value in mixture)
+    nothing = expected >= max_range
+    star = jnp.where(nothing, 0.5 * max_range, expected)
+    mass = ndtr((max_range - star) / sigma) - ndtr(-star / sigma)
+    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi) * mass)
+    # Where max_range is expected, short ones are spread over all of it.
+    end = jnp.where(nothing, max_range, jnp.maximum(expected, 1e-6))
+    early = jnp.where(z <= end, rate * jnp.exp(-rate * z) / -jnp.expm1(-rate * end), 0.0)
+    near = jnp.where(nothing, 0.0, hit * normal) + short * early + random / max_range
+    far = maximum + jnp.where(nothing, hit, 0.0)
+    least = jnp.finfo(jnp.result_type(z, float)).tiny
+    return jnp.log(jnp.maximum(jnp.where(z >= max_range, far, near), least))
+
+
+def ray_cast(
+    mixture: Mixture = USUAL,
+    *,
+    max_range: float,
+    method: str = "surface",
+    mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> BeamModel:
+    """The ray-cast model: `mixture_log_density` of each range given that of `grids.cast`.
+
+    Differentiable by the parameters, and by the pose in the sense of `cast`.
+
+    Args:
+        mixture: parameters, which `fit` learns from data; the four shares have sum 1.
+        max_range: [m]. method: of `ray_map`.
+        mount: (3,) pose of the laser on the robot.
+    """
+    check_weights("ray_cast", dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
+
+    def prepare(grid: Grid) -> RayMap:
+        return ray_map(grid, method=method)
+
+    def each(rays: Any, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
+        expected = cast(rays, eye, beams.angle, max_range)
+        z = jnp.minimum(beams.range, max_range)
+        return mixture_log_density(mixture, z, expected, max_range)
+
+    return BeamModel("ray_cast", prepare, each)
+
+
+def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:
+    """Raise ValueError unless the shares of a mixture are >= 0 and have sum 1."""
+    if not is_concrete(weights):
+        return
+    values = np.array([float(np.asarray(value)) for value in weights.values()])
+    if np.any(values < 0) or not abs(values.sum() - 1) < 1e-6:
+        told = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
+        raise ValueError(f"{name}: expected shares >= 0 of sum 1, got {told}")

@@ -1,0 +1,215 @@
+"""Maps from scans at known poses: hits and misses of cells, and what follows from their counts."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from jaxslam import programs
+from jaxslam.grids.beam_models.beam_model import usable_beams
+from jaxslam.grids.grid import Grid, check_frame, to_cells
+from jaxslam.math import se2
+from jaxslam.types import Beams
+from jaxslam.validation.numbers import is_concrete
+
+
+class Counts(NamedTuple):
+    """How many beams ended in each cell, and how many passed through it."""
+
+    hits: Int[Array, "H W"]
+    misses: Int[Array, "H W"]
+    origin: Float[Array, "3"]
+    resolution: Float[Array, ""]
+    outside: Int[Array, ""]
+    """usable beams that say nothing: their origin is off the map"""
+    unusable: Int[Array, ""]
+    """beams that are not valid, of NaN or below 0"""
+
+
+def count(
+    shape: tuple[int, int],
+    origin: ArrayLike,
+    resolution: ArrayLike,
+    poses: Float[Array, "T 3"],
+    beams: Beams,
+    *,
+    max_range: float,
+    no_return: float | None = None,
+    mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> Counts:
+    """The hits and misses of a map of (H, W) cells by T scans at known poses.
+
+    A beam misses each cell that it crosses, in order (Amanatides & Woo 1987), before the one in
+    which it ends, which it hits. One of max_range or more hits nothing, and misses the cells up to
+    no_return; where that is 0 it says nothing. What is off the map is not counted. The counts are
+    sums of integers: the order of the scans does not matter, and those of two logs add.
+
+    Args:
+        origin, resolution: of the map, as in `Grid`.
+        no_return: [m] how far a beam of max_range is free; None for max_range. A laser that misses
+            black or wet walls needs less.
+        poses: of the robot. beams: with leading T. max_range: [m].
+        mount: (3,) pose of the laser on the robot.
+    Raises:
+        ValueError: a frame, poses and beams that do not fit; outside a trace, no usable beam, or a
+            usable pose that is not finite.
+    """
+    check_frame("count", origin, resolution)
+    _check_scans(poses, beams, max_range)
+    free = max_range if no_return is None else no_return
+    if not 0 <= free <= max_range:
+        raise ValueError(f"count: expected no_return from 0 to {max_range}, got {no_return}")
+    frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
+    eye = jnp.asarray(mount, float)
+    return programs.call(
+        _count, (_shape(*shape),), *frame, jnp.asarray(poses), beams, max_range, free, eye
+    )
+
+
+@functools.cache
+def _shape(height: int, width: int) -> tuple[int, int]:
+    """The same object for the same shape, as `programs.call` wants it."""
+    return height, width
+
+
+def _check_scans(poses: Any, beams: Beams, max_range: float) -> None:
+    shapes = [np.shape(part) for part in beams]
+    if len(set(shapes)) != 1 or len(shapes[0]) != 2:
+        raise ValueError(f"count: expected as many ranges, angles and masks (T, B), got {shapes}")
+    if np.shape(poses) != (shapes[0][0], 3):
+        raise ValueError(
+            f"count: expected a pose (x, y, θ) for each of {shapes[0][0]} scans, got "
+            f"{np.shape(poses)}"
+        )
+    if not max_range > 0:
+        raise ValueError(f"count: expected max_range above 0, got {max_range}")
+    if not is_concrete(beams, poses):
+        return
+    if not np.all(np.isfinite(poses)):
+        raise ValueError("count: expected finite poses")
+    if not np.any(np.asarray(beams.valid) & (np.asarray(beams.range) >= 0)):
+        raise ValueError("count: no scan has a valid beam")
+
+
+def _count(
+    shape: tuple[int, int],
+    origin: Array,
+    resolution: Array,
+    poses: Array,
+    beams: Beams,
+    max_range: Array,
+    free: Array,
+    mount: Array,
+) -> Counts:
+    height, width = shape
+    nowhere = height * width
+
+    def add(total: Any, row: tuple[Array, Beams]) -> tuple[Any, None]:
+        hits, misses, outside, unusable = total
+        pose, scan = row
+        usable = usable_beams(scan)
+        eye = se2.compose(pose, mount)
+        far = scan.range >= max_range
+        length = jnp.where(far, free, jnp.where(usable, scan.range, 0.0))
+        heading = eye[2] + scan.angle
+        e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
+        ends = to_cells(origin, resolution, eye[None, :2] + length[:, None] * e)
+        start = to_cells(origin, resolution, eye[:2])
+        inside = (start >= 0).all() & (start[0] < width) & (start[1] < height)
+        live = usable & inside & ~(far & (free <= 0))
+        misses, last = _cross(misses, start, ends, live, shape)
+        on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
+        at = jnp.where(live & on_map, last, nowhere)
+        hits = hits.at[at].add((~far).astype(jnp.int32), mode="drop")
+        misses = misses.at[at].add(far.astype(jnp.int32), mode="drop")
+        outside = outside + (usable & ~inside).sum(dtype=jnp.int32)
+        return (hits, misses, outside, unusable + (~usable).sum(dtype=jnp.int32)), None
+
+    none = jnp.zeros(nowhere, jnp.int32)
+    zero = jnp.zeros((), jnp.int32)
+    total, _ = jax.lax.scan(add, (none, none, zero, zero), (poses, beams))
+    return Counts(total[0].reshape(shape), total[1].reshape(shape), origin, resolution, *total[2:])
+
+
+def _cross(
+    misses: Array, start: Array, ends: Array, live: Array, shape: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Add one to each cell from start up to, without, that of the end; and the latter's index.
+
+    A beam crosses as many lines of the table as there are between the two cells.
+    """
+    height, width = shape
+    delta = ends - start[None, :]
+    forward = jnp.where(delta >= 0, 1, -1)
+    first = jnp.floor(start).astype(jnp.int32)
+    last = jnp.floor(ends).astype(jnp.int32)
+    steps = jnp.where(live, jnp.abs(last - first[None, :]).sum(axis=1), 0)
+    slope = jnp.where(delta != 0, 1.0 / jnp.where(delta != 0, delta, 1.0), 0.0)
+
+    def unfinished(state: tuple[Array, ...]) -> Array:
+        return (state[2] < steps).any()
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        misses, cell, done = state
+        going = done < steps
+        inside = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+        at = jnp.where(going & inside, cell[:, 1] * width + cell[:, 0], height * width)
+        misses = misses.at[at].add(1, mode="drop")
+        # The share of the beam up to the next line of each axis; none where the end is reached.
+        crossing = (cell + (forward > 0) - start[None, :]) * slope
+        crossing = jnp.where(cell == last, jnp.inf, crossing)
+        across = crossing[:, 0] < crossing[:, 1]
+        move = jnp.stack([across, ~across], axis=1) * forward
+        return misses, jnp.where(going[:, None], cell + move, cell), done + going
+
+    cells = jnp.broadcast_to(first, last.shape)
+    begin: tuple[Array, ...] = (misses, cells, jnp.zeros_like(steps))
+    misses, *_ = jax.lax.while_loop(unfinished, step, begin)
+    return misses, last[:, 1] * width + last[:, 0]
+
+
+def occupancy(counts: Counts, *, hit: ArrayLike = 0.7, miss: ArrayLike = 0.4) -> Grid:
+    """The log-odds of an inverse sensor model: hits · logit(hit) + misses · logit(miss).
+
+    As the occupancy-grid filter sums them beam by beam, with a prior of ½ (Thrun, Burgard & Fox
+    2005, "Probabilistic robotics", table 9.1). A cell of no beam has exactly 0. Cells and beams are
+    taken to be independent, so the log-odds are overconfident. Differentiable by both numbers.
+
+    Raises ValueError unless 0 < miss < ½ < hit < 1.
+    """
+    if (
+        is_concrete(hit, miss)
+        and not 0 < float(np.asarray(miss)) < 0.5 < float(np.asarray(hit)) < 1
+    ):
+        raise ValueError(f"occupancy: expected 0 < miss < 0.5 < hit < 1, got {miss!r} and {hit!r}")
+    log_hit = jnp.log(hit) - jnp.log1p(-jnp.asarray(hit))
+    log_miss = jnp.log(miss) - jnp.log1p(-jnp.asarray(miss))
+    log_odds = counts.hits * log_hit + counts.misses * log_miss
+    return Grid(log_odds, counts.origin, counts.resolution)
+
+
+def reflection(counts: Counts, *, prior: ArrayLike = 1.0) -> Grid:
+    """The counting model: p = (hits + prior)/(hits + misses + 2 prior), how often a cell reflects.
+
+    The mean of a Beta(prior, prior) distribution updated by the counts. A cell of no beam has a
+    log-odds of exactly 0; the counts, not the grid, say how sure p is.
+
+    Raises ValueError unless prior is above 0.
+    """
+    if is_concrete(prior) and not float(np.asarray(prior)) > 0:
+        raise ValueError(f"reflection: expected a prior above 0, got {prior!r}")
+    log_odds = jnp.log(counts.hits + prior) - jnp.log(counts.misses + prior)
+    return Grid(log_odds, counts.origin, counts.resolution)
+
+
+def entropy(grid: Grid) -> Float[Array, "H W"]:
+    """The entropy -p log₂ p - (1 - p) log₂(1 - p) [bit] of each cell: 1 where it is unknown."""
+    size = jnp.abs(grid.log_odds)
+    odds = jnp.exp(-size)
+    # With the larger share 1/(1 + odds): -log of it is log1p(odds), of the other size more.
+    nats = jnp.log1p(odds) + size * odds / (1 + odds)
+    return jnp.asarray(nats / np.log(2.0))

@@ -1,0 +1,174 @@
+"""A laser scanner in a world of exact walls, and what its scan can say of the pose."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jaxslam import programs
+from jaxslam.math import se2
+from jaxslam.protocols import Motion
+from jaxslam.simulation.walls import Walls, exact_ranges
+from jaxslam.simulation.worlds import drive
+from jaxslam.types import Beams
+from jaxslam.validation.numbers import check_key
+
+
+@dataclass(frozen=True, eq=False)
+class Laser:
+    """A 2-D laser scanner. Raises ValueError on numbers out of range."""
+
+    angles: ArrayLike
+    """(B,) directions of the beams in the frame of the mount [rad]"""
+    sigma: float = 0.02
+    """standard deviation of a range [m]"""
+    max_range: float = 10.0
+    """[m]; a beam that meets nothing nearer has this range, without noise"""
+    dropout: float = 0.0
+    """share of the beams that return nothing, in [0, 1]; they are not valid"""
+    mount: ArrayLike = (0.0, 0.0, 0.0)
+    """(3,) pose on the robot"""
+
+    def __post_init__(self) -> None:
+        angles, mount = np.asarray(self.angles), np.asarray(self.mount)
+        if angles.ndim != 1 or angles.size == 0 or not np.all(np.isfinite(angles)):
+            raise ValueError(f"Laser: expected finite angles (at least 1,), got {angles.shape}")
+        if mount.shape != (3,) or not np.all(np.isfinite(mount)):
+            raise ValueError(f"Laser: expected a mount that is a pose (x, y, θ), got {mount}")
+        if not (self.sigma > 0 and self.max_range > 0 and 0 <= self.dropout <= 1):
+            raise ValueError(
+                "Laser: expected sigma and max_range above 0 and dropout in [0, 1], got "
+                f"{self.sigma}, {self.max_range}, {self.dropout}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class LaserWorld:
+    """A robot that drives among exact walls with a laser; `scan_world` draws a history of it."""
+
+    name: str
+    walls: Walls
+    laser: Laser
+    motion: Motion
+    """its noise is on the odometry in the log; the robot drives as the controls say"""
+    controls: ArrayLike
+    """(T, U)"""
+    pose: ArrayLike
+    """(3,) before the first control"""
+
+
+class LaserLog(NamedTuple):
+    """A history of a `LaserWorld`. Row t: the control that led *to* pose t, and the scan there."""
+
+    pose: Float[Array, "T 3"]
+    """the true one"""
+    control: Float[Array, "T U"]
+    """with noise, as the robot records it"""
+    beams: Beams
+    """with leading T"""
+
+
+def true_ranges(laser: Laser, walls: Walls, pose: Float[Array, "3"]) -> Float[Array, "B"]:
+    """The exact ranges [m] of a laser on a robot at a pose, at most max_range."""
+    eye = se2.compose(pose, jnp.asarray(laser.mount, pose.dtype))
+    return exact_ranges(walls, eye, jnp.asarray(laser.angles, pose.dtype), laser.max_range)
+
+
+def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Beams:
+    """A random scan: exact ranges with N(0, σ²) on those below max_range, less the dropouts.
+
+    A noisy range lies within [0, max_range].
+    """
+    exact = true_ranges(laser, walls, pose)
+    key_noise, key_drop = jax.random.split(key)
+    noise = laser.sigma * jax.random.normal(key_noise, exact.shape, exact.dtype)
+    noisy = jnp.clip(exact + noise, 0.0, laser.max_range)
+    valid = jax.random.uniform(key_drop, exact.shape) >= laser.dropout
+    ranges = jnp.where(exact < laser.max_range, noisy, laser.max_range)
+    angles = jnp.asarray(laser.angles, exact.dtype)
+    return Beams(jnp.where(valid, ranges, 0.0), angles, valid)
+
+
+def scan_world(world: LaserWorld, key: Array) -> LaserLog:
+    """A random history of a world: its path, odometry and scans; traceable, as `simulate` is."""
+    check_key("scan_world", key)
+    return programs.call(_scan_world, (world,), key)
+
+
+def _scan_world(world: LaserWorld, key: Array) -> LaserLog:
+    dtype = jnp.result_type(float)
+    key_motion, key_scan = jax.random.split(key)
+    controls = jnp.asarray(world.controls, dtype)
+    start = jnp.asarray(world.pose, dtype)
+    poses, logged = drive(world.motion, start, controls, key_motion, "odometry")
+    keys = jax.random.split(key_scan, len(poses))
+    beams = jax.vmap(lambda pose, k: scan(world.laser, world.walls, pose, k))(poses, keys)
+    return LaserLog(poses, logged, beams)
+
+
+class Observability(NamedTuple):
+    """What one scan can say of the pose (x, y, θ)."""
+
+    information: Float[np.ndarray, "3 3"]
+    """J, Fisher's information in units of 1/m², 1/m and 1/rad²"""
+    bound: Float[np.ndarray, "3 3"]
+    """the Cramér-Rao bound: no unbiased estimate has a smaller covariance than J⁻¹; within the
+    directions that the scan determines (a pseudo-inverse) where there are others"""
+    directions: Float[np.ndarray, "D 3"]
+    """unit motions (dx, dy, dθ) of the pose that change no range"""
+    names: tuple[str, ...]
+    """of these directions: a translation with its heading, or a rotation with its centre"""
+
+
+def observability(
+    laser: Laser, walls: Walls, pose: ArrayLike, *, tolerance: float = 1e-9
+) -> Observability:
+    """The Fisher information of a scan about the pose, its bound, and the degenerate directions.
+
+    J = (1 - dropout)/σ² Σ g gᵀ over beams below max_range, g the derivative of the exact range by
+    the pose, by automatic differentiation. Lengths are measured in median ranges when eigenvalues
+    are compared; a direction is degenerate below `tolerance` times the largest.
+
+    Censi 2007, "On achievable accuracy for range-finder localization", ICRA.
+
+    Raises ValueError if no beam meets a wall.
+    """
+    place = np.asarray(pose, np.float64)
+    if place.shape != (3,):
+        raise ValueError(f"observability: expected a pose (x, y, θ), got {place.shape}")
+    ranges, slopes = programs.call(_ranges_and_slopes, (laser, walls), place)
+    met = np.asarray(ranges) < laser.max_range * (1 - 1e-6)
+    if not met.any():
+        raise ValueError(f"observability: no beam from {place} meets a wall within max_range")
+    g = np.asarray(slopes, np.float64)[met]
+    information = (1 - laser.dropout) / laser.sigma**2 * g.T @ g
+    unit = np.array([1.0, 1.0, 1.0 / float(np.median(np.asarray(ranges)[met]))])
+    values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
+    seen = values > tolerance * values[-1]
+    inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
+    scaled = unit[:, None] * vectors
+    bound = scaled * inverse @ scaled.T
+    free = scaled[:, ~seen].T
+    free = free / np.linalg.norm(free, axis=1, keepdims=True)
+    return Observability(information, bound, free, tuple(_named(d, place, unit[2]) for d in free))
+
+
+def _ranges_and_slopes(laser: Laser, walls: Walls, pose: Array) -> tuple[Array, Array]:
+    def ranges(pose: Array) -> Array:
+        return true_ranges(laser, walls, pose)
+
+    return ranges(pose), jax.jacfwd(ranges)(pose)
+
+
+def _named(direction: Any, pose: Any, per_length: float) -> str:
+    """A motion in words: with turn ω it is a rotation about t + (-dy, dx)/ω."""
+    dx, dy, turn = direction
+    if abs(turn) < 1e-3 * per_length * np.hypot(dx, dy):
+        heading = np.degrees(np.arctan2(dy, dx)) % 180
+        return f"translation along {heading if heading < 179.95 else 0.0:.1f}°"
+    x, y = pose[0] - dy / turn, pose[1] + dx / turn
+    return f"rotation about ({x + 0.0:.2f} m, {y + 0.0:.2f} m)"

@@ -1,0 +1,143 @@
+"""Rooms whose walls a laser sees exactly: segments and circles, without a grid."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jaxslam.grids.grid import Grid
+
+
+class Walls(NamedTuple):
+    """The walls of a world: closed chains of segments, and whole circles, which do not cross.
+
+    Free is what an odd number of them encloses: the inside of an outer wall without that of a
+    pillar.
+    """
+
+    segments: Float[Array, "K 2 2"]
+    """both ends (x, y) of each [m]"""
+    circles: Float[Array, "C 3"]
+    """centre (x, y) and radius of each [m]"""
+
+
+def walls(*chains: ArrayLike, circles: ArrayLike = ()) -> Walls:
+    """The walls of some closed chains, each the corners (N, 2) of a polygon [m], and of circles.
+
+    Raises ValueError on a chain that is not at least three finite corners, a circle that is not
+    (x, y, radius) with radius above 0, and on no wall at all.
+    """
+    segments = [np.zeros((0, 2, 2))]
+    for k, chain in enumerate(chains):
+        corners = np.asarray(chain, np.float64)
+        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+            raise ValueError(
+                f"walls: expected chain {k} of at least three corners (x, y), got {corners.shape}"
+            )
+        segments.append(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+    rounds = (
+        np.asarray(circles, np.float64).reshape(-1, 3) if np.size(circles) else np.zeros((0, 3))
+    )
+    made: Any = Walls(np.concatenate(segments), rounds)  # type: ignore[arg-type]
+    if not all(np.all(np.isfinite(part)) for part in made) or np.any(rounds[:, 2] <= 0):
+        raise ValueError("walls: expected finite numbers and radii above 0")
+    if len(made.segments) + len(rounds) == 0:
+        raise ValueError("walls: expected at least one wall")
+    return Walls(*made)
+
+
+def exact_ranges(
+    world: Walls, pose: Float[Array, "3"], angles: Float[Array, "B"], max_range: float | Array
+) -> Float[Array, "B"]:
+    """The range [m] of each beam to the nearest wall, at most max_range; exact.
+
+    With o the origin and e the direction of the beam: the segment from a to b is met at
+    r = (a - o) × (b - a)/(e × (b - a)), at the share (a - o) × e/(e × (b - a)) of its length; the
+    circle of centre c and radius ρ at r = e·(c - o) ± sqrt(ρ² - |c - o|² + (e·(c - o))²).
+    Differentiable by the pose and by the walls, but where a beam passes an edge.
+    """
+    dtype = jnp.result_type(pose, float)
+    heading = pose[2] + angles
+    e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)[:, None, :]
+    ranges = [jnp.full((len(angles), 1), max_range, dtype)]
+    if len(world.segments):
+        a = jnp.asarray(world.segments[:, 0], dtype)[None] - pose[None, None, :2]
+        along = jnp.asarray(world.segments[:, 1] - world.segments[:, 0], dtype)[None]
+        parallel = _cross(e, along)
+        safe = jnp.where(parallel == 0, 1.0, parallel)
+        r, share = _cross(a, along) / safe, _cross(a, e) / safe
+        met = (parallel != 0) & (r > 0) & (share >= 0) & (share <= 1)
+        ranges.append(jnp.where(met, r, max_range))
+    if len(world.circles):
+        c = jnp.asarray(world.circles[:, :2], dtype)[None] - pose[None, None, :2]
+        ahead = (e * c).sum(axis=-1)
+        reach = jnp.asarray(world.circles[:, 2], dtype)[None] ** 2 - (c * c).sum(axis=-1) + ahead**2
+        root = jnp.sqrt(jnp.where(reach > 0, reach, 1.0))
+        for r in (ahead - root, ahead + root):
+            ranges.append(jnp.where((reach > 0) & (r > 0), r, max_range))
+    return jnp.minimum(jnp.concatenate(ranges, axis=1).min(axis=1), max_range)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def is_free(world: Walls, points: ArrayLike) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Whether points (…, 2) lie in free space: inside an odd number of walls; on the host."""
+    p = np.asarray(points, np.float64)
+    inside = np.zeros(p.shape[:-1], bool)
+    for (ax, ay), (bx, by) in np.asarray(world.segments):
+        over = (ay > p[..., 1]) != (by > p[..., 1])
+        at = ax + (p[..., 1] - ay) * (bx - ax) / (by - ay if by != ay else 1.0)
+        inside ^= over & (p[..., 0] < at)
+    for x, y, radius in np.asarray(world.circles):
+        inside ^= np.hypot(p[..., 0] - x, p[..., 1] - y) < radius
+    return inside
+
+
+def rasterize(
+    world: Walls, resolution: float, *, margin: float = 0.5, samples: int = 8, yaw: float = 0.0
+) -> Grid:
+    """A grid of the share of each cell that is solid, as probability, on the host.
+
+    Of samples × samples points a cell; the share is kept half a sample from 0 and 1, so that the
+    log-odds are finite, and no cell is unknown: a share of exactly ½ counts as a little more. What
+    is not free is solid, so walls between rooms need a thickness, of two cells or more for `cast`.
+
+    Args:
+        resolution: side of a cell [m].
+        margin: of solid cells around the walls [m].
+        samples: points along a side of a cell.
+        yaw: heading of the grid in the world [rad].
+    Raises:
+        ValueError: a resolution or a number of samples that is not above 0.
+    """
+    if not 0 < resolution < np.inf or samples < 1:
+        raise ValueError(
+            f"rasterize: expected a resolution and samples above 0, got {resolution}, {samples}"
+        )
+    corners = [np.asarray(world.segments).reshape(-1, 2)]
+    for x, y, radius in np.asarray(world.circles):
+        turn = 2 * np.pi * np.arange(360) / 360
+        corners.append(np.stack([x + radius * np.cos(turn), y + radius * np.sin(turn)], axis=1))
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn_back = np.array([[c, -s], [s, c]])  # points in rows times this: R(yaw)ᵀ p
+    local = np.concatenate(corners) @ turn_back
+    low = local.min(axis=0) - margin
+    count = np.ceil((local.max(axis=0) + margin - low) / resolution - 1e-9).astype(int)
+    fine = resolution * (np.arange(max(count) * samples) + 0.5) / samples
+    x = low[0] + fine[: count[0] * samples]
+    solid = np.empty((count[1], count[0]))
+    for i in range(count[1]):  # a row of cells at a time
+        y = low[1] + fine[i * samples : (i + 1) * samples]
+        points = np.stack(np.meshgrid(x, y), axis=-1) @ turn_back.T
+        share = ~is_free(world, points)
+        solid[i] = share.reshape(samples, count[0], samples).mean(axis=(0, 2))
+    edge = 0.5 / samples**2
+    solid = np.clip(solid, edge, 1 - edge)
+    solid = np.where(solid == 0.5, 0.5 + 1e-9, solid)
+    origin = np.array([*(turn_back @ low), yaw])
+    made: Any = np.log(solid) - np.log1p(-solid), origin, np.array(resolution)
+    return Grid(*made)

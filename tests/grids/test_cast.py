@@ -1,0 +1,220 @@
+"""Rays: every cell against a slow traversal, ranges against exact geometry, derivatives by pose."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxslam import grids
+from jaxslam.simulation.walls import exact_ranges, is_free, rasterize, walls
+
+ANGLES = np.linspace(-np.pi, np.pi, 37)[:-1] + 0.05
+
+
+def grid_of(log_odds, origin=(0.0, 0.0, 0.0), resolution=0.1):
+    return grids.Grid(
+        np.asarray(log_odds, float), np.asarray(origin, float), np.float64(resolution)
+    )
+
+
+def reference_range(occupied, x, y, angle, limit):
+    """In cells: the least entry of the ray into any occupied cell, tried one by one."""
+    e = np.array([np.cos(angle), np.sin(angle)])
+    best = limit
+    for i, j in np.argwhere(occupied):
+        enter, leave = 0.0, np.inf
+        for start, slope, low in ((x, e[0], j), (y, e[1], i)):
+            a, b = sorted(((low - start) / slope, (low + 1 - start) / slope))
+            enter, leave = max(enter, a), min(leave, b)
+        if enter < leave:
+            best = min(best, enter)
+    return best
+
+
+@pytest.fixture(scope="module")
+def blocks():
+    """A map of random blocks, turned, and poses all over its free cells."""
+    rng = np.random.default_rng(0)
+    cells = rng.random((23, 31)) < 0.06
+    cells[rng.random(cells.shape) < 0.02] = False
+    log_odds = np.where(cells, 2.0, -2.0)
+    log_odds[rng.random(cells.shape) < 0.2] = 0.0  # unknown
+    free = np.argwhere(log_odds < 0)
+    at = free[rng.choice(len(free), 12, replace=False)][:, ::-1] + rng.uniform(0.05, 0.95, (12, 2))
+    heading = rng.uniform(-3, 3, 12)
+    origin = np.array([3.0, -1.0, 0.6])
+    c, s = np.cos(0.6), np.sin(0.6)
+    position = origin[:2] + 0.1 * at @ np.array([[c, s], [-s, c]])
+    return grid_of(log_odds, origin), at, heading, np.column_stack([position, heading + 0.6])
+
+
+def test_a_ray_ends_where_it_enters_the_first_occupied_cell(blocks):
+    grid, at, heading, pose = blocks
+    found = grids.cast(grids.ray_map(grid, method="cells", skip=False), pose, ANGLES, 1.5)
+    occupied = grid.log_odds > 0
+    exact = [
+        [reference_range(occupied, *p, h + a, 15.0) for a in ANGLES]
+        for p, h in zip(at, heading, strict=True)
+    ]
+    np.testing.assert_allclose(found, 0.1 * np.array(exact), atol=1e-12)
+    assert 0.2 < np.mean(np.asarray(found) < 1.5) < 0.99
+
+
+@pytest.mark.parametrize("method", ["cells", "surface"])
+def test_long_steps_through_free_space_change_no_range(blocks, method):
+    grid, _, _, pose = blocks
+    step_by_step, skipping = (
+        grids.cast(grids.ray_map(grid, method=method, skip=skip), pose, ANGLES, 1.5)
+        for skip in (False, True)
+    )
+    np.testing.assert_allclose(skipping, step_by_step, rtol=0, atol=1e-12)
+
+
+def test_many_rays_are_as_few(blocks):
+    grid, _, _, pose = blocks
+    rays = grids.ray_map(grid, method="cells")
+    few = np.asarray(grids.cast(rays, pose, ANGLES, 1.5))
+    many = grids.cast(rays, np.tile(pose, (2, 10, 1)), np.tile(ANGLES, 3), 1.5)  # several chunks
+    np.testing.assert_array_equal(many, np.tile(few, (2, 10, 3)))
+
+
+def test_poses_under_vmap_are_a_batch_of_poses_and_maps_may_vary(blocks):
+    grid, _, _, pose = blocks
+    rays = grids.ray_map(grid)
+    batch = grids.cast(rays, pose, ANGLES, 1.5)
+    each = jax.jit(jax.vmap(lambda p: grids.cast(rays, p, ANGLES, 1.5)))(pose)
+    np.testing.assert_allclose(each, batch, rtol=0, atol=1e-12)
+    moved = jax.tree.map(lambda x: np.stack([x, x]), rays)._replace(
+        origin=np.stack([grid.origin, grid.origin + [0.1, 0, 0]])
+    )
+    two = jax.jit(jax.vmap(lambda r, p: grids.cast(r, p, ANGLES, 1.5)))(
+        moved, np.stack([pose, pose + [0.1, 0, 0]])
+    )
+    np.testing.assert_allclose(two, np.stack([batch, batch]), atol=1e-9)
+    np.testing.assert_allclose(two[0], batch, rtol=0, atol=1e-12)
+
+
+def test_rays_along_the_axes_through_corners_and_from_borders_end():
+    log_odds = np.full((6, 8), -2.0)
+    log_odds[2, 5] = 2.0
+    grid = grid_of(log_odds, resolution=1.0)
+    rays = grids.ray_map(grid, method="cells")
+    quarter = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2])
+    np.testing.assert_allclose(
+        grids.cast(rays, np.array([1.5, 2.5, 0.0]), quarter, 9.0), [3.5, 9, 9, 9]
+    )
+    diagonal = grids.cast(rays, np.array([3.0, 0.0, np.pi / 4]), np.zeros(1), 9.0)
+    np.testing.assert_allclose(diagonal, [2 * np.sqrt(2)])  # through the corners of cells
+    corner = grids.cast(rays, np.array([8.0, 6.0, 0.0]), quarter, 9.0)
+    np.testing.assert_allclose(corner, 9.0)
+    np.testing.assert_array_equal(grids.cast(rays, np.array([5.5, 2.5, 0.0]), quarter, 9.0), 0.0)
+
+
+def rooms():
+    """Slanted walls, a pillar of eight corners and a round one; every solid part is thick."""
+    outer = [[0, 0], [6, 0.7], [7, 4], [3.1, 5.3], [-0.8, 3.6]]
+    turn = 2 * np.pi * np.arange(8) / 8 + 0.2
+    pillar = np.array([4.6, 2.4]) + 0.5 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return walls(outer, pillar, circles=[[1.7, 2.9, 0.45]])
+
+
+def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():
+    """Beams whose exact range is steady under a shift of a cell to either side: none of those that
+    pass an edge, which the grid rounds, or go along a wall."""
+    world, cell = rooms(), 0.05
+    rays = grids.ray_map(rasterize(world, cell, yaw=0.3))
+    rng = np.random.default_rng(1)
+    spots = rng.uniform([-0.5, 0.2], [6.8, 5], (300, 2))
+    near = cell * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
+    spots = spots[is_free(world, spots[:, None] + 2 * near).all(axis=1)][:60]
+    pose = np.column_stack([spots, rng.uniform(-3, 3, len(spots))])
+    found = np.asarray(grids.cast(rays, pose, ANGLES, 5.0))
+    exact_of = jax.jit(
+        jax.vmap(
+            lambda p: jax.vmap(lambda q, a: exact_ranges(world, q, a[None], 5.0)[0])(p, ANGLES)
+        )
+    )
+
+    def shifted(side):
+        heading = pose[:, 2, None] + ANGLES
+        shift = side * cell * np.stack([-np.sin(heading), np.cos(heading), 0 * heading], axis=-1)
+        return np.asarray(exact_of(pose[:, None] + shift))
+
+    left, exact, right = (shifted(side) for side in (1, 0, -1))
+    steady = (np.maximum(np.abs(left - exact), np.abs(right - exact)) < 2 * cell) & (exact < 5)
+    error = np.abs(found - exact)[steady] / cell
+    assert steady.mean() > 0.7
+    assert error.max() < 0.5
+    assert np.median(error) < 0.1
+    # The ends of all other beams lie on a wall as well, or the exact range was cut.
+    heading = pose[:, 2, None] + ANGLES
+    ends = pose[:, None, :2] + found[..., None] * np.stack(
+        [np.cos(heading), np.sin(heading)], axis=-1
+    )
+    around = cell / 2 * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
+    sides = is_free(world, ends[:, :, None] + around)
+    assert np.all(sides.any(axis=2) & ~sides.all(axis=2) | (found >= 5))
+
+
+@pytest.mark.parametrize("method", ["cells", "surface"])
+def test_the_derivative_by_the_pose_is_that_of_a_wall(method):
+    world, cell = rooms(), 0.05
+    rays = grids.ray_map(rasterize(world, cell, yaw=0.3), method=method)
+    pose = np.array([[3.0, 2.1, 0.4], [2.6, 3.9, -1.0], [5.7, 2.2, 2.0]])
+    slopes = jax.jit(jax.vmap(jax.jacfwd(lambda p: grids.cast(rays, p, ANGLES, 9.0))))(pose)
+    exact = jax.jit(jax.vmap(jax.jacfwd(lambda p: exact_ranges(world, p, ANGLES, 9.0))))(pose)
+    level = np.linalg.norm(np.asarray(exact)[..., :2], axis=-1) < 2  # less than 60° from the normal
+    error = np.abs(slopes - exact)[level] / [1.0, 1.0, 2.0]  # by the heading as by a shift at 2 m
+    assert level.mean() > 0.7
+    assert np.median(error) < 0.02
+    assert np.mean(error < 0.1) > 0.9
+
+
+@pytest.mark.parametrize("method", ["cells", "surface"])
+def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(blocks, method):
+    grid, at, _, pose = blocks
+    rays = grids.ray_map(grid, method=method)
+    blocked = np.argwhere(grid.log_odds > 0)[:4, ::-1]
+    c, s = np.cos(0.6), np.sin(0.6)
+    hard = np.concatenate([blocked + 0.5, blocked, [[0, 0], [31, 23], [-5, 90], [31, 5.5]]])
+    world = grid.origin[:2] + 0.1 * hard @ np.array([[c, s], [-s, c]])
+    poses = np.concatenate([pose, np.column_stack([world, np.full(len(world), 0.6)])])
+    angles = np.concatenate([ANGLES[::6], [0.0, np.pi / 2, np.pi, np.pi / 4]])
+    slope = jax.jit(jax.vmap(jax.grad(lambda p: grids.cast(rays, p, angles, 1.5).sum())))(poses)
+    assert np.all(np.isfinite(slope))
+    assert np.all(slope[-2] == 0)  # off the map
+
+
+@pytest.mark.parametrize(
+    ("call", "reason"),
+    [
+        (
+            lambda g: grids.cast(g, np.array([9.0, 0.1, 0.0]), ANGLES, 1.0),
+            r"pose 0, .*, is off the map",
+        ),
+        (lambda g: grids.cast(g, np.array([0.1, np.nan, 0.0]), ANGLES, 1.0), "pose 0"),
+        (lambda g: grids.cast(g, np.zeros(2), ANGLES, 1.0), r"expected poses \(x, y, θ\)"),
+        (lambda g: grids.cast(g, np.zeros(3), ANGLES[:0], 1.0), "expected angles of shape"),
+        (lambda g: grids.cast(g, np.zeros(3), ANGLES * np.nan, 1.0), "expected finite angles"),
+        (lambda g: grids.cast(g, np.zeros(3), ANGLES, -1.0), "expected one max_range above 0"),
+        (
+            lambda g: grids.ray_map(g._replace(log_odds=np.ones((2, 2)))),
+            "ray_map: the map has no free cell",
+        ),
+        (lambda g: grids.ray_map(g, method="lut"), "ray_map: expected a method of surface, cells"),
+    ],
+)
+def test_bad_input_is_refused(call, reason):
+    with pytest.raises(ValueError, match=reason):
+        call(grid_of(np.full((5, 6), -1.0)))
+
+
+def test_rays_in_float32(blocks):
+    grid, _, _, pose = blocks
+    single = jax.tree.map(np.float32, grid)
+    for method in ("cells", "surface"):
+        exact = grids.cast(grids.ray_map(grid, method=method), pose, ANGLES, 1.5)
+        found = grids.cast(
+            grids.ray_map(single, method=method), np.float32(pose), np.float32(ANGLES), 1.5
+        )
+        assert found.dtype == np.float32
+        assert np.mean(np.abs(found - exact) < 1e-4) > 0.99  # a ray through a corner may part

@@ -1,0 +1,167 @@
+"""ROS maps in and out: shades to log-odds by hand, exact round trips, and errors with file and line."""
+
+import math
+
+import numpy as np
+import pytest
+import recordings
+
+from jaxslam import grids
+from jaxslam.datasets.ros_map import CERTAIN
+
+YAML = """# a map
+image: map.pgm
+resolution: 0.05   # metres
+origin: [-1.5, 2.0, 0.25]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+# The top row first: 0 black, 254 nearly white, 205 grey; 100 is p = 0.608.
+SHADES = [[0, 254, 205], [100, 255, 10]]
+
+
+def made(folder, yaml=YAML, image=None):
+    if image is None:
+        image = b"P5\n# by hand\n3 2\n255\n" + bytes(SHADES[0] + SHADES[1])
+    (folder / "map.pgm").write_bytes(image)
+    path = folder / "map.yaml"
+    path.write_text(yaml, encoding="utf-8")
+    return path
+
+
+def same(a, b):
+    for one, two in zip(a, b, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def logit(p):
+    return math.log(p / (1 - p))
+
+
+def test_a_trinary_map_by_hand(tmp_path):
+    grid = grids.read_map(made(tmp_path))
+    o = CERTAIN
+    np.testing.assert_array_equal(grid.log_odds, [[0, -o, o], [o, -o, 0]])  # the last row first
+    np.testing.assert_array_equal(grid.origin, [-1.5, 2.0, 0.25])
+    assert grid.resolution == 0.05
+    np.testing.assert_array_equal(grid.known, [[False, True, True], [True, True, False]])
+    assert logit(1 - 0.5 / 255) == pytest.approx(CERTAIN)
+
+
+def test_scale_and_negate_by_hand(tmp_path):
+    yaml = YAML.replace("negate: 0", "mode: scale\nnegate: true")
+    grid = grids.read_map(made(tmp_path, yaml))
+    p = (100 / 255 - 0.196) / (0.65 - 0.196)
+    o = CERTAIN
+    np.testing.assert_allclose(grid.log_odds, [[logit(p), o, -o], [-o, o, o]], atol=1e-12)
+
+
+def test_text_images_wide_shades_and_lists_in_lines(tmp_path):
+    expected = grids.read_map(made(tmp_path))
+    text = b"P2 # text\n3 2\n255\n0 254 205\n# half way\n100 255 10\n"
+    same(grids.read_map(made(tmp_path, image=text)), expected)
+    wide = b"P5 3 2 65535\n" + np.array(SHADES, ">u2").__mul__(257).astype(">u2").tobytes()
+    same(grids.read_map(made(tmp_path, image=wide)), expected)
+    lines = YAML.replace("[-1.5, 2.0, 0.25]", "\n- -1.5\n- 2.0\n- 0.25").replace(
+        "map.pgm", '"map.pgm"'
+    )
+    same(grids.read_map(made(tmp_path, lines)), expected)
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale"])
+def test_round_trips_are_exact(tmp_path, mode):
+    first = grids.read_map(made(tmp_path))
+    out = tmp_path / "out"
+    paths = grids.write_map(out / "again.yaml", first, mode=mode)
+    assert [path.name for path in paths] == ["again.yaml", "again.pgm"]
+    same(grids.read_map(out / "again.yaml"), first)
+
+
+@pytest.mark.parametrize("top", [254, 255])
+def test_every_level_of_a_scaled_map_survives(tmp_path, top):
+    image = f"P5 {top + 1} 1 {top}\n".encode() + bytes(range(top + 1))
+    yaml = YAML.replace("0.65", "1").replace("0.196", "0").replace("negate", "mode: scale\nnegate")
+    grid = grids.read_map(made(tmp_path, yaml, image))
+    assert np.sum(~grid.known) == (top == 254)
+    assert len(np.unique(grid.log_odds)) == top + 1
+    _, pgm = grids.write_map(tmp_path / "b.yaml", grid, mode="scale")
+    assert pgm.read_bytes() == f"P5\n{top + 1} 1\n{top}\n".encode() + bytes(range(top + 1))
+    same(grids.read_map(tmp_path / "b.yaml"), grid)
+
+
+def test_the_map_of_turtlebot(tmp_path):
+    path = recordings.folder("maps") / "turtlebot3_world.yaml"
+    grid = grids.read_map(path)
+    counts = [int(np.sum(c)) for c in (grid.log_odds > 0, grid.log_odds < 0, grid.log_odds == 0)]
+    assert counts == [870, 7903, 138683]
+    np.testing.assert_array_equal(grid.origin, [-10.0, -10.0, 0.0])
+    grids.write_map(tmp_path / "map.yaml", grid)
+    same(grids.read_map(tmp_path / "map.yaml"), grid)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "reason"),
+    [
+        ("map.pgm", "none.pgm", 2, "no image"),
+        ("0.05", "0", 3, "expected a resolution above 0"),
+        ("0.05", "-0.05", 3, "expected a resolution above 0"),
+        ("0.05", "fine", 3, "resolution is not a finite number: 'fine'"),
+        ("0.05", "nan", 3, "resolution is not a finite number"),
+        ("-1.5, 2.0, 0.25", "-1.5, 2.0", 4, "expected origin: [x, y, yaw], got [-1.5, 2.0]"),
+        ("-1.5, 2.0, 0.25", "-1.5, 2.0, inf", 4, "yaw is not a finite number"),
+        ("negate: 0", "negate: 2", 5, "expected negate to be 0 or 1"),
+        ("negate: 0", "mode: raw\nnegate: 0", 5, "expected mode to be trinary or scale"),
+        ("0.65", "0.1", 6, "expected 0 <= free_thresh < occupied_thresh <= 1"),
+        ("negate: 0", "negat: 0", 5, "unknown key 'negat'"),
+        ("negate: 0", "negate 0", 5, "expected `key: value`"),
+        ("negate: 0", "resolution: 0.05", 5, "resolution occurs twice"),
+        ("negate: 0\n", "", 6, "negate is missing"),
+    ],
+)
+def test_a_bad_yaml_is_refused_with_its_line(tmp_path, old, new, line, reason):
+    path = made(tmp_path, YAML.replace(old, new))
+    recordings.assert_error(path, line, reason, lambda: grids.read_map(path))
+
+
+@pytest.mark.parametrize(
+    ("image", "reason"),
+    [
+        (b"\x89PNG\r\n\x1a\n123", "expected a PGM image (P5 or P2), got PNG"),
+        (b"P6 3 2 255\n", "got P6"),
+        (b"", "got another format"),
+        (b"P5 3 2 255\n123", "the image ends after 3 of 6 bytes"),
+        (b"P2 3 2 255\n1 2 3", "the image ends after 3 of 6 numbers"),
+        (b"P2 3 2 255\n1 2 3 4 5 x", "expected a whole number, got 'x'"),
+        (b"P5 3 -2 255\n123456", "expected a whole number, got '-2'"),
+        (b"P5 0 2 255\n", "expected an image of at least 1 × 1"),
+        (b"P2 3 2 9\n1 2 3 4 5 10", "a shade of 10 is above the largest, 9"),
+    ],
+)
+def test_a_bad_image_is_refused(tmp_path, image, reason):
+    path = made(tmp_path, image=image)
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 the message is looked at below
+        grids.read_map(path)
+    assert str(caught.value).startswith(f"{tmp_path / 'map.pgm'}: ")
+    assert reason in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises((ValueError, OSError), match=r"none\.yaml"):
+        grids.read_map(tmp_path / "none.yaml")
+
+
+def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path):
+    grid = grids.read_map(made(tmp_path))
+    for path, wrong, mode, reason in [
+        ("a.yaml", grid._replace(log_odds=np.full((2, 2), np.nan)), "trinary", "unknown is 0"),
+        ("a.yaml", grid._replace(log_odds=np.zeros((0, 2))), "trinary", "expected log-odds"),
+        ("a.yaml", grid._replace(origin=np.zeros(2)), "trinary", "an origin that is a pose"),
+        ("a.yaml", grid._replace(resolution=0.0), "trinary", "a resolution above 0"),
+        ("a.yaml", "grid", "trinary", "expected a Grid"),
+        ("a.yaml", grid, "raw", "expected mode"),
+        ("a.pgm", grid, "trinary", "expected a path NAME.yaml"),
+    ]:
+        with pytest.raises(ValueError, match=f"write_map: .*{reason}"):
+            grids.write_map(tmp_path / "new" / path, wrong, mode=mode)
+    assert not (tmp_path / "new").exists()

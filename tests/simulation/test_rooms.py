@@ -1,0 +1,150 @@
+"""Worlds of exact walls: ranges by hand, scans as their laser says, and what a scan cannot see."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxslam.simulation.laser import Laser, observability, scan, scan_world
+from jaxslam.simulation.scenarios import ROOMS, circular_room, corridor, office, square
+from jaxslam.simulation.walls import exact_ranges, is_free, rasterize, walls
+
+
+def reference_range(world, x, y, angle, limit):
+    """By the intersection of two lines, one wall at a time."""
+    e, best = np.array([np.cos(angle), np.sin(angle)]), limit
+    for a, b in np.asarray(world.segments):
+        try:
+            r, share = np.linalg.solve(np.stack([e, a - b], axis=1), a - [x, y])
+        except np.linalg.LinAlgError:
+            continue
+        if r > 0 and 0 <= share <= 1:
+            best = min(best, r)
+    for cx, cy, radius in np.asarray(world.circles):
+        roots = np.roots([1, 2 * e @ [x - cx, y - cy], (x - cx) ** 2 + (y - cy) ** 2 - radius**2])
+        best = min([best, *(r.real for r in roots if abs(r.imag) < 1e-12 and r.real > 0)])
+    return best
+
+
+def test_exact_ranges_are_intersections_with_every_wall(differences):
+    turn = 2 * np.pi * np.arange(5) / 5
+    star = np.stack([np.cos(turn), np.sin(turn)], axis=1) * [[5], [4], [5], [6], [4]]
+    world = walls(star, [[1, 1], [2, 1], [1.4, 2]], circles=[[-2, 0, 0.7]])
+    rng = np.random.default_rng(0)
+    pose = np.column_stack([rng.uniform(-1, 1, (20, 2)), rng.uniform(-3, 3, 20)])
+    angles = np.linspace(-3, 3, 25)
+    both = jax.jit(
+        jax.vmap(
+            lambda p: (
+                exact_ranges(world, p, angles, 4.5),
+                jax.jacfwd(exact_ranges, 1)(world, p, angles, 4.5),
+            )
+        )
+    )
+    found, slopes = both(pose)
+    exact = [[reference_range(world, x, y, h + a, 4.5) for a in angles] for x, y, h in pose]
+    np.testing.assert_allclose(found, exact, atol=1e-12)
+    error = np.abs(slopes - differences(lambda p: both(p)[0], (pose,), 0, 1e-7)).max(axis=2)
+    assert np.mean(error < 1e-5) > 0.99  # but where a beam passes an edge between the two sides
+    assert np.all(np.isfinite(slopes))
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_the_robot_drives_in_free_space_and_its_scans_are_the_lasers(name):
+    world = ROOMS[name](beams=24)
+    log = scan_world(world, jax.random.key(0))
+    assert np.all(is_free(world.walls, np.asarray(log.pose)[:, :2]))
+    laser = world.laser
+    exact = np.array(
+        jax.jit(jax.vmap(lambda p: exact_ranges(world.walls, p, laser.angles, laser.max_range)))(
+            log.pose
+        )
+    )
+    valid = np.asarray(log.beams.valid)
+    n = valid.size
+    assert abs((~valid).mean() - laser.dropout) < 5 * np.sqrt(laser.dropout / n)
+    met = valid & (exact < laser.max_range - 6 * laser.sigma)
+    error = (np.asarray(log.beams.range) - exact)[met] / laser.sigma
+    assert abs(error.mean()) < 5 / np.sqrt(met.sum())
+    assert abs(error.std() - 1) < 5 / np.sqrt(2 * met.sum())
+    beyond = valid & (exact >= laser.max_range)
+    assert np.all(np.asarray(log.beams.range)[beyond] == laser.max_range)
+    assert np.asarray(log.control)[:, 0].std() > 0.03  # the odometry has noise
+
+
+def test_free_space_is_what_an_odd_number_of_walls_encloses():
+    world = walls([[0, 0], [4, 0], [4, 4], [0, 4]], [[1, 1], [2, 1], [2, 2]], circles=[[3, 3, 0.5]])
+    points = [[0.5, 2], [1.9, 1.5], [1.1, 1.9], [3, 3], [3, 2], [5, 1]]
+    np.testing.assert_array_equal(is_free(world, points), [True, False, True, False, True, False])
+
+
+def test_a_grid_of_shares_has_the_area_of_the_room():
+    world = circular_room().walls
+    grid = rasterize(world, 0.1, yaw=0.4)
+    area = 0.01 * np.sum(1 - np.asarray(grid.probability))
+    edge = 0.01 * grid.log_odds.size * 0.5 / 64
+    assert area == pytest.approx(np.pi * 9, abs=edge + 0.02)
+    assert np.all(grid.known)
+
+
+def test_the_directions_that_a_scan_does_not_see_are_named():
+    room, hall = circular_room(), corridor()
+    found = observability(room.laser, room.walls, [0.7, -1.1, 0.3])
+    assert found.names == ("rotation about (0.00 m, 0.00 m)",)
+    about = np.array([1.1, 0.7, 1.0])
+    np.testing.assert_allclose(
+        np.abs(found.directions[0]), about / np.linalg.norm(about), atol=1e-6
+    )
+    np.testing.assert_allclose(found.information @ about, 0, atol=1e-6 * found.information.max())
+    found = observability(hall.laser, hall.walls, [20.0, 0.2, 0.5])
+    assert found.names == ("translation along 0.0°",)
+    assert np.sqrt(found.bound[1, 1]) < 0.01
+    for world, pose in ((square(), [2, 3, 0.1]), (hall, [3, 0.2, 0.5]), (office(), [1.8, 1.5, 0])):
+        assert observability(world.laser, world.walls, pose).names == ()
+
+
+def test_maximum_likelihood_estimates_reach_the_cramer_rao_bound():
+    """400 draws, three steps of Gauss and Newton each: the mean NEES under the bound is 3."""
+    world = square(beams=60)
+    laser, pose = world.laser, np.array([2.1, 3.4, 0.3])
+    bound = observability(laser, world.walls, pose).bound
+
+    def ranges(pose):
+        return exact_ranges(world.walls, pose, laser.angles, laser.max_range)
+
+    def estimate(key):
+        beams = scan(laser, world.walls, pose, key)
+        weight = beams.valid / laser.sigma**2
+        found = jax.numpy.asarray(pose) + 0.02
+        for _ in range(3):
+            g = jax.jacfwd(ranges)(found)
+            step = jax.scipy.linalg.solve(
+                g.T @ (weight[:, None] * g), g.T @ (weight * (beams.range - ranges(found)))
+            )
+            found = found + step
+        return found
+
+    error = np.asarray(jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(1), 400))) - pose
+    nees = np.einsum("ni,ij,nj->n", error, np.linalg.inv(bound), error)
+    assert abs(nees.mean() - 3) < 4 * np.sqrt(6 / 400) + 0.1
+
+
+@pytest.mark.parametrize(
+    ("call", "reason"),
+    [
+        (lambda: walls(), "walls: expected at least one wall"),
+        (lambda: walls([[0, 0], [1, 1]]), "walls: expected chain 0 of at least three corners"),
+        (lambda: walls(circles=[[0, 0, 0]]), "walls: expected finite numbers and radii above 0"),
+        (lambda: Laser([]), "Laser: expected finite angles"),
+        (lambda: Laser([0.0], sigma=0.0), "Laser: expected sigma and max_range above 0"),
+        (lambda: Laser([0.0], dropout=2.0), "dropout in"),
+        (lambda: Laser([0.0], mount=(0, 0)), "Laser: expected a mount that is a pose"),
+        (lambda: rasterize(square().walls, 0.0), "rasterize: expected a resolution"),
+        (
+            lambda: observability(Laser([0.0], max_range=0.1), square().walls, [3, 3, 0]),
+            "no beam from",
+        ),
+    ],
+)
+def test_bad_input_is_refused(call, reason):
+    with pytest.raises(ValueError, match=reason):
+        call()
