@@ -134,7 +134,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     film = ""
     if options.animate:
         films = write_films(out, scenario, filters, asked["seed"], campaign.dtype)
-        film = next(iter(films.values())).player()
+        film = "" if written else next(iter(films.values())).player()
     if written:
         more = "but films" if options.animate else "and nothing written"
         print(

@@ -21,7 +21,12 @@ QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
 def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch):
     out, filmed = tmp_path / "results", []
-    monkeypatch.setattr(cli.campaign, "write_films", lambda *given: filmed.append(given))
+
+    def write_films(*given):
+        filmed.append(given)
+        return {"ekf": SimpleNamespace(player=lambda: "<p>the film of ekf</p>")}
+
+    monkeypatch.setattr(cli.campaign, "write_films", write_films)
     asked = ["--filters", "ekf,ideal", "--seed", "4", "--animate", "--out", str(out)]
     assert cli.main([*QUICK, *asked]) == 0
     printed = capsys.readouterr().out
@@ -50,6 +55,7 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
     assert (found["runs"], found["steps"], found["seed"]) == (3, 8, 4)
     assert list(found["filters"]) == ["ekf", "ideal"]
     assert found["command"].startswith("jaxslam consistency --scenario circle")
+    assert "<p>the film of ekf</p>" in (out / "report.html").read_text(encoding="utf-8")
     ((folder, world, filters, *rest),) = filmed
     assert (folder, world.name, list(filters), rest) == (
         out,
