@@ -59,10 +59,11 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / f"jax-{
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("JAX_ENABLE_X64", "1")
+os.environ["JAXSLAM_PROGRESS"] = "0"  # `!jaxslam …` in a cell runs in a terminal, by IPython
 
 # `!jaxslam …` in a page is the command of this environment.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-os.environ |= {"COLUMNS": "100", "TERM": "dumb"}  # no bar of progress
+os.environ["COLUMNS"] = "100"
 
 # The reference.
 default_role = "code"

@@ -29,8 +29,9 @@ from jaxslam.linearize.at_truth import at_truth
 from jaxslam.linearize.first_estimate import first_estimate
 from jaxslam.linearize.observability import observability
 from jaxslam.linearize.unscented import unscented
-from jaxslam.protocols import Candidate, Filter
+from jaxslam.protocols import Candidate, Estimator, Filter
 from jaxslam.simulation.worlds import Scenario
+from jaxslam.smoothing.batch_map import batch_map
 from jaxslam.smoothing.fixed_lag import fixed_lag
 from jaxslam.types import Info, Scan, Truth
 
@@ -107,6 +108,16 @@ def in_a_window(scenario: Scenario, *, first_estimates: bool = False, **options:
         first_estimates=first_estimates,
         **mine,
     )
+
+
+def in_one_batch(scenario: Scenario, **options: Any) -> Callable[[Truth], Estimator]:
+    """The graph of the whole log (`smoothing.batch_map`), with those options of `ekf_slam` that it
+    has: a function of the truth, which it does not use, that returns the estimator."""
+    asked = scenario.filter_options | options
+    mine = {name: asked[name] for name in ("gate", "associate", "births") if name in asked}
+    capacity = int(np.shape(scenario.landmarks)[0])
+    start = np.asarray(scenario.pose), np.asarray(scenario.pose_cov)
+    return lambda truth: batch_map(scenario.motion, scenario.sensor, capacity, *start, **mine)
 
 
 WINDOW = 5
@@ -224,15 +235,16 @@ CANONICAL: dict[str, Callable[..., Candidate]] = {
 SMOOTHERS: dict[str, Callable[..., Candidate]] = {
     "fixed_lag": in_a_window,
     "fixed_lag_fej": lambda world, **more: in_a_window(world, first_estimates=True, **more),
+    "batch_map": in_one_batch,
 }
-"""The fixed-lag smoothers; as FILTERS."""
+"""The fixed-lag smoothers, and the batch solution of the whole log; as FILTERS."""
 
 KINDS: dict[str, tuple[str, ...]] = {
     "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
     "consistent Jacobians": ("fej", "oc"),
     "error coordinates": ("right_invariant", "left_invariant", "robocentric"),
     "unscented": ("ukf", "ukf_right", "ukf_left"),
-    "fixed lag": ("fixed_lag", "fixed_lag_fej"),
+    "smoothing": ("fixed_lag", "fixed_lag_fej", "batch_map"),
     "information": ("eif_slam", "seif", "eseif"),
     "particles": ("fastslam1", "fastslam2", "particle_localization"),
     "baselines": ("dead_reckoning", "localization"),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.catalog import ALL, CANONICAL
+from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS
 from jaxslam.cli.common import pick
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.settings import association_options
@@ -63,6 +63,11 @@ def _filter(name: str, candidate: Any, data: Dataset) -> Filter:
         raise ValueError(f"--filters: {name} needs the tag of every measurement")
     if isinstance(candidate, Filter):
         return candidate
+    if name in SMOOTHERS:
+        raise ValueError(
+            f"--filters: {name} takes a whole log at once, which `jaxslam run` does not: call "
+            f"jaxslam.smoothing.{name} from Python"
+        )
     if name == "ideal" or not data.one_frame or data.landmarks is None:
         needs = (
             "the true path of a simulation"

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from jaxslam.datasets.bonn import bonn
+from jaxslam.datasets.carmen import LaserLog, carmen
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam import mrclam, mrclam_team
 from jaxslam.datasets.mrclam_calibration import MRCLAM_CALIBRATION, Calibration
@@ -48,7 +49,9 @@ __all__ = [
     "Calibration",
     "Dataset",
     "DatasetFit",
+    "LaserLog",
     "bonn",
+    "carmen",
     "fit",
     "mrclam",
     "mrclam_team",

@@ -11,14 +11,15 @@ from jaxslam.consistency import DOF, Measure
 class Progress:
     """A progress bar on a terminal's standard error or below a notebook's cell, gone at the end.
 
-    Where there is neither, as in a pipe, or where TERM is "dumb", nothing is written and `shown` is
-    false.
+    Where there is neither, as in a pipe, or where the environment has TERM=dumb or
+    JAXSLAM_PROGRESS=0, nothing is written and `shown` is false.
     """
 
     def __init__(self, what: str, unit: str = "runs") -> None:
         self._what, self._unit = what, unit
         self._began = time.perf_counter()
-        plain = os.environ.get("TERM") == "dumb"
+        here = os.environ
+        plain = here.get("TERM") == "dumb" or here.get("JAXSLAM_PROGRESS") == "0"
         self._terminal = not plain and sys.stderr is not None and sys.stderr.isatty()
         self._cell = None if plain or self._terminal else _notebook_cell()
         self._first: tuple[float, int] | None = None

@@ -168,6 +168,7 @@ def test_several_filters_side_by_side(tmp_path, capsys):
         (["--filters", "ekf,ekf"], "--filters: expected different names"),
         (["--filters", "ekf,"], "--filters: expected different names"),
         (["--filters", "ideal"], "--filters: ideal needs the true path of a simulation"),
+        (["--filters", "batch_map"], "--filters: batch_map takes a whole log at once"),
         (["--filters", "seif"], "--filters: seif needs the tag of every measurement"),
         (["--gate", "9.2", "--associate", "joint"], "--gate: expected a probability"),
         (["--gate", "0.9"], "--gate: expected --associate beside it"),

@@ -1,4 +1,4 @@
-"""Fixed-lag smoothers: the window learns a heading it cannot know, unless Jacobians stay put."""
+"""Smoothing: a window of poses learns a heading it cannot know, unless Jacobians stay put."""
 
 import jax
 

@@ -1,0 +1,105 @@
+"""Laser logs: what is read of each line, what is dropped and said, and errors with their line."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from benchmarks.real_data import DATA
+from jaxslam import datasets
+
+ODOM = "ODOM {x} 0.5 7.0 0.1 0.2 0 12.5 host {t}"
+FLASER = "FLASER 4 1.5 nan 81.91 0 1 2 0.5 1 2 0.5 3.25 host {t}"
+FIRST = "ROBOTLASER1 0 -1.5 3.0 0.5 50 0.1 0 3 1 2 60 1 9 4 5 0.5 6 7 -0.5 0 0 0 0 0 1.0 x 8.5"
+
+
+def written(path, *lines, end="\n"):
+    path.write_text("\n".join(lines) + end)
+    return path
+
+
+@pytest.fixture
+def log(tmp_path):
+    lines = "# x", "PARAM a b", FLASER.format(t=1), ODOM.format(x=1, t=2), ODOM.format(x=3, t=4)
+    return datasets.carmen(written(tmp_path / "room.log", *lines, FLASER.format(t=5), FIRST))
+
+
+def test_every_line_is_read(log):
+    assert (log.name, log.max_range) == ("room", 50.0)
+    np.testing.assert_allclose(log.time, [1, 5, 8.5])
+    np.testing.assert_allclose(log.odometry, [[1, 0.5, 7 - 2 * np.pi], [3, 0.5, 7 - 2 * np.pi]])
+    np.testing.assert_allclose(log.odometry_time, [2, 4])
+    np.testing.assert_array_equal(log.row, [-1, 1, 1])
+    np.testing.assert_allclose(log.raw[:, 0], [1, 3, 3])
+    np.testing.assert_allclose(log.corrected, [[1, 2, 0.5], [1, 2, 0.5], [4, 5, 0.5]])
+    np.testing.assert_allclose(log.beams.range[1], [1.5, 0, 50, 0])
+    np.testing.assert_array_equal(log.beams.valid[1], [True, False, True, False])
+    np.testing.assert_allclose(np.rad2deg(log.beams.angle[1]), [-90, -45, 0, 45])
+    np.testing.assert_allclose(log.beams.angle[2, :3], [-1.5, -1.0, -0.5])
+    np.testing.assert_array_equal(log.beams.valid[2], [True, True, True, False])
+
+
+def test_what_is_dropped_and_changed_is_told(log):
+    assert log.dropped == {"comments": 1, "lines PARAM": 1, "beams without a range": 4}
+    assert log.corrections == ("scans before the first ODOM line, which take its pose: 1",)
+
+
+@pytest.mark.parametrize(
+    ("beams", "step"), [(180, 1.0), (181, 1.0), (360, 0.5), (361, 0.5), (1, 180.0)]
+)
+def test_angles_follow_from_the_number_of_beams(tmp_path, beams, step):
+    line = f"FLASER {beams} {'1.0 ' * beams}0 0 0 0 0 0 1 host 1"
+    angle = np.rad2deg(datasets.carmen(written(tmp_path / "a.log", line)).beams.angle[0])
+    np.testing.assert_allclose(angle, -90 + step * np.arange(beams), atol=1e-9)
+
+
+def test_a_packed_log_without_odometry(tmp_path):
+    (tmp_path / "lab.log.gz").write_bytes(gzip.compress(f"{FIRST}\n".encode()))
+    log = datasets.carmen(tmp_path / "lab.log", max_range=1.5)
+    np.testing.assert_allclose(log.raw, [[6, 7, -0.5]])
+    np.testing.assert_allclose(log.beams.range, [[1, 1.5, 1.5]])
+    assert log.odometry.shape == (0, 3)
+    assert "no ODOM lines" in log.corrections[0]
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        (FLASER.format(t=1)[:30], "expected 15 fields in this line FLASER, got"),
+        ("FLASER", "FLASER ends after 1 fields"),
+        ("FLASER four 1 2", "number of values is not a whole number"),
+        (FLASER.format(t=1).replace("81.91", "1,5"), "range 3 is no number: '1,5'"),
+        (FLASER.format(t="x"), "logger time is not a finite number"),
+        ("ODOM 1 2 3", "expected 9 fields"),
+        (ODOM.format(x="nan", t=1), "x is not a finite number"),
+        (FIRST[:70], "expected"),
+    ],
+)
+def test_a_bad_line_is_named(tmp_path, line, why):
+    path = written(tmp_path / "bad.log", FLASER.format(t=1), line, end="")
+    with pytest.raises(ValueError, match=f"bad.log:2: .*{why}"):
+        datasets.carmen(path)
+
+
+def test_a_file_without_scans_and_a_range_below_zero_are_refused(tmp_path):
+    path = written(tmp_path / "none.log", ODOM.format(x=1, t=2))
+    with pytest.raises(ValueError, match=r"none\.log:1: expected a line FLASER"):
+        datasets.carmen(path)
+    with pytest.raises(ValueError, match="max_range above 0"):
+        datasets.carmen(path, max_range=0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "scans", "beams", "lines"),
+    [("intel", 910, 180, 14541), ("csail", 406, 361, 2394), ("freiburg-101", 292, 360, 4569)],
+)
+def test_public_logs(name, scans, beams, lines):
+    path = DATA / "carmen" / f"{name}-corrected.log"
+    if not path.with_suffix(".log.gz").exists():
+        pytest.skip("the public logs are not here")
+    log = datasets.carmen(path)
+    assert log.beams.range.shape == (scans, beams)
+    assert (len(log.odometry), len(log.row)) == (lines, scans)
+    assert log.beams.range.max() == log.max_range
+    turned = np.abs(np.angle(np.exp(1j * np.diff(log.corrected[:, 2]))))
+    assert np.median(turned) < 1.0
