@@ -18,6 +18,8 @@ def draws(found, dof):
     nees, ordered, cost = panels
     for i, (scale, each) in enumerate(found.items()):
         good = ~each.failed
+        if good.sum() < 2:
+            continue
         name = f"noise × {scale:g}"
         pose = np.arange(1, each.nees.shape[1] + 1)
         curve(nees, i, pose, each.nees[good].mean(axis=0), name)
@@ -27,12 +29,12 @@ def draws(found, dof):
         ratio = np.sort(each.chi2[good]) / dof
         curve(cost, i, ratio, (np.arange(len(ratio)) + 0.5) / len(ratio), name)
     nees.axhline(3, color=INK, lw=0.8, zorder=1.5)
-    nees.set_yscale("log")
+    nees.set_ylim(bottom=0)
     nees.set_xlabel("pose")
-    titled(nees, "pose NEES, average of the draws (dof 3)")
+    titled(nees, "pose NEES (dof 3)")
     ordered.plot([0, 1], [0, 1], color=INK, lw=0.8, label="honest")
     ordered.set_xlabel("share of the poses")
-    titled(ordered, "probability that they lie within")
+    titled(ordered, "probability of their region")
     x = np.linspace(*cost.get_xlim(), 200)
     cost.plot(x, scipy.stats.chi2(dof).cdf(x * dof), color=INK, lw=0.8, label="honest")
     cost.set_xlabel("χ² of the optimum / dof")

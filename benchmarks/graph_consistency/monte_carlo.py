@@ -18,6 +18,18 @@ from jaxslam.math import stats
 
 SCALES = (1.0, 3.0, 10.0)
 
+MERITS = (
+    "pose NEES",
+    "its 95 % interval ±",
+    "poses within 95 %",
+    "χ² / dof",
+    "χ²: p of Kolmogorov-Smirnov",
+    "RMSE / bound",
+    "wrong minima from chordal",
+    "certificate fails",
+    "not converged",
+)
+
 
 class Draws(NamedTuple):
     """What came of the draws at one noise, a row each."""
@@ -35,7 +47,7 @@ class Draws(NamedTuple):
     certified: np.ndarray
     """whether the chordal surrogate's optimum beside the second is proved global"""
     failed: np.ndarray
-    """whether an optimization did not converge"""
+    """whether the optimization from the truth did not converge; such draws have no figures"""
 
 
 def draws(graph, scale, runs, block=8):
@@ -58,7 +70,7 @@ def draws(graph, scale, runs, block=8):
         nees = np.einsum("rni,rni->rn", error, np.linalg.solve(cov, error[..., None])[..., 0])
         square = (error[..., :2] ** 2).sum(axis=-1)
         wrong = again[2] > found[2] * (1 + 1e-6)
-        rows.append((found[2], nees, square, wrong, certified, found[3] | again[3]))
+        rows.append((found[2], nees, square, wrong, certified, found[3]))
     chi2, nees, square, *flags = (np.concatenate(part)[:runs] for part in zip(*rows, strict=True))
     return Draws(chi2, nees, square, np.trace(bound[:, :2, :2], axis1=1, axis2=2), *flags)
 
@@ -82,18 +94,18 @@ def _from_chordal(many):
 def summary(found, dof):
     """The figures of merit of the draws, by name."""
     good = ~found.failed
+    if good.sum() < 2:
+        nothing = dict.fromkeys(MERITS[:-3], np.nan)
+        return nothing | _shares(found)
     mean = found.nees[good].mean(axis=1)
     half = stats.t_quantile(0.975, max(len(mean) - 1, 1)) * mean.std(ddof=1) / len(mean) ** 0.5
     rmse = np.sqrt(found.square[good].mean() / found.bound.mean())
     p = scipy.stats.kstest(found.chi2[good], scipy.stats.chi2(dof).cdf).pvalue
-    return {
-        "pose NEES": mean.mean(),
-        "its 95 % interval ±": half,
-        "poses within 95 %": (found.nees[good] < stats.chi2_quantile(0.95, 3)).mean(),
-        "χ² / dof": found.chi2[good].mean() / dof,
-        "χ²: p of Kolmogorov-Smirnov": p,
-        "RMSE / bound": rmse,
-        "wrong minima from chordal": found.wrong.mean(),
-        "certificate fails": 1 - found.certified.mean(),
-        "not converged": found.failed.mean(),
-    }
+    inside = (found.nees[good] < stats.chi2_quantile(0.95, 3)).mean()
+    values = mean.mean(), half, inside, found.chi2[good].mean() / dof, p, rmse
+    return dict(zip(MERITS[:-3], values, strict=True)) | _shares(found)
+
+
+def _shares(found):
+    shares = found.wrong.mean(), 1 - found.certified.mean(), found.failed.mean()
+    return dict(zip(MERITS[-3:], shares, strict=True))
