@@ -11,11 +11,15 @@ import jax
 import numpy as np
 
 from jaxslam import graphs
-from jaxslam.cli.common import pick
-from jaxslam.cli.compile_clock import CompileClock
-from jaxslam.datasets import g2o
+from jaxslam.cli.common import add_dtype, add_out, pick
+from jaxslam.cli.runtime import cache
+from jaxslam.cli.runtime.compile_clock import CompileClock
+from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.solver.search import METHODS as STEPS
+from jaxslam.graphs.starts import STARTS
 from jaxslam.graphs.validation import label, variables_of
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, csv_text, json_text, versions, write_files
@@ -230,3 +234,33 @@ def _shown(value: object) -> str:
     if value is None:
         return "not finite"
     return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam optimize`."""
+    parser.add_argument("path", metavar="FILE", help="a graph in the format of g2o or TORO")
+    for name, default, known, text in (
+        ("start", "given", STARTS, "where to start"),
+        ("method", "levenberg_marquardt", STEPS, "the steps"),
+        ("kernel", None, KERNELS, "a robust kernel for loop edges and measurements of points"),
+        ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
+    ):
+        parser.add_argument(
+            f"--{name}",
+            metavar="NAME",
+            default=default,
+            help=f"{text}, one of: {', '.join(known)} (default: {default or 'none'})",
+        )
+    parser.add_argument(
+        "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
+    )
+    parser.add_argument(
+        "--certificate",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
+    )
+    cache.add_options(parser)
+    add_dtype(parser)
+    add_out(parser)
+    parser.set_defaults(command=optimize_graph)
