@@ -29,7 +29,7 @@ def test_a_world_of_other_numbers_is_drawn_by_what_is_there(compilations):
     assert not np.allclose(first.pose, second.pose)
 
 
-@pytest.mark.parametrize("name", ["ekf", "robocentric", "square_root"])
+@pytest.mark.parametrize("name", ["robocentric", "square_root"])
 def test_other_numbers_run_what_is_there_place_by_place(name, compilations):
     """As `test_family` has it of all filters, corrected jointly."""
 
