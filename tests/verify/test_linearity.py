@@ -287,7 +287,9 @@ def test_inverse_depth_is_near_linear_where_range_is_not(share):
 def test_bad_input_is_refused(change, why):
     arguments = {"f": curved, "x": X, "cov": COV} | change
     with pytest.raises(ValueError, match=why):
-        jax.eval_shape(lambda: jaxslam.linearity_index(**arguments))
+        if "noise_cov" in change:  # by its shape alone
+            jax.eval_shape(lambda: jaxslam.linearity_index(**arguments))
+        jaxslam.linearity_index(**arguments)
 
 
 @pytest.mark.parametrize(
