@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxslam.datasets.formats.lines import read_bytes
+
 _HEADER = 128
 _INTEGERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 12: "i8", 13: "u8"}
 _NUMBERS = _INTEGERS | {7: "f4", 9: "f8"}
@@ -29,10 +31,7 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
     Raises ValueError, which begins with the path and says at which byte, on anything else than such
     a file, and where it cannot be read.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as problem:
-        raise ValueError(f"{path}: cannot be read: {problem.strerror}") from problem
+    path, content = read_bytes(path)
     mark = content[_HEADER - 2 : _HEADER]
     if mark not in (b"IM", b"MI"):
         raise ValueError(f"{path}: cannot be read: expected a MAT-file of level 5 (save -v7)")

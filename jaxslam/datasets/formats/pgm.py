@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxslam.datasets.formats.lines import read_bytes
+
 _OTHERS = {
     b"\x89PNG": "PNG",
     b"\xff\xd8": "JPEG",
@@ -22,10 +24,7 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
 
     Raises ValueError, `path: reason`, on a file of another format or one that is damaged.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as problem:
-        raise ValueError(f"{path}: cannot be read: {problem.strerror}") from problem
+    path, data = read_bytes(path)
     kind = data[:2]
     if kind not in (b"P5", b"P2") or not data[2:3].isspace():
         names = [name for begin, name in _OTHERS.items() if data.startswith(begin)]
