@@ -149,6 +149,7 @@ def draw(scenario, seed=1):
     return jax.device_get(simulate(scenario, jax.random.key(seed)))
 
 
+@np.errstate(invalid="ignore")  # of a filter without a map
 def judged(truth, estimate, info):
     """What a campaign says of many runs (runs, T, …): {measure: (mean, low, high)}, in NumPy.
 
