@@ -100,6 +100,7 @@ def made(request, hard_angles):
         observe=compiled(sensor.observe),
         residual=compiled(sensor.residual),
         invert=compiled(sensor.invert),
+        carried=compiled(sensor.carried),
     )
 
 
@@ -253,10 +254,9 @@ def test_a_mounting_pose_is_a_robot_that_stands_there(made):
 def test_what_is_seen_does_not_depend_on_where_the_world_puts_its_origin(made):
     turn = 2.2
     r = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    pose, point = made.pose, made.point
+    pose = made.pose
     carried = np.concatenate([pose[:, :2] @ r.T + [5, -2], pose[:, 2:] + turn], axis=1)
-    first = np.concatenate([made.first[:, :2] @ r.T + [5, -2], made.first[:, 2:] + turn], axis=1)
-    landmark = np.asarray(made.embed(first, point @ r.T + [5, -2]))
+    landmark = made.carried(np.tile([5, -2, turn], (len(pose), 1)), made.landmark)
     before = np.asarray(made.observe(pose, made.landmark))
     after = np.asarray(made.observe(carried, landmark))
     if made.absolute:  # it sees the map's axes: the measurement moves along
