@@ -101,8 +101,8 @@ def on_circle(s: Float[Array, "2 2"], h: Float[Array, "2"]) -> Float[Array, "2"]
         phi = (h1 / u) ** 2 + (h2 / v) ** 2
         slope = h1**2 / u**3 + h2**2 / v**3
         # ψ = φ^-½, ψ' = φ^-3/2 (h₁²/u³ + h₂²/v³); the step is (½ - ψ)/ψ'.
-        return at + (0.5 * jnp.sqrt(phi) - 1.0) * phi / slope
+        return jnp.asarray(at + (0.5 * jnp.sqrt(phi) - 1.0) * phi / slope)
 
-    at = jax.lax.fori_loop(0, _NEWTON, newton, start)
+    at: Array = jax.lax.fori_loop(0, _NEWTON, newton, start)
     r = -0.5 * (h1 / (low + at) * e1 + h2 / (high + at) * e2)
     return r / jnp.sqrt((r**2).sum())

@@ -132,7 +132,7 @@ def correlative(
             return score[best], shift[best]
 
         def unfinished(state: Any) -> Array:
-            return bound[state[0]] > ambiguous * state[1].max()
+            return jnp.asarray(bound[state[0]] > ambiguous * state[1].max())
 
         def step(state: Any) -> Any:
             next_, score, shift = state

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.graphs.kernels import Kernel
+from jaxslam.graphs.solver.kernels import Kernel
 
 FAR = 1e6
 """Coordinate [m] of a reference point that is not there, so that others are nearer."""
@@ -61,4 +61,4 @@ def weights(
     if rule.kernel is None:
         return weight
     square = jnp.where(kept, residual / rule.scale, 0.0) ** 2
-    return jax.lax.stop_gradient(weight * rule.kernel.weight(square))
+    return jnp.asarray(jax.lax.stop_gradient(weight * rule.kernel.weight(square)))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.graphs.kernels import Kernel
+from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.grids.distance import distance_field
 from jaxslam.grids.grid import Field, Grid
 from jaxslam.grids.interpolation import interpolate
@@ -79,7 +79,7 @@ def field(
         low, high = _DAMPING[1:]
 
         def unfinished(state: Any) -> Array:
-            return (state[0] < iterations) & ~state[4]
+            return jnp.asarray((state[0] < iterations) & ~state[4])
 
         def step(state: Any) -> Any:
             k, pose, at, damping, _ = state

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.graphs.kernels import Kernel
+from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.matching.correspondences import Rule, nearest, weights
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import Limits, concluded, information_of, length_of
@@ -78,7 +78,7 @@ def icp(
 
         def unfinished(state: Any) -> Array:
             k, _, _, change = state
-            return (k < iterations) & (change > tolerance)
+            return jnp.asarray((k < iterations) & (change > tolerance))
 
         def step(state: Any) -> Any:
             k, pose, before, _ = state

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.graphs.kernels import Kernel
+from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.matching.closed_form import align_to_lines
 from jaxslam.matching.icp import Metric, Pairs, icp
 from jaxslam.matching.matcher import Matcher

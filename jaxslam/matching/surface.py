@@ -2,11 +2,18 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.matching.correspondences import FAR
 from jaxslam.matching.points import Points
+
+_BENT = 4.0
+"""A line whose points scatter by more than this times the median variance goes round a corner."""
+
+_FLAT = 1e-3
+"""[m] Points that scatter less than this are of a line."""
 
 
 class Surface(NamedTuple):
@@ -21,7 +28,8 @@ class Surface(NamedTuple):
     tilt: Float[Array, "M"]
     """variance of the direction of the line [rad²], by how far the neighbours are from it"""
     straight: Bool[Array, "M"]
-    """whether there is a line: three neighbours or more, along it rather than across"""
+    """whether there is a line: three neighbours or more, along it rather than across, which scatter
+    about it as they do elsewhere, so that it goes round no corner"""
 
 
 def surface(of: Points, span: int, gap: float) -> Surface:
@@ -60,11 +68,19 @@ def surface(of: Points, span: int, gap: float) -> Surface:
     root = jnp.sqrt(size)
     direction = 0.5 * jnp.arctan2(cross, flat)
     largest, least = 0.5 * (xx + yy + root), jnp.maximum(0.5 * (xx + yy - root), 0.0)
-    tilt = least / (jnp.maximum(n - 2, 1) * jnp.where(round_, 1.0, largest))
+    variance = least / jnp.maximum(n - 2, 1)
+    usual = jax.lax.stop_gradient(_median(variance, ~round_))
     return Surface(
         position=jnp.where(valid[:, None], p, FAR),
         middle=jnp.where(round_[:, None], p, middle),
         normal=jnp.stack([-jnp.sin(direction), jnp.cos(direction)], axis=-1),
-        tilt=tilt,
-        straight=~round_ & (least < 0.1 * largest),
+        tilt=variance / jnp.where(round_, 1.0, largest),
+        straight=~round_ & (least < 0.1 * largest) & (variance < _BENT * usual + _FLAT**2),
     )
+
+
+def _median(values: Float[Array, "M"], there: Bool[Array, "M"]) -> Float[Array, ""]:
+    """The median of the values that are there; 0 of none."""
+    ordered = jnp.sort(jnp.where(there, values, jnp.inf))
+    middle = ordered[jnp.maximum(there.sum() - 1, 0) // 2]
+    return jnp.where(there.any(), middle, 0.0)

@@ -45,7 +45,10 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
             changed = with_ranges(reference, of_reference)
             there = matcher.prepare(changed) if isinstance(reference, Points) else prepared
             moved = moved_along_rays(points, of_scan)
-            return jax.grad(lambda pose: matcher.cost(there, moved, pose, found))(found.pose)
+            by_pose: Any = jax.grad(lambda pose: matcher.cost(there, moved, pose, found))(
+                found.pose
+            )
+            return jnp.asarray(by_pose)
 
         dtype = points.position.dtype
         zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)

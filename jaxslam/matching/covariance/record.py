@@ -13,6 +13,7 @@ from jaxslam import programs
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.points import Points, moved_along_rays
 from jaxslam.math import linalg
+from jaxslam.validation.numbers import is_concrete
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +39,14 @@ def covariance(
 
     With a leading axis on the start, and so on all arrays but the key, (B, 3, 3).
     """
-    many = np.ndim(start) == 2
-    return programs.call(
-        _many if many else way.of, (way, matcher) if many else (matcher,), reference, points,
-        found, start, key,
-    )  # fmt: skip
+    given = reference, points, found, start, key
+    if np.ndim(start) == 2:
+        return programs.call(_many, (way, matcher), *given)
+    return programs.call(_one, (way, matcher), *given)
+
+
+def _one(way: MatchCovariance, matcher: Matcher, *given: Any) -> Array:
+    return way.of(matcher, *given)
 
 
 def _many(
@@ -55,13 +59,13 @@ def _many(
     key: Array,
 ) -> Array:
     keys = jax.random.split(key, len(start))
-    each = jax.vmap(lambda *pair: way.of(matcher, *pair))
-    return each(reference, points, found, start, keys)
+    each: Any = jax.vmap(lambda *pair: way.of(matcher, *pair))
+    return jnp.asarray(each(reference, points, found, start, keys))
 
 
 def check_sigma(name: str, sigma: Any) -> None:
     """Raise ValueError unless sigma, of a range [m], is above 0; a tracer is accepted."""
-    if isinstance(sigma, int | float | np.generic) and not 0 < sigma < np.inf:
+    if is_concrete(sigma) and not 0 < float(sigma) < np.inf:
         raise ValueError(f"{name}: expected sigma above 0 [m], got {sigma}")
 
 

@@ -76,9 +76,9 @@ def sampling(sigma: ArrayLike, start_cov: Any, samples: int = 30) -> MatchCovari
             other = reference
             if isinstance(reference, Points):
                 noise = jax.random.normal(key_reference, (range_count(reference),), dtype)
-                other = with_ranges(reference, sigma * noise)
+                other = with_ranges(reference, jnp.asarray(sigma) * noise)
             scan = moved_along_rays(
-                points, sigma * jax.random.normal(key_scan, points.valid.shape, dtype)
+                points, jnp.asarray(sigma) * jax.random.normal(key_scan, points.valid.shape, dtype)
             )
             begin = start + root @ jax.random.normal(key_start, (3,), dtype)
             return matcher.match(matcher.prepare(other), scan, begin).pose
