@@ -1,5 +1,6 @@
 """Scan matching: where a scan lies on another or on a map, and how well that is known."""
 
+from jaxslam.matching import covariance
 from jaxslam.matching.correlative import correlative
 from jaxslam.matching.field import field
 from jaxslam.matching.matcher import Match, Matcher, MatchStatus, match
@@ -13,6 +14,7 @@ __all__ = [
     "Matcher",
     "Points",
     "correlative",
+    "covariance",
     "field",
     "match",
     "moved_along_rays",

@@ -119,9 +119,7 @@ def _checked(matcher: Any, reference: Any, points: Any, start: Any) -> bool:
         )
     batch = np.shape(start)[:-1]
     if len(batch) > 1 or np.shape(start)[-1:] != (3,):
-        raise ValueError(
-            f"match: expected a start that is a pose (x, y, θ), got {shape_told(start)}"
-        )
+        raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_told(start)}")
     check_points("match", points, batch)
     if isinstance(reference, Points):
         check_points("match", reference, batch)
