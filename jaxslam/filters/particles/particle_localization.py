@@ -14,15 +14,7 @@ from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.known.localization import checked_map
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
-from jaxslam.filters.particles.moments import weighted_nis
-from jaxslam.filters.particles.pose_state import (
-    PoseParticles,
-    draw_start,
-    initial_pose_particles,
-    pose_particle_moments,
-)
 from jaxslam.filters.particles.pose_steps import predict_particles, weigh_particles
-from jaxslam.filters.particles.region import box_region
 from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import (
     MonteCarloSettings,
@@ -31,6 +23,14 @@ from jaxslam.filters.particles.settings import (
     checked_least,
     known_map_sensors,
 )
+from jaxslam.filters.particles.states.moments import weighted_nis
+from jaxslam.filters.particles.states.pose_state import (
+    PoseParticles,
+    draw_start,
+    initial_pose_particles,
+    pose_particle_moments,
+)
+from jaxslam.filters.particles.states.region import box_region
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.protocols import Associate, Differentiable, Filter, Motion, Resample, Sensor
 from jaxslam.resampling.systematic import systematic

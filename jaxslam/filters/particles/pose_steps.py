@@ -5,17 +5,17 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.particles.particle_info import ParticleInfo
-from jaxslam.filters.particles.pose_state import (
+from jaxslam.filters.particles.proposal import sample_motion
+from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
+from jaxslam.filters.particles.settings import MonteCarloSettings
+from jaxslam.filters.particles.states.particle_info import ParticleInfo
+from jaxslam.filters.particles.states.pose_state import (
     ParticleEvents,
     PoseParticles,
     active_mask,
     draw_start,
     no_events,
 )
-from jaxslam.filters.particles.proposal import sample_motion
-from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
-from jaxslam.filters.particles.settings import MonteCarloSettings
 from jaxslam.resampling.kld import bins_of, enough
 from jaxslam.resampling.weights import effective_size, normalized
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam import validation
 from jaxslam.association.known import known as known_association
-from jaxslam.filters.particles.region import Region
+from jaxslam.filters.particles.states.region import Region
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Differentiable, Life, Motion, Resample, Sensor
 from jaxslam.sensors.suite import Suite

@@ -124,7 +124,8 @@ def ray_cast(
 
         expected, by_pose = expected_at(pose), jax.jacfwd(expected_at)(pose)
         z = jnp.minimum(beams.range, max_range)
-        return density_slope(mixture, z, expected, max_range)[:, None] * by_pose
+        by_range: Array = density_slope(mixture, z, expected, max_range)
+        return by_range[:, None] * jnp.asarray(by_pose)
 
     return BeamModel("ray_cast", prepare, each, jacobian)
 

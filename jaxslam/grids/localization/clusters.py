@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jaxslam import programs
-from jaxslam.filters.particles.moments import weighted_pose_moments
+from jaxslam.filters.particles.states.moments import weighted_pose_moments
 
 
 class Clusters(NamedTuple):
@@ -23,7 +23,7 @@ class Clusters(NamedTuple):
     """Σ w of each; the sum is 1 less what `least` left out"""
     mean: Float[np.ndarray, "K 3"]
     cov: Float[np.ndarray, "K 3 3"]
-    count: Int[np.ndarray, "K"]
+    size: Int[np.ndarray, "K"]
     """particles of positive weight"""
     label: Int[np.ndarray, "P"]
     """the group of each particle, -1 of none"""

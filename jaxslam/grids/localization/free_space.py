@@ -9,9 +9,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxslam.filters.particles.region import Region
-from jaxslam.grids.grid import Grid, centers
-from jaxslam.math import se2
+from jaxslam.filters.particles.states.region import Region
+from jaxslam.grids.grid import Grid
 from jaxslam.math.angles import wrap
 
 
@@ -23,14 +22,16 @@ def free_region(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> 
     free = np.asarray(grid.log_odds) < 0
     if not free.any():
         raise ValueError(f"{name}: the map has no free cell (log-odds below 0)")
-    middle = np.asarray(jax.device_get(centers(grid)), np.float64)
+    origin, cell = np.asarray(grid.origin, np.float64), float(np.asarray(grid.resolution))
+    c, s = np.cos(origin[2]), np.sin(origin[2])
+    sides = cell * np.array([[c, s], [-s, c]])  # of a cell, as rows
+    i, j = np.indices(free.shape) + 0.5
+    middle = np.stack([j, i], axis=-1) @ sides + origin[:2]
     if box is not None:
         free = free & ((middle >= box[0]) & (middle <= box[1])).all(axis=2)
         if not free.any():
             raise ValueError(f"{name}: no free cell of the map is in the box {box.tolist()}")
     places = middle[free]
-    turn = np.asarray(se2.rotation(jnp.asarray(grid.origin)[2]), np.float64)
-    sides = float(np.asarray(grid.resolution)) * turn.T  # of a cell, as rows
     mean = np.array([*places.mean(axis=0), 0.0])
     cov = np.zeros((3, 3))
     cov[:2, :2] = np.cov(places.T, bias=True) + sides.T @ sides / 12

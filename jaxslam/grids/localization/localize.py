@@ -9,23 +9,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.particles.pose_state import (
-    PoseParticles,
-    active_mask,
-    draw_start,
-    initial_pose_particles,
-    pose_particle_moments,
-)
 from jaxslam.filters.particles.pose_steps import predict_particles, weigh_particles
 from jaxslam.filters.particles.settings import (
     MonteCarloSettings,
     check_start,
     checked_box,
     checked_least,
+)
+from jaxslam.filters.particles.states.pose_state import (
+    PoseParticles,
+    active_mask,
+    draw_start,
+    initial_pose_particles,
+    pose_particle_moments,
 )
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
@@ -80,11 +80,11 @@ def localize(
     a uniform start.
 
     The estimate is a single mean and covariance, also where the particles form several groups:
-    `clusters` of `final.pose` and `final.log_weight` finds these. In `info.extra["particles"]`, a
-    `ParticleInfo`, `outside` counts the particles in use that are off the map; their beams are
-    weighed as the model does there. A scan without a usable beam changes no weight. The status of a
-    beam is FUSED if it entered the weights, UNMATCHED if `every` left it out. log_likelihood is
-    log Σ w p(z | x)^exponent, without constants of the exponent.
+    `clusters` of `final.pose` and `final.log_weight` finds these. A particle off the map or in an
+    occupied cell has weight zero; `blocked` of `info.extra["particles"]`, a `ParticleInfo`, counts
+    those in use. A scan without a usable beam tells no more than that. The status of a beam is
+    FUSED if it entered the weights, UNMATCHED if `every` left it out. log_likelihood is
+    log Σ w p(z | x)^exponent.
 
     Args:
         grid: a map with a free cell, outside a trace.
@@ -147,12 +147,15 @@ def localize(
 
         # Else XLA computes it again in each of its consumers.
         fit = no_inline(fit_of, state.pose, _in_dtype(prepared, state.pose.dtype), beams)
-        misfit = jnp.asarray(exponent, fit.dtype) * fit
+        blocked = _blocked(grid, state.pose)
+        fit = jnp.where(blocked, jnp.inf, fit)
+        misfit = jnp.where(blocked, jnp.inf, jnp.asarray(exponent, fit.dtype) * fit)
         evidence = normalized(state.log_weight - misfit)[1]
-        outside = _outside(grid, state)
+        blocked = blocked & active_mask(state)
         state, found = weigh_particles(state, misfit, fit, beams.valid.sum(), settings)
+        found = found._replace(blocked=blocked.sum(dtype=jnp.int32))
         info = _info_of_beams(scan, every, evidence)
-        return state, with_extra(info, "particles", found._replace(outside=outside))
+        return state, with_extra(info, "particles", found)
 
     def estimate(state: PoseParticles) -> Estimate:
         pose, cov = pose_particle_moments(state)
@@ -186,12 +189,13 @@ def _in_dtype(prepared: Any, dtype: Any) -> Any:
     )
 
 
-def _outside(grid: Grid, state: PoseParticles) -> Int[Array, ""]:
-    """How many particles in use are off the map."""
+def _blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
+    """Which poses are off the map or in an occupied cell."""
     height, width = grid.log_odds.shape
-    at = to_cells(jnp.asarray(grid.origin), grid.resolution, state.pose[:, :2])
+    at = jnp.floor(to_cells(jnp.asarray(grid.origin), grid.resolution, pose[:, :2]))
     inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
-    return (active_mask(state) & ~inside).sum(dtype=jnp.int32)
+    j, i = jnp.where(inside[:, None], at, 0.0).astype(jnp.int32).T
+    return ~inside | (jnp.asarray(grid.log_odds > 0)[i, j])
 
 
 def _info_of_beams(scan: Scan, every: int, log_likelihood: Float[Array, ""]) -> Info:
