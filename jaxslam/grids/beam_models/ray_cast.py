@@ -115,7 +115,7 @@ def ray_cast(
         z = jnp.minimum(beams.range, max_range)
         return mixture_log_density(mixture, z, expected, max_range)
 
-    def jacobian(rays: Any, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
+    def jacobian(rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
         """The derivative by z*, times that of z*, for which `cast` has its own rule."""
         frame = jnp.asarray(mount, pose.dtype)
 
