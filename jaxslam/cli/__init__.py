@@ -17,6 +17,7 @@ from jaxslam.cli.campaign import DEFAULTS, OUT, consistency
 from jaxslam.cli.common import INTERRUPTED, as_folders
 from jaxslam.cli.compile_clock import CompileClock
 from jaxslam.cli.dataset import run_dataset
+from jaxslam.cli.laser import options as laser_options
 from jaxslam.cli.models import verify_models
 from jaxslam.cli.optimize import COST, ERRORS, optimize_graph
 from jaxslam.datasets import READERS
@@ -220,7 +221,9 @@ def _add_consistency(parser: argparse.ArgumentParser) -> None:
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam run`."""
-    parser.add_argument("--dataset", required=True, help=f"one of: {', '.join(READERS)}")
+    parser.add_argument(
+        "--dataset", required=True, help=f"one of: {', '.join([*READERS, *laser_options.READERS])}"
+    )
     parser.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
     parser.add_argument(
         "--robot",
@@ -268,6 +271,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="DIR", default=str(OUT), help=f"folder for results (default: {OUT})"
     )
+    laser_options.add_options(parser)
     parser.set_defaults(command=run_dataset)
 
 
