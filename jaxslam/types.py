@@ -185,7 +185,7 @@ class Info(NamedTuple):
     """the search for the best association ended at its budget; None where there is no search"""
     extra: dict[str, Any] | None = None
     """records of one family or wrapper of filters alone, by name, as
-    "particles" for a `filters.particles.particle_info.ParticleInfo`."""
+    "particles" for a `filters.particles.states.particle_info.ParticleInfo`."""
 
     @property
     def overflow(self) -> jax.Array:

@@ -10,16 +10,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam import programs
-from jaxslam.graphs.batch import in_one_dtype, over_batch, with_batch
 from jaxslam.graphs.factor import Factor
-from jaxslam.graphs.gnc import graduated
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.implicit import followed
-from jaxslam.graphs.kernels import Kernel
-from jaxslam.graphs.linearized import cost, data_of, variables_of
-from jaxslam.graphs.model import Model, model_of
-from jaxslam.graphs.plan import Plan, plan_for
-from jaxslam.graphs.search import METHODS, Solution, minimize
+from jaxslam.graphs.solver.batch import in_one_dtype, over_batch, with_batch
+from jaxslam.graphs.solver.gnc import graduated
+from jaxslam.graphs.solver.implicit import followed
+from jaxslam.graphs.solver.kernels import Kernel
+from jaxslam.graphs.solver.linearized import cost, data_of, variables_of
+from jaxslam.graphs.solver.model import Model, model_of
+from jaxslam.graphs.solver.plan import Plan, plan_for
+from jaxslam.graphs.solver.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
 from jaxslam.validation.numbers import check_count
 

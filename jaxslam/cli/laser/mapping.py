@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from jaxslam import grids
 from jaxslam.cli.laser.job import Files, Job, figure_files
-from jaxslam.datasets import LaserLog, ros_map
+from jaxslam.datasets import LaserLog
+from jaxslam.datasets.formats import ros_map
 from jaxslam.grids import Counts, Grid
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
@@ -55,9 +56,7 @@ def run(log: LaserLog, options: argparse.Namespace) -> Job:
     return Job(summary | map_told(grid), files, figures)
 
 
-def frame_of(
-    log: LaserLog, resolution: float
-) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:
+def frame_of(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:
     """The shape (H, W) and the origin of a map that holds all poses and hits.
 
     Raises ValueError on more than `MOST` cells.
@@ -94,9 +93,7 @@ def counted(
     for begin in range(0, total, TOGETHER):
         rows = slice(begin, begin + TOGETHER)
         beams = Beams(*(_padded(part[rows]) for part in log.beams))
-        unusable += int((~np.asarray(beams.valid)).sum()) - width * (
-            TOGETHER - len(log.time[rows])
-        )
+        unusable += int((~np.asarray(beams.valid)).sum()) - width * (TOGETHER - len(log.time[rows]))
         if beams.valid.any():
             found = grids.count(
                 shape,

@@ -81,7 +81,9 @@ def complete(options: argparse.Namespace) -> argparse.Namespace:
             raise ValueError(f"--{name.replace('_', '-')}: not of a laser log")
     if options.animate:
         raise ValueError("--animate: not of a laser log with --map or --localize")
-    for_localization = [n for n in ("start", "particles", "seed") if getattr(options, n) is not None]
+    for_localization = [
+        n for n in ("start", "particles", "seed") if getattr(options, n) is not None
+    ]
     if options.localize is None and for_localization:
         raise ValueError(f"--{for_localization[0]}: only with --localize")
     if options.localize is not None and options.resolution is not None:
@@ -144,8 +146,6 @@ def start_pose(text: str, log: LaserLog) -> np.ndarray | None:
     except ValueError:
         pose = np.zeros(0)
     if pose.shape != (3,) or not np.all(np.isfinite(pose)):
-        raise ValueError(
-            f"--start: expected file, global or X,Y,HEADING [m, m, deg], got {text!r}"
-        )
+        raise ValueError(f"--start: expected file, global or X,Y,HEADING [m, m, deg], got {text!r}")
     pose[2] = np.angle(np.exp(1j * np.deg2rad(pose[2])))
     return pose

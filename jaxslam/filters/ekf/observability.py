@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam import validation
-from jaxslam.filters.ekf.linear_system import (
+from jaxslam.filters.ekf.coordinates.linear_system import (
     InTurn,
     LinearLandmarks,
     LinearMeasurements,

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import SensorTurn, update_by_scan
 from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
@@ -21,6 +19,8 @@ from jaxslam.filters.ekf.settings import (
     check_ekf_options,
     check_iterations,
 )
+from jaxslam.filters.ekf.steps.predict import propagate
+from jaxslam.filters.ekf.steps.scan import SensorTurn, update_by_scan
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
 from jaxslam.protocols import (

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.filters.ekf.coordinates import cov_of_coordinates
+from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.alignment import with_unit_blocks
 from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
 from jaxslam.filters.map_management.merging import squared_distance

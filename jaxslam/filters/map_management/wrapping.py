@@ -7,7 +7,11 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from jaxslam import validation
-from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem, linearized_steps
+from jaxslam.filters.ekf.coordinates.linear_system import (
+    LinearizedSteps,
+    LinearSystem,
+    linearized_steps,
+)
 from jaxslam.protocols import Filter
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan

@@ -12,8 +12,6 @@ from jaxtyping import Bool, Float, Int
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.particles.landmark_ekf import update_map
-from jaxslam.filters.particles.moments import slam_estimate, weighted_nis
-from jaxslam.filters.particles.particle_info import ParticleInfo
 from jaxslam.filters.particles.proposal import (
     PoseProposal,
     associate_particle,
@@ -27,7 +25,9 @@ from jaxslam.filters.particles.settings import (
     check_resampling,
     particle_map_settings,
 )
-from jaxslam.filters.particles.slam_state import (
+from jaxslam.filters.particles.states.moments import slam_estimate, weighted_nis
+from jaxslam.filters.particles.states.particle_info import ParticleInfo
+from jaxslam.filters.particles.states.slam_state import (
     SlamParticles,
     draw_poses,
     initial_slam_particles,

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from jaxslam.graphs import Factor, Graph
-from jaxslam.graphs.model import factors_of
+from jaxslam.graphs.solver.model import factors_of
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,

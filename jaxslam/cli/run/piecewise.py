@@ -1,0 +1,156 @@
+"""A filter run over a long log piece by piece, with checks of its state in between."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxslam.protocols import Filter
+from jaxslam.types import Estimate, Info, Log
+
+State: TypeAlias = Any
+"""A filter's own state, a pytree."""
+
+Rows: TypeAlias = tuple[tuple[Any, ...], Any]
+"""What is kept of each step, and of the steps to watch: arrays with leading T."""
+
+CHECKS = 20
+"""Default number of progress updates, and of checks of the state."""
+
+_LONGEST = 500
+"""Largest number of steps in a piece."""
+
+
+class PiecewiseRun(NamedTuple):
+    """The results of a filter over a log of T steps, as NumPy arrays."""
+
+    path: Estimate
+    """pose (T, 3) and pose_cov (T, 3, 3); the fields of the map are ()"""
+    status: Int[np.ndarray, "T M"]
+    slot: Int[np.ndarray, "T M"]
+    nis: Float[np.ndarray, "T M"]
+    dof: Int[np.ndarray, "T M"]
+    log_likelihood: Float[np.ndarray, "T"]
+    last: Estimate
+    """the estimate after the last step"""
+    final: State
+    """the filter's own state there"""
+    checked: list[int]
+    """the steps, from 1, after which the state was checked"""
+    passed: list[bool]
+    """the results of these checks"""
+    estimates: Estimate | None = None
+    """the whole estimates (F, …) after the steps to watch, where there are such, and"""
+    watched: Any = None
+    """what `watch` returned of the states there"""
+    kept: Any = None
+    """what `keep` returned of the info of each step, leading T"""
+
+
+def run_in_pieces(
+    filter: Filter,
+    log: Log,
+    pose: np.ndarray,
+    pose_cov: np.ndarray,
+    *,
+    every: int | None = None,
+    check: Callable[[State], bool],
+    progress: Callable[[int, int], object],
+    seed: int = 0,
+    at: Int[np.ndarray, "F"] | None = None,
+    watch: Callable[[State], Any] = lambda state: None,
+    keep: Callable[[Info], Any] = lambda info: None,
+) -> PiecewiseRun:
+    """Predict and update row by row, as `run` does, for a log whose values have been checked.
+
+    One compiled program processes the log piece by piece; the last piece is padded.
+
+    Args:
+        log: T rows of arrays in the dtype of the arithmetic.
+        every: number of steps between two checks of the state; the last step is checked, too.
+            0: no checks. Default: `CHECKS` checks.
+        check: the check, called with the filter's own state.
+        progress: called after each piece with the steps done and their total.
+        seed: of the random numbers of a particle filter.
+        at: the steps to watch, from 0, in order: the whole estimate after each is kept, and what
+            `watch` makes of the filter's own state. Default none.
+        keep: called with the info of each step.
+    """
+    total = log.control.shape[0]
+    every = max(1, -(-total // CHECKS)) if every is None else every
+    size = min(every or _LONGEST, _LONGEST, total)
+    key = jax.random.key(seed)
+
+    def step(state: State, row: Log, number: jax.Array) -> tuple[State, Rows]:
+        to_predict, to_update = jax.random.split(jax.random.fold_in(key, number))
+        state = filter.predict(state, row.control, to_predict)
+        state, info = filter.update(state, row.scan, to_update)
+        now = filter.estimate(state)
+        kept = info.status, info.slot, info.nis, info.dof, info.log_likelihood, keep(info)
+        return state, ((now.pose, now.pose_cov, *kept), None if at is None else (now, watch(state)))
+
+    @jax.jit
+    def piece(
+        state: State, rows: Log, count: jax.Array, before: jax.Array
+    ) -> tuple[State, Rows, Estimate]:
+        def one(i: jax.Array, carry: tuple[State, Rows]) -> tuple[State, Rows]:
+            state, kept = carry
+            state, new = step(state, jax.tree.map(lambda leaf: leaf[i], rows), before + i)
+            return state, jax.tree.map(lambda all, one: all.at[i].set(one), kept, new)
+
+        first = jax.tree.map(lambda leaf: leaf[0], rows)
+        shapes = jax.eval_shape(step, state, first, before)[1]
+        kept = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), shapes)
+        state, kept = jax.lax.fori_loop(0, count, one, (state, kept))
+        return state, kept, filter.estimate(state)
+
+    kind = log.control.dtype
+    state = jax.jit(filter.init)(pose.astype(kind), pose_cov.astype(kind))
+    pieces, films, checked, passed, done = [], [], [], [], 0
+    while done < total:
+        until = total if not every else min(total, (done // every + 1) * every)
+        until = min(until, done + size)
+        rows = jax.tree.map(lambda leaf, a=done, b=until: _padded(leaf[a:b], size), log)
+        state, kept, last = piece(state, rows, jnp.asarray(until - done), jnp.asarray(done))
+        pieces.append(
+            jax.tree.map(lambda leaf, n=until - done: np.asarray(leaf)[:n], kept[0])  # type: ignore[misc]
+        )
+        if at is not None:
+            mine = at[(at >= done) & (at < until)] - done
+            films.append(jax.tree.map(lambda leaf, a=mine: np.asarray(leaf)[a], kept[1]))
+        done = until
+        progress(done, total)
+        if every and (done % every == 0 or done == total):
+            checked.append(done)
+            passed.append(check(state))
+    pose, cov, status, slot, nis, dof, log_likelihood, told = jax.tree.map(
+        lambda *parts: np.concatenate(parts), *pieces
+    )
+    path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
+    estimates, watched = (
+        jax.tree.map(lambda *parts: np.concatenate(parts), *films) if films else (None, None)
+    )
+    return PiecewiseRun(
+        path=path,
+        status=status,
+        slot=slot,
+        nis=nis,
+        dof=dof,
+        log_likelihood=log_likelihood,
+        last=jax.tree.map(np.asarray, last),
+        final=state,
+        checked=checked,
+        passed=passed,
+        estimates=estimates,
+        watched=watched,
+        kept=told,
+    )
+
+
+def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+    """The rows with zeros appended up to `size` of them."""
+    rows = np.asarray(rows)
+    return np.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
