@@ -93,6 +93,7 @@ def run(log: LaserLog, options: argparse.Namespace) -> Job:
         figure = plot.grid_figure(
             grid,
             poses=path.pose,
+            width=plot.PAGE,
             others={"poses in the file": log.corrected},
             title=f"{log.name}: localization",
         )

@@ -43,7 +43,10 @@ def run(log: LaserLog, options: argparse.Namespace) -> Job:
         from jaxslam.results import plot  # matplotlib is slow to load
 
         figure = plot.grid_figure(
-            grid, poses=log.corrected, title=f"{log.name}: {len(log.time):,} scans at known poses"
+            grid,
+            poses=log.corrected,
+            width=plot.PAGE,
+            title=f"{log.name}: {len(log.time):,} scans at known poses",
         )
         return figure_files("map", figure, formats)
 
