@@ -85,7 +85,7 @@ def run(log: LaserLog, options: argparse.Namespace) -> Job:
         "hypotheses at the end": len(groups.weight),
         "weight of the heaviest": float(groups.weight[0]),
         "final pose": [float(value) for value in path.pose[-1]],
-    } | scores(path.pose, log.corrected)
+    } | scores(np.asarray(path.pose), log.corrected)
 
     def figures(formats: tuple[str, ...]) -> Files:
         from jaxslam.results import plot  # matplotlib is slow to load
@@ -113,7 +113,9 @@ def _particle_info(info: Info) -> Any:
 
 def _on(grid: Grid, pose: Float[np.ndarray, "3"]) -> bool:
     """Whether a pose is on the map."""
-    at = np.asarray(grids.to_cells(jnp.asarray(grid.origin), grid.resolution, pose[:2]))
+    at = np.asarray(
+        grids.to_cells(jnp.asarray(grid.origin), grid.resolution, jnp.asarray(pose[:2]))
+    )
     height, width = grid.log_odds.shape
     return bool(np.all((at >= 0) & (at <= [width, height])))
 

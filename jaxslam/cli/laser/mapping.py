@@ -102,7 +102,7 @@ def counted(
                 shape,
                 origin,
                 resolution,
-                _padded(log.corrected[rows]),  # type: ignore[arg-type]
+                _padded(log.corrected[rows]),
                 beams,
                 max_range=log.max_range,
                 no_return=0.0,

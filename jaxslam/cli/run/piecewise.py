@@ -115,9 +115,7 @@ def run_in_pieces(
         until = min(until, done + size)
         rows = jax.tree.map(lambda leaf, a=done, b=until: _padded(leaf[a:b], size), log)
         state, kept, last = piece(state, rows, jnp.asarray(until - done), jnp.asarray(done))
-        pieces.append(
-            jax.tree.map(lambda leaf, n=until - done: np.asarray(leaf)[:n], kept[0])  # type: ignore[misc]
-        )
+        pieces.append(jax.tree.map(lambda leaf, n=until - done: np.asarray(leaf)[:n], kept[0]))
         if at is not None:
             mine = at[(at >= done) & (at < until)] - done
             films.append(jax.tree.map(lambda leaf, a=mine: np.asarray(leaf)[a], kept[1]))
