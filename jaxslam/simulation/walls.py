@@ -57,7 +57,8 @@ def walls(
         raise ValueError("walls: expected finite numbers and radii above 0")
     if len(made.segments) + len(rounds) == 0:
         raise ValueError("walls: expected at least one wall")
-    return Walls(*made[:2], glass=_shares(segments[1:], glass) if glass else None)  # type: ignore[arg-type]
+    shares: Any = _shares(segments[1:], glass) if glass else None
+    return Walls(made.segments, made.circles, shares)
 
 
 def _shares(
