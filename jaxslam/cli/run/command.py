@@ -25,7 +25,7 @@ from jaxslam.monte_carlo.progress import Progress
 from jaxslam.protocols import Filter
 from jaxslam.results import report
 from jaxslam.results.campaign_files import check_formats
-from jaxslam.results.files import check_writable, json_text, versions, write_files
+from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Status
 
@@ -45,7 +45,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     at = film_steps(data) if options.animate else None
     runs = {name: _run(name, filter, data, options, at) for name, filter in filters.items()}
     last = next(iter(runs.values())).result.last
-    summary: dict[str, Any] = {
+    summary: Json = {
         "dataset": data.name,
         "source": data.source,
         "command": command,
@@ -88,7 +88,7 @@ class _Run(NamedTuple):
 
     result: PiecewiseRun
     found: Evaluation
-    summary: dict[str, Any]
+    summary: Json
 
 
 def _run(
@@ -204,7 +204,7 @@ def _definiteness(result: PiecewiseRun) -> str:
     return f"{count}, not at {', '.join(map(str, failed[:5]))}{more}"
 
 
-def _flat(summary: dict[str, Any]) -> dict[str, Any]:
+def _flat(summary: Json) -> Json:
     """The summary as rows of one value: a row a status that occurs, a row a coordinate."""
     counts = {f"status: {name}": count for name, count in summary["status"].items() if count}
     names = ("x [m]", "y [m]", "theta [rad]")

@@ -16,6 +16,7 @@ from jaxslam.results.plot.style import (
     INK,
     PAGE,
     TEXT,
+    Look,
     caption,
     every_handle,
     panels_of,
@@ -81,7 +82,7 @@ def grid_figure(
         axes.plot(*np.asarray(other)[:, :2].T, color=color, lw=0.7, label=name, zorder=4)
     if path is not None:
         axes.plot(*path[:, :2].T, color=COLORS[0], lw=1.2, label="path", zorder=3)
-        end: dict[str, Any] = {
+        end: Look = {
             "mfc": COLORS[0],
             "mec": "white",
             "ms": 5,
