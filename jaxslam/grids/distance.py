@@ -125,7 +125,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
 
 
 @_envelope.def_vmap
-def _of_all(size: int, _: Any, columns: Int[Array, "P W H"]) -> tuple[Array, bool]:
+def _of_all(size: int, _: object, columns: Int[Array, "P W H"]) -> tuple[Array, bool]:
     """The rows of all tables of a batch together: a loop of each table's own would copy all."""
     _, width, rows = columns.shape
     found = _envelope(jnp.swapaxes(columns, 0, 1).reshape(width, size * rows))

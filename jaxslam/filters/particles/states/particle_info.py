@@ -25,3 +25,5 @@ class ParticleInfo(NamedTuple):
     """particles drawn from the whole box before this step's motion, to find a lost robot"""
     capped: Bool[Array, "*T"] | None = None
     """the wanted number of particles was above the capacity"""
+    outside: Int[Array, "*T"] | None = None
+    """tmp"""
