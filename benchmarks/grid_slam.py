@@ -90,7 +90,7 @@ def judged(world, truth, filter, log, rows, key):
         "pose NEES, median": float(np.median(nees[regular])),
         "map correlation": float(grids.correlation(truth, grid)),
         "ESS": float(np.mean(trace.info.extra["particles"].ess)),
-        "copies": int(np.sum(trace.info.extra["copied"])),
+        "copies": int(np.sum(trace.info.extra["maps"].copied)),
         "CPU ms a step": 1e3 * seconds / len(log.pose),
     }, trace
 

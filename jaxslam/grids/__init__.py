@@ -1,4 +1,4 @@
-"""Occupancy grids: maps and files, distance fields, rays, beam models, mapping, SLAM."""
+"""Occupancy grids: maps, files, distances, rays, beam models, mapping, localization, SLAM."""
 
 from jaxslam.grids.beam_models import (
     BeamModel,
@@ -13,13 +13,14 @@ from jaxslam.grids.distance import distance_field, gradient
 from jaxslam.grids.files import read_map, write_map
 from jaxslam.grids.grid import Field, Grid, centers, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolate
-from jaxslam.grids.localization import beam_log
+from jaxslam.grids.localization import Clusters, beam_log, clusters, localize
 from jaxslam.grids.mapping import Counts, count, entropy, occupancy, reflection
 from jaxslam.grids.resampling import correlation, crop, resample
 from jaxslam.grids.slam import GridParticles, best_map, grid_slam
 
 __all__ = [
     "BeamModel",
+    "Clusters",
     "Counts",
     "Field",
     "Grid",
@@ -31,6 +32,7 @@ __all__ = [
     "cast",
     "centers",
     "check_grid",
+    "clusters",
     "correlation",
     "count",
     "crop",
@@ -41,6 +43,7 @@ __all__ = [
     "grid_slam",
     "interpolate",
     "likelihood_field",
+    "localize",
     "log_likelihood",
     "occupancy",
     "ray_cast",

@@ -11,7 +11,7 @@ from jaxslam import cli, grids
 from jaxslam.cli.laser.mapping import TOGETHER
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
-from jaxslam.simulation.walls import is_free
+from jaxslam.simulation.walls import is_free, rasterize
 
 BEAMS, STEPS = 24, TOGETHER + 6
 
@@ -122,3 +122,65 @@ def test_options_of_laser_logs_are_of_no_other_data_set(tmp_path, refused):
     run = ["run", "--dataset", "bonn", tmp_path, "--map", "known"]
     refused(run, "--map: only of a laser log (--dataset carmen)")
     refused(["run", "--dataset", "moon", tmp_path], "unknown dataset 'moon'; known: ", ", carmen")
+
+
+@pytest.fixture(scope="module")
+def room_map(log_file, tmp_path_factory):
+    """A map of the room, as another program would have made it."""
+    path = tmp_path_factory.mktemp("map") / "room.yaml"
+    grids.write_map(path, rasterize(square(beams=4).walls, 0.1))
+    return path
+
+
+def test_a_robot_is_localized_in_a_map_by_odometry_and_scans(log_file, room_map, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ["--max-range", "10", "--particles", "200", "--localize", str(room_map)]
+    assert run(log_file.path, out, *options) == 0
+    capsys.readouterr()
+    assert {path.name for path in out.iterdir()} == {
+        *("localization.png", "trajectory.csv", "trajectory.tum", "summary.json")
+    }
+    rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(rows[:, 0], 100 + 0.25 * np.arange(STEPS))
+    error = np.hypot(*(rows[:, 1:3] - log_file.pose[:, :2]).T)
+    assert np.median(error) < 0.3 and error[-1] < 0.15
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["from the poses in the file, median [m]"] == pytest.approx(np.median(error))
+    assert summary["scans left out"]["without a valid beam"] == 1
+    assert 0 < summary["particles in use, mean"] <= 200
+    assert summary["hypotheses at the end"] >= 1
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        (("", ""), ["--start", "9,9,0"], "--start: the pose (9 m, 9 m, 0°) is off the map"),
+        (("", ""), ["--start", "here"], "--start: expected file, global or X,Y,HEADING"),
+        (("image: room.pgm", "image: no.pgm"), [], "room.yaml:1: no image"),
+        (("resolution: 0.1", "resolution: 0"), [], "room.yaml:3: expected a resolution above 0"),
+        (("origin: [-0.5, ", "origin: ["), [], "room.yaml:4: expected origin: [x, y, yaw]"),
+        (("negate: 0", "negate: 1"), [], "room.yaml: the map has no free cell"),
+    ],
+)
+def test_a_map_or_a_start_that_is_none_is_refused(
+    log_file, room_map, tmp_path, refused, change, options, message
+):
+    here, out = tmp_path / "room.yaml", tmp_path / "out"
+    text = room_map.read_text()
+    assert change[0] in text
+    here.write_text(text.replace(*change))
+    full = "negate: 1" in change  # then white is occupied
+    image = b"P5\n2 1\n255\n\xff\xff" if full else room_map.with_suffix(".pgm").read_bytes()
+    (tmp_path / "room.pgm").write_bytes(image)
+    run = ["run", "--dataset", "carmen", log_file.path, "--out", out, "--localize", here]
+    refused([*run, *options], message)
+    assert not out.exists()
+
+
+def test_an_image_of_another_format_is_refused(log_file, room_map, tmp_path, refused):
+    here, out = tmp_path / "room.yaml", tmp_path / "out"
+    here.write_text(room_map.read_text())
+    (tmp_path / "room.pgm").write_bytes(b"\x89PNG\r\n")
+    run = ["run", "--dataset", "carmen", log_file.path, "--out", out, "--localize", here]
+    refused(run, "room.pgm: expected a PGM image (P5 or P2), got PNG")
+    assert not out.exists()

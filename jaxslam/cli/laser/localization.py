@@ -81,7 +81,9 @@ def run(log: LaserLog, options: argparse.Namespace) -> Job:
         "particles in use, mean": float(np.mean(info.active)),
         "particles drawn anywhere, to recover": int(np.sum(info.injected)),
         "scans that left no particle a weight": int(np.sum(info.underflow)),
-        "particles off the map, largest share": float(np.max(info.outside / info.active)),
+        "particles off the map or in a wall, largest share": float(
+            np.max(info.blocked / info.active)
+        ),
         "hypotheses at the end": len(groups.weight),
         "weight of the heaviest": float(groups.weight[0]),
         "final pose": [float(value) for value in path.pose[-1]],
