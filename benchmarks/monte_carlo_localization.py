@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.gate import Metric, alone
 from jaxslam import run, sensors, simulate
 from jaxslam.filters import localization, particle_localization
-from jaxslam.filters.particles import pose_state
+from jaxslam.filters.particles.states import pose_state
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.simulation.scenarios import circle
 

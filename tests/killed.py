@@ -18,7 +18,7 @@ import numpy as np
 import worlds
 
 from jaxslam import filters, store
-from jaxslam.cli.library import ProgramFolder
+from jaxslam.cli.runtime.library import ProgramFolder
 from jaxslam.monte_carlo import monte_carlo
 
 RUNS, BLOCK = 400, 2

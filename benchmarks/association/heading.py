@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxslam import association, plot
-from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
+from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.math.stats import chi2_quantile

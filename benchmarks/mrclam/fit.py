@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 
 from benchmarks.gate import Metric
 from jaxslam.datasets import MRCLAM_CALIBRATION, Calibration
-from jaxslam.datasets.mrclam_files import read_landmarks, read_robot, read_truth
+from jaxslam.datasets.mrclam.files import read_landmarks, read_robot, read_truth
 from jaxslam.streams import interpolate_poses
 
 RATE = 50.0

@@ -1,7 +1,7 @@
 """Helpers of all commands: look-up by name, and folders among the options."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -9,6 +9,9 @@ _T = TypeVar("_T")
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
+
+OUT = Path("out")
+"""Default folder of results."""
 
 
 def pick(kind: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
@@ -30,3 +33,30 @@ def as_folders(options: argparse.Namespace) -> None:
         if not text.strip():
             raise ValueError(f"--{name}: expected a folder, got {text!r}")
         setattr(options, name, Path(text))
+
+
+def add_out(parser: argparse.ArgumentParser) -> None:
+    """Add the option of the folder of results."""
+    parser.add_argument(
+        "--out", metavar="DIR", default=str(OUT), help=f"folder for results (default: {OUT})"
+    )
+
+
+def add_dtype(parser: argparse.ArgumentParser, of: str = "") -> None:
+    """Add the option of the floating-point type; `of` completes the help, as " of the filters"."""
+    parser.add_argument(
+        "--dtype",
+        default="float64",
+        choices=["float32", "float64"],
+        help=f"floating-point type{of} (default: float64)",
+    )
+
+
+def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more: str = "") -> None:
+    """Add the option of the formats of figures; `more` is said after the default."""
+    parser.add_argument(
+        "--figures",
+        default="png",
+        metavar="FORMATS",
+        help=f"formats of figures, of {','.join(formats)}; comma-separated (default: png{more})",
+    )

@@ -1,5 +1,6 @@
 """The files of films, and what is said of them."""
 
+import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,3 +34,13 @@ def film_files(
 
 def _writer(content: bytes) -> Callable[[Path], object]:
     return lambda path: path.write_bytes(content)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the option of films."""
+    parser.add_argument(
+        "--animate",
+        action="store_true",
+        help="also write a film of each filter (consistency: of run 0): film.html to step and "
+        "play, and film.mp4, or film.gif where ffmpeg is missing",
+    )

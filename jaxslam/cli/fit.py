@@ -3,18 +3,18 @@
 import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from jaxslam.cli import cache
+from jaxslam.cli.common import add_out
+from jaxslam.cli.runtime import cache
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
-from jaxslam.datasets.settings_text import changed, fragment
+from jaxslam.datasets.table.settings_text import changed, fragment
 from jaxslam.records import POSE
-from jaxslam.results.files import check_writable, json_text, versions, write_files
+from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
 
 
-def add_options(parser: argparse.ArgumentParser, out: Path) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam fit`."""
     parser.add_argument("path", metavar="FOLDER", help="the folder of the CSV files")
     parser.add_argument(
@@ -30,9 +30,7 @@ def add_options(parser: argparse.ArgumentParser, out: Path) -> None:
         "--write", action="store_true", help="also change dataset.toml in the folder"
     )
     cache.add_options(parser)
-    parser.add_argument(
-        "--out", metavar="DIR", default=str(out), help=f"folder for results (default: {out})"
-    )
+    add_out(parser)
     parser.set_defaults(command=fit_folder, dtype="float64")
 
 
@@ -83,7 +81,7 @@ def _settings(
     return changes, comments
 
 
-def _summary(data: Dataset, result: DatasetFit) -> dict[str, Any]:
+def _summary(data: Dataset, result: DatasetFit) -> Json:
     """What `fit.json` says; what is infinite is null."""
     found = result.found
     rows = zip(

@@ -8,9 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 from jaxslam import motion, sensors, verify
+from jaxslam.cli.common import add_out
+from jaxslam.cli.runtime import cache
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, json_text, versions, write_files
-from jaxslam.verify import user_files
+from jaxslam.verify.inputs import user_files
 
 FAILED = 1
 
@@ -60,3 +62,23 @@ def _verify_all(verify_one: Callable[..., verify.Report]) -> list[verify.Report]
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return reports
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam verify`."""
+    parser.add_argument(
+        "target",
+        metavar="FILE.py[:NAME]",
+        nargs="?",
+        help="a file that defines a Motion, a Sensor, a factory of one, or a function f and its "
+        "f_jacobian; NAME: only that one (default: every model of jaxslam)",
+    )
+    parser.add_argument(
+        "--states", type=int, default=24, help="number of random states (default: 24)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the random states (default: 0)"
+    )
+    add_out(parser)
+    cache.add_options(parser)
+    parser.set_defaults(command=verify_models, dtype="float64")

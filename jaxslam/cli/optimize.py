@@ -11,11 +11,16 @@ import jax
 import numpy as np
 
 from jaxslam import graphs
-from jaxslam.cli.common import pick
-from jaxslam.cli.compile_clock import CompileClock
-from jaxslam.datasets import g2o
+from jaxslam.cli.common import add_dtype, add_out, pick
+from jaxslam.cli.films import film_files
+from jaxslam.cli.runtime import cache
+from jaxslam.cli.runtime.compile_clock import CompileClock
+from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.solver.search import METHODS as STEPS
+from jaxslam.graphs.starts import STARTS
 from jaxslam.graphs.validation import label, variables_of
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, csv_text, json_text, versions, write_files
@@ -34,6 +39,8 @@ TRUSTED = ("relative_pose", "prior")
 NOT_CONVERGED = 1
 WORST = 10
 """Number of rows with the largest residuals in the summary and the figure."""
+FRAMES = 60
+"""Number of iterations that a film shows at most."""
 
 
 def optimize_graph(options: argparse.Namespace, command: str) -> int:
@@ -41,6 +48,11 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     start = pick("start", options.start, starts.STARTS)
     kernel = None if options.kernel is None else pick("kernel", options.kernel, graphs.KERNELS)()
     relative, equation = pick("error", options.error, ERRORS)
+    if options.animate and kernel is not None and kernel.limit is not None:
+        raise ValueError(
+            f"--animate: the kernel {options.kernel} is solved in rounds of many iterations each; "
+            "films show the iterations of one"
+        )
     loaded = g2o.load(options.path)
     check_writable(options.out)
     known = {**of_files(), "relative_pose": relative()}
@@ -102,6 +114,8 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "optimized.g2o": g2o.text_of(found),
         "graph.png": _figure(options, begun, found, squared, summary),
     }
+    if options.animate:
+        files |= _film(options, begun, factors, doubted, solution)
     if len(found.points):
         files["points.csv"] = _csv(("x", "y"), found.point_id, found.points, found.fixed_point)
     written = write_files(options.out, files)
@@ -217,6 +231,43 @@ def _figure(
     return lambda path: path.write_bytes(plot.png(figure))
 
 
+def _film(
+    options: argparse.Namespace,
+    begun: Graph,
+    factors: Mapping[str, Factor],
+    kernel: Mapping[str, graphs.Kernel] | None,
+    solution: graphs.Solution,
+) -> dict[str, Callable[[Path], object]]:
+    """What writes the film of the iterations, by file name.
+
+    Iterate k is where the same optimization stops after k steps; the limit is no part of the
+    compiled program.
+    """
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    taken = int(solution.iterations)
+    shown = np.unique(np.linspace(1, taken, min(taken, FRAMES)).round().astype(int)).tolist()
+    iterates, costs = [begun], [float(solution.chi2_start)]
+    with Progress(f"{Path(options.path).name}: film", "frames") as progress:
+        for done, steps in enumerate(shown):
+            at = graphs.optimize(
+                begun, factors, method=options.method, kernel=kernel, iterations=steps
+            )
+            iterates.append(jax.tree.map(np.asarray, at.graph))
+            costs.append(float(at.chi2))
+            progress(done + 1, len(shown))
+    note = "" if len(shown) == taken else f"{len(shown)} of {taken} iterations shown"
+    scene = plot.graph_scene(
+        iterates,
+        costs,
+        steps=[0, *shown],
+        factors=factors,
+        title=Path(options.path).name,
+        note=note,
+    )
+    return film_files({"optimize": plot.render(scene, fps=2.0)}, suffixed=False)
+
+
 def _table(summary: Mapping[str, Any]) -> str:
     """The summary, a line an entry."""
     wide = max(map(len, summary))
@@ -230,3 +281,39 @@ def _shown(value: object) -> str:
     if value is None:
         return "not finite"
     return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam optimize`."""
+    parser.add_argument("path", metavar="FILE", help="a graph in the format of g2o or TORO")
+    for name, default, known, text in (
+        ("start", "given", STARTS, "where to start"),
+        ("method", "levenberg_marquardt", STEPS, "the steps"),
+        ("kernel", None, KERNELS, "a robust kernel for loop edges and measurements of points"),
+        ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
+    ):
+        parser.add_argument(
+            f"--{name}",
+            metavar="NAME",
+            default=default,
+            help=f"{text}, one of: {', '.join(known)} (default: {default or 'none'})",
+        )
+    parser.add_argument(
+        "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
+    )
+    parser.add_argument(
+        "--certificate",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
+    )
+    parser.add_argument(
+        "--animate",
+        action="store_true",
+        help="also write a film of the iterations: film.html to step and play, and film.mp4, or "
+        "film.gif where ffmpeg is missing",
+    )
+    cache.add_options(parser)
+    add_dtype(parser)
+    add_out(parser)
+    parser.set_defaults(command=optimize_graph)

@@ -19,7 +19,7 @@ from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.verify.errors import describe_error
-from jaxslam.verify.user_files import import_file, split_target
+from jaxslam.verify.inputs.user_files import import_file, split_target
 
 _OWN = "; or FILE.py:NAME, one of your own"
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from jaxslam.datasets.bonn import bonn
 from jaxslam.datasets.carmen import LaserLog, carmen
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.mrclam import mrclam, mrclam_team
-from jaxslam.datasets.mrclam_calibration import MRCLAM_CALIBRATION, Calibration
+from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, Calibration
+from jaxslam.datasets.mrclam.reader import mrclam, mrclam_team
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza import plaza
-from jaxslam.datasets.table import table
+from jaxslam.datasets.table.reader import table
 from jaxslam.datasets.victoria_park import victoria_park
 
 Reader = Callable[[str | Path, int | None], Dataset]

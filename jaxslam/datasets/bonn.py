@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.lines import TextFile
+from jaxslam.datasets.formats.lines import TextFile
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import range_bearing

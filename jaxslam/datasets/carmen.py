@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam.datasets.lines import TextFile
+from jaxslam.datasets.formats.lines import TextFile
 from jaxslam.types import Beams
 
 POSE = ("x", "y", "theta")

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxslam import programs
 from jaxslam.consistency import LEVEL
-from jaxslam.filters.ekf.coordinates import cov_of_coordinates
+from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.protocols import Chart, Filter
 from jaxslam.slots import Joint

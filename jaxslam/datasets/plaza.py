@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.mat_file import read_matrices
+from jaxslam.datasets.formats.mat_file import read_matrices
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import range_only

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.lines import TextFile
+from jaxslam.datasets.formats.lines import TextFile
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import relative_position

@@ -5,7 +5,6 @@ relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without
 """
 
 from jaxslam.graphs import starts
-from jaxslam.graphs.certificate import Certificate, certificate
 from jaxslam.graphs.factor import (
     REGISTRY,
     Factor,
@@ -20,15 +19,16 @@ from jaxslam.graphs.factor import (
 )
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.kernels import REGISTRY as KERNELS
-from jaxslam.graphs.kernels import Kernel, cauchy, dcs, huber, truncated
 from jaxslam.graphs.log import of_log
 from jaxslam.graphs.loops import with_loops_apart
-from jaxslam.graphs.marginals import Marginals, marginals
 from jaxslam.graphs.optimize import chi2, optimize
-from jaxslam.graphs.plan import Plan, plan
-from jaxslam.graphs.residuals import degrees_of_freedom, squared_residuals
-from jaxslam.graphs.search import Ending, Solution
+from jaxslam.graphs.solution.certificate import Certificate, certificate
+from jaxslam.graphs.solution.marginals import Marginals, marginals
+from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.solver.kernels import Kernel, cauchy, dcs, huber, truncated
+from jaxslam.graphs.solver.plan import Plan, plan
+from jaxslam.graphs.solver.residuals import degrees_of_freedom, squared_residuals
+from jaxslam.graphs.solver.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [

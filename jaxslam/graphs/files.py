@@ -1,4 +1,4 @@
-"""Graphs in files: the public names of the reader and the writer, which `datasets.g2o` has."""
+"""Graphs in files: the public names of what `datasets.formats.g2o` reads and writes."""
 
 from pathlib import Path
 
@@ -21,9 +21,9 @@ def read(path: str | Path) -> Graph:
 
     Poses and points are in the order of the file; the last five name tables.
     Numbers are those of the file. Comments (`#`) and scans (`ROBOTLASER1`) are skipped;
-    `datasets.g2o.load` counts them. In a file without vertices, poses and points have the order of
-    their ids and are placed along the edges, `starts.odometry`. The cost of what is read is
-    χ² = Σ eᵀ Ω e, with e as `graphs.REGISTRY` has it and no factor ½.
+    `datasets.formats.g2o.load` counts them. In a file without vertices, poses and points have the
+    order of their ids and are placed along the edges, `starts.odometry`. The cost of what is read
+    is χ² = Σ eᵀ Ω e, with e as `graphs.REGISTRY` has it and no factor ½.
 
     Kümmerle et al. 2011, "g2o: A general framework for graph optimization", ICRA; Grisetti et al.
     2007, "A tree parameterization for efficiently computing maximum likelihood maps using gradient
@@ -34,7 +34,7 @@ def read(path: str | Path) -> Graph:
             twice, an edge to a vertex that is nowhere or from one to itself, and an information
             that is not positive semidefinite.
     """
-    from jaxslam.datasets import g2o
+    from jaxslam.datasets.formats import g2o
 
     return g2o.load(path).graph
 
@@ -48,6 +48,6 @@ def write(path: str | Path, graph: Graph) -> None:
     Raises ValueError on a table that g2o has no line for, points of other than two numbers, and an
     id of both a pose and a point.
     """
-    from jaxslam.datasets import g2o
+    from jaxslam.datasets.formats import g2o
 
     g2o.save(path, graph)

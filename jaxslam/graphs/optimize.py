@@ -2,24 +2,24 @@
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam import programs
-from jaxslam.graphs.batch import in_one_dtype, over_batch, with_batch
 from jaxslam.graphs.factor import Factor
-from jaxslam.graphs.gnc import graduated
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.implicit import followed
-from jaxslam.graphs.kernels import Kernel
-from jaxslam.graphs.linearized import cost, data_of, variables_of
-from jaxslam.graphs.model import Model, model_of
-from jaxslam.graphs.plan import Plan, plan_for
-from jaxslam.graphs.search import METHODS, Solution, minimize
+from jaxslam.graphs.solver.batch import in_one_dtype, over_batch, with_batch
+from jaxslam.graphs.solver.gnc import graduated
+from jaxslam.graphs.solver.implicit import followed
+from jaxslam.graphs.solver.kernels import Kernel
+from jaxslam.graphs.solver.linearized import cost, data_of, variables_of
+from jaxslam.graphs.solver.model import Model, model_of
+from jaxslam.graphs.solver.plan import Plan, plan_for
+from jaxslam.graphs.solver.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
 from jaxslam.validation.numbers import check_count
 
@@ -98,11 +98,11 @@ def _solver(model: Model, method: str) -> Callable[..., Solution]:
     solve = over_batch("graphs.optimize", functools.partial(search, model, method))
 
     @jax.custom_jvp
-    def solved(graph: Graph, *shared: Any) -> Solution:
+    def solved(graph: Graph, *shared: PyTree) -> Solution:
         return solve(shared, graph)
 
     @solved.defjvp
-    def slope(primals: Any, tangents: Any) -> tuple[Solution, Any]:
+    def slope(primals: PyTree, tangents: PyTree) -> tuple[Solution, PyTree]:
         graph, plan, *_ = primals
         found = solved(*primals)
         return found, jax.jvp(

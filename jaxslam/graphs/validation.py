@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.model import factors_of
+from jaxslam.graphs.solver.model import factors_of
 from jaxslam.validation.numbers import is_concrete
 
 INDEFINITE = 1e-6

@@ -1,10 +1,8 @@
 """The exact Euclidean distance of each cell from the nearest one that is occupied."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam import programs
 from jaxslam.grids.grid import Field, Grid, check_grid
@@ -45,7 +43,7 @@ def gradient(field: Field) -> Float[Array, "H W 2"]:
     def slope(axis: int) -> Array:
         if field.values.shape[axis] < 2:
             return jnp.zeros_like(field.values)
-        difference: Any = jnp.gradient(field.values, axis=axis)
+        difference: PyTree = jnp.gradient(field.values, axis=axis)
         return jnp.asarray(difference / field.resolution)
 
     x, y = slope(1), slope(0)

@@ -1,4 +1,4 @@
-"""Maps in files: the public names of the reader and the writer, which `datasets.ros_map` has."""
+"""Maps in files: the public names of what `datasets.formats.ros_map` reads and writes."""
 
 from pathlib import Path
 
@@ -17,8 +17,8 @@ def read_map(path: str | Path) -> Grid:
     | `occupied_thresh`, `free_thresh` | above, below which p a cell is occupied, free |
     | `mode` | `trinary` (default): all else is unknown; `scale`: all else is in between |
 
-    An occupied cell gets the log-odds `datasets.ros_map.CERTAIN`, a free one the negative of it, an
-    unknown one 0. In mode `scale` a cell between the thresholds has the probability
+    An occupied cell gets the log-odds `datasets.formats.ros_map.CERTAIN`, a free one the negative
+    of it, an unknown one 0. In mode `scale` a cell between the thresholds has the probability
     (p - free_thresh)/(occupied_thresh - free_thresh), bounded in the same way.
 
     Source: the map format of the ROS package `map_server`, wiki.ros.org/map_server.
@@ -28,7 +28,7 @@ def read_map(path: str | Path) -> Grid:
             resolution that is not above 0, an origin that is no pose, thresholds out of order, and
             an image that is missing, of another format, or damaged.
     """
-    from jaxslam.datasets import ros_map
+    from jaxslam.datasets.formats import ros_map
 
     return ros_map.load(path)
 
@@ -43,6 +43,6 @@ def write_map(path: str | Path, grid: Grid, *, mode: str = "trinary") -> list[Pa
 
     Raises ValueError on a grid that is none, another mode, and a path that does not end in .yaml.
     """
-    from jaxslam.datasets import ros_map
+    from jaxslam.datasets.formats import ros_map
 
     return ros_map.save(path, grid, mode)

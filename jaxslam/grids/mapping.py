@@ -1,13 +1,13 @@
 """Maps from scans at known poses: hits and misses of cells, and what follows from their counts."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam import programs
 from jaxslam.grids.beam_models.beam_model import usable_beams
@@ -76,7 +76,7 @@ def _shape(height: int, width: int) -> tuple[int, int]:
     return height, width
 
 
-def _check_scans(poses: Any, beams: Beams, max_range: float) -> None:
+def _check_scans(poses: Array, beams: Beams, max_range: float) -> None:
     shapes = [np.shape(part) for part in beams]
     if len(set(shapes)) != 1 or len(shapes[0]) != 2:
         raise ValueError(f"count: expected as many ranges, angles and masks (T, B), got {shapes}")
@@ -108,7 +108,7 @@ def _count(
     height, width = shape
     nowhere = height * width
 
-    def add(total: Any, row: tuple[Array, Beams]) -> tuple[Any, None]:
+    def add(total: PyTree, row: tuple[Array, Beams]) -> tuple[PyTree, None]:
         hits, misses, outside, unusable = total
         pose, scan = row
         usable = usable_beams(scan)

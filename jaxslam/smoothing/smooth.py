@@ -8,7 +8,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.ekf.coordinates import estimate_of
+from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.verify.jacobians import Evaluated, Evaluation
+from jaxslam.verify.derivatives.jacobians import Evaluated, Evaluation
+from jaxslam.verify.inputs.samples import NOMINAL, Samples
 from jaxslam.verify.record import Finding, WrongEntry
-from jaxslam.verify.samples import NOMINAL, Samples
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 """Jacobians (S, m, n)."""

@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.validation.numbers import check_covariance
-from jaxslam.verify.differences import on_circle
+from jaxslam.verify.derivatives.differences import on_circle
+from jaxslam.verify.derivatives.jacobians import Evaluated
+from jaxslam.verify.derivatives.singular import CURES, singular_operation
 from jaxslam.verify.errors import describe_error, line_of
-from jaxslam.verify.functions import Function, at_state, periods, sensor_functions
-from jaxslam.verify.jacobians import Evaluated
+from jaxslam.verify.inputs.functions import Function, at_state, periods, sensor_functions
+from jaxslam.verify.inputs.samples import NOMINAL, Samples
 from jaxslam.verify.record import Check
-from jaxslam.verify.samples import NOMINAL, Samples
-from jaxslam.verify.singular import CURES, singular_operation
 
 Values: TypeAlias = np.ndarray
 

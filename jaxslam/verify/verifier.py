@@ -14,11 +14,13 @@ from numpy.typing import ArrayLike
 from jaxslam.graphs import Factor
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.verify import properties, samples
-from jaxslam.verify.claims import Claim
+from jaxslam.verify import properties
 from jaxslam.verify.comparison import compare_methods
+from jaxslam.verify.derivatives.jacobians import Evaluated, evaluate
 from jaxslam.verify.errors import describe_error
-from jaxslam.verify.functions import (
+from jaxslam.verify.inputs import samples
+from jaxslam.verify.inputs.claims import Claim
+from jaxslam.verify.inputs.functions import (
     Function,
     at_state,
     example_line,
@@ -28,10 +30,9 @@ from jaxslam.verify.functions import (
     plain_function,
     sensor_functions,
 )
-from jaxslam.verify.jacobians import Evaluated, evaluate
+from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 from jaxslam.verify.record import Check, Report
-from jaxslam.verify.samples import Samples
 
 Model: TypeAlias = Motion | Sensor | Factor | Callable[..., jax.Array]
 

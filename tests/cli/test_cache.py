@@ -9,8 +9,8 @@ import jax
 import pytest
 
 from jaxslam import cli
-from jaxslam.cli import cache
-from jaxslam.cli.compile_clock import CompileClock
+from jaxslam.cli.runtime import cache
+from jaxslam.cli.runtime.compile_clock import CompileClock
 
 OURS = {
     "jax_compilation_cache_dir",

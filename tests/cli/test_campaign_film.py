@@ -8,7 +8,7 @@ import worlds
 from PIL import Image
 
 from jaxslam import catalog, plot
-from jaxslam.cli.campaign_film import write_films
+from jaxslam.cli.consistency.film import write_films
 from jaxslam.results.film import encoding
 
 

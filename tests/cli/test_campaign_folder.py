@@ -18,7 +18,7 @@ def test_an_interrupt_exits_with_130_and_writes_nothing(tmp_path, capsys, monkey
     def interrupted(*arguments, **options):
         raise Interrupted(None, 3)
 
-    monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
+    monkeypatch.setattr(cli.consistency.command, "monte_carlo", interrupted)
     assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
     assert "nothing was written" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.*"))
@@ -30,7 +30,7 @@ def test_an_interrupt_shows_what_is_done_and_how_to_go_on(tmp_path, capsys, monk
     def interrupted(*arguments, **options):
         raise Interrupted(done, 300)
 
-    monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
+    monkeypatch.setattr(cli.consistency.command, "monte_carlo", interrupted)
     out = tmp_path / "out"
     assert cli.main([*QUICK, "--out", str(out)]) == 130
     told = capsys.readouterr()
@@ -45,8 +45,8 @@ def test_an_interrupted_command_leaves_no_thread_that_would_be_torn_down(tmp_pat
     def interrupted(*arguments, **options):
         raise Interrupted(None, 3)
 
-    monkeypatch.setattr(cli.campaign, "monte_carlo", interrupted)
-    monkeypatch.setattr(cli.campaign, "_prepare_drawing", ended.wait)
+    monkeypatch.setattr(cli.consistency.command, "monte_carlo", interrupted)
+    monkeypatch.setattr(cli.consistency.command, "_prepare_drawing", ended.wait)
     before = set(threading.enumerate())
     try:
         assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
@@ -130,12 +130,12 @@ def test_an_unfinished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch
         keep.save(0, {"x": np.zeros(2)}, 2)
         raise Interrupted(None, 3)
 
-    monkeypatch.setattr(cli.campaign, "monte_carlo", stopped)
-    monkeypatch.setattr(cli.campaign.shutil, "rmtree", lambda *a, **k: None)
+    monkeypatch.setattr(cli.consistency.command, "monte_carlo", stopped)
+    monkeypatch.setattr(cli.consistency.command.shutil, "rmtree", lambda *a, **k: None)
     assert cli.main([*QUICK, "--out", str(out)]) == 130
     monkeypatch.undo()
     refused([*QUICK, "--out", out], "2 of 3 runs done", "--resume", "--overwrite")
-    monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: 1 / 0)
+    monkeypatch.setattr(cli.consistency.command, "monte_carlo", lambda *a, **k: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cli.main([*QUICK, "--out", str(out), "--overwrite"])
     assert store.resume(out / "blocks").spans() == []
@@ -151,7 +151,7 @@ def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, r
         begun.append(keep.spans())
         raise Interrupted(None, 3)
 
-    monkeypatch.setattr(cli.campaign, "monte_carlo", finished)
+    monkeypatch.setattr(cli.consistency.command, "monte_carlo", finished)
     asked = [*QUICK, "--out", str(out)]
     assert cli.main(asked) == 130
     mine = out / "blocks" / "mine"
@@ -165,7 +165,7 @@ def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, r
         assert cli.main([*asked, accepted]) == 130
         assert not mine.exists()
     # Results without their blocks are results all the same.
-    cli.campaign.shutil.rmtree(out / "blocks")
+    cli.consistency.command.shutil.rmtree(out / "blocks")
     (out / "consistency.json").write_text("{}")
     refused([*asked, "--again"], f"{out} holds the results of a campaign: add --overwrite")
     assert cli.main([*asked, "--overwrite"]) == 130

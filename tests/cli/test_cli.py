@@ -12,7 +12,7 @@ import pytest
 from worlds import three_parameters
 
 from jaxslam import catalog, cli
-from jaxslam.cli import devices
+from jaxslam.cli.runtime import devices
 from jaxslam.monte_carlo import Interrupted
 from jaxslam.results import campaign_files, files
 
@@ -26,7 +26,7 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
         filmed.append(given)
         return {"ekf": SimpleNamespace(player=lambda: "<p>the film of ekf</p>")}
 
-    monkeypatch.setattr(cli.campaign, "write_films", write_films)
+    monkeypatch.setattr(cli.consistency.command, "write_films", write_films)
     asked = ["--filters", "ekf,ideal", "--seed", "4", "--animate", "--out", str(out)]
     assert cli.main([*QUICK, *asked]) == 0
     printed = capsys.readouterr().out
@@ -127,13 +127,15 @@ def test_particles_are_named_as_any_filter_and_all_spans_them(tmp_path, monkeypa
         seen.extend(filters)
         raise Interrupted(None, 3)
 
-    monkeypatch.setattr(cli.campaign, "monte_carlo", begun)
+    monkeypatch.setattr(cli.consistency.command, "monte_carlo", begun)
     assert cli.main([*QUICK, "--filters", asked, "--out", str(tmp_path / "out")]) == 130
     assert seen == (list(catalog.ALL) if asked == "all" else list(catalog.PARTICLES))
 
 
 def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refused, monkeypatch):
-    monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: pytest.fail("work was begun"))
+    monkeypatch.setattr(
+        cli.consistency.command, "monte_carlo", lambda *a, **k: pytest.fail("work was begun")
+    )
     monkeypatch.setitem(cli.SCENARIOS, "signs", lambda steps: three_parameters())
     asked = ["consistency", "--scenario", "signs", "--steps", "5", "--filters", "ekf,fej"]
     parts = ("filter 'fej' cannot run scenario 'ring'", "range_bearing_signature")
@@ -141,7 +143,9 @@ def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refuse
 
 
 def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, refused, monkeypatch):
-    monkeypatch.setattr(cli.campaign, "monte_carlo", lambda *a, **k: pytest.fail("work was begun"))
+    monkeypatch.setattr(
+        cli.consistency.command, "monte_carlo", lambda *a, **k: pytest.fail("work was begun")
+    )
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "deeper" / "out"
     assert refused([*QUICK, "--out", out]) == (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxslam import cli
-from jaxslam.cli.dataset import positive_definite
+from jaxslam.cli.run.command import positive_definite
 from jaxslam.results import plot
 from jaxslam.results.film import encoding
 

@@ -7,8 +7,8 @@ import worlds
 
 import jaxslam
 from jaxslam import programs
-from jaxslam.cli import cache, library
-from jaxslam.cli.compile_clock import CompileClock
+from jaxslam.cli.runtime import cache, library
+from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.monte_carlo import monte_carlo
 
 ASKED = {"scenario": "ring", "filters": "ekf", "seed": 0, "runs": 4, "bound": False}

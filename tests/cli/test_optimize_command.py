@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,10 @@ from reference import graph as plain
 
 from jaxslam import cli, graphs
 from jaxslam.results import plot
+
+FILM = SimpleNamespace(
+    moving=lambda: ("gif", b"GIF", ""), encoded=lambda kind: kind.encode(), note=""
+)
 
 
 def small():
@@ -35,15 +40,20 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
         drawn.update(before=before, after=after, **more)
         return draw(before, after, squared, **more)
 
+    scenes = {}
     monkeypatch.setattr(plot, "graph_figure", graph_figure)
+    monkeypatch.setattr(plot, "render", lambda scene, **more: scenes.update(scene=scene) or FILM)
     out = tmp_path / "out"
-    assert cli.main(["optimize", str(file), "--start", "chordal", "--out", str(out)]) == 0
+    assert (
+        cli.main(["optimize", str(file), "--start", "chordal", "--animate", "--out", str(out)]) == 0
+    )
     printed = capsys.readouterr().out
     fixed = small()._replace(fixed_pose=np.arange(8) == 0)
     poses, points, chi2 = plain.optimum(fixed)
 
     assert {path.name for path in out.iterdir()} == {
-        *("summary.json", "poses.csv", "points.csv", "optimized.g2o", "graph.png")
+        *("summary.json", "poses.csv", "points.csv", "optimized.g2o", "graph.png"),
+        *("film.gif", "film.html"),
     }
     summary = json.loads((out / "summary.json").read_text())
     np.testing.assert_allclose(summary["chi2"], chi2, rtol=1e-9)
@@ -67,6 +77,11 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     np.testing.assert_allclose(again.points, points, atol=1e-6)
     np.testing.assert_array_equal(drawn["after"].poses, found)
     assert "converged: χ² = " in drawn["subtitles"][1]
+    # The film's last iterate is the optimum.
+    scene = scenes["scene"]
+    assert scene.frames == 1 + summary["iterations"]
+    assert scene.said(0) == f"start, χ² = {summary['chi2 at the start']:.6g}"
+    assert scene.said(summary["iterations"]).endswith(f"χ² = {summary['chi2']:.6g}")
 
     for part in (
         "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxslam import charts
-from jaxslam.cli.piecewise import run_in_pieces
+from jaxslam.cli.run.piecewise import run_in_pieces
 from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Filter
 from jaxslam.types import Estimate, Log, Scan

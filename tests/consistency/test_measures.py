@@ -13,10 +13,10 @@ from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 from jaxslam import charts, consistency, motion, sensors
 from jaxslam.consistency.nees import block_nees
 from jaxslam.consistency.score import EVENTS
-from jaxslam.filters.ekf.to_points import ToPoints
+from jaxslam.filters.ekf.coordinates.to_points import ToPoints
 from jaxslam.filters.map_management.merging import Merged
-from jaxslam.filters.particles.moments import weighted_pose_moments
-from jaxslam.filters.particles.particle_info import ParticleInfo
+from jaxslam.filters.particles.states.moments import weighted_pose_moments
+from jaxslam.filters.particles.states.particle_info import ParticleInfo
 from jaxslam.filters.reporting import Pruned
 from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Estimate, Info, Log, Scan, Status, Trace, Truth

@@ -9,8 +9,8 @@ import pytest
 from recordings import EPOCH, MRCLAM, assert_log, assert_spoiled, folder, mapped, mrclam, write
 
 from jaxslam import datasets
-from jaxslam.datasets.mrclam import white_noise
-from jaxslam.datasets.mrclam_files import EXCHANGED
+from jaxslam.datasets.mrclam.files import EXCHANGED
+from jaxslam.datasets.mrclam.reader import white_noise
 
 
 def test_mrclam_by_hand(tmp_path):

@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from jaxslam.datasets.settings_text import changed, fragment
+from jaxslam.datasets.table.settings_text import changed, fragment
 
 CHANGES = {
     "motion": {"noise": [0.012345678, 1e-9]},

@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.verify import differences, verify_jacobians
+from jaxslam.verify import verify_jacobians
+from jaxslam.verify.derivatives import differences
 
 
 def smooth(x):

@@ -10,11 +10,11 @@ from verified import by_name, failed
 
 from jaxslam import sensors
 from jaxslam.verify import build, verify_jacobians
-from jaxslam.verify.functions import plain_function, sensor_functions
-from jaxslam.verify.jacobians import Evaluated
-from jaxslam.verify.jumps import Jump
-from jaxslam.verify.samples import Samples
-from jaxslam.verify.singular import CURES, singular_operation
+from jaxslam.verify.derivatives.jacobians import Evaluated
+from jaxslam.verify.derivatives.jumps import Jump
+from jaxslam.verify.derivatives.singular import CURES, singular_operation
+from jaxslam.verify.inputs.functions import plain_function, sensor_functions
+from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.verifier import notes_of
 
 # --- lengths of arguments -------------------------------------------------------------------------

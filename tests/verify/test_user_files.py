@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from jaxslam.cli import main
-from jaxslam.verify import user_files
+from jaxslam.verify.inputs import user_files
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

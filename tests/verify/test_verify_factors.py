@@ -5,7 +5,7 @@ import dataclasses
 from verified import failed
 
 from jaxslam import graphs, verify_jacobians
-from jaxslam.verify import user_files
+from jaxslam.verify.inputs import user_files
 
 
 def test_a_wrong_entry_of_a_factor_is_named():

@@ -25,10 +25,10 @@ from jaxslam.filters.delayed.state import (
 from jaxslam.filters.delayed.stored_measurements import store_measurements
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.filters.ekf.innovation import Correction
-from jaxslam.filters.ekf.scan import associate_scan
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.update import correct_in_turn
+from jaxslam.filters.ekf.steps.innovation import Correction
+from jaxslam.filters.ekf.steps.scan import associate_scan
+from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
 from jaxslam.filters.reporting import info_of, seen_before, status_of
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Association, Filter, Motion, Sensor

@@ -7,11 +7,9 @@ from jaxtyping import Array, Float
 from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.ekf import to_points
-from jaxslam.filters.ekf.coordinates import estimate_of
-from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
-from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import turns_of, update_by_scan
+from jaxslam.filters.ekf.coordinates import to_points
+from jaxslam.filters.ekf.coordinates.linear_system import LinearizedSteps, LinearSystem
+from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
@@ -20,6 +18,8 @@ from jaxslam.filters.ekf.settings import (
     check_make_room,
     check_settings,
 )
+from jaxslam.filters.ekf.steps.predict import propagate
+from jaxslam.filters.ekf.steps.scan import turns_of, update_by_scan
 from jaxslam.filters.reporting import with_extra, with_removed
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg

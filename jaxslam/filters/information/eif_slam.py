@@ -7,7 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.ekf.coordinates import estimate_of
+from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.filters.information import canonical
 from jaxslam.filters.information.settings import InformationSettings
 from jaxslam.filters.information.tag_association import associate_by_table

@@ -5,31 +5,31 @@ from jax import Array
 from jaxtyping import Bool, Int
 
 from jaxslam.filters.information import canonical
-from jaxslam.filters.information.active_set import (
+from jaxslam.filters.information.canonical import CanonicalInnovations
+from jaxslam.filters.information.settings import RelocationSettings
+from jaxslam.filters.information.sparse.active_set import (
     activate,
     active_matches,
     assign_indices,
     deactivate,
 )
-from jaxslam.filters.information.canonical import CanonicalInnovations
-from jaxslam.filters.information.mean_recovery import (
+from jaxslam.filters.information.sparse.mean_recovery import (
     recover_passive_means,
     repeat_recovery,
 )
-from jaxslam.filters.information.relocation import relocate_or_correct
-from jaxslam.filters.information.settings import RelocationSettings
-from jaxslam.filters.information.sparse_filter import (
+from jaxslam.filters.information.sparse.relocation import relocate_or_correct
+from jaxslam.filters.information.sparse.sparse_filter import (
     check_scan_size,
     correct_active,
     finish_scan,
     initialize_active,
     sparse_filter,
 )
-from jaxslam.filters.information.sparse_state import (
+from jaxslam.filters.information.sparse.sparse_state import (
     SparseState,
     linked_to_robot,
 )
-from jaxslam.filters.information.sparsification import cut_robot_links
+from jaxslam.filters.information.sparse.sparsification import cut_robot_links
 from jaxslam.filters.information.tag_association import TagAssociation, associate_by_index
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.types import Info, Scan

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.particles.landmark_ekf import update_map
-from jaxslam.filters.particles.moments import slam_estimate
 from jaxslam.filters.particles.proposal import associate_particle, propose_pose
 from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import particle_map_settings
-from jaxslam.filters.particles.slam_state import (
+from jaxslam.filters.particles.states.moments import slam_estimate
+from jaxslam.filters.particles.states.slam_state import (
     SlamParticles,
     as_only_particle,
     initial_slam_particles,

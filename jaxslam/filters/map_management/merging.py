@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots, validation
-from jaxslam.filters.ekf.coordinates import retracted
+from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
 from jaxslam.filters.map_management.wrapping import joint_of, managed
 from jaxslam.filters.reporting import with_extra
 from jaxslam.math import linalg

@@ -3,7 +3,7 @@
 from jaxtyping import Array, Float
 
 from jaxslam import validation
-from jaxslam.filters.ekf.scan import without_landmarks
+from jaxslam.filters.ekf.steps.scan import without_landmarks
 from jaxslam.filters.map_management.wrapping import joint_of, managed
 from jaxslam.filters.reporting import with_removed
 from jaxslam.protocols import Filter, Life

@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxslam.filters.ekf.coordinates import cov_of_coordinates, with_cov_of_coordinates
+from jaxslam.filters.ekf.coordinates.map_coordinates import (
+    cov_of_coordinates,
+    with_cov_of_coordinates,
+)
 from jaxslam.filters.map_management.alignment import align_points
 from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
 from jaxslam.filters.map_management.point_pairs import PointSets

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxslam.filters.ekf.coordinates import cov_of_coordinates
+from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.merging import closest_pair, merge_landmarks
 from jaxslam.life.recency import Recency
 from jaxslam.math.xla import where_any

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxslam.filters.ekf.scan import SensorTurn
 from jaxslam.filters.ekf.settings import EkfSettings
+from jaxslam.filters.ekf.steps.scan import SensorTurn
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.team import Robot
 from jaxslam.validation.numbers import check_count, check_gate

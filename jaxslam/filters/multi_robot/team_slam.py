@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float
 from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance_form
+from jaxslam.filters.ekf.steps.predict import propagate
+from jaxslam.filters.ekf.steps.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.multi_robot.pose_initialization import best_initialization, observed_points
 from jaxslam.filters.multi_robot.settings import (
     SIZE,

@@ -2,18 +2,16 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.particles.landmark_ekf import update_map
-from jaxslam.filters.particles.moments import slam_estimate, weighted_nis
-from jaxslam.filters.particles.particle_info import ParticleInfo
 from jaxslam.filters.particles.proposal import (
     PoseProposal,
     associate_particle,
@@ -27,7 +25,9 @@ from jaxslam.filters.particles.settings import (
     check_resampling,
     particle_map_settings,
 )
-from jaxslam.filters.particles.slam_state import (
+from jaxslam.filters.particles.states.moments import slam_estimate, weighted_nis
+from jaxslam.filters.particles.states.particle_info import ParticleInfo
+from jaxslam.filters.particles.states.slam_state import (
     SlamParticles,
     draw_poses,
     initial_slam_particles,
@@ -167,7 +167,7 @@ def fastslam(
 
 
 def of_each_particle(
-    scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: Any
+    scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: PyTree
 ) -> _T:
     """step(*of_particle, scan=…, settings=…) of every particle."""
     return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)

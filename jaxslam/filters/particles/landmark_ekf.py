@@ -11,11 +11,11 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.filters.particles.moments import slam_estimate
 from jaxslam.filters.particles.proposal import ParticleInnovations
 from jaxslam.filters.particles.scan_association import ParticleAssociation
 from jaxslam.filters.particles.settings import ParticleMapSettings
-from jaxslam.filters.particles.slam_state import SlamParticles, as_only_particle
+from jaxslam.filters.particles.states.moments import slam_estimate
+from jaxslam.filters.particles.states.slam_state import SlamParticles, as_only_particle
 from jaxslam.filters.reporting import info_of, seen_before, status_of, with_removed
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg

@@ -14,17 +14,6 @@ from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.known.localization import checked_map
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
-from jaxslam.filters.particles.moments import weighted_nis
-from jaxslam.filters.particles.particle_info import ParticleInfo
-from jaxslam.filters.particles.pose_state import (
-    ParticleEvents,
-    PoseParticles,
-    active_mask,
-    draw_start,
-    initial_pose_particles,
-    no_events,
-    pose_particle_moments,
-)
 from jaxslam.filters.particles.proposal import sample_motion
 from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
 from jaxslam.filters.particles.scan_association import zero_padding
@@ -33,6 +22,17 @@ from jaxslam.filters.particles.settings import (
     checked_box,
     checked_least,
     known_map_sensors,
+)
+from jaxslam.filters.particles.states.moments import weighted_nis
+from jaxslam.filters.particles.states.particle_info import ParticleInfo
+from jaxslam.filters.particles.states.pose_state import (
+    ParticleEvents,
+    PoseParticles,
+    active_mask,
+    draw_start,
+    initial_pose_particles,
+    no_events,
+    pose_particle_moments,
 )
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.protocols import Associate, Differentiable, Filter, Motion, Resample, Sensor

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.particles.pose_state import PoseParticles, draw_uniform_poses
 from jaxslam.filters.particles.settings import MonteCarloSettings
+from jaxslam.filters.particles.states.pose_state import PoseParticles, draw_uniform_poses
 from jaxslam.resampling.weights import survivors
 
 

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.model import factors_of
+from jaxslam.graphs.solver.model import factors_of
 from jaxslam.math import se2
 
 Factors = Mapping[str, Factor]

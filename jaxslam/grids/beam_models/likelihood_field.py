@@ -1,11 +1,9 @@
 """Beam end-points against the distance to the nearest obstacle."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam.grids.beam_models.beam_model import BeamModel
 from jaxslam.grids.beam_models.ray_cast import check_weights
@@ -47,7 +45,7 @@ def likelihood_field(
     def prepare(grid: Grid) -> Field:
         return distance_field(grid, truncate=truncate)
 
-    def each(field: Any, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def each(field: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
         far = beams.range >= max_range
         ranges = jnp.where(far, 0.0, beams.range)

@@ -1,12 +1,12 @@
 """The range of a beam against the one that the map predicts: a mixture of four components."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam.grids.beam_models.beam_model import BeamModel
 from jaxslam.grids.cast import RayMap, cast, ray_map
@@ -84,7 +84,7 @@ def ray_cast(
     def prepare(grid: Grid) -> RayMap:
         return ray_map(grid, method=method)
 
-    def each(rays: Any, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def each(rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
         expected = cast(rays, eye, beams.angle, max_range)
         z = jnp.minimum(beams.range, max_range)

@@ -15,6 +15,7 @@ from jaxslam.results.plot.style import (
     INK,
     PAGE,
     TEXT,
+    Look,
     caption,
     every_handle,
     panels_of,
@@ -76,7 +77,7 @@ def grid_figure(
         handles = []
     if path is not None:
         axes.plot(*path[:, :2].T, color=COLORS[0], lw=1.2, label="path", zorder=3)
-        end: dict[str, Any] = {
+        end: Look = {
             "mfc": COLORS[0],
             "mec": "white",
             "ms": 5,

@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxslam import charts, filters, motion, sensors
 from jaxslam.filters.ekf.observability import after
-from jaxslam.filters.ekf.scan import linear_corrections
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.update import correct_in_turn
+from jaxslam.filters.ekf.steps.scan import linear_corrections
+from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
 from jaxslam.types import Scan
 
 SEES = sensors.range_bearing(np.diag([0.04, 0.01]))

@@ -12,7 +12,7 @@ import pytest
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.charts import right_invariant
 from jaxslam.filters import compressed_ekf_slam, ekf_slam
-from jaxslam.filters.ekf.to_points import ready, reduce, reduction
+from jaxslam.filters.ekf.coordinates.to_points import ready, reduce, reduction
 from jaxslam.linearize import unscented
 from jaxslam.protocols import Basis
 from jaxslam.types import Log, Scan, Status

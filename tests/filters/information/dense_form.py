@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters.information.marginals import information_of
+from jaxslam.filters.information.sparse.marginals import information_of
 
 COUNT = 36
 """landmarks of the cloister"""

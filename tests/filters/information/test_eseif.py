@@ -21,10 +21,10 @@ from dense_form import (
 )
 
 from jaxslam import filters, motion, sensors
-from jaxslam.filters.information import sparsification
-from jaxslam.filters.information.mean_recovery import recover_passive_means
-from jaxslam.filters.information.relocation import determines_pose, marginalize_pose
-from jaxslam.filters.information.sparse_state import linked_to_robot
+from jaxslam.filters.information.sparse import sparsification
+from jaxslam.filters.information.sparse.mean_recovery import recover_passive_means
+from jaxslam.filters.information.sparse.relocation import determines_pose, marginalize_pose
+from jaxslam.filters.information.sparse.sparse_state import linked_to_robot
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import simulate

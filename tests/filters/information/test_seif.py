@@ -11,14 +11,14 @@ from dense_form import COUNT, canonical, close, dense, dtypes, initialized, meas
 from worlds import draw
 
 from jaxslam import filters, sensors
-from jaxslam.filters.information import link_lists, sparse_state, sparsification
-from jaxslam.filters.information.marginals import (
+from jaxslam.filters.information.sparse import link_lists, sparse_state, sparsification
+from jaxslam.filters.information.sparse.marginals import (
     blanket_cov,
     blanket_marginals,
     whole_information,
     whole_mean,
 )
-from jaxslam.filters.information.mean_recovery import recover_passive_means
+from jaxslam.filters.information.sparse.mean_recovery import recover_passive_means
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.scenarios.view import between_ranges

@@ -12,8 +12,8 @@ import worlds
 
 from jaxslam import association, life, monte_carlo, motion, programs, resampling, sensors
 from jaxslam.filters import fastslam
-from jaxslam.filters.particles import moments
-from jaxslam.filters.particles.slam_state import SlamParticles
+from jaxslam.filters.particles.states import moments
+from jaxslam.filters.particles.states.slam_state import SlamParticles
 from jaxslam.run import run
 from jaxslam.types import Scan, Status
 

@@ -12,7 +12,7 @@ import worlds
 
 from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.filters import fastslam, localization, particle_localization
-from jaxslam.filters.particles import pose_state
+from jaxslam.filters.particles.states import pose_state
 from jaxslam.sensors import Part, suite
 from jaxslam.types import Scan, Status
 

@@ -1,6 +1,7 @@
 """Scenes, which are rendered to films: panels of layers, each a function that draws frame k."""
 
 from jaxslam.results.plot.scene.animate import animate, animate_world
+from jaxslam.results.plot.scene.graph_scene import graph_scene
 from jaxslam.results.plot.scene.history import History, history_of
 from jaxslam.results.plot.scene.probe import Cloud, Links, probe
 from jaxslam.results.plot.scene.render import Draw, Layer, Panel, Scene, render
@@ -16,6 +17,7 @@ __all__ = [
     "Scene",
     "animate",
     "animate_world",
+    "graph_scene",
     "history_of",
     "probe",
     "render",

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.filters.information.eif_slam import CanonicalState
-from jaxslam.filters.information.marginals import information_of
-from jaxslam.filters.information.sparse_state import SparseState
-from jaxslam.filters.particles.pose_state import PoseParticles
-from jaxslam.filters.particles.slam_state import SlamParticles
+from jaxslam.filters.information.sparse.marginals import information_of
+from jaxslam.filters.information.sparse.sparse_state import SparseState
+from jaxslam.filters.particles.states.pose_state import PoseParticles
+from jaxslam.filters.particles.states.slam_state import SlamParticles
 
 
 class Cloud(NamedTuple):

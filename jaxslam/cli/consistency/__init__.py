@@ -1,0 +1,1 @@
+"""The command `jaxslam consistency`: options, campaign, folder, films."""

@@ -1,0 +1,228 @@
+"""The command `jaxslam consistency`: a Monte-Carlo campaign, its table and its files."""
+
+import argparse
+import re
+import shutil
+import sys
+import threading
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from typing import Any
+
+import jax
+
+from jaxslam.cli.common import INTERRUPTED, OUT
+from jaxslam.cli.consistency.film import write_films
+from jaxslam.cli.consistency.folder import (
+    BLOCKS,
+    TIMES,
+    check_same_campaign,
+    earlier_results,
+    open_store,
+)
+from jaxslam.cli.runtime import devices, library
+from jaxslam.cli.user_objects import UserObjects
+from jaxslam.monte_carlo import Interrupted, Library, monte_carlo
+from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
+from jaxslam.monte_carlo.fingerprint import fingerprint
+from jaxslam.protocols import Candidate
+from jaxslam.results import campaign_files, run_table, store
+from jaxslam.results.files import check_writable
+from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.types import Estimate, Truth
+from jaxslam.validation.numbers import check_count
+
+DEFAULTS: dict[str, Any] = {
+    "scenario": "circle",
+    "filters": "dead_reckoning,ekf",
+    "runs": 100,
+    "steps": None,
+    "seed": 0,
+    "bound": False,
+    "dtype": "float64",
+}
+"""Default values of the options that define a campaign."""
+
+
+def consistency(options: argparse.Namespace, command: str) -> int:
+    """Run a campaign, print its table and write its files; returns the exit status."""
+    asked, settings = _asked(options)
+    part = _part(options)
+    out = options.resume or options.out or OUT
+    # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
+    jax.config.update("jax_enable_x64", True)
+    devices.join(options)
+    formats = campaign_files.check_formats("--figures", options.figures.split(","))
+    there = [kind for kind in run_table.FORMATS if (out / f"runs.{kind}").exists()]  # up to date
+    asked_for = filter(None, options.table.split(","))
+    tables = run_table.check_formats("--table", [*asked_for, *there])
+    files = UserObjects()
+    scenario = files.scenario(asked["scenario"], asked["steps"])
+    filters = files.filters(asked["filters"], scenario)
+    if not 0 <= asked["seed"] < 2**32:
+        raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {asked['seed']}")
+    check_count("runs", asked["runs"])
+    if options.block is not None:
+        check_count("block", options.block)
+    check_writable(out)
+    # What is missing of a campaign of parts is computed as the parts would.
+    here = devices.chosen(options.devices, settings.get("devices"))
+    key = jax.random.key(asked["seed"])
+    identity, programs = _identity(asked, files, scenario, filters, key, here[0].platform)
+    if part is not None and options.block is None:
+        options.block = fitting_block(scenario, filters, here[0])
+    if part is not None and (part[0] - 1) * options.block * len(here) >= asked["runs"]:
+        print(f"part {part[0]} of {part[1]} has no block of the {asked['runs']:,} runs")
+        return 0
+    keep = open_store(options, out, asked, settings, part and len(here))
+    earlier = None if part else earlier_results(out, keep)
+    names = campaign_files.file_names(formats) + [f"runs.{kind}" for kind in tables]
+    written = earlier is not None and all((out / name).exists() for name in names)
+    if not written and part is None:
+        # Matplotlib is loaded while filters run. Not in a daemon thread: such a thread crashes in
+        # compiled code when the interpreter exits.
+        threading.Thread(target=_prepare_drawing).start()
+    try:
+        with files.located_errors(), programs as kept:
+            campaign = monte_carlo(
+                scenario,
+                filters,
+                asked["runs"],
+                key,
+                block=options.block,
+                devices=here,
+                bound=asked["bound"],
+                dtype=asked["dtype"],
+                keep=keep,
+                part=part,
+                identity=identity,
+                library=kept,
+            )
+    except Interrupted as stop:
+        if stop.campaign is None:
+            if not keep.spans() and part is None:  # other processes may have saved some
+                shutil.rmtree(keep.folder, ignore_errors=True)
+            raise
+        if jax.process_index() == 0:
+            print(stop.campaign)
+            print(f"\njaxslam: interrupted, {stop}; --resume {out} continues it", file=sys.stderr)
+        return INTERRUPTED
+    for sentence in keep.set_aside:
+        print(f"jaxslam: {sentence}", file=sys.stderr)
+    if jax.process_index() > 0:
+        return 0
+    if part is not None:
+        print(
+            f"part {part[0]} of {part[1]} is done, {campaign.runs:,} runs; {keep.folder} holds "
+            f"{keep.done():,} of {asked['runs']:,}; jaxslam consistency --resume {out} computes "
+            "what is missing, and sums up"
+        )
+        return 0
+    took = campaign.seconds
+    ran = took - campaign.compile_seconds if campaign.compile_seconds else 0.0
+    if earlier is not None and not keep.set_aside:  # else some runs were computed again
+        times = {name: earlier[name] for name in TIMES}
+        campaign, command = replace(campaign, **times), earlier["command"]
+    else:
+        written = False
+    print(campaign)
+    film = ""
+    if options.animate:
+        films = write_films(out, scenario, filters, asked["seed"], campaign.dtype)
+        film = "" if written else next(iter(films.values())).player()
+    if written:
+        more = "but films" if options.animate else "and nothing written"
+        print(
+            f"\n{out} holds this campaign, finished: nothing was run {more}; "
+            f"--runs above {campaign.runs} extends it"
+        )
+        return 0
+    if not campaign.first:
+        name = campaign_files.filter_of_run_zero(campaign)
+        first = _run_zero(scenario, filters[name], key, campaign.dtype)
+        campaign = replace(campaign, first={name: first})
+    paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"], film)
+    paths += [campaign.save_runs(out / f"runs.{kind}") for kind in tables]
+    print("\nwrote " + ", ".join(map(str, paths)))
+    print(
+        f"results after {took:.1f} s"
+        + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
+    )
+    return 0
+
+
+def _asked(options: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The options that define the campaign, and the settings that a resumed one began with.
+
+    They come from the command, the resumed campaign and the defaults, in this order. The options of
+    a resumed campaign get its size of blocks unless another is given.
+    """
+    asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
+    settings: dict[str, Any] = {}
+    if options.resume is not None:
+        there = store.resume(options.resume / BLOCKS)
+        check_same_campaign(options, there, asked)
+        settings = there.settings
+        asked = settings["asked"] | {"runs": there.runs} | asked
+        if options.block is None:  # blocks of another size would round differently
+            options.block = settings.get("block")
+    return DEFAULTS | asked, settings
+
+
+def _part(options: argparse.Namespace) -> tuple[int, int] | None:
+    """The part of the runs that is asked for, (i, n); raises ValueError where it is none."""
+    if options.part is None:
+        return None
+    found = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise ValueError(f"--part: expected I/N with 1 <= I <= N, as 3/16, got {options.part!r}")
+    unfit = {
+        "--coordinator": options.coordinator,
+        "--overwrite": options.overwrite,
+        "--again": options.again,
+    }
+    for name, given in unfit.items():
+        if given:
+            raise ValueError(f"--part: expected no {name} with it")
+    return int(found[1]), int(found[2])
+
+
+def _identity(
+    asked: Mapping[str, Any],
+    files: UserObjects,
+    scenario: Scenario,
+    filters: Mapping[str, Candidate],
+    key: jax.Array,
+    platform: str,
+) -> tuple[dict[str, str], AbstractContextManager[Library | None]]:
+    """What tells the campaign from others, and its compiled programs in the cache folder.
+
+    By the names and the source of the package, without a trace. What comes from a user's file may
+    depend on anything, as other files: it is told by what it computes (`fingerprint`), which takes
+    a trace, and its programs are found in JAX's own cache, by their text.
+    """
+    if not files.used:
+        identity = library.identity(asked, platform)
+        return identity, library.program_folder(identity)
+    with files.located_errors():
+        found = fingerprint(scenario, filters, key, platform, asked["bound"], asked["dtype"])
+    return found, nullcontext()
+
+
+def _prepare_drawing() -> None:
+    """Load what draws the figures."""
+    from jaxslam.results import page, plot  # noqa: F401
+
+    plot.warm_up()
+
+
+def _run_zero(
+    scenario: Scenario, candidate: Candidate, key: jax.Array, dtype: str
+) -> tuple[Truth, Estimate]:
+    """Run 0 of a filter, computed again where another process or an earlier command computed it."""
+    key_world, key_filter = jax.random.split(jax.random.fold_in(key, 0))
+    truth, log = rounded(simulate(scenario, key_world), dtype)
+    method, _ = estimator_of(candidate, truth, scenario)
+    found: tuple[Truth, Estimate] = jax.device_get((truth, method(log, key_filter).estimate))
+    return found

@@ -1,0 +1,1 @@
+"""The command `jaxslam run`: options, filters, pieces, films."""

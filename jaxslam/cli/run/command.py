@@ -1,0 +1,236 @@
+"""The command `jaxslam run`: filters on a recorded data set."""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxslam.cli.common import pick
+from jaxslam.cli.run.film import film_steps, films, watching
+from jaxslam.cli.run.filters import chosen, with_options
+from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
+from jaxslam.datasets import READERS, Dataset
+from jaxslam.datasets.evaluation import Evaluation, evaluate
+from jaxslam.datasets.map_test import joint_map_cov
+from jaxslam.monte_carlo.progress import Progress
+from jaxslam.protocols import Filter
+from jaxslam.results import report
+from jaxslam.results.campaign_files import check_formats
+from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
+from jaxslam.slots import Joint
+from jaxslam.types import Estimate, Status
+
+
+def run_dataset(options: argparse.Namespace, command: str) -> int:
+    """Run filters over the data set, print and write their results; returns the exit status."""
+    if options.check_every is not None and options.check_every < 0:
+        raise ValueError(f"--check-every: expected at least 0, got {options.check_every}")
+    formats = check_formats("--figures", options.figures.split(","))
+    data = pick("dataset", options.dataset, READERS)(options.path, options.robot)
+    data = with_options(data, options)
+    filters = chosen(data, options.filters)
+    check_writable(options.out)
+    at = film_steps(data) if options.animate else None
+    runs = {name: _run(name, filter, data, options, at) for name, filter in filters.items()}
+    last = next(iter(runs.values())).result.last
+    summary: Json = {
+        "dataset": data.name,
+        "source": data.source,
+        "command": command,
+        "dtype": str(last.pose.dtype),
+        "steps": data.steps,
+        "measurements": data.measurements,
+        "dropped by the reader": data.dropped,
+        "corrections to the data": list(data.corrections),
+        "defaults taken": list(data.assumed),
+    }
+    several = len(runs) > 1
+    if several:
+        print(_table({"": summary}), end="\n\n")
+        print(_table({name: _flat(run.summary) for name, run in runs.items()}))
+        summary["filters"] = {name: run.summary for name, run in runs.items()}
+    else:
+        summary |= next(iter(runs.values())).summary
+        print(_table({"": summary}))
+    files: dict[str, str | Callable[[Path], object]] = {}
+    for name, run in runs.items():
+        suffix = f"-{name}" if several else ""
+        files[f"trajectory{suffix}.csv"] = report.trajectory_csv(data.time, run.result.path)
+        files[f"trajectory{suffix}.tum"] = report.trajectory_tum(data.time, run.result.path)
+        files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
+    files["summary.json"] = json_text(summary | {"versions": versions()})
+    files |= _figure(data, runs, formats)
+    if at is not None:
+        files |= films(data, {name: run[:2] for name, run in runs.items()}, at)
+    written = write_files(options.out, files)
+    print("\nwrote " + ", ".join(str(path) for path in written))
+    return 0
+
+
+class _Run(NamedTuple):
+    """A filter's results on a data set."""
+
+    result: PiecewiseRun
+    found: Evaluation
+    summary: Json
+
+
+def _run(
+    name: str,
+    filter: Filter,
+    data: Dataset,
+    options: argparse.Namespace,
+    at: Int[np.ndarray, "F"] | None,
+) -> _Run:
+    """Run one filter over a data set; its covariance is checked where the state holds P.
+
+    at: the steps that a film shows, None without one.
+    """
+
+    def check(state: Any) -> bool:
+        return positive_definite(np.asarray(state.cov))
+
+    pose, pose_cov = (np.asarray(part, np.float64) for part in (data.pose, data.pose_cov))
+    state = jax.eval_shape(filter.init, pose, pose_cov)
+    has_covariance = isinstance(state, Joint) and name != "square_root"
+    with Progress(f"{data.name}, {name}", "steps") as progress:
+        began = time.perf_counter()
+        # The reader has checked the values; `asarray` converts the log to the chosen dtype.
+        result = run_in_pieces(
+            filter,
+            jax.tree.map(jnp.asarray, data.log),
+            pose,
+            pose_cov,
+            every=options.check_every if has_covariance else 0,
+            check=check,
+            progress=progress,
+            **({} if at is None else watching(at)),
+        )
+    seconds = time.perf_counter() - began
+    last = result.last
+    nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
+    found = evaluate(data, result.path, last, joint_map_cov(filter, result.final))
+    summary = {
+        "landmarks": int(last.alive.sum()),
+        "status": {
+            s.name.lower(): int((result.status == s).sum()) for s in Status if s != Status.EMPTY
+        },
+        "NIS / dof": float(nis / max(int(result.dof.sum()), 1)),
+        "log-likelihood": float(result.log_likelihood.sum()),
+        "P positive definite": _definiteness(result),
+        "final pose": [float(value) for value in last.pose],
+        "seconds": round(seconds, 2),
+    }
+    tested = {} if found.map_test is None else found.map_test.rows()
+    return _Run(result, found, summary | found.errors | tested)
+
+
+def _figure(
+    data: Dataset, runs: dict[str, _Run], formats: tuple[str, ...]
+) -> dict[str, Callable[[Path], object]]:
+    """What writes the map: the first filter with ellipses and truth, the others without."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    (name, first), *rest = runs.items()
+    found = first.found
+    figure = plot.map_figure(
+        _whole(first.result),
+        true_points=found.points,
+        names=None if found.points is None else data.tags,
+        true_path=found.path,
+        dead_reckoning=_dead_reckoning(data),
+        others={each: _whole(run.result) for each, run in rest},
+        title=f"{data.name}: {name} with ellipses" if rest else data.name,
+    )
+
+    def saved(kind: str) -> Callable[[Path], object]:
+        return lambda path: path.write_bytes(plot.encode(figure, kind))
+
+    return {f"map.{kind}": saved(kind) for kind in formats}
+
+
+def _whole(result: PiecewiseRun) -> Estimate:
+    """The estimated path with the map of its end."""
+    last = result.last
+    at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive", "tag")}
+    return result.path._replace(**at_end)
+
+
+def positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
+    """Whether a covariance has a finite Cholesky factor, by NumPy."""
+    try:
+        return bool(np.isfinite(np.linalg.cholesky(cov)).all())
+    except np.linalg.LinAlgError:
+        return False
+
+
+def _dead_reckoning(data: Dataset) -> Float[np.ndarray, "T 3"]:
+    """The path by the controls alone, without noise."""
+    nominal = jnp.zeros(len(data.motion.noises))
+
+    def step(pose: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pose = data.motion.step(pose, control, nominal)
+        return pose, pose
+
+    drive = jax.jit(lambda pose, controls: jax.lax.scan(step, pose, controls)[1])
+    return np.asarray(drive(jnp.asarray(data.pose), jnp.asarray(data.log.control)))
+
+
+def _definiteness(result: PiecewiseRun) -> str:
+    """A phrase: at how many of the checked steps P was positive definite, and where not."""
+    if not result.checked:
+        return "not checked"
+    failed = [step for step, good in zip(result.checked, result.passed, strict=True) if not good]
+    count = f"at {sum(result.passed)} of {len(result.passed)} checked steps"
+    if not failed:
+        return count
+    more = ", …" if len(failed) > 5 else ""
+    return f"{count}, not at {', '.join(map(str, failed[:5]))}{more}"
+
+
+def _flat(summary: Json) -> Json:
+    """The summary as rows of one value: a row a status that occurs, a row a coordinate."""
+    counts = {f"status: {name}": count for name, count in summary["status"].items() if count}
+    names = ("x [m]", "y [m]", "theta [rad]")
+    pose = {f"final {n}": value for n, value in zip(names, summary["final pose"], strict=True)}
+    rows = {key: summary[key] for key in summary if key not in ("status", "final pose")}
+    return counts | rows | pose
+
+
+def _table(columns: dict[str, Json]) -> str:
+    """Summaries side by side, a row an entry; names above them where there are several."""
+    rows = list(dict.fromkeys(key for column in columns.values() for key in column))
+    head = [["", *columns]] if len(columns) > 1 else []
+    lines = head + [
+        [
+            row,
+            *(
+                _shown(column.get(row, 0 if row.startswith("status: ") else "-"))
+                for column in columns.values()
+            ),
+        ]
+        for row in rows
+    ]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    return "\n".join(
+        "  ".join(
+            [*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]]
+        ).replace("\n", "\n" + " " * (widths[0] + 2))
+        for line in lines
+    )
+
+
+def _shown(value: object) -> str:
+    """A value of the summary as it is printed."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
+    if isinstance(value, list):
+        lines = all(isinstance(part, str) for part in value)
+        return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"

@@ -1,0 +1,64 @@
+"""The films that `jaxslam run --animate` writes."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxslam.cli.films import film_files
+from jaxslam.cli.run.piecewise import PiecewiseRun
+from jaxslam.datasets import Dataset
+from jaxslam.datasets.evaluation import Evaluation
+from jaxslam.monte_carlo.progress import Progress
+from jaxslam.results.files import Json
+
+
+def film_steps(data: Dataset) -> Int[np.ndarray, "F"]:
+    """The steps that a film of the data set shows."""
+    from jaxslam.results.film import frame_steps  # Pillow is slow to load
+
+    return frame_steps(data.steps, time=data.time)
+
+
+def watching(at: Int[np.ndarray, "F"]) -> Json:
+    """The arguments of `run_in_pieces` that keep what films of these steps show."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    return {"at": at, "watch": plot.probe}
+
+
+def films(
+    data: Dataset, runs: Mapping[str, tuple[PiecewiseRun, Evaluation]], at: Int[np.ndarray, "F"]
+) -> dict[str, Callable[[Path], object]]:
+    """What writes the film of each filter, by file name; see `film_files`."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    made = {}
+    for name, (run, found) in runs.items():
+        scene = plot.run_scene(
+            plot.History(
+                path=np.asarray(run.path.pose),
+                step=at,
+                estimate=run.estimates,
+                tag=np.asarray(data.log.scan.tag),
+                status=run.status,
+                slot=run.slot,
+                seen=run.watched,
+            ),
+            true_points=found.points,
+            true_path=_true_path(data, found),
+            title=f"{data.name}: {name}",
+        )
+        with Progress(f"{data.name}, {name}: film", "frames") as progress:
+            made[name] = plot.render(scene, progress=progress)
+    return film_files(made, suffixed=len(made) > 1)
+
+
+def _true_path(data: Dataset, found: Evaluation) -> Float[np.ndarray, "T 3"] | None:
+    """The true poses in the frame of the map, NaN where they are not known."""
+    if found.path is None:
+        return None
+    path = np.full((data.steps, 3), np.nan)
+    path[np.ones(data.steps, bool) if data.true_at is None else data.true_at] = found.path
+    return path

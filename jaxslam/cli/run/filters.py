@@ -1,0 +1,82 @@
+"""The filters that `jaxslam run` runs on a data set, by their names in the catalog."""
+
+import argparse
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS
+from jaxslam.cli.common import pick
+from jaxslam.datasets import Dataset
+from jaxslam.datasets.table.settings import association_options
+from jaxslam.protocols import Filter
+from jaxslam.simulation.worlds import Scenario
+from jaxslam.types import Truth
+
+
+def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
+    """The data set with the gate and the association that the command asks for."""
+    if options.gate is None and options.associate is None:
+        return data
+    mine = dict(data.filter_options)
+    held = mine.pop("associate", None)
+    mine.pop("gate", None)
+    if options.associate is None and held is not None:
+        raise ValueError("--gate: expected --associate beside it, since the tags are not used")
+    try:
+        size = len(data.sensor.measurements)
+        mine |= association_options(options.associate or "known", options.gate, size)
+    except ValueError as problem:
+        raise ValueError(f"--{problem}") from problem
+    asked = [name for name in ("gate", "associate") if getattr(options, name) is not None]
+    assumed = (
+        line for line in data.assumed if not line.startswith(tuple(f"[filter] {n}" for n in asked))
+    )
+    return dataclasses.replace(data, filter_options=mine, assumed=tuple(assumed))
+
+
+def chosen(data: Dataset, asked: str) -> dict[str, Filter]:
+    """The filters of a comma-separated list of names.
+
+    Raises ValueError on names that are unknown or occur twice, and on a filter that needs what the
+    data set does not have: the truth at every step, a map in the frame of the start, or tags.
+    """
+    names = [name.strip() for name in asked.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise ValueError(f"--filters: expected different names with commas between, got {asked!r}")
+    slots = np.zeros((data.capacity, len(data.sensor.landmark)))
+    world = Scenario(
+        name=data.name,
+        motion=data.motion,
+        sensor=data.sensor,
+        landmarks=slots,
+        controls=data.log.control,
+        places=data.log.scan.tag.shape[1],
+        filter_options=data.filter_options,
+    )
+    return {name: _filter(name, pick("filter", name, ALL)(world), data) for name in names}
+
+
+def _filter(name: str, candidate: Any, data: Dataset) -> Filter:
+    if "associate" in data.filter_options and (name in CANONICAL or name == "localization"):
+        raise ValueError(f"--filters: {name} needs the tag of every measurement")
+    if isinstance(candidate, Filter):
+        return candidate
+    if name in SMOOTHERS:
+        raise ValueError(
+            f"--filters: {name} takes a whole log at once, which `jaxslam run` does not: call "
+            f"jaxslam.smoothing.{name} from Python"
+        )
+    if name == "ideal" or not data.one_frame or data.landmarks is None:
+        needs = (
+            "the true path of a simulation"
+            if name == "ideal"
+            else ("a map, landmarks.csv, in the frame of the start")
+        )
+        raise ValueError(f"--filters: {name} needs {needs}")
+    landmarks: Any = data.landmarks
+    nothing: Any = np.zeros(0)
+    made = candidate(Truth(nothing, landmarks, nothing, nothing))
+    assert isinstance(made, Filter)
+    return made

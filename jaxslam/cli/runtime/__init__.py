@@ -1,0 +1,1 @@
+"""What a command runs on: devices, kept programs, the time compilation takes."""

@@ -1,0 +1,268 @@
+"""Reader and writer of pose and landmark graphs: g2o and TORO; `graphs.read`, `graphs.write`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.starts import odometry
+from jaxslam.graphs.validation import indefinite
+from jaxslam.results.files import write_files
+
+
+class Edge(NamedTuple):
+    """What a line of one kind holds."""
+
+    table: str
+    who: tuple[str, ...]
+    """kinds of the variables, "pose" or "point" """
+    measured: tuple[str, ...]
+    entries: tuple[tuple[int, int], ...]
+    """where in Ω each number stands"""
+
+
+_BY_ROWS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+_POSE = ("x", "y", "theta")
+EDGES = {
+    "EDGE_SE2": Edge("relative_pose", ("pose", "pose"), _POSE, _BY_ROWS),
+    "EDGE2": Edge("relative_pose", ("pose", "pose"), _POSE, _TORO),
+    "EDGE_PRIOR_SE2": Edge("prior", ("pose",), _POSE, _BY_ROWS),
+    "EDGE_SE2_XY": Edge(
+        "relative_position", ("pose", "point"), ("x", "y"), ((0, 0), (0, 1), (1, 1))
+    ),
+    "EDGE_BEARING_SE2_XY": Edge("bearing", ("pose", "point"), ("bearing",), ((0, 0),)),
+}
+VERTICES = {
+    "VERTEX_SE2": ("pose", _POSE),
+    "VERTEX2": ("pose", _POSE),
+    "VERTEX_XY": ("point", ("x", "y")),
+}
+SKIPPED = {"ROBOTLASER1": "laser scans"}
+"""Lines that are no part of the graph, and what they are counted as."""
+
+_LARGEST = 2**31 - 1
+
+
+class Loaded(NamedTuple):
+    """A graph as a file has it, and what was done to it."""
+
+    graph: Graph
+    skipped: dict[str, int]
+    """lines that are not in the graph, by what they are"""
+    placed: int
+    """poses and points without a line of their own, placed along the edges"""
+
+
+class _Rows(NamedTuple):
+    """The lines of one table."""
+
+    ids: list[list[int]]
+    numbers: list[list[float]]
+    lines: list[int]
+    kinds: list[Edge]
+
+
+def load(path: str | Path) -> Loaded:
+    """The graph in a file; see `graphs.read`, which says what is read and what is refused."""
+    file = TextFile(path)
+    vertices: dict[str, dict[int, list[float]]] = {"pose": {}, "point": {}}
+    rows: dict[str, _Rows] = {}
+    fixed: list[tuple[int, int]] = []
+    skipped: dict[str, int] = {}
+    for line, (kind, *fields) in file:
+        if kind in EDGES:
+            _read_edge(file, line, EDGES[kind], fields, rows)
+        elif kind in VERTICES:
+            _read_vertex(file, line, *VERTICES[kind], fields, vertices)
+        elif kind == "FIX":
+            if not fields:
+                raise file.error(line, "expected at least 1 field (id), got 0")
+            fixed += [(line, _identity(file, line, field, "id")) for field in fields]
+        elif kind in SKIPPED or kind.startswith("#"):
+            what = SKIPPED.get(kind, "comments")
+            skipped[what] = skipped.get(what, 0) + 1
+        else:
+            known = ", ".join([*VERTICES, "FIX", *EDGES])
+            raise file.error(line, f"unknown kind {kind!r}; known: {known}")
+    if not rows:
+        raise file.end_error("no edge in the file")
+    unplaced = not vertices["pose"] and not vertices["point"]
+    if unplaced:
+        vertices = _named_by_edges(file, rows)
+    return _assembled(file, vertices, rows, fixed, skipped, unplaced)
+
+
+def save(path: str | Path, graph: Graph) -> None:
+    """Write a graph as a file of g2o; see `graphs.write`."""
+    path = Path(path)
+    write_files(path.parent, {path.name: text_of(graph)})
+
+
+def text_of(graph: Graph) -> str:
+    """The graph in the format of g2o; raises ValueError as `graphs.write` does."""
+    ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
+    if len(both := np.intersect1d(ids["pose"], ids["point"])):
+        raise ValueError(
+            f"graphs.write: {both[0]} is the id of a pose and of a point, which g2o does not allow"
+        )
+    points = np.asarray(graph.points)
+    if len(points) and points.shape[1] != 2:
+        raise ValueError(f"graphs.write: expected points (x, y), got {points.shape[1]} numbers")
+    lines = []
+    for kind, name, values in (
+        ("pose", "VERTEX_SE2", np.asarray(graph.poses)),
+        ("point", "VERTEX_XY", points),
+    ):
+        lines += [_line(name, [one], row) for one, row in zip(ids[kind], values, strict=True)]
+    held = [
+        *ids["pose"][np.asarray(graph.fixed_pose)],
+        *ids["point"][np.asarray(graph.fixed_point)],
+    ]
+    lines += [f"FIX {one}" for one in held]
+    written = {edge.table: (name, edge) for name, edge in reversed(EDGES.items())}
+    for key, table in graph.tables.items():
+        base = key.split("/")[0]
+        if base not in written:
+            raise ValueError(
+                f"graphs.write: g2o has no line for table {key!r}; it has some for "
+                f"{', '.join(written)}"
+            )
+        name, edge = written[base]
+        valid = np.asarray(table.valid)
+        information = np.asarray(table.information)[valid]
+        entries = np.stack([information[:, i, j] for i, j in edge.entries], axis=1)
+        numbers = np.concatenate([np.asarray(table.z)[valid], entries], axis=1)
+        who = np.asarray(table.who)[valid]
+        names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
+        lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def _line(kind: str, ids: Sequence[int], numbers: np.ndarray) -> str:
+    return " ".join([kind, *map(str, ids), *map(repr, np.asarray(numbers, float).tolist())])
+
+
+def _identity(file: TextFile, line: int, field: str, name: str) -> int:
+    found = file.identity(line, field, name)
+    if found > _LARGEST:
+        raise file.error(line, f"{name} is above {_LARGEST}: {field}")
+    return found
+
+
+def _read_vertex(
+    file: TextFile,
+    line: int,
+    kind: str,
+    names: tuple[str, ...],
+    fields: list[str],
+    vertices: dict[str, dict[int, list[float]]],
+) -> None:
+    """Add a vertex; raises ValueError on a malformed line and on an id that occurred before."""
+    file.expect(line, fields, ("id", *names))
+    vertex = _identity(file, line, fields[0], "id")
+    if any(vertex in known for known in vertices.values()):
+        raise file.error(line, f"vertex {vertex} occurs twice")
+    vertices[kind][vertex] = file.numbers(line, fields[1:], names)
+
+
+def _read_edge(
+    file: TextFile, line: int, edge: Edge, fields: list[str], rows: dict[str, _Rows]
+) -> None:
+    """Add an edge to its table; raises ValueError on a malformed line."""
+    names = (*"ij"[: len(edge.who)], *edge.measured, *(f"I{i + 1}{j + 1}" for i, j in edge.entries))
+    file.expect(line, fields, names)
+    count = len(edge.who)
+    ids = [_identity(file, line, field, n) for field, n in zip(fields[:count], names, strict=False)]
+    if len(set(ids)) < count:
+        raise file.error(line, f"an edge from vertex {ids[0]} to itself")
+    table = rows.setdefault(edge.table, _Rows([], [], [], []))
+    table.ids.append(ids)
+    table.numbers.append(file.numbers(line, fields[count:], names[count:]))
+    table.lines.append(line)
+    table.kinds.append(edge)
+
+
+def _named_by_edges(file: TextFile, rows: dict[str, _Rows]) -> dict[str, dict[int, list[float]]]:
+    """The vertices that edges name, at the origin, in the order of their ids."""
+    found: dict[str, set[int]] = {"pose": set(), "point": set()}
+    for table in rows.values():
+        for ids, edge, line in zip(table.ids, table.kinds, table.lines, strict=True):
+            for vertex, kind in zip(ids, edge.who, strict=True):
+                found[kind].add(vertex)
+                if vertex in found["point" if kind == "pose" else "pose"]:
+                    raise file.error(
+                        line, f"vertex {vertex} is a pose in one edge, a point in another"
+                    )
+    return {
+        kind: {vertex: [0.0] * (3 if kind == "pose" else 2) for vertex in sorted(ids)}
+        for kind, ids in found.items()
+    }
+
+
+def _assembled(
+    file: TextFile,
+    vertices: dict[str, dict[int, list[float]]],
+    rows: dict[str, _Rows],
+    fixed: list[tuple[int, int]],
+    skipped: dict[str, int],
+    unplaced: bool,
+) -> Loaded:
+    """The graph of the lines of a file; raises ValueError where they do not fit together."""
+    index = {
+        kind: {vertex: at for at, vertex in enumerate(named)} for kind, named in vertices.items()
+    }
+    held = {kind: np.zeros(len(named), bool) for kind, named in vertices.items()}
+    for line, vertex in fixed:
+        for kind, known in index.items():
+            if vertex in known:
+                held[kind][known[vertex]] = True
+        if not any(vertex in known for known in index.values()):
+            raise file.error(line, f"vertex {vertex} is nowhere in the file")
+    values = {
+        kind: np.array(list(named.values())).reshape(-1, 3 if kind == "pose" else 2)
+        for kind, named in vertices.items()
+    }
+    ids = {kind: np.array(list(named), np.int32) for kind, named in vertices.items()}
+    fields: Any = {  # the records are declared as JAX arrays
+        "poses": values["pose"],
+        "points": values["point"],
+        "tables": {key: _table(file, table, index) for key, table in rows.items()},
+        "fixed_pose": held["pose"],
+        "fixed_point": held["point"],
+        "pose_id": ids["pose"],
+        "point_id": ids["point"],
+    }
+    graph = Graph(**fields)
+    placed = len(ids["pose"]) + len(ids["point"]) if unplaced else 0
+    return Loaded(odometry(graph) if unplaced else graph, skipped, placed)
+
+
+def _table(file: TextFile, rows: _Rows, index: dict[str, dict[int, int]]) -> Table:
+    """A table; raises ValueError on a vertex that is nowhere and an indefinite information."""
+    who = []
+    for line, ids, edge in zip(rows.lines, rows.ids, rows.kinds, strict=True):
+        for vertex, kind in zip(ids, edge.who, strict=True):
+            if vertex not in index[kind]:
+                elsewhere = any(vertex in known for known in index.values())
+                why = f"is no {kind}" if elsewhere else "is nowhere in the file"
+                raise file.error(line, f"vertex {vertex} {why}")
+        who.append([index[kind][vertex] for vertex, kind in zip(ids, edge.who, strict=True)])
+    numbers, size = np.array(rows.numbers), len(rows.kinds[0].measured)
+    information = np.zeros((len(who), size, size))
+    for edge in set(rows.kinds):
+        mine = np.array([kind is edge for kind in rows.kinds])
+        for (i, j), column in zip(edge.entries, numbers[:, size:].T, strict=True):
+            information[mine, i, j] = information[mine, j, i] = column[mine]
+    bad = indefinite(information)
+    if bad.any():
+        row = int(bad.argmax())
+        why = "the information is not positive semidefinite"
+        if rows.kinds[row].entries == _TORO:
+            why += "; EDGE2 has the order I11 I12 I22 I33 I13 I23, EDGE_SE2 that of the rows"
+        raise file.error(rows.lines[row], why)
+    fields: Any = (np.array(who, np.int32), numbers[:, :size], information, np.ones(len(who), bool))
+    return Table(*fields)

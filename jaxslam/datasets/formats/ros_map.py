@@ -1,0 +1,167 @@
+"""Reader and writer of occupancy grids as ROS has them: a flat YAML file and a PGM image."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.formats.pgm import pgm_bytes, read_pgm
+from jaxslam.grids.grid import Grid, check_grid
+from jaxslam.results.files import write_files
+
+CERTAIN = math.log(509.0)
+"""Log-odds of an occupied cell: p = 1 - ε with ε half a level of grey, 0.5/255."""
+
+_REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+_MODES = ("trinary", "scale")
+_UNKNOWN = 205
+"""The shade of unknown cells: p = 50/255 is between the usual thresholds."""
+
+
+def load(path: str | Path) -> Grid:
+    """The grid in a map file; `grids.read_map` says what is read."""
+    head = Header(path)
+    resolution = head.number("resolution")
+    if not resolution > 0:
+        raise head.error("resolution", f"expected a resolution above 0, got {resolution:g}")
+    origin = head.numbers("origin", ("x", "y", "yaw"))
+    occupied, free = head.number("occupied_thresh"), head.number("free_thresh")
+    if not 0 <= free < occupied <= 1:
+        raise head.error(
+            "occupied_thresh",
+            f"expected 0 <= free_thresh < occupied_thresh <= 1, got {free:g} and {occupied:g}",
+        )
+    negate = head.choice("negate", {"0": False, "1": True, "false": False, "true": True})
+    mode = head.choice("mode", dict(zip(_MODES, _MODES, strict=True)), "trinary")
+    image = head.file.path.parent / head.text("image")
+    if not image.is_file():
+        raise head.error("image", f"no image {image}")
+    shade = read_pgm(image)
+    p = shade if negate else 1.0 - shade
+    between = np.full(p.shape, 0.5) if mode == "trinary" else (p - free) / (occupied - free)
+    p = np.where(p > occupied, 1.0, np.where(p < free, 0.0, between))
+    grid: Any = _log_odds(p)[::-1].copy(), np.array(origin), np.array(resolution)
+    return Grid(*grid)
+
+
+def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
+    """Write a map file and its image; `grids.write_map` says how."""
+    path = Path(path)
+    check_grid("write_map", grid)
+    if mode not in _MODES:
+        raise ValueError(f'write_map: expected mode "trinary" or "scale", got {mode!r}')
+    if path.suffix != ".yaml" or path.stem == "":
+        raise ValueError(f"write_map: expected a path NAME.yaml, got {path}")
+    log_odds = np.asarray(grid.log_odds, np.float64)[::-1]
+    if mode == "trinary":
+        occupied, free = 0.65, 0.196
+        image = np.where(log_odds > 0, 0, np.where(log_odds < 0, 254, _UNKNOWN))
+        levels = 255
+    else:
+        occupied, free = 1.0, 0.0
+        image, levels = _levels(log_odds)
+    numbers = ", ".join(repr(float(value)) for value in np.asarray(grid.origin))
+    text = (
+        f"image: {path.stem}.pgm\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
+        f"origin: [{numbers}]\nnegate: 0\noccupied_thresh: {occupied}\nfree_thresh: {free}\n"
+    )
+    data = pgm_bytes(image, levels)
+    image_file = {f"{path.stem}.pgm": lambda target: target.write_bytes(data)}
+    return write_files(path.parent, {path.name: text, **image_file})
+
+
+def _log_odds(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """log p/(1-p) within ±CERTAIN; exactly 0 at ½."""
+    within = np.clip(p, 0.5 / 255, 1.0 - 0.5 / 255)
+    found = np.where(p == 0.5, 0.0, np.log(within) - np.log1p(-within))
+    found = np.where(within > p, -CERTAIN, np.where(within < p, CERTAIN, found))
+    return np.asarray(found)
+
+
+def _levels(log_odds: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
+    """The image of a grid in shades, and the largest shade: 255, or 254, which has one of ½."""
+    p = 1.0 / (1.0 + np.exp(-log_odds))
+    p = np.where(log_odds >= CERTAIN, 1.0, np.where(log_odds <= -CERTAIN, 0.0, p))
+    images = {top: np.rint((1.0 - p) * top).astype(np.int64) for top in (255, 254)}
+    for top, image in images.items():
+        if np.array_equal(_log_odds(1.0 - image / top), log_odds):
+            return image, top
+    top = 254 if np.any(log_odds == 0) else 255
+    return images[top], top
+
+
+class Header:
+    """The keys of a map file, a line each as `key: value`; a list may follow in lines `- value`."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.file = TextFile(path)
+        self.found: dict[str, tuple[int, str]] = {}
+        key = ""
+        for line, text in enumerate(self.file.lines, start=1):
+            text = _without_comment(text).strip()
+            if not text or text in ("---", "..."):
+                continue
+            if text.startswith("- ") and key:
+                at, so_far = self.found[key]
+                self.found[key] = at, f"{so_far}, {text[2:].strip()}".removeprefix(", ")
+                continue
+            key, colon, value = text.partition(":")
+            key = key.strip()
+            if not colon or (value and not value[0].isspace()):
+                raise self.file.error(line, f"expected `key: value`, got {text!r}")
+            if key not in (*_REQUIRED, "mode"):
+                raise self.file.error(line, f"unknown key {key!r}")
+            if key in self.found:
+                raise self.file.error(line, f"{key} occurs twice")
+            self.found[key] = line, value.strip()
+        for key in _REQUIRED:
+            if key not in self.found:
+                raise self.file.end_error(f"{key} is missing")
+
+    def error(self, key: str, reason: str) -> ValueError:
+        """A ValueError about the line of a key, for the caller to raise."""
+        return self.file.error(self.found[key][0], reason)
+
+    def text(self, key: str) -> str:
+        """The value of a key, without quotes."""
+        value = self.found[key][1]
+        if len(value) > 1 and value[0] == value[-1] and value[0] in "\"'":
+            value = value[1:-1]
+        if not value:
+            raise self.error(key, f"{key} has no value")
+        return value
+
+    def number(self, key: str) -> float:
+        """The value of a key as a finite number."""
+        return self.file.numbers(self.found[key][0], [self.text(key)], [key])[0]
+
+    def numbers(self, key: str, names: tuple[str, ...]) -> list[float]:
+        """The value of a key as a list of finite numbers, one a name."""
+        line, value = self.found[key]
+        fields = [field.strip() for field in value.removeprefix("[").removesuffix("]").split(",")]
+        try:
+            return self.file.numbers(line, fields, names)
+        except ValueError as problem:
+            reason = str(problem).removeprefix(f"{self.file.path}:{line}: ")
+            wanted = f"expected {key}: [{', '.join(names)}]"
+            raise self.file.error(line, f"{wanted}, got {value}: {reason}") from problem
+
+    def choice(self, key: str, choices: dict[str, Any], default: str | None = None) -> Any:
+        """What the value of a key stands for."""
+        if key not in self.found and default is not None:
+            return choices[default]
+        value = self.text(key).lower()
+        if value not in choices:
+            raise self.error(key, f"expected {key} to be {' or '.join(choices)}, got {value}")
+        return choices[value]
+
+
+def _without_comment(text: str) -> str:
+    """A line up to a # that begins it or follows a blank."""
+    for at, letter in enumerate(text):
+        if letter == "#" and (at == 0 or text[at - 1].isspace()):
+            return text[:at]
+    return text

@@ -1,0 +1,1 @@
+"""The UTIAS multi-robot data sets (MRCLAM): files, calibration, truth, reader."""

@@ -1,0 +1,326 @@
+"""The file `dataset.toml` of a table: models, noises, gate and start, each with a default."""
+
+import inspect
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam import association, motion, sensors
+from jaxslam.datasets.table.settings_text import line_of
+from jaxslam.math import stats
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.records import INTERVAL, POSE, odometry_columns, split_unit
+
+_Model = TypeVar("_Model")
+
+MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
+MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
+"""Default standard deviations by unit."""
+GATE = 0.99
+"""Default probability of the gate of an association."""
+NEW_GATE = 0.9999
+"""Probability beyond which a measurement is of a new landmark."""
+ROOM = 100
+"""Default number of landmarks, where identities are unknown."""
+METHODS = ("nearest", "global_nearest", "maximum_likelihood", "joint", "known")
+_FILTER = ("gate", "capacity", "associate", "update", "start", "start_noise")
+_FIRST = ("unicycle", "pose_increment", "range_bearing")
+"""Of models with the same columns, those taken by default."""
+
+
+class Parametric(NamedTuple, Generic[_Model]):
+    """A model by the standard deviations of its noise and its mount, and what the file says."""
+
+    names: tuple[str, ...]
+    deviations: tuple[float, ...]
+    mount: tuple[float, ...] | None
+    """None where the model has none"""
+    make: Callable[[Any, Any], _Model]
+    """(deviations (W,) an array, mount (3,) or None) -> model"""
+
+    def made(self) -> _Model:
+        """The model that the file describes."""
+        return self.make(np.array(self.deviations), self.mount)
+
+
+class Settings:
+    """The settings of a folder; `assumed` lists the defaults taken so far.
+
+    Raises ValueError on a file that is no TOML, and on a section or a key that does not exist.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.assumed: list[str] = []
+        try:
+            self._text = path.read_text(encoding="utf-8")
+            self.content = tomllib.loads(self._text)
+        except FileNotFoundError:
+            self._text, self.content = "", {}
+            self.assumed.append(f"no {path.name}")
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
+            raise ValueError(f"{path}: cannot be read: {problem}") from problem
+        known = ("name", "source", "motion", "sensor", "filter")
+        self._check_keys("", self.content, known)
+        for name in known:
+            kind = str if name in ("name", "source") else dict
+            if not isinstance(self.content.get(name, kind()), kind):
+                wanted = "text" if kind is str else f"a section [{name}]"
+                raise ValueError(f"{self._at('', name)}: expected {wanted}")
+
+    def text(self, name: str, default: str) -> str:
+        """The name or the source of the data."""
+        return str(self.content.get(name, default))
+
+    def motion(self, given: Sequence[str], interval: float) -> Parametric[Motion]:
+        """The motion model; its noise is that of a line of odometry, whatever rows divide it.
+
+        Velocities have the covariance σ² interval/Δt over Δt, white noise. Poses give increments
+        with covariance σ² Δt/interval, and Δt as a last control. Other increments have σ².
+
+        Args:
+            given: the columns of the odometry.
+            interval: the time between its lines [s].
+        """
+        factory, options = self._model("motion", motion.REGISTRY, given)
+        shell = self._built("motion", factory, options, _of_no_noise)
+        from_poses = odometry_columns(shell.controls, given) == POSE
+        with_interval = INTERVAL in shell.controls
+
+        def model(deviations: Any, mount: Any = None) -> Motion:
+            def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
+                cov = jnp.diag(jnp.asarray(deviations, u.dtype) ** 2)
+                if from_poses:
+                    return cov * u[-1] / interval
+                if with_interval:
+                    moving = u[-1] > 0
+                    return cov * jnp.where(moving, interval / jnp.where(moving, u[-1], 1.0), 0.0)
+                return cov
+
+            plain: Motion = self._built("motion", factory, options, noise_cov)
+            if not from_poses:
+                return plain
+            return replace(
+                plain,
+                controls=(*plain.controls, INTERVAL),
+                step=lambda pose, u, w: plain.step(pose, u[:-1], w),
+                noise_cov=noise_cov,
+                perturb=None,
+                jacobians=None,
+            )
+
+        deviations = self._noise("motion", shell.noises, MOTION_NOISE)
+        return Parametric(shell.noises, tuple(deviations), None, model)
+
+    def sensor(self, given: Sequence[str]) -> Parametric[Sensor]:
+        """The sensor. given: the columns of the measurements."""
+        factory, options = self._model("sensor", sensors.REGISTRY, given)
+        mount, has_mount = None, "mount" in inspect.signature(factory).parameters
+        if "mount" in options:
+            mount = self._numbers("sensor", "mount", options.pop("mount"), POSE)
+        names = self._built("sensor", factory, options, _of_no_noise).measurements
+        deviations = self._noise("sensor", names, MEASUREMENT_NOISE)
+        if not all(deviations):
+            raise ValueError(f"{self._at('sensor', 'noise')}: expected numbers above 0")
+        if has_mount and mount is None:
+            mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
+
+        def model(deviations: Any, mount: Any) -> Sensor:
+            # In NumPy where they are numbers, so that nothing is compiled.
+            cov = deviations[:, None] ** 2 * np.eye(len(names))
+            more = options if mount is None else options | {"mount": mount}
+            built: Sensor = self._built("sensor", factory, more, cov)
+            return built
+
+        return Parametric(names, tuple(deviations), None if mount is None else tuple(mount), model)
+
+    def filter_options(self, size: int, unknown: bool) -> dict[str, Any]:
+        """The options of `ekf_slam`. size: of a measurement; unknown: whether tags are unknown."""
+        section = self._filter()
+        options: dict[str, Any] = {"update": section.get("update")}
+        if options["update"] is None:
+            options["update"] = self._default("filter", "update", "sequential")
+        if options["update"] not in ("sequential", "joint"):
+            raise ValueError(
+                f'{self._at("filter", "update")}: expected "sequential" or "joint", '
+                f"got {options['update']!r}"
+            )
+        method, gate = section.get("associate"), section.get("gate")
+        if method is None:
+            method = self._default("filter", "associate", METHODS[0] if unknown else "known")
+        try:
+            options |= association_options(method, gate, size)
+        except ValueError as problem:
+            key, _, reason = str(problem).partition(": ")
+            raise ValueError(f"{self._at('filter', key)}: {reason}") from problem
+        if gate is None:
+            self.assumed.append(f"[filter] gate{': none' if method == 'known' else f' = {GATE}'}")
+        return options
+
+    def capacity(self, tags: int, unknown: bool) -> int:
+        """The number of landmark slots. tags: how many landmarks have a name."""
+        asked = self._filter().get("capacity")
+        if asked is None:
+            return int(self._default("filter", "capacity", max(tags, 1) + ROOM * unknown))
+        if type(asked) is not int or asked < max(tags, 1):
+            raise ValueError(
+                f"{self._at('filter', 'capacity')}: expected a whole number of at least "
+                f"{max(tags, 1)}, the number of tags, got {asked!r}"
+            )
+        return asked
+
+    def start(self) -> np.ndarray | None:
+        """The pose before the first row (3,); None where the file does not say."""
+        return self._three("start")
+
+    def start_noise(self) -> np.ndarray:
+        """Its standard deviations (3,)."""
+        asked = self._three("start_noise")
+        if asked is None:
+            return np.array(self._default("filter", "start_noise", [0.0, 0.0, 0.0]))
+        if (asked < 0).any():
+            raise ValueError(f"{self._at('filter', 'start_noise')}: expected numbers of at least 0")
+        return asked
+
+    def _filter(self) -> dict[str, Any]:
+        section: dict[str, Any] = self.content.get("filter", {})
+        self._check_keys("filter", section, _FILTER)
+        return section
+
+    def _three(self, key: str) -> np.ndarray | None:
+        asked = self._filter().get(key)
+        if asked is None:
+            return None
+        return np.array(self._numbers("filter", key, asked, POSE))
+
+    def _model(
+        self, section: str, registry: Mapping[str, Callable[..., Any]], given: Sequence[str]
+    ) -> tuple[Callable[..., Any], dict[str, Any]]:
+        """The factory that a section names, or the columns fit, and its options."""
+        options = dict(self.content.get(section, {}))
+        name = options.pop("model", None)
+        if name is None:
+            name = self._default(section, "model", _fitting(section, registry, given, self.path))
+        if name not in registry:
+            raise ValueError(
+                f"{self._at(section, 'model')}: expected one of {', '.join(registry)}, got {name!r}"
+            )
+        known = [key for key in inspect.signature(registry[name]).parameters if key != "noise_cov"]
+        self._check_keys(section, options, ("model", "noise", *known))
+        options.pop("noise", None)
+        return registry[name], options
+
+    def _noise(
+        self, section: str, names: tuple[str, ...], defaults: Mapping[str, float]
+    ) -> list[float]:
+        """The standard deviations of a model's noise, in its order."""
+        asked = self.content.get(section, {}).get("noise")
+        if asked is None:
+            usual = [defaults.get(split_unit(name)[1] or "", 0.1) for name in names]
+            self.assumed.append(f"[{section}] noise = {usual} ({', '.join(names)})")
+            return usual
+        found = self._numbers(section, "noise", asked, names)
+        if min(found) < 0:
+            raise ValueError(
+                f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {asked}"
+            )
+        return found
+
+    def _numbers(self, section: str, key: str, asked: Any, names: Sequence[str]) -> list[float]:
+        if (
+            not isinstance(asked, list)
+            or len(asked) != len(names)
+            or not all(map(_is_number, asked))
+        ):
+            raise ValueError(
+                f"{self._at(section, key)}: expected {len(names)} numbers "
+                f"({', '.join(names)}), got {asked!r}"
+            )
+        return [float(value) for value in asked]
+
+    def _built(
+        self, section: str, factory: Callable[..., Any], options: dict[str, Any], noise: Any
+    ) -> Any:
+        try:
+            return factory(noise, **options)
+        except (ValueError, TypeError) as problem:
+            raise ValueError(f"{self.path}: [{section}] {problem}") from problem
+
+    def _default(self, section: str, key: str, value: Any) -> Any:
+        shown = f'"{value}"' if isinstance(value, str) else value
+        self.assumed.append(f"[{section}] {key} = {shown}")
+        return value
+
+    def _check_keys(self, section: str, content: Mapping[str, Any], known: Sequence[str]) -> None:
+        for key in content:
+            if key not in known:
+                raise ValueError(f"{self._at(section, key)}: expected one of {', '.join(known)}")
+
+    def _at(self, section: str, key: str) -> str:
+        """The place of a key, with which a message begins."""
+        line = line_of(self._text, section, key)
+        where = f"{self.path}:" + (f"{line}: " if line else " ")
+        return where + (f"[{section}] " if section else "") + key
+
+
+def association_options(method: str, gate: float | None, size: int) -> dict[str, Any]:
+    """Options of `ekf_slam` for a method by name and a gate by probability.
+
+    Raises ValueError, "associate: …" or "gate: …", on a name that is none and a gate that is no
+    probability. Known identities need no gate (None); other methods take `GATE`.
+
+    Args:
+        method: one of `METHODS`.
+        gate: the probability that a correct measurement passes.
+        size: numbers of a measurement.
+    """
+    if gate is not None and not (_is_number(gate) and 0 < gate < 1):
+        raise ValueError(f"gate: expected a probability between 0 and 1, got {gate!r}")
+    if method not in METHODS:
+        raise ValueError(f"associate: expected one of {', '.join(METHODS)}, got {method!r}")
+    if method == "known":
+        return {} if gate is None else {"gate": stats.chi2_quantile(gate, size)}
+    inner = GATE if gate is None else gate
+    beyond = stats.chi2_quantile(max(inner, NEW_GATE), size)
+    limit = inner if method == "joint" else stats.chi2_quantile(inner, size)
+    return {"associate": getattr(association, method)(limit, beyond)}
+
+
+def _fitting(
+    section: str, registry: Mapping[str, Callable[..., Any]], given: Sequence[str], path: Path
+) -> str:
+    """The model whose columns are given; of several the one with most, then of `_FIRST`."""
+    bare = {split_unit(name)[0] for name in given}
+    fitting, known = [], []
+    for name, factory in registry.items():
+        model = factory(_of_no_noise)
+        names = (
+            odometry_columns(model.controls, given) if section == "motion" else model.measurements
+        )
+        known.append(f"{name} ({', '.join(names)})")
+        if {split_unit(one)[0] for one in names} <= bare:
+            fitting.append((len(names), name in _FIRST, name))
+    if not fitting:
+        raise ValueError(
+            f"{path}: [{section}] model: expected one, since no model has the columns "
+            f"{', '.join(given)}; there are {'; '.join(known)}"
+        )
+    most = max(fitting)[:2]
+    return next(name for *rank, name in fitting if tuple(rank) == most)
+
+
+def _of_no_noise(*_: Any) -> Any:
+    """The noise of a model that is made for its names alone, and is never evaluated."""
+    raise AssertionError("a model that was made for its names was evaluated")
+
+
+def _is_number(value: Any) -> bool:
+    return (
+        isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    )

@@ -1,0 +1,1 @@
+"""Coordinates of the error state, and changes between them."""

@@ -1,0 +1,1 @@
+"""The steps of a scan, in the order of the textbook."""

@@ -1,0 +1,239 @@
+"""The sequential correction of a Kalman-type SLAM filter: one measurement after the other."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
+from jaxslam.filters.ekf.coordinates.robocentric_motion import unmoved
+from jaxslam.filters.ekf.settings import EkfSettings
+from jaxslam.filters.ekf.steps import robocentric_update
+from jaxslam.filters.ekf.steps.innovation import Correction, innovate, view_of
+from jaxslam.filters.ekf.steps.update import correct, retract_means
+from jaxslam.math import linalg
+from jaxslam.math.xla import no_inline, where_any
+from jaxslam.protocols import Chart
+from jaxslam.slots import Joint
+
+# Up to this many rows P stays in the cache next to a core: the pass over it is bound by arithmetic,
+# on vectors of this many entries, and the rest of a row costs as much as a whole vector.
+_CACHED, _LANES = 128, 16
+
+# Measurements a pass over P, where P is cached and where it is not. More of them cost more loads of
+# P_I, fewer cost more loads of P.
+_GROUP, _GROUP_BEYOND = 3, 4
+
+_State = TypeVar("_State")
+
+Measurements = tuple[Float[Array, "m Z"], Int[Array, "m"], Bool[Array, "m"]]
+"""z, the slot of the landmark of each, and whether it is known"""
+
+
+def correct_in_turn(
+    joint: Joint,
+    z: Float[Array, "m Z"],
+    slot: Int[Array, "m"],
+    known: Bool[Array, "m"],
+    settings: EkfSettings,
+) -> tuple[Joint, Correction]:
+    """The joint corrected by m measurements in turn, each linearized at the estimate before it.
+
+    The same numbers as `correct` on each alone, with P read and written once a group of them:
+
+        for each group (g measurements, W = 3 + g·L):
+            P_I (W, D)  <-  rows of the robot and of the group's landmarks, of P (D, D)
+            for each measurement: means and P_I corrected, P_I ← P_I - V_Iᵀ V; V (Z, D) is left
+            P (D, D)    <-  P - Σ Vᵀ V over the group
+
+    This is the postponed update of Guivant & Nebot 2001 ("Optimization of the simultaneous
+    localization and map-building algorithm for real-time implementation", IEEE T-RA 17(3)), over
+    one scan. A group without a known measurement in any run of a batch costs nothing.
+
+    In a chart with `motion_apart`, map and motion are corrected separately and composed once
+    (`robocentric_update`). A form of the covariance that needs all of P is corrected by
+    `correct`, one measurement at a time.
+    """
+    measurements = z, slot, known
+    size = joint.cov.shape[1]
+    if settings.covariance != "plain":
+        return _one_by_one(joint, measurements, settings)
+    cached = size <= _CACHED
+    group = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
+    if settings.chart.motion_apart and joint.last:
+        return _in_turn_with_motion(joint, measurements, group, settings)
+    if cached:
+        joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
+    joint, done = _in_groups(
+        lambda joint, part: correct_group(joint, part, settings),
+        joint,
+        measurements,
+        group,
+        partial(_nothing, joint, chart=settings.chart),
+    )
+    return joint._replace(cov=joint.cov[:, :size]), done
+
+
+def _one_by_one(
+    joint: Joint, measurements: Measurements, settings: EkfSettings
+) -> tuple[Joint, Correction]:
+    """`correct_in_turn` by `correct` of each measurement alone."""
+
+    def of_one(done: Correction) -> Correction:
+        return done._replace(moved=jax.tree.map(lambda leaf: leaf[None], done.moved))
+
+    def work(joint: Joint, one: Measurements) -> tuple[Joint, Correction]:
+        joint, done = correct(joint, *one, settings)
+        return joint, of_one(done)
+
+    def nothing(one: Measurements) -> Correction:
+        return of_one(_nothing(joint, one, settings.chart))
+
+    return _in_groups(work, joint, measurements, 1, nothing)
+
+
+def _in_turn_with_motion(
+    joint: Joint, measurements: Measurements, group: int, settings: EkfSettings
+) -> tuple[Joint, Correction]:
+    """`correct_in_turn` in a chart with `motion_apart`; P has columns for the last motion."""
+    known = measurements[2]
+    size = joint.cov.shape[1]
+    columns = size + 3 + (-(size + 3) % _LANES if size <= _CACHED else 0)
+
+    def with_motion(joint: Joint) -> tuple[Joint, Correction]:
+        rest, done = _in_groups(
+            lambda rest, part: robocentric_update.correct_map_and_motion(rest, part, settings),
+            robocentric_update.separate_motion(joint, settings.chart, columns),
+            measurements,
+            group,
+            partial(_nothing, joint._replace(last=None), chart=settings.chart),
+        )
+        # A run without a measurement must keep exactly its map.
+        after = robocentric_update.compose_map(rest, settings.chart)
+        before = joint, unmoved(joint, settings.chart)
+        kept, moved = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, before)
+        return kept, done._replace(moved=moved)
+
+    nothing = _nothing(joint, measurements, settings.chart)
+    return where_any(known.any(), with_motion, lambda joint: (joint, nothing), joint)
+
+
+def _in_groups(
+    work: Callable[[_State, Measurements], tuple[_State, Correction]],
+    state: _State,
+    measurements: Measurements,
+    group: int,
+    nothing: Callable[[Measurements], Correction],
+) -> tuple[_State, Correction]:
+    """The state after work(state, g measurements) on each group of m, padded: (⌈m/g⌉, g, …).
+
+    nothing: of unused measurements, the `Correction`.
+    """
+    m = len(measurements[0])
+    groups = -(-m // group)
+
+    def padded(part: jax.Array) -> jax.Array:
+        wide = jnp.pad(part, [(0, groups * group - m), *[(0, 0)] * (part.ndim - 1)])
+        return wide.reshape(groups, group, *part.shape[1:])
+
+    def of_group(state: _State, part: Measurements) -> tuple[_State, Correction]:
+        unused = nothing(part)
+        return where_any(part[2].any(), lambda s: work(s, part), lambda s: (s, unused), state)
+
+    state, done = jax.lax.scan(of_group, state, jax.tree.map(padded, measurements))
+    shape = (groups * group,)
+    return state, jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[2:])[:m], done)
+
+
+def correct_group(
+    joint: Joint, part: Measurements, settings: EkfSettings
+) -> tuple[Joint, Correction]:
+    """The joint corrected by g measurements in turn: local states by each, then P by all at once.
+
+        local P (W, W) | M (W, W)    P_I of now = M P_I of before, W = 3 + g·L
+        V (g·Z, D) = reach (g·Z, W) P_I of before
+
+    P may have columns of zeros beyond its own.
+    """
+    slot, chart = part[1], settings.chart
+    size_l, size = joint.landmarks.shape[1], joint.cov.shape[0]
+    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
+    at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
+    rows = joint.cov[at]
+    local = joint._replace(
+        landmarks=joint.landmarks[slot],
+        cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
+        alive=joint.alive[slot],
+        tag=joint.tag[slot],
+    )
+
+    def one(local: Joint, measurement: tuple[jax.Array, PyTree]) -> tuple[Joint, PyTree]:
+        return _correct_local(local, measurement, joint, settings)
+
+    # A gradient stores the input of each step, and recomputes the rest.
+    local, (reach, whitened, done) = jax.lax.scan(
+        jax.checkpoint(one, prevent_cse=False),
+        local,
+        (jnp.arange(len(slot)), part),
+    )
+    v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
+    landmarks = _moved_map(joint, v[:, :size], whitened, chart)
+    cov = joint.cov - linalg.gram(v[:, :size], v)
+    return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov), done
+
+
+def _correct_local(
+    local: Joint, measurement: tuple[jax.Array, PyTree], whole: Joint, settings: EkfSettings
+) -> tuple[Joint, tuple[jax.Array, jax.Array, Correction]]:
+    """A local map corrected by a measurement of its landmark i (), of slot () in the whole map.
+
+    P of the local map and the matrix M beside it are corrected as one:
+    [P M] ← [P M] - Vᵀ [V reach].
+    Returns reach (Z, W), and L⁻¹ ν (Z,).
+    """
+    i, (z, slot, known) = jax.tree.map(lambda leaf: leaf[None], measurement)
+    width = local.cov.shape[0]
+    memory = whole._replace(pose=local.pose), slot
+    found = innovate(local, i, view_of(local, i), z, known, memory, settings)
+    v, reach = found.v[:, :width], found.v[:, width:]
+    moved = retract_means(local, found.xi[:width], settings.chart)
+    moved = moved._replace(cov=local.cov - linalg.gram(v, found.v))
+    done = jax.tree.map(lambda leaf: leaf[0], found.correction)
+    return moved, (reach, found.whitened, done)
+
+
+def _nothing(joint: Joint, unused: Measurements, chart: Chart) -> Correction:
+    """The `Correction` of m unused measurements, all zero; the map is not composed anew."""
+    z = unused[0]
+    (m, size), width = z.shape, 3 + joint.landmarks.shape[1]
+    dtype = jnp.result_type(z, joint.pose, joint.cov)
+    each, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
+    return Correction(
+        innovation=jnp.zeros((m, size), dtype),
+        innovation_cov=jnp.zeros((m, size, size), dtype),
+        nis=each,
+        log_likelihood=each,
+        inside=flags,
+        positive=flags,
+        jacobian=jnp.zeros((m, size, width), dtype),
+        basis=None if chart.basis is None else jnp.zeros((m, width, width), dtype),
+        moved=unmoved(joint, chart) if joint.last else None,
+    )
+
+
+def _moved_map(
+    joint: Joint, v: Float[Array, "K D"], whitened: Float[Array, "g Z"], chart: Chart
+) -> Float[Array, "N L"]:
+    """The landmarks after corrections V (g·Z, D), L⁻¹ ν, one after the other."""
+    if chart.basis is None:  # retractions are additive
+        xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
+        return retracted(chart, joint, xi)[1]
+
+    def move(joint: Joint, one: tuple[jax.Array, jax.Array]) -> tuple[Joint, None]:
+        return retract_means(joint, linalg.gram(one[0], one[1][:, None])[:, 0], chart), None
+
+    each = v.reshape(*whitened.shape, -1)
+    return jax.lax.scan(move, joint, (each, whitened))[0].landmarks

@@ -1,0 +1,1 @@
+"""The sparse canonical form: state, links, sparsification, mean recovery."""

@@ -1,0 +1,127 @@
+"""Covariances and means of a `SparseState`: of Markov blankets, or of the whole map.
+
+The inverse of a block of Ω is the covariance of its variables given all others; it is at most the
+marginal covariance. With the Markov blanket of a variable (all that it is linked to) in the block,
+the inverse is near the marginal if the uncertainty of the neighbourhood is small, and far below it
+where a whole map has drifted, since the other variables are fixed at their means. A wider blanket
+only delays this. For consistency take `whole_marginals`.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxslam.filters.information.sparse.sparse_state import SparseState, landmark_blocks
+from jaxslam.math import linalg
+from jaxslam.math.angles import wrap
+
+
+def information_of(state: SparseState, slot: Int[Array, "B"]) -> Float[Array, "D D"]:
+    """Ω of the robot and the landmarks of these slots, D = 3 + 2B; N for none, no slot twice."""
+    n, count = state.alive.shape[0], slot.shape[0]
+    present = slot < n
+    rows = state.neighbours.at[slot].get(mode="fill", fill_value=n)
+    links = state.links.at[slot].get(mode="fill", fill_value=0)
+    match = (rows[:, :, None] == slot[None, None, :]) & present[None, None, :]
+    blocks = jnp.einsum("bkij,bkc->bcij", links, match.astype(links.dtype))
+    at = (slot[:, None] == state.active[None, :]) & present[:, None]
+    active, index = at.any(axis=1), jnp.argmax(at, axis=1)
+    both = active[:, None] & active[None, :]
+    dense = landmark_blocks(state.omega)[index][:, index]
+    blocks = blocks + jnp.where(both[:, :, None, None], dense, 0.0)
+    passive = state.diagonal.at[slot].get(mode="fill", fill_value=0)
+    passive = jnp.where(present[:, None, None], passive, jnp.eye(2, dtype=passive.dtype)[None])
+    every = jnp.arange(count)
+    blocks = blocks.at[every, every].add(jnp.where(active[:, None, None], 0.0, passive))
+    robot = state.omega[:3, 3:].reshape(3, -1, 2)[:, index]
+    robot = jnp.where(active[None, :, None], robot, 0.0).reshape(3, 2 * count)
+    flat = blocks.transpose(0, 2, 1, 3).reshape(2 * count, 2 * count)
+    top = jnp.concatenate([state.omega[:3, :3], robot], axis=1)
+    return jnp.concatenate([top, jnp.concatenate([robot.T, flat], axis=1)])
+
+
+def blanket_cov(state: SparseState, slot: Int[Array, ""]) -> Float[Array, "5 5"]:
+    """P of the robot and the landmark of a slot, given all landmarks outside their Markov blankets.
+
+    The blankets are the active landmarks and those of the landmark's list: a matrix of 3 + 2(1 + A
+    + K) is factored, whatever N.
+    """
+    n = state.alive.shape[0]
+    row = state.neighbours[slot]
+    listed = (state.active[:, None] == row[None, :]).any(axis=1) | (state.active == slot)
+    members = jnp.concatenate([slot[None], row, jnp.where(listed, n, state.active)])
+    omega = information_of(state, members)
+    eye = jnp.eye(omega.shape[0], 5, dtype=omega.dtype)
+    return linalg.symmetrize(linalg.solve_psd(omega, eye)[0][:5])
+
+
+def blanket_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Array, "N 2 2"]]:
+    """P of the robot and of each landmark, given all landmarks outside their Markov blankets."""
+    omega = state.omega
+    eye = jnp.eye(omega.shape[0], 3, dtype=omega.dtype)
+    pose_cov = linalg.symmetrize(linalg.solve_psd(omega, eye)[0][:3])
+    every = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
+    return pose_cov, jax.lax.map(lambda slot: blanket_cov(state, slot)[3:, 3:], every)
+
+
+def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Array, "N 2 2"]]:
+    """P of the robot and of each landmark by inverting the whole Ω, O(N³)."""
+    count = state.alive.shape[0]
+    omega = information_of(state, jnp.arange(count, dtype=jnp.int32))
+    cov = linalg.inverse_psd(omega)
+    every = jnp.arange(count)
+    points = cov[3:, 3:].reshape(count, 2, count, 2)[every, :, every]
+    return cov[:3, :3], points
+
+
+def whole_information(state: SparseState) -> scipy.sparse.csc_array:
+    """Ω of robot and all N landmarks, (3 + 2N, 3 + 2N); not traceable."""
+    active = np.asarray(state.active)
+    n, index = len(state.alive), np.flatnonzero(active < len(state.alive))
+    slot, passive = active[index], np.setdiff1d(np.arange(n), active)
+    rows, columns, values = [], [], []
+
+    def add(first: np.ndarray, second: np.ndarray, blocks: np.ndarray) -> None:
+        """Add blocks (m, 2, 2) at landmarks first (m,), second (m,)."""
+        i = 3 + 2 * first[:, None, None] + np.arange(2)[None, :, None]
+        j = 3 + 2 * second[:, None, None] + np.arange(2)[None, None, :]
+        rows.append(np.broadcast_to(i, blocks.shape).ravel())
+        columns.append(np.broadcast_to(j, blocks.shape).ravel())
+        values.append(blocks.ravel())
+
+    add(passive, passive, np.asarray(state.diagonal)[passive])
+    neighbours = np.asarray(state.neighbours)
+    first, column = np.nonzero(neighbours < n)
+    add(first, neighbours[first, column], np.asarray(state.links)[first, column])
+    dense = np.asarray(landmark_blocks(state.omega))[index][:, index]
+    one, two = (m.ravel() for m in np.meshgrid(slot, slot, indexing="ij"))
+    add(one, two, dense.reshape(-1, 2, 2))
+    # The robot's rows and columns: its own block, and its links to the active landmarks.
+    own, linked = (3 + (2 * k[:, None] + np.arange(2)).ravel() for k in (slot, index))
+    i, j = (
+        m.ravel()
+        for m in np.meshgrid(np.arange(3), np.concatenate([np.arange(3), own]), indexing="ij")
+    )
+    top = np.asarray(state.omega)[:3][:, np.concatenate([np.arange(3), linked])].ravel()
+    beside = j >= 3
+    rows += [i, j[beside]]
+    columns += [j, i[beside]]
+    values += [top, top[beside]]
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.coo_array(entries, shape=(3 + 2 * n, 3 + 2 * n)).tocsc()
+
+
+def whole_mean(state: SparseState) -> tuple[np.ndarray, np.ndarray]:
+    """Pose (3,) and landmarks (N, 2) of the mean Ω⁻¹ ξ, by a sparse factorization; not traceable.
+
+    That is the mean to which mean recovery converges; the state is left as it is.
+    """
+    residual = np.concatenate([state.pose_residual, np.ravel(state.landmark_residual)])
+    step = scipy.sparse.linalg.splu(whole_information(state)).solve(residual)
+    pose = np.asarray(state.pose) + step[:3]
+    pose[2] = wrap(pose[2])
+    return pose, np.asarray(state.landmarks) + step[3:].reshape(-1, 2)

@@ -1,0 +1,1 @@
+"""Weighted particles: their states and moments."""

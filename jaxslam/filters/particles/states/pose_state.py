@@ -1,0 +1,133 @@
+"""Weighted poses in a known map: the state of Monte-Carlo localization."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.filters.particles.settings import MonteCarloSettings
+from jaxslam.filters.particles.states.moments import weighted_pose_moments
+from jaxslam.filters.particles.states.slam_state import draw_pose
+from jaxslam.math.angles import wrap
+
+
+class ParticleEvents(NamedTuple):
+    """Events of the particles since the last scan."""
+
+    resampled: Bool[Array, ""]
+    injected: Int[Array, ""]
+    """drawn from the box"""
+    invalid: Int[Array, ""]
+    """with a non-finite pose after the motion"""
+    capped: Bool[Array, ""]
+    """more particles were wanted than there may be"""
+
+
+class PoseParticles(NamedTuple):
+    """P particles, of which the first `active` are in use; the others have weight zero."""
+
+    pose: Float[Array, "P 3"]
+    """finite also where not in use"""
+    log_weight: Float[Array, "P"]
+    """Σ exp = 1, -inf where not in use"""
+    active: Int[Array, ""]
+    best: Int[Array, ""]
+    """the most likely particle"""
+    fresh: Bool[Array, ""]
+    """nothing was drawn yet"""
+    start_cov: Float[Array, "3 3"]
+    """of the start while it is not drawn yet, then zero"""
+    fast: Float[Array, ""]
+    """short-term average of the scans' likelihood, in units of its peak"""
+    slow: Float[Array, ""]
+    """long-term average of the same; both 0 before the first scan"""
+    due: Bool[Array, ""]
+    """to be resampled before the next motion"""
+    injection: Float[Array, ""]
+    """the probability of each particle to be drawn from the whole box then"""
+    events: ParticleEvents
+
+
+def no_events() -> ParticleEvents:
+    """The record of no events."""
+    no, none = jnp.asarray(False), jnp.zeros((), jnp.int32)
+    return ParticleEvents(resampled=no, injected=none, invalid=none, capped=no)
+
+
+def initial_pose_particles(
+    pose: Float[Array, "3"], start_cov: Float[Array, "3 3"], settings: MonteCarloSettings
+) -> PoseParticles:
+    """The initial state: P copies of the pose, to be drawn from N(pose, start_cov) or the box."""
+    kind, particles = pose.dtype, settings.particles
+    if settings.start == "uniform":
+        pose, start_cov = uniform_pose_moments(jnp.asarray(settings.box, kind))
+    zero, no = jnp.zeros((), kind), jnp.asarray(False)
+    return PoseParticles(
+        pose=jnp.broadcast_to(pose, (particles, 3)),
+        log_weight=jnp.full(particles, -math.log(particles), kind),
+        active=jnp.asarray(particles, jnp.int32),
+        best=jnp.zeros((), jnp.int32),
+        fresh=jnp.asarray(True),
+        start_cov=start_cov,
+        fast=zero,
+        slow=zero,
+        due=no,
+        injection=zero,
+        events=no_events(),
+    )
+
+
+def draw_start(state: PoseParticles, key: Array, settings: MonteCarloSettings) -> PoseParticles:
+    """The state with its initial poses drawn, if not done before."""
+    if settings.start == "uniform":
+        box = jnp.asarray(settings.box, state.pose.dtype)
+        first = draw_uniform_poses(box, settings.particles, key)
+    else:
+        first = draw_gaussian_poses(state.pose, state.start_cov, key)
+    return state._replace(
+        pose=jnp.where(state.fresh, first, state.pose),
+        start_cov=jnp.zeros_like(state.start_cov),
+        fresh=jnp.asarray(False),
+    )
+
+
+def active_mask(state: PoseParticles) -> Bool[Array, "P"]:
+    """Which particles are in use."""
+    return jnp.arange(state.pose.shape[0]) < state.active
+
+
+def pose_particle_moments(
+    state: PoseParticles,
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Mean and covariance of the pose: `weighted_pose_moments`, or those of the undrawn start."""
+    mean, spread = weighted_pose_moments(state.pose, state.log_weight, state.best)
+    return mean, spread + state.start_cov
+
+
+def draw_gaussian_poses(
+    pose: Float[Array, "P 3"], cov: Float[Array, "3 3"], key: Array
+) -> Float[Array, "P 3"]:
+    """Poses drawn from N(pose_p, cov); cov may be singular or zero."""
+    normals = jax.random.normal(key, pose.shape, pose.dtype)
+    return jax.vmap(draw_pose, (0, None, 0))(pose, cov, normals)
+
+
+def draw_uniform_poses(box: Float[Array, "2 2"], count: int, key: Array) -> Float[Array, "P 3"]:
+    """Poses drawn uniformly in a box, rows its lowest and highest (x, y), with any heading."""
+    share = jax.random.uniform(key, (count, 3), box.dtype)
+    low, high = box[0][None], box[1][None]
+    heading = wrap(2 * math.pi * share[:, 2:])
+    return jnp.concatenate([low + (high - low) * share[:, :2], heading], axis=1)
+
+
+def uniform_pose_moments(
+    box: Float[Array, "2 2"],
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Mean and covariance of `draw_uniform_poses`; the heading, uniform, gets 0 ± π/√3."""
+    width = box[1] - box[0]
+    mean = jnp.concatenate([0.5 * (box[0] + box[1]), jnp.zeros(1, box.dtype)])
+    variance = jnp.concatenate([width**2, jnp.full(1, 4 * math.pi**2, box.dtype)]) / 12
+    return mean, jnp.diag(variance)

@@ -1,0 +1,1 @@
+"""What is said of an optimum: marginal covariances, a certificate."""

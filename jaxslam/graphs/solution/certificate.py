@@ -1,0 +1,196 @@
+"""A certificate of global optimality: a lower bound of the chordal cost of a pose graph."""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxslam import programs
+from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.solution.dual import FACTORS, dual, weights_of
+from jaxslam.graphs.solver.batch import in_one_dtype, over_batch
+from jaxslam.graphs.solver.linearized import data_of, variables_of
+from jaxslam.graphs.solver.model import Model, model_of
+from jaxslam.graphs.solver.plan import Plan, plan_for
+from jaxslam.graphs.solver.search import minimize
+from jaxslam.graphs.sparse.cholesky import factorize, substitute
+from jaxslam.graphs.validation import check_graph
+from jaxslam.validation.numbers import is_concrete
+
+SHARE = 1e-6
+"""The gap that is tried first, relative to χ² + 1."""
+
+ENOUGH = 1e-5
+"""The gap that counts as none."""
+
+POWERS = 100
+"""iterations for the smallest eigenvalue"""
+
+
+class Certificate(NamedTuple):
+    """What is proved of a pose graph's optimum; leading axes by `vmap`.
+
+    The proof is of the chordal cost with isotropic weights, Σ τ |t_j - t_i - R_i t|² + κ |R_j - R_i
+    R|²/2. Of the graph's own cost nothing is proved: `position` and `heading` say how far the two
+    optima are apart. Where they are close, and the surrogate's is global, another minimum of the
+    graph's own cost that is lower would have to have a higher chordal cost.
+    """
+
+    certified: Bool[Array, ""]
+    """the optimum of the surrogate that was found is its global one, up to `gap`"""
+    gap: Float[Array, ""]
+    """what is proved: no poses have a chordal cost below `chi2 - gap`"""
+    smallest: Float[Array, ""]
+    """the smallest eigenvalue of the dual matrix, about 0 where certified: the optimum itself is
+    its eigenvector"""
+    chi2: Float[Array, ""]
+    """chordal cost at the optimum of the surrogate next to the graph"""
+    graph: Graph
+    """with the poses of that optimum"""
+    position: Float[Array, ""]
+    """[m], root mean square distance of the poses of both optima"""
+    heading: Float[Array, ""]
+    """[rad], the same of their headings"""
+
+
+def certificate(
+    graph: Graph, factors: Mapping[str, Factor] | None = None, *, plan: Plan | None = None
+) -> Certificate:
+    """Whether the optimum next to a graph is the global one, of the chordal cost (see above).
+
+    Poses are complex numbers p = x + iy and u = exp(iθ), |u| = 1, and the chordal cost is a
+    quadratic form zᴴ M z of both. At a stationary point λ_i = Re(ū_i (M z)_i), and for all other
+    poses the cost is at least Σλ + N μ, where μ is the smallest eigenvalue, if negative, of
+    M - diag(0, λ) after the positions are eliminated (Carlone, Calafiore, Tommolillo and Dellaert
+    2016, "Planar pose graph optimization: duality, optimal solutions, and verification", T-RO
+    32(3); Rosen et al. 2019, "SE-Sync", IJRR 38). μ > -η is proved by a Cholesky factor of
+    M - diag(0, λ - η), with the sparsity of the information matrix.
+
+    τ is the mean of the two position entries of an information's diagonal, κ its heading entry;
+    other entries are left out. First the chordal cost is minimized from the graph's variables.
+
+    Args:
+        graph: usually that of a `Solution`. One pose is held: fixed, or by a prior, which is left
+            out.
+        factors: as in `optimize`; each must be a relative pose, a relative position, or a prior.
+        plan: of `plan(graph)`; needed under `jit` and `vmap`.
+    Raises:
+        ValueError: on other factors, on more poses held than one, and on what `check_graph`
+            refuses.
+    """
+    caller = "graphs.certificate"
+    model = model_of(caller, graph, factors)
+    for name, factor in model.factors:
+        if factor.name not in FACTORS:
+            raise ValueError(
+                f"{caller}: the table {name!r} has no chordal cost: its factor is {factor.name}, "
+                f"and there are {', '.join(FACTORS)}"
+            )
+    check_graph(caller, graph, dict(model.factors))
+    plan = plan_for(caller, graph, dict(model.factors), plan)
+    if is_concrete(graph):
+        # NumPy, since each operation on a new shape would be a program.
+        held = np.array(graph.fixed_pose)
+        for name, factor in model.factors:
+            if factor.name == "prior":
+                held[
+                    np.asarray(graph.tables[name].who)[np.asarray(graph.tables[name].valid), 0]
+                ] = True
+        if held.sum() != 1:
+            raise ValueError(
+                f"{caller}: expected one pose that is fixed or has a prior, got {held.sum()}; the "
+                "dual is of a graph that is free but for that"
+            )
+    return programs.call(_certificate, (model,), graph, plan)
+
+
+def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
+    """The poses that are fixed or have a prior."""
+    held = graph.fixed_pose
+    for name, factor in model.factors:
+        if factor.name == "prior":
+            held = held.at[plan.who[name][:, 0]].max(graph.tables[name].valid)
+    return held
+
+
+def _certificate(model: Model, graph: Graph, plan: Plan) -> Certificate:
+    return _batched(model)((plan,), in_one_dtype(graph))
+
+
+@functools.lru_cache(maxsize=256)
+def _batched(model: Model) -> Callable[..., Certificate]:
+    return over_batch("graphs.certificate", functools.partial(_proved, model))
+
+
+def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
+    """Of graphs with a last axis B."""
+    poses, dtype = len(graph.poses), graph.poses.dtype
+    held = _held(model, plan, graph)
+    tables = {}
+    for name, factor in model.factors:
+        table = graph.tables[name]
+        weights = weights_of(FACTORS[factor.name].name, table.information)
+        unit = jnp.eye(weights.shape[1], dtype=dtype)[None, ..., None]
+        tables[name] = table._replace(information=unit * weights[:, None])
+    chordal = Model(tuple((name, FACTORS[factor.name]) for name, factor in model.factors))
+    surrogate = graph._replace(tables=tables, fixed_pose=held)
+    tolerance = jnp.asarray(1e-13, dtype)
+    found = minimize(chordal, "levenberg_marquardt", plan, jnp.asarray(100), tolerance, surrogate)
+    variables, data = variables_of(found.graph), data_of(surrogate, plan.column)
+    blocks, multipliers, turns = dual(chordal, plan, variables, data)
+    value = found.chi2
+    bound = multipliers.sum(axis=0)
+    margin = jnp.maximum(
+        SHARE * (value + 1.0) / poses, 16 * jnp.finfo(dtype).eps * blocks.max((0, 1, 2))
+    )
+
+    def shifted(shift: Array) -> Array:
+        return blocks + shift[None, None, None] * turns
+
+    def proof(shift: Array) -> Array:
+        return factorize(plan.cholesky, shifted(shift)).regular.all(axis=0)
+
+    def wider(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        shift, good, count = carry
+        shift = jnp.where(good, shift, 10 * shift)
+        return shift, proof(shift), count + 1
+
+    shift, good, _ = jax.lax.while_loop(
+        lambda carry: ~carry[1].all() & (carry[2] < 40),
+        wider,
+        (margin / 10, jnp.zeros(margin.shape, bool), jnp.zeros((), jnp.int32)),
+    )
+    factored = factorize(plan.cholesky, shifted(shift))
+    of_turns = jnp.diagonal(turns[plan.cholesky.diagonal], axis1=1, axis2=2)
+    of_turns = jnp.moveaxis(of_turns, 2, 1)
+
+    def power(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        v, _ = carry
+        w = of_turns * substitute(plan.cholesky, factored, v)
+        inverse = (v * w).sum((0, 1))
+        norm = jnp.sqrt((w * w).sum((0, 1)))
+        return w / jnp.where(norm > 0, norm, 1.0)[None, None], 1.0 / inverse - shift
+
+    angle = jnp.arange(len(plan.order), dtype=dtype) ** 2
+    first = jnp.stack([jnp.zeros_like(angle)] * 2 + [jnp.cos(angle), jnp.sin(angle)], axis=1)
+    first = jnp.broadcast_to(of_turns * first[..., None], (*first.shape, *value.shape))
+    first = first / jnp.sqrt((first * first).sum((0, 1)))[None, None]
+    first = jnp.broadcast_to(first, (*first.shape[:2], *shift.shape))
+    smallest = jax.lax.fori_loop(0, POWERS, power, (first, jnp.zeros_like(shift)))[1]
+    gap = value - bound + poses * shift
+    away = found.graph.poses - graph.poses
+    turned = jnp.arctan2(jnp.sin(away[:, 2]), jnp.cos(away[:, 2]))
+    return Certificate(
+        certified=good & (gap <= ENOUGH * (value + 1.0)),
+        gap=jnp.where(good, gap, jnp.inf),
+        smallest=smallest,
+        chi2=value,
+        graph=graph._replace(poses=found.graph.poses, points=found.graph.points),
+        position=jnp.sqrt((away[:, :2] ** 2).sum(1).mean(axis=0)),
+        heading=jnp.sqrt((turned**2).mean(axis=0)),
+    )

@@ -1,0 +1,129 @@
+"""Marginal covariances of poses and points, from the information matrix of a graph."""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jaxslam import programs
+from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.solver.batch import in_one_dtype, over_batch
+from jaxslam.graphs.solver.kernels import Kernel
+from jaxslam.graphs.solver.linearized import data_of, linearize, variables_of
+from jaxslam.graphs.solver.model import Model, model_of
+from jaxslam.graphs.solver.plan import Plan, plan_for
+from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
+from jaxslam.graphs.sparse.inverse import selected_inverse
+from jaxslam.graphs.validation import check_graph
+
+
+class Marginals(NamedTuple):
+    """Covariances of a graph's variables, zero for what is fixed; leading axes by `vmap`."""
+
+    poses: Float[Array, "N 3 3"]
+    """of (x, y, θ), in world coordinates as the poses themselves"""
+    points: Float[Array, "P L L"]
+    pairs: Float[Array, "Q 2 2 d d"]
+    """the joint covariance of each pair by its two variables, d = max(3, L); rows and columns that
+    a variable does not have are zero"""
+    singular: Int[Array, ""]
+    """the first variable that the measurements do not determine, poses before points; then the
+    covariances are not valid. -1: none"""
+
+
+def marginals(
+    graph: Graph,
+    factors: Mapping[str, Factor] | None = None,
+    *,
+    kernel: Kernel | Mapping[str, Kernel] | None = None,
+    pairs: ArrayLike = (),
+    plan: Plan | None = None,
+) -> Marginals:
+    """The covariances (Σ Jᵀ ρ' Ω J)⁻¹ of all poses and points of a graph, and of pairs of them.
+
+    J is taken at the graph's variables, so give the graph of a `Solution`. The inverse is computed
+    where the Cholesky factor has blocks (`sparse.inverse`), and at the pairs.
+
+    Args:
+        graph: outside of a trace it is checked.
+        factors: as in `optimize`.
+        kernel: as in `optimize`.
+        pairs: (Q, 2), two variables each, points counted on from the poses.
+        plan: of `plan(graph, marginals=True, pairs=pairs)`; needed under `jit` and `vmap`. Its
+            pairs stand if none are given here.
+    Raises:
+        ValueError: on what `check_graph` refuses, and on a plan without marginals or those pairs.
+    """
+    caller = "graphs.marginals"
+    model = model_of(caller, graph, factors, kernel)
+    known = dict(model.factors)
+    check_graph(caller, graph, known)
+    wanted = np.asarray(pairs, int).reshape(-1, 2)
+    plan = plan_for(caller, graph, known, plan, marginals=True, pairs=wanted)
+    return programs.call(_marginals, (model,), graph, plan)
+
+
+def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:
+    return _batched(model)((plan,), in_one_dtype(graph))
+
+
+@functools.lru_cache(maxsize=256)
+def _batched(model: Model) -> Callable[..., Marginals]:
+    return over_batch("graphs.marginals", functools.partial(_inverted, model))
+
+
+def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:
+    """Of graphs with a last axis B."""
+    assert plan.inverse is not None
+    data, variables = data_of(graph, plan.column), variables_of(graph)
+    system = linearize(model, plan, variables, data)
+    factored = factorize(plan.cholesky, system.blocks)
+    blocks = selected_inverse(plan.inverse, factored)
+    own = blocks[plan.inverse.diagonal[plan.column]]  # by variable
+    own = _masked(own, *[data.free[plan.column]] * 2)
+    poses, size = len(graph.poses), graph.points.shape[1]
+    width = data.free.shape[1]
+    turn = _turns(graph, width)
+    own = by_transposed(by(turn, own), turn)
+    first, second = plan.pairs[:, 0], plan.pairs[:, 1]
+    cross = blocks[plan.inverse.pairs]
+    turned = plan.inverse.turned[:, None, None, None]
+    cross = jnp.where(turned, jnp.swapaxes(cross, 1, 2), cross)
+    cross = _masked(cross, data.free[plan.column[first]], data.free[plan.column[second]])
+    cross = by_transposed(by(turn[first], cross), turn[second])
+    joint = jnp.stack(
+        [
+            jnp.stack([own[first], cross], axis=1),
+            jnp.stack([jnp.swapaxes(cross, 1, 2), own[second]], axis=1),
+        ],
+        axis=1,
+    )
+    regular = factored.regular
+    culprit = plan.order[jnp.argmin(regular, axis=0)].astype(jnp.int32)
+    return Marginals(
+        poses=own[:poses, :3, :3],
+        points=own[poses:, :size, :size],
+        pairs=joint,
+        singular=jnp.where(regular.all(axis=0), -1, culprit).astype(jnp.int32),
+    )
+
+
+def _masked(
+    blocks: Float[Array, "k d d B"], rows: Bool[Array, "k d B"], columns: Bool[Array, "k d B"]
+) -> Float[Array, "k d d B"]:
+    return jnp.where(rows[:, :, None] & columns[:, None], blocks, 0.0)
+
+
+def _turns(graph: Graph, width: int) -> Float[Array, "n d d B"]:
+    """∂(coordinates)/∂(increments) of each variable: R(θ) for the position of a pose."""
+    poses, points, batch = len(graph.poses), len(graph.points), graph.poses.shape[-1]
+    unit = jnp.eye(width, dtype=graph.poses.dtype)[None, ..., None]
+    every = jnp.broadcast_to(unit, (poses + points, width, width, batch))
+    cos, sin = jnp.cos(graph.poses[:, 2]), jnp.sin(graph.poses[:, 2])
+    turn = jnp.stack([jnp.stack([cos, -sin], axis=1), jnp.stack([sin, cos], axis=1)], axis=1)
+    return every.at[:poses, :2, :2].set(turn)

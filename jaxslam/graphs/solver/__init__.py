@@ -1,0 +1,1 @@
+"""The optimization of a graph: models, plans, steps, robust kernels."""

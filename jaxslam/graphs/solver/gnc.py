@@ -1,0 +1,124 @@
+"""Truncated least squares by graduated non-convexity."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.solver.linearized import cost, data_of, row_costs, variables_of
+from jaxslam.graphs.solver.model import Model
+from jaxslam.graphs.solver.plan import Plan
+from jaxslam.graphs.solver.search import Ending, Solution, minimize
+
+ROUNDS = 100
+"""at most"""
+GROWTH = 1.4
+"""of μ in each round"""
+LOOSE = 1e-6
+"""tolerance of the rounds before the last"""
+
+
+class Round(NamedTuple):
+    """The state of the rounds of B graphs."""
+
+    found: Solution
+    weights: dict[str, Float[Array, "E B"]]
+    control: Float[Array, "B"]
+    """μ: the surrogate is convex near zero, and the truncated cost at infinity"""
+    settled: Bool[Array, "B"]
+    """the weights are zeros and ones, and were before the last optimization"""
+    rounds: Int[Array, ""]
+
+
+def graduated(
+    model: Model, method: str, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
+) -> Solution:
+    """The solutions of graphs with a last axis B, whose model has truncated kernels.
+
+    Yang et al. 2020, "Graduated non-convexity for robust spatial perception: from non-minimal
+    solvers to global outlier rejection", RA-L 5(2). Rounds of weighted least squares: with s = eᵀΩe
+    of the round before, a row has the weight
+
+        1 if s <= μ c²/(μ + 1), 0 if s >= (μ + 1) c²/μ, else c √(μ(μ + 1)/s) - μ
+
+    and μ grows by 1.4 a round, from c²/(2 max s - c²) after a first round with all weights one,
+    until all weights are zeros or ones.
+    """
+    truncated = {name: k.limit for name, k in model.kernels if k.limit is not None}
+    plain = Model(model.factors, tuple((name, k) for name, k in model.kernels if k.limit is None))
+    data = data_of(graph, plan.column)
+
+    def solved(graph: Graph, weights: dict[str, Array], tolerance: Array) -> Solution:
+        tables = dict(graph.tables)
+        for name, weight in weights.items():
+            table = tables[name]
+            tables[name] = table._replace(information=table.information * weight[:, None, None])
+        return minimize(plain, method, plan, iterations, tolerance, graph._replace(tables=tables))
+
+    def squares(found: Solution) -> dict[str, Array]:
+        out = {}
+        for name, factor in model.factors:
+            if name in truncated:
+                s = row_costs(
+                    factor,
+                    None,
+                    plan.who[name],
+                    variables_of(found.graph),
+                    data.z[name],
+                    data.information[name],
+                )[1]
+                out[name] = jnp.where(data.valid[name], s, 0.0)
+        return out
+
+    def again(state: Round) -> Array:
+        return ~state.settled.all() & (state.rounds < ROUNDS)
+
+    def work(state: Round) -> Round:
+        """The optimum with the weights, then the weights there."""
+        binary = jnp.stack([_binary(w) for w in state.weights.values()]).all(axis=0)
+        new = solved(state.found.graph, state.weights, jnp.where(binary, tolerance, loose))
+        first = state.rounds == 0
+        new = new._replace(
+            graph=new.graph._replace(tables=graph.tables),
+            iterations=state.found.iterations + new.iterations,
+            chi2_start=jnp.where(first, new.chi2_start, state.found.chi2_start),
+            gradient_start=jnp.where(first, new.gradient_start, state.found.gradient_start),
+        )
+        found = jax.tree.map(
+            lambda a, b: jnp.where(state.settled[(None,) * (a.ndim - 1)], b, a), new, state.found
+        )
+        ratio = {name: s / truncated[name] ** 2 for name, s in squares(found).items()}
+        worst = jnp.stack([r.max(axis=0, initial=0.0) for r in ratio.values()]).max(axis=0)
+        begin = 1.0 / jnp.maximum(2 * worst - 1.0, 1e-6)
+        control = jnp.where(first, begin, GROWTH * state.control)
+        weights = {name: _weight(r, control[None]) for name, r in ratio.items()}
+        same = [(weights[name] == state.weights[name]).all(axis=0) for name in weights]
+        settled = state.settled | (binary & jnp.stack(same).all(axis=0))
+        return Round(found, weights, control, settled, state.rounds + 1)
+
+    batch = graph.poses.shape[-1:]
+    zero, none = jnp.zeros(batch, graph.poses.dtype), jnp.zeros(batch, jnp.int32)
+    loose = jnp.maximum(tolerance, jnp.asarray(LOOSE, tolerance.dtype))
+    start = Solution(graph, zero, none, none, none - 1, zero, zero, zero)
+    ones = {name: jnp.ones_like(data.z[name][:, 0]) for name in truncated}
+    state = Round(start, ones, zero, jnp.zeros(batch, bool), jnp.zeros((), jnp.int32))
+    end = jax.lax.while_loop(again, work, state)
+    found, converged = end.found, end.found.status == Ending.CONVERGED
+    return found._replace(
+        chi2=cost(model, plan.who, variables_of(found.graph), data),
+        status=jnp.where(converged & ~end.settled, Ending.EXHAUSTED, found.status),
+    )
+
+
+def _binary(weight: Float[Array, "E B"]) -> Bool[Array, "B"]:
+    return ((weight == 0) | (weight == 1)).all(axis=0)
+
+
+def _weight(ratio: Float[Array, "E B"], control: Float[Array, "1 B"]) -> Float[Array, "E B"]:
+    """The weight of rows by s/c² and μ."""
+    low, high = control / (control + 1), (control + 1) / control
+    safe = jnp.where(ratio > 0, ratio, 1.0)
+    between = jnp.sqrt(control * (control + 1) / safe) - control
+    return jnp.where(ratio <= low, 1.0, jnp.where(ratio >= high, 0.0, between))

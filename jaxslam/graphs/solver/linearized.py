@@ -1,0 +1,237 @@
+"""A graph about its variables: residuals, gradient, and the blocks of the information matrix.
+
+Arrays have a batch B as their last axis, as those of `sparse.cholesky`. Increments are local, in
+the frame of a pose, X ∘ exp(δ) (`se2.boxplus`); those of a point are added.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.solver.kernels import Kernel
+from jaxslam.graphs.solver.model import Model
+from jaxslam.graphs.solver.plan import Plan
+from jaxslam.graphs.sparse.gathered import summed
+from jaxslam.math import se2
+from jaxslam.math.linalg import total
+
+
+class Variables(NamedTuple):
+    """What is estimated."""
+
+    poses: Float[Array, "N 3 B"]
+    points: Float[Array, "P L B"]
+
+
+class Data(NamedTuple):
+    """What is measured, and what is held; numbers of rows that are not valid are zero."""
+
+    z: dict[str, Float[Array, "_ _ B"]]
+    information: dict[str, Float[Array, "_ _ _ B"]]
+    valid: dict[str, Bool[Array, "_ B"]]
+    free: Bool[Array, "n d B"]
+    """which entries of the increments are estimated, by column"""
+
+
+class System(NamedTuple):
+    """The normal equations of a Gauss-Newton step."""
+
+    chi2: Float[Array, "B"]
+    gradient: Float[Array, "n d B"]
+    """Σ Jᵀ ρ' Ω e, by column: half the derivative of χ² by the increments"""
+    blocks: Float[Array, "M d d B"]
+    """Σ Jᵀ ρ' Ω J; one on the diagonal of what is not estimated"""
+
+
+def retract(variables: Variables, increments: Float[Array, "n d B"], plan: Plan) -> Variables:
+    """The variables moved by increments."""
+    by_variable = increments[plan.column]
+    poses, size = len(variables.poses), variables.points.shape[1]
+    move = jax.vmap(jax.vmap(se2.boxplus, -1, -1))
+    return Variables(
+        move(variables.poses, by_variable[:poses, :3]),
+        variables.points + by_variable[poses:, :size],
+    )
+
+
+def _taken(factor: Factor, who: Array, variables: Variables) -> tuple[Array, ...]:
+    return tuple(
+        (variables.poses if kind == "pose" else variables.points)[who[:, k]]
+        for k, kind in enumerate(factor.variables)
+    )
+
+
+def _over_rows(function: Callable[..., Any], *arguments: PyTree) -> PyTree:
+    """The function of one row of one graph, over rows (first axis) and graphs (last axis)."""
+    return jax.vmap(jax.vmap(function, -1, -1))(*arguments)
+
+
+def squared(information: Float[Array, "E R R B"], e: Float[Array, "E R B"]) -> Float[Array, "E B"]:
+    """s = eᵀ Ω e."""
+    size = e.shape[1]
+    return total(e[:, i] * information[:, i, j] * e[:, j] for i in range(size) for j in range(size))
+
+
+def row_costs(
+    factor: Factor, kernel: Kernel | None, who: Array, variables: Variables, z: Array, info: Array
+) -> tuple[Float[Array, "E R B"], Float[Array, "E B"], Float[Array, "E B"]]:
+    """Residuals, squared residuals s, and costs ρ(s) of the rows of a table."""
+    e = _over_rows(factor.residual, _taken(factor, who, variables), z)
+    s = squared(info, e)
+    return e, s, s if kernel is None else kernel.cost(s)
+
+
+def cost(
+    model: Model, who: Mapping[str, Array], variables: Variables, data: Data
+) -> Float[Array, "B"]:
+    """χ²."""
+    parts = []
+    for name, factor in model.factors:
+        rows = row_costs(
+            factor,
+            model.kernel(name),
+            who[name],
+            variables,
+            data.z[name],
+            data.information[name],
+        )
+        parts.append(jnp.where(data.valid[name], rows[2], 0.0).sum(axis=0))
+    return total(parts)
+
+
+def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> System:
+    """The normal equations about the variables."""
+    width, poses = data.free.shape[1], len(variables.poses)
+    chi2, gradients, blocks = [], [], []
+    for name, factor in model.factors:
+        e, jacobian = _jacobians(factor, plan.who[name], variables, data.z[name], width)
+        info, valid = data.information[name], data.valid[name]
+        s, kernel = squared(info, e), model.kernel(name)
+        chi2.append(jnp.where(valid, s if kernel is None else kernel.cost(s), 0.0).sum(axis=0))
+        weight = 1.0 if kernel is None else kernel.weight(s)
+        info = info * jnp.where(valid, weight, 0.0)[:, None, None]
+        free = data.free[plan.column[variable_numbers(factor, plan.who[name], poses)]]
+        keep = valid[:, None, None, None] & free[:, None]  # (E, 1, K, d, B)
+        jacobian = jnp.where(keep, jacobian, 0.0)
+        rows, size = e.shape[0], e.shape[1]
+        weighted = total(info[:, :, r, None, None] * jacobian[:, r, None] for r in range(size))
+        e = jnp.where(valid[:, None], e, 0.0)
+        gradient = total(weighted[:, r] * e[:, r, None, None] for r in range(size))
+        gradients.append(gradient.reshape(-1, *gradient.shape[2:]))
+        product = total(
+            jacobian[:, r, :, None, :, None] * weighted[:, r, None, :, None, :] for r in range(size)
+        )
+        blocks.append(product.reshape(rows * len(factor.variables) ** 2, *product.shape[3:]))
+    return System(
+        total(chi2),
+        summed(plan.gradient, jnp.concatenate(gradients)),
+        _assembled(plan, blocks, data),
+    )
+
+
+def _assembled(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
+    """The blocks of the matrix from those of the rows of each table, (E K K, d, d, B)."""
+    out = summed(plan.information, jnp.concatenate(blocks))
+    held = plan.on_diagonal[:, None, None] & ~data.free[plan.block_column]
+    unit = jnp.eye(out.shape[1], dtype=out.dtype)[None, ..., None]
+    return out + jnp.where(held[:, None], unit, 0.0)
+
+
+def hessian(model: Model, plan: Plan, variables: Variables, data: Data) -> Float[Array, "M d d B"]:
+    """Half the second derivative of χ² by the increments, as `System.blocks`."""
+    width, poses = data.free.shape[1], len(variables.poses)
+    blocks = []
+    for name, factor in model.factors:
+        kernel, count = model.kernel(name), len(factor.variables)
+
+        def half(steps: Array, own: tuple[Array, ...], z: Array, info: Array) -> Array:
+            e = factor.residual(_moved(factor, steps, own), z)  # noqa: B023
+            s = e @ info @ e
+            return 0.5 * (s if kernel is None else kernel.cost(s))  # noqa: B023
+
+        own = _taken(factor, plan.who[name], variables)
+        still = jnp.zeros((count, width), variables.poses.dtype)
+        second: Array = jax.vmap(
+            jax.vmap(jax.jacfwd(jax.grad(half)), (None, -1, -1, -1), -1), (None, 0, 0, 0)
+        )(still, own, data.z[name], data.information[name])  # (E, K, d, K, d, B)
+        free = data.free[plan.column[variable_numbers(factor, plan.who[name], poses)]]
+        keep = free[:, :, :, None, None] & free[:, None, None]
+        keep = keep & data.valid[name][:, None, None, None, None]
+        second = jnp.moveaxis(jnp.where(keep, second, 0.0), 3, 2)
+        blocks.append(second.reshape(-1, *second.shape[3:]))
+    return _assembled(plan, blocks, data)
+
+
+def variable_numbers(factor: Factor, who: Array, poses: int) -> Array:
+    """The variables of rows, points counted on from so many poses."""
+    shift = np.array([[poses * (kind == "point") for kind in factor.variables]], np.int32)
+    return who + shift
+
+
+def _moved(factor: Factor, steps: Float[Array, "K d"], own: tuple[Array, ...]) -> tuple[Array, ...]:
+    """The variables of a row moved by increments."""
+    return tuple(
+        se2.boxplus(x, step[:3]) if kind == "pose" else x + step[: len(x)]
+        for kind, x, step in zip(factor.variables, own, steps, strict=True)
+    )
+
+
+def _jacobians(
+    factor: Factor, who: Array, variables: Variables, z: Array, width: int
+) -> tuple[Float[Array, "E R B"], Float[Array, "E R K d B"]]:
+    """Residuals of rows, and their derivatives by the increments of each variable.
+
+    Those by coordinates, whose first two are turned into the frame of a pose; by the increments
+    themselves they take two to five times as long.
+    """
+
+    def seen(own: tuple[Array, ...], z: Array) -> tuple[Array, Array]:
+        e = factor.residual(own, z)
+        return e, e
+
+    own = _taken(factor, who, variables)
+    parts, e = _over_rows(jax.jacfwd(seen, has_aux=True), own, z)
+    out = []
+    for kind, x, part in zip(factor.variables, own, parts, strict=True):
+        if kind == "pose":
+            cos, sin = jnp.cos(x[:, 2])[:, None], jnp.sin(x[:, 2])[:, None]
+            turned = [cos * part[:, :, 0] + sin * part[:, :, 1]]
+            turned += [cos * part[:, :, 1] - sin * part[:, :, 0], part[:, :, 2]]
+            part = jnp.stack(turned, axis=2)
+        out.append(jnp.pad(part, [(0, 0), (0, 0), (0, width - part.shape[2]), (0, 0)]))
+    return e, jnp.stack(out, axis=2)
+
+
+def variables_of(graph: Graph) -> Variables:
+    """The variables of graphs with a last axis B."""
+    return Variables(graph.poses, graph.points)
+
+
+def data_of(graph: Graph, column: Array) -> Data:
+    """The data of graphs with a last axis B; column: of each variable."""
+    size = graph.points.shape[1] if len(graph.points) else 0
+    width = max(3, size)
+    fixed = jnp.concatenate([graph.fixed_pose, graph.fixed_point])
+    own = np.array([3] * len(graph.poses) + [size] * len(graph.points))
+    there = np.arange(width) < own[:, None]
+    free = there[..., None] & ~fixed[:, None]
+    tables = graph.tables.items()
+    return Data(
+        {name: jnp.where(rows.valid[:, None], rows.z, 0.0) for name, rows in tables},
+        {
+            name: jnp.where(
+                rows.valid[:, None, None],
+                0.5 * (rows.information + jnp.swapaxes(rows.information, 1, 2)),
+                0.0,
+            )
+            for name, rows in tables
+        },
+        {name: rows.valid for name, rows in tables},
+        jnp.zeros_like(free).at[column].set(free, unique_indices=True),
+    )

@@ -1,0 +1,62 @@
+"""The functions of a graph: a factor for each table, and a robust kernel where there is one."""
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.solver.kernels import Kernel
+
+
+@dataclass(frozen=True)
+class Model:
+    """Factors and kernels by table; one object for the same functions (`model_of`)."""
+
+    factors: tuple[tuple[str, Factor], ...]
+    kernels: tuple[tuple[str, Kernel], ...] = ()
+
+    def kernel(self, table: str) -> Kernel | None:
+        """The kernel of a table."""
+        return dict(self.kernels).get(table)
+
+
+_same = functools.lru_cache(maxsize=256)(Model)
+
+
+def model_of(
+    name: str,
+    graph: Graph,
+    factors: Mapping[str, Factor] | None,
+    kernel: Kernel | Mapping[str, Kernel] | None = None,
+) -> Model:
+    """The model of a graph's tables. Raises ValueError, which begins with a caller's name."""
+    known = factors_of(name, graph, factors)
+    if isinstance(kernel, Kernel):
+        kernel = dict.fromkeys(graph.tables, kernel)
+    if lost := sorted(set(kernel or ()) - set(graph.tables)):
+        raise ValueError(
+            f"{name}: kernels of tables that are not in the graph: {', '.join(lost)}; "
+            f"there are: {', '.join(graph.tables)}"
+        )
+    return _same(tuple(known.items()), tuple(sorted(kernel.items())) if kernel else ())
+
+
+def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
+    """The factor of each table: of the same name, or of the part before a slash.
+
+    They are in the order of the names, as in a graph that has been through `jax.tree.map`. Without
+    factors they are those of files. Raises ValueError, which begins with a caller's name.
+    """
+    known = of_files() if factors is None else factors
+    out = {}
+    for key in sorted(graph.tables):
+        found = known.get(key, known.get(key.split("/")[0]))
+        if found is None:
+            raise ValueError(
+                f"{name}: table {key!r} has no factor; there are: {', '.join(known) or 'none'}"
+            )
+        out[key] = found
+    if not out:
+        raise ValueError(f"{name}: the graph has no tables")
+    return out

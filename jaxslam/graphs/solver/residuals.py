@@ -1,0 +1,53 @@
+"""The squared residuals of a graph, row by row."""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam import programs
+from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.solver.model import factors_of
+
+
+def squared_residuals(
+    graph: Graph, factors: Mapping[str, Factor] | None = None
+) -> dict[str, Float[Array, "E"]]:
+    """eᵀ Ω e of every row of every table, 0 where a row is not valid; their sum is χ².
+
+    Of a row with R residuals, at the truth and with the right Ω, it is χ² distributed with R
+    degrees of freedom. factors: as for `optimize`.
+    """
+    factors = factors_of("graphs.squared_residuals", graph, factors)
+    return programs.call(_squared, tuple(factors[key] for key in sorted(graph.tables)), graph)
+
+
+def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None) -> int:
+    """The residuals of all valid rows minus the free numbers of poses and points."""
+    factors = factors_of("graphs.degrees_of_freedom", graph, factors)
+    residuals = sum(
+        int(table.valid.sum()) * len(factors[key].errors) for key, table in graph.tables.items()
+    )
+    free = 3 * int((~graph.fixed_pose).sum())
+    return residuals - free - graph.points.shape[1] * int((~graph.fixed_point).sum())
+
+
+def _squared(*arguments: Factor | Graph) -> dict[str, Float[Array, "E"]]:
+    *factors, graph = arguments
+    assert isinstance(graph, Graph)
+    found = {}
+    for factor, (key, table) in zip(factors, sorted(graph.tables.items()), strict=True):
+        assert isinstance(factor, Factor)
+
+        def square(who: Array, z: Array, information: Array, factor: Factor = factor) -> Array:
+            values = tuple(
+                (graph.poses if kind == "pose" else graph.points)[who[k]]
+                for k, kind in enumerate(factor.variables)
+            )
+            e = factor.residual(values, z)
+            return e @ information @ e
+
+        found[key] = jnp.where(table.valid, jax.vmap(square)(*table[:3]), 0.0)
+    return found

@@ -1,0 +1,243 @@
+"""The iterations of an optimization: a trial step, its χ², and what follows from it."""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.solver.linearized import (
+    System,
+    Variables,
+    data_of,
+    linearize,
+    retract,
+    variables_of,
+)
+from jaxslam.graphs.solver.model import Model
+from jaxslam.graphs.solver.plan import Plan
+from jaxslam.graphs.solver.steps import dogleg, dot, marquardt
+
+METHODS = ("levenberg_marquardt", "gauss_newton", "dogleg")
+
+FIRST_DAMPING = 1e-7
+"""λ after an undamped step that fails, as a share of the diagonal."""
+
+
+class Ending(IntEnum):
+    """The reason for the end of the iterations: the `status` of a `Solution`."""
+
+    CONVERGED = 0
+    """The next step lowers χ² by less than the tolerance, and the information is regular."""
+    STALLED = 1
+    """No step lowers χ²: rounding, or a residual whose derivatives are wrong."""
+    DIVERGED = 2
+    """χ² is not finite, or Gauss-Newton ended above its start."""
+    SINGULAR = 3
+    """The measurements do not determine the variable `singular`; where the method damps its steps
+    it went on and χ² is a minimum."""
+    EXHAUSTED = 4
+    """All iterations were made."""
+
+
+class Solution(NamedTuple):
+    """What `optimize` found; leading axes by `vmap`."""
+
+    graph: Graph
+    """with poses and points of the last iterate"""
+    chi2: Float[Array, ""]
+    """χ² = Σ ρ(eᵀ Ω e), without a factor ½"""
+    status: Int[Array, ""]
+    """an `Ending`"""
+    iterations: Int[Array, ""]
+    """steps that were tried"""
+    singular: Int[Array, ""]
+    """the first variable that the measurements do not determine, poses before points; -1: none"""
+    chi2_start: Float[Array, ""]
+    gradient: Float[Array, ""]
+    """length of ½ ∂χ²/∂(increments) at the last iterate"""
+    gradient_start: Float[Array, ""]
+
+
+class Search(NamedTuple):
+    """The state of the iterations of B graphs."""
+
+    trial: Variables
+    predicted: Float[Array, "B"]
+    """by how much the trial lowers χ² in the quadratic model"""
+    length: Float[Array, "B"]
+    """of the trial's step, with the diagonal as the metric"""
+    stepped: Bool[Array, "B"]
+    """whether the trial is another point than the iterate"""
+    variables: Variables
+    system: System
+    """about the iterate"""
+    bound: Float[Array, "B"]
+    """λ, or the radius of the dogleg"""
+    going: Bool[Array, "B"]
+    ending: Int[Array, "B"]
+    taken: Int[Array, "B"]
+    singular: Int[Array, "B"]
+    refused: Bool[Array, "B"]
+    """the undamped step from the iterate does not lower χ²"""
+    careful: Bool[Array, "B"]
+    """the last step was refused"""
+    former: Float[Array, "B"]
+    """χ² of the iterate before"""
+
+
+def minimize(
+    model: Model, method: str, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
+) -> Solution:
+    """The solutions of graphs with a last axis B."""
+    data = data_of(graph, plan.column)
+    start = variables_of(graph)
+    unknown = jax.eval_shape(lambda v: linearize(model, plan, v, data), start)
+    unsolved = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unknown)
+    batch, dtype = unknown.chi2.shape, unknown.chi2.dtype
+    eps = float(jnp.finfo(dtype).eps)
+    none, no = jnp.zeros(batch, jnp.int32), jnp.zeros(batch, bool)
+    zero = jnp.zeros(batch, dtype)
+    begin = Search(
+        trial=start,
+        predicted=zero,
+        length=zero,
+        stepped=~no,
+        variables=start,
+        system=unsolved._replace(chi2=zero + jnp.inf),
+        bound=zero + (jnp.inf if method == "dogleg" else 0.0),
+        going=~no,
+        ending=none + Ending.EXHAUSTED,
+        taken=none - 1,
+        singular=none - 1,
+        refused=no,
+        careful=no,
+        former=zero,
+    )
+
+    def iterate(carry: tuple[Search, Array, Array]) -> tuple[Search, Array, Array]:
+        search, first_chi2, first_gradient = carry
+        search = judged(search)
+        starts = search.taken == 0
+        first_chi2 = jnp.where(starts, search.system.chi2, first_chi2)
+        norm = jnp.sqrt(dot(search.system.gradient, search.system.gradient))
+        first_gradient = jnp.where(starts, norm, first_gradient)
+        return proposed(search), first_chi2, first_gradient
+
+    def judged(search: Search) -> Search:
+        """The search after its trial is taken or refused."""
+        there = linearize(model, plan, search.trial, data)
+        finite, began = jnp.isfinite(there.chi2), search.taken < 0
+        gain = search.system.chi2 - there.chi2
+        ratio = gain / jnp.where(search.predicted > 0, search.predicted, 1.0)
+        if method == "gauss_newton":
+            good = finite
+            bound = search.bound
+        else:
+            # A step hardly damped may go uphill, as far as the iterate before: it crosses curved
+            # valleys along which damped steps crawl (Grippo, Lampariello and Lucidi 1986, "A
+            # nonmonotone line search technique for Newton's method", SIAM J. Num. Analysis 23(4)).
+            above = jnp.maximum(search.former - search.system.chi2, 0.0)
+            plain = (search.bound <= FIRST_DAMPING) & (method == "levenberg_marquardt")
+            slack = jnp.where(plain, above, 0.0)
+            good = finite & (began | (gain + slack > 1e-3 * search.predicted))
+            bound = (radius if method == "dogleg" else damping)(search, good, ratio)
+        asked = search.going & search.stepped
+        take = asked & good
+        refused = jnp.where(take, False, search.refused | (asked & ~good & (search.bound == 0)))
+
+        def chosen(new: Array, old: Array) -> Array:
+            return jnp.where(take.reshape((1,) * (new.ndim - 1) + batch), new, old)
+
+        lost = asked & ~finite & (began | (method == "gauss_newton"))
+        return search._replace(
+            variables=jax.tree.map(chosen, search.trial, search.variables),
+            system=jax.tree.map(chosen, there, search.system),
+            bound=jnp.where(asked & ~began, bound, search.bound),
+            going=search.going & ~lost,
+            ending=jnp.where(lost, Ending.DIVERGED, search.ending).astype(jnp.int32),
+            taken=search.taken + asked,
+            refused=refused,
+            careful=jnp.where(asked, ~good, search.careful),
+            former=jnp.where(take & ~began, search.system.chi2, search.former),
+        )
+
+    def damping(search: Search, good: Array, ratio: Array) -> Array:
+        """λ after a step: less after good ones, down to none; more after refused ones.
+
+        The first good step after a refused one leaves it as it is.
+        """
+        known = search.singular >= 0
+        less = jnp.where(search.bound < 1e-10, jnp.where(known, 1e-10, 0.0), search.bound / 10)
+        kept = jnp.where((ratio > 0.25) & ~search.careful, less, search.bound)
+        more = jnp.where(search.careful, 100.0, 10.0) * search.bound
+        return jnp.where(good, kept, jnp.maximum(more, FIRST_DAMPING))
+
+    def radius(search: Search, good: Array, ratio: Array) -> Array:
+        """The trust region's radius after a step (Nocedal and Wright 2006, algorithm 4.1)."""
+        wider = jnp.maximum(search.bound, 2 * search.length)
+        kept = jnp.where(ratio > 0.75, wider, search.bound)
+        return jnp.where(good & (ratio > 0.25), kept, search.length / 4)
+
+    def proposed(search: Search) -> Search:
+        """The search with its next trial, or at its end."""
+        plain = (search.bound == 0) | (method == "dogleg")
+        known = search.singular >= 0
+        make = dogleg if method == "dogleg" else marquardt
+        step = make(plan, search.system, search.bound)
+        regular = step.regular.all(axis=0)
+        culprit = plan.order[jnp.argmin(step.regular, axis=0)].astype(jnp.int32)
+        singular = jnp.where(plain & ~regular & ~known, culprit, search.singular)
+        known = singular >= 0
+        least = jnp.maximum(tolerance, 32 * eps) * (search.system.chi2 + 1)
+        small = step.decrement <= least
+        bound, stepped = search.bound, ~no
+        if method == "gauss_newton":
+            done = ~regular | small
+            ending = jnp.where(regular, Ending.CONVERGED, Ending.SINGULAR)
+        else:
+            stuck = (search.refused if method != "dogleg" else no) | (step.predicted <= 0)
+            done = small & (plain | known | stuck)
+            ending = jnp.where(known, Ending.SINGULAR, Ending.CONVERGED)
+            ending = jnp.where(~known & (~plain | stuck), Ending.STALLED, ending)
+        if method == "dogleg":
+            stuck = ~small & (step.predicted <= least * 1e-3)
+            done, ending = done | stuck, jnp.where(stuck, Ending.STALLED, ending)
+        if method == "levenberg_marquardt":
+            # Without a step: an undamped factor that failed, or that has to confirm convergence.
+            stepped = regular & ~(small & ~plain)
+            bound = jnp.where(regular, bound, jnp.maximum(10 * bound, FIRST_DAMPING))
+            bound = jnp.where(regular & small & ~plain, 0.0, bound)
+            stuck = ~done & (bound > 1e10)
+            done, ending = done | stuck, jnp.where(stuck, Ending.STALLED, ending)
+        ends = search.going & done
+        return search._replace(
+            trial=retract(search.variables, step.increments, plan),
+            predicted=step.predicted,
+            length=step.length,
+            stepped=stepped,
+            bound=jnp.where(search.going, bound, search.bound),
+            going=search.going & ~done & (search.taken < iterations),
+            ending=jnp.where(ends, ending, search.ending).astype(jnp.int32),
+            singular=jnp.where(search.going, singular, search.singular),
+        )
+
+    end, first_chi2, first_gradient = jax.lax.while_loop(
+        lambda carry: carry[0].going.any(), iterate, (begin, zero, zero)
+    )
+    ending = end.ending
+    if method == "gauss_newton":
+        rose = (ending == Ending.EXHAUSTED) & (end.system.chi2 > first_chi2)
+        ending = jnp.where(rose, Ending.DIVERGED, ending)
+    return Solution(
+        graph=graph._replace(poses=end.variables.poses, points=end.variables.points),
+        chi2=end.system.chi2,
+        status=ending,
+        iterations=jnp.maximum(end.taken, 0),
+        singular=end.singular,
+        chi2_start=first_chi2,
+        gradient=jnp.sqrt(dot(end.system.gradient, end.system.gradient)),
+        gradient_start=first_gradient,
+    )

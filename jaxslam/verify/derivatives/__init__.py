@@ -1,0 +1,1 @@
+"""Derivatives of a function: computed in several ways, and where they fail."""

@@ -1,0 +1,1 @@
+"""What is verified: functions, claims, samples, a user's file."""

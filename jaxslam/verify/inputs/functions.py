@@ -1,0 +1,247 @@
+"""Functions to verify, with names and units of their arguments and outputs."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from jaxslam.graphs import Factor
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.verify.inputs.claims import Claim
+from jaxslam.verify.inputs.lengths import LONGEST, MOST_UNKNOWN, Deduced, deduce_lengths
+
+POSE = ("x [m]", "y [m]", "theta [rad]")
+POINT = ("x [m]", "y [m]")
+GLOSSARY = {
+    "pose": POSE,
+    "frame": POSE,
+    "landmark": POINT,
+    "l": POINT,
+    "point": POINT,
+}
+"""Default entries of an argument by its name."""
+
+PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
+"""A whole turn by its unit."""
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An argument of a function, with the names and units of its entries."""
+
+    name: str
+    entries: tuple[str, ...]
+    scale: float = 1.0
+    """factor of its random values; noise is small"""
+    deduced: bool = False
+    """whether its length is known from shapes alone, so that its entries have no names"""
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of vectors with its hand-derived Jacobians."""
+
+    name: str
+    call: Callable[..., jax.Array]
+    arguments: tuple[Argument, ...]
+    outputs: tuple[str, ...]
+    hand: Claim | None = None
+    """arguments -> a tuple of a Jacobian or None for each argument, or one array: by the first
+    argument, or by all of them side by side"""
+
+    @property
+    def periods(self) -> Float[np.ndarray, "m"]:
+        """The periods of the outputs, inf of those on a line."""
+        return periods(self.outputs)
+
+
+def at_state(function: Function, state: Sequence[ArrayLike]) -> str:
+    """The arguments at a state as text, as in "pose = (1, 2, 0.5), u = (0, 1)"."""
+    pairs = zip(function.arguments, state, strict=True)
+    return ", ".join(
+        f"{argument.name} = ({', '.join(f'{v:.6g}' for v in np.asarray(row))})"
+        for argument, row in pairs
+    )
+
+
+def periods(names: Sequence[str]) -> Float[np.ndarray, "m"]:
+    """The periods of quantities by their units: 2π of [rad], 360 of [deg], inf of all else."""
+    return np.array([PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
+
+
+def motion_functions(motion: Motion) -> tuple[Function]:
+    """The function of a motion model: `step` by pose, control and noise."""
+    arguments = (
+        Argument("pose", POSE),
+        Argument("control", motion.controls),
+        Argument("noise", motion.noises, scale=0.1),
+    )
+    return (Function("step", motion.step, arguments, POSE, motion.jacobians),)
+
+
+def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
+    """The functions of a sensor: `observe` by (pose, landmark), `invert` by (pose, z, s)."""
+    pose, landmark = Argument("pose", POSE), Argument("landmark", sensor.landmark)
+    free = tuple(f"s[{k}]" for k in range(len(sensor.free.mean)))
+    inverse = (pose, Argument("measurement", sensor.measurements), Argument("free", free))
+    return (
+        Function(
+            "observe",
+            sensor.observe,
+            (pose, landmark),
+            sensor.measurements,
+            sensor.observe_jacobians,
+        ),
+        Function("invert", sensor.invert, inverse, sensor.landmark, sensor.invert_jacobians),
+    )
+
+
+def factor_function(factor: Factor) -> Function:
+    """The residual of a factor of a graph by its variables and its measurement.
+
+    A point has two coordinates.
+    """
+    known = {"pose": POSE, "point": POINT}
+    counts = {kind: factor.variables.count(kind) for kind in known}
+    arguments = [
+        Argument(kind if counts[kind] == 1 else f"{kind} {k + 1}", known[kind])
+        for k, kind in enumerate(factor.variables)
+    ]
+    hand = factor.jacobians
+
+    def call(*values: jax.Array) -> jax.Array:
+        return factor.residual(values[:-1], values[-1])
+
+    def claim(*values: jax.Array) -> tuple[jax.Array | None, ...]:
+        assert hand is not None
+        return (*hand(values[:-1], values[-1]), None)
+
+    return Function(
+        "residual",
+        call,
+        (*arguments, Argument("measurement", factor.measurements)),
+        factor.errors,
+        None if hand is None else claim,
+    )
+
+
+def plain_function(
+    call: Callable[..., jax.Array],
+    jacobian: Claim | None,
+    arguments: Mapping[str, Sequence[str] | int] | None = None,
+    outputs: Sequence[str] | None = None,
+    name: str | None = None,
+    states: Sequence[ArrayLike] | None = None,
+) -> Function:
+    """A function of vectors, whose arguments are known by the names of its parameters.
+
+    Lengths that are neither given nor follow from a parameter's name are those of the states, or
+    deduced by `deduce_lengths`. Raises ValueError where the length of an argument is undetermined.
+    """
+    name = name or str(getattr(call, "__name__", type(call).__name__))
+    if arguments is not None and not isinstance(arguments, Mapping):
+        raise ValueError(f"{name}: expected its arguments as {{name: entries}}, got {arguments!r}")
+    if isinstance(outputs, str):
+        raise ValueError(f"{name}: expected its outputs as a tuple of names, got {outputs!r}")
+    given = dict(arguments or {})
+    parameters = _parameters(call, given)
+    if unknown := [key for key in given if key not in parameters]:
+        raise ValueError(
+            f"{name}: expected arguments of {', '.join(parameters) or 'no parameter'}, got "
+            f"{', '.join(unknown)}"
+        )
+    if not parameters:
+        raise ValueError(
+            f"{name}: expected a function with a parameter to differentiate by, got none"
+        )
+    named = {p: _entries(name, p, given.get(p, GLOSSARY.get(p))) for p in parameters}
+    lengths = {p: None if entries is None else len(entries) for p, entries in named.items()}
+    shapes = [np.shape(table) for table in (() if states is None else states)]
+    if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
+        pairs = zip(parameters, shapes, strict=True)
+        lengths |= {p: shape[1] for p, shape in pairs if lengths[p] is None}
+    if None in lengths.values():
+        deduced = deduce_lengths(call, jacobian, lengths, len(outputs) if outputs else None)
+        lengths |= deduced.lengths
+        if missing := [p for p, length in lengths.items() if length is None]:
+            raise ValueError(_undetermined(name, missing, jacobian is not None, deduced))
+    arguments_of = tuple(
+        Argument(p, _numbered(p, lengths[p] or 0), deduced=True)
+        if entries is None
+        else Argument(p, entries)
+        for p, entries in named.items()
+    )
+    return Function(name, call, arguments_of, tuple(outputs or ()), jacobian)
+
+
+def _parameters(call: Callable[..., object], given: dict[str, Sequence[str] | int]) -> list[str]:
+    """The names of a function's required parameters, or those given where Python has none."""
+    if given and not _has_signature(call):
+        return list(given)
+    return [
+        p.name
+        for p in inspect.signature(call).parameters.values()
+        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+    ]
+
+
+def _entries(
+    name: str, parameter: str, entries: Sequence[str] | int | None
+) -> tuple[str, ...] | None:
+    """The names of an argument's entries, or None where they are unknown."""
+    if entries is None:
+        return None
+    if isinstance(entries, int):
+        return _numbered(parameter, entries)
+    if isinstance(entries, str) or not all(isinstance(entry, str) for entry in entries):
+        raise ValueError(f"{name}: {parameter}: expected a tuple of names, got {entries!r}")
+    return tuple(entries)
+
+
+def _numbered(parameter: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{parameter}[{k}]" for k in range(count))
+
+
+def _undetermined(name: str, missing: list[str], claimed: bool, deduced: Deduced) -> str:
+    """The message that the lengths of some arguments are needed, and how they are given."""
+    both = f"{name} and its Jacobian accept" if claimed else f"{name} accepts"
+    why = f"{both} more than one"
+    if deduced.error:
+        why = f"{name} fails with 1 to {LONGEST} entries ({deduced.error})"
+    elif len(missing) > MOST_UNKNOWN:
+        why = f"at most {MOST_UNKNOWN} are deduced"
+    which = ", ".join(map(repr, missing))
+    return (
+        f"{name}: what is the length of its argument {which}? {why}. Name the entries, each with "
+        f"its unit: {name}_arguments = {example_line(missing)} in the file, or arguments= in Python"
+    )
+
+
+def example_line(parameters: Sequence[str]) -> str:
+    """What a user may write for `arguments`, as if each argument were a speed and a turn rate."""
+    return "{" + ", ".join(f'"{p}": ("v [m/s]", "omega [rad/s]")' for p in parameters) + "}"
+
+
+def _has_signature(call: Callable[..., object]) -> bool:
+    """Whether Python knows the parameters of a callable."""
+    try:
+        inspect.signature(call)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def makes_a_model(factory: Callable[..., object]) -> bool:
+    """Whether a function is annotated as a factory: `def mine(noise_cov, mount=…) -> Sensor`."""
+    try:
+        signature = inspect.signature(factory)
+    except (TypeError, ValueError):
+        return False
+    returns = signature.return_annotation
+    required = [p for p in signature.parameters.values() if p.default is p.empty]
+    named = returns if isinstance(returns, str) else getattr(returns, "__name__", "")
+    return named.rpartition(".")[2] in ("Motion", "Sensor") and len(required) == 1
