@@ -18,7 +18,7 @@ FLOORS = [
     "types protocols slots validation noise derivatives streams records",
     "motion sensors charts linearize association resampling life team",
     "run filters smoothing graphs grids simulation",
-    "consistency monte_carlo verify catalog calibration",
+    "consistency monte_carlo verify catalog calibration laser_slam",
     "datasets results cli __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}

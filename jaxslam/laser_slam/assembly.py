@@ -62,9 +62,6 @@ def relative(
     # x_i + δ_i is x_i ∘ R(θ_i)ᵀ δ_i to first order, which moves the end by -Ad(z)⁻¹ of it.
     by_i = -poses.adjoint(poses.between(j, i)) @ poses.turns(-i[:, 2])
     by_j = poses.turns(-j[:, 2])
-    return (
-        by_i @ joint[:, 0, 0] @ np.swapaxes(by_i, 1, 2)
-        + by_i @ joint[:, 0, 1] @ np.swapaxes(by_j, 1, 2)
-        + by_j @ joint[:, 1, 0] @ np.swapaxes(by_i, 1, 2)
-        + by_j @ joint[:, 1, 1] @ np.swapaxes(by_j, 1, 2)
-    )
+    both = np.concatenate([by_i, by_j], axis=2)
+    whole = np.swapaxes(joint, 2, 3).reshape(-1, 6, 6)
+    return poses.carried(both, whole)

@@ -1,5 +1,7 @@
 """The map of a log's scans at given poses."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -46,9 +48,8 @@ def map_of(
     beams = _used(log, settings, usable)
     if not (beams.valid & (beams.range > 0)).any():
         return Grid(np.zeros(shape), origin, np.asarray(resolution))  # type: ignore[arg-type]
-    counts = grids.count(
-        shape, origin, resolution, path, beams, max_range=settings.max_range
-    )
+    poses: Any = path
+    counts = grids.count(shape, origin, resolution, poses, beams, max_range=settings.max_range)
     found = grids.occupancy(counts)
     return Grid(*(np.asarray(part) for part in found))  # type: ignore[arg-type]
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -16,6 +15,13 @@ from jaxslam.laser_slam.settings import Settings
 
 NEAR = Window(turns=11, turn=float(np.deg2rad(2.0)), blocks=3, level=1, kept=64)
 """The search about raw odometry: 0.6 m and 22° to either side."""
+FAR = Window(turns=24, turn=float(np.deg2rad(2.5)), blocks=2, level=3, kept=256)
+"""Where that finds little: 1.6 m and 60°, with raw odometry's covariance times `DOUBT`."""
+DOUBT = 16.0
+SURE = 0.6
+"""Share of the points on walls below which the wider search is made."""
+BETTER = 0.1
+"""By how much more its share has to be."""
 
 
 class Odometry(NamedTuple):
@@ -72,9 +78,15 @@ def laser_odometry(
         of = [one for one in keys[-width:] if scans.usable[one]]
         z, cov = guess, prior
         if scans.usable[scan] and of:
-            fit, seen = _tracked(scans, scan, of, result.poses, key, guess, prior, settings)
+            fit, seen = _tracked(NEAR, scans, scan, of, result.poses, key, guess, prior, settings)
+            if fit.inliers < SURE:
+                wider = _tracked(
+                    FAR, scans, scan, of, result.poses, key, guess, DOUBT * prior, settings
+                )
+                if wider[0].inliers > fit.inliers + BETTER:
+                    fit, seen = wider
             result.inliers[scan], result.residual[scan] = fit.inliers, fit.residual
-            if fit.inliers >= settings.least_inliers and _within(fit.pose, guess, steps.cov[scan]):
+            if fit.inliers >= settings.least_inliers:
                 result.matched[scan] = True
                 z, cov = np.asarray(fit.pose, np.float64), seen
         result.base[scan], result.z[scan], result.cov[scan] = key, z, cov
@@ -88,13 +100,8 @@ def laser_odometry(
     return result._replace(keyframe=np.array(keys))
 
 
-def _within(found: Any, guess: np.ndarray, cov: np.ndarray) -> bool:
-    """Whether a match is not farther from raw odometry than the search went, and a margin."""
-    off = poses.between(guess, np.asarray(found, np.float64))
-    return bool(np.hypot(off[0], off[1]) < 1.5 * NEAR.distance and abs(off[2]) < 0.6)
-
-
 def _tracked(
+    window: Window,
     scans: Scans,
     scan: int,
     of: list[int],
@@ -112,7 +119,7 @@ def _tracked(
     information = np.linalg.inv(wide)
     fit = programs.call(
         _track,
-        (),
+        (window,),
         scans.points[take],
         scans.normals[take],
         scans.valid[take] & again[:, None],
@@ -130,6 +137,7 @@ def _tracked(
 
 
 def _track(
+    window: Window,
     points: Array,
     normals: Array,
     valid: Array,
@@ -141,8 +149,6 @@ def _track(
     weight: Array,
 ) -> Any:
     reference = gathered(points, normals, valid, there)
-    levels = tables(reference, NEAR.level)
-    found = correlate(levels, scan[::2], scan_valid[::2], guess, information, NEAR)
+    levels = tables(reference, window.level)
+    found = correlate(levels, scan[::2], scan_valid[::2], guess, information, window)
     return fit_lines(reference, scan, scan_valid, found.pose, guess, weight * information)
-
-

@@ -8,12 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+Poses = Float[np.ndarray, "... 3"]
+Covs = Float[np.ndarray, "... 3 3"]
 
-Poses = Float[np.ndarray, "*n 3"]
-Covs = Float[np.ndarray, "*n 3 3"]
 
-
-def wrapped(angle: ArrayLike) -> Float[np.ndarray, "*n"]:
+def wrapped(angle: ArrayLike) -> Float[np.ndarray, "..."]:
     """Angles in (-π, π]."""
     turned = np.asarray(angle, np.float64)
     return np.asarray(np.pi - np.mod(np.pi - turned, 2 * np.pi))
@@ -48,7 +47,7 @@ def chain(first: Poses, steps: Poses) -> Poses:
     return out
 
 
-def transform(pose: Poses, points: Float[np.ndarray, "*n B 2"]) -> Float[np.ndarray, "*n B 2"]:
+def transform(pose: Poses, points: Float[np.ndarray, "... B 2"]) -> Float[np.ndarray, "... B 2"]:
     """Points of the frames of poses, in the frame in which the poses are."""
     c, s = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
     x, y = points[..., 0], points[..., 1]
@@ -65,15 +64,20 @@ def adjoint(pose: Poses) -> Covs:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def carried(by: Float[np.ndarray, "... 3 k"], cov: Float[np.ndarray, "... k k"]) -> Covs:
+    """J Σ Jᵀ."""
+    return np.asarray(by @ cov @ np.swapaxes(by, -1, -2))
+
+
 def moved(cov: Covs, by: Poses) -> Covs:
     """The covariance of the end of z ∘ by, where by is certain and that of the end of z is cov."""
     ad = adjoint(inverse(by))
-    return ad @ cov @ np.swapaxes(ad, -1, -2)
+    return carried(ad, cov)
 
 
 def composed_cov(cov: Covs, step: Poses, step_cov: Covs) -> Covs:
     """The covariance of the end of z ∘ step, both uncertain and independent."""
-    return moved(cov, step) + step_cov
+    return np.asarray(moved(cov, step) + step_cov)
 
 
 def inverse_cov(cov: Covs, z: Poses) -> Covs:
@@ -84,13 +88,13 @@ def inverse_cov(cov: Covs, z: Poses) -> Covs:
 def at_end(cov: Covs, z: Poses) -> Covs:
     """The covariance of the end of z from that of its coordinates (x, y, θ)."""
     turn = turns(-z[..., 2])
-    return turn @ cov @ np.swapaxes(turn, -1, -2)
+    return carried(turn, cov)
 
 
 def of_coordinates(cov: Covs, z: Poses) -> Covs:
     """The covariance of the coordinates (x, y, θ) of z from that of its end."""
     turn = turns(z[..., 2])
-    return turn @ cov @ np.swapaxes(turn, -1, -2)
+    return carried(turn, cov)
 
 
 def along(poses: Float[np.ndarray, "N 3"], covs: Float[np.ndarray, "m 3 3"]) -> Covs:
@@ -101,7 +105,7 @@ def along(poses: Float[np.ndarray, "N 3"], covs: Float[np.ndarray, "m 3 3"]) -> 
     """
     ad = adjoint(poses[1:])
     total = np.zeros((len(poses), 3, 3))
-    np.cumsum(ad @ covs @ np.swapaxes(ad, -1, -2), axis=0, out=total[1:])
+    np.cumsum(carried(ad, covs), axis=0, out=total[1:])
     return total
 
 
@@ -109,10 +113,10 @@ def relative_cov(total: Covs, poses: Poses, i: np.ndarray, j: np.ndarray) -> Cov
     """The covariance of the end of pose j relative to pose i along a chain, in either order."""
     difference = total[np.maximum(i, j)] - total[np.minimum(i, j)]
     ad = adjoint(inverse(poses[j]))
-    return ad @ difference @ np.swapaxes(ad, -1, -2)
+    return carried(ad, difference)
 
 
-def turns(angle: Float[np.ndarray, "*n"]) -> Covs:
+def turns(angle: Float[np.ndarray, "..."]) -> Covs:
     """R(angle) for x and y, 1 for θ."""
     c, s = np.cos(angle), np.sin(angle)
     zero, one = np.zeros_like(c), np.ones_like(c)

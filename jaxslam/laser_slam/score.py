@@ -61,5 +61,3 @@ def closure_score(
         correct=int(right.sum()),
         revisits=len(again),
     )
-
-

@@ -17,7 +17,7 @@ class Settings:
     """a scan with fewer points is left out"""
     sigma: float = 0.02
     """least standard deviation of a point's distance from a wall"""
-    correlation: float = 4.0
+    correlation: float = 2.0
     """beams that err together: information of a match is divided by it"""
     floor: tuple[float, float, float] = (0.005, 0.005, 0.002)
     """standard deviations of x, y and θ that are added to each match, for what the lines miss"""
@@ -33,9 +33,9 @@ class Settings:
     """a scan farther than this from the last keyframe is one"""
     key_turn: float = 0.35
     """or turned by more than this"""
-    least_inliers: float = 0.3
+    least_inliers: float = 0.4
     """share of a scan's points that lie on the walls of the reference, for a match in odometry"""
-    loop_inliers: float = 0.6
+    loop_inliers: float = 0.65
     """and for a loop"""
     loop_gap: int = 20
     """keyframes between the two ends of a loop, at least"""
@@ -47,7 +47,7 @@ class Settings:
     """keyframes before and after its middle in a submap that loops are closed with"""
     submap_every: int = 3
     """keyframes from the middle of a submap to that of the next"""
-    rounds: int = 3
+    rounds: int = 2
     """of candidates, matches and optimization"""
     candidates: int = 3
     """submaps that a keyframe is matched with in a round, at most"""

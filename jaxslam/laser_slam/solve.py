@@ -115,5 +115,3 @@ def _counts(
     for outcome in LoopOutcome:
         counts[f"loops {outcome.name.lower()}"] = int((loops.outcome == outcome).sum())
     return counts
-
-

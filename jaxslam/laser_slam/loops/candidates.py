@@ -8,6 +8,9 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.laser_slam import poses
 from jaxslam.laser_slam.settings import Settings
 
+SAME = 15
+"""Keyframes between submaps that are taken to be of one place."""
+
 
 class Candidates(NamedTuple):
     """Pairs of a submap, by the keyframe in its middle, and a keyframe; where the latter may be."""
@@ -40,6 +43,7 @@ def by_place(
     pairs: Int[np.ndarray, "Q 2"],
     cov: Float[np.ndarray, "Q 3 3"],
     tried: set[tuple[int, int, bool]],
+    closed: set[tuple[int, int]],
     settings: Settings,
     narrow: tuple[float, float],
     wide: tuple[float, float],
@@ -51,7 +55,8 @@ def by_place(
     other in the log count as one place.
 
     Args:
-        cov: of the end of the relative pose of each pair. tried: (first, second, wide) of before.
+        cov: of the end of the relative pose of each pair.
+        tried: (first, second, wide) of rounds before. closed: (first, second) that matched.
         narrow, wide: windows, [m] and [rad] to either side.
     """
     sigmas = np.sqrt(-2 * np.log(1 - settings.loop_probability))
@@ -65,10 +70,12 @@ def by_place(
     rows = rows[np.lexsort((far[rows], pairs[rows, 1]))]
     chosen: list[int] = []
     taken: dict[int, list[int]] = {}
+    for first, second in closed:
+        taken.setdefault(second, []).append(first)
     for row in rows:
         first, second = (int(one) for one in pairs[row])
         same = taken.setdefault(second, [])
-        if len(same) >= settings.candidates or any(abs(first - one) < 15 for one in same):
+        if len(same) >= settings.candidates or any(abs(first - one) < SAME for one in same):
             continue
         same.append(first)
         if (first, second, not small[row]) not in tried:

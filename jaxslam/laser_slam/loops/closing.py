@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from jaxslam import graphs
-from jaxslam.graphs import Graph, Table
+from jaxslam.graphs import Graph
 from jaxslam.graphs.loops import LOOPS
 from jaxslam.laser_slam import poses
 from jaxslam.laser_slam.assembly import graph_of, relative, table_of
@@ -50,14 +50,15 @@ def closed(
     index = np.arange(len(keyframe))
     chain = table_of(index[:-1], index[1:], steps, covs)
     total = poses.along(at, covs)
-    middle = index[::max(settings.submap_every, 1)]
+    middle = index[:: max(settings.submap_every, 1)]
     usable = scans.usable[keyframe]
     looks = descriptors(scans.points[keyframe], scans.valid[keyframe])
     graph = graph_of(at, keyframe, chain)
     tried: list[Candidates] = []
     found: list[Matches] = []
     done: set[tuple[int, int, bool]] = set()
-    kept = np.zeros(0, bool)
+    ends: set[tuple[int, int]] = set()
+    loops, kept = _agreeing(tried, found, at, total, settings)
     for turn in range(settings.rounds if len(keyframe) > settings.loop_gap else 0):
         path = np.asarray(graph.poses, np.float64)
         pairs = near(path, middle, usable, settings.loop_reach + WIDE.distance, settings.loop_gap)
@@ -67,7 +68,7 @@ def closed(
             else relative(graph, pairs)
         )
         windows = [(w.distance, w.turns * w.turn) for w in (NARROW, WIDE)]
-        new = by_place(path, pairs, cov, done, settings, windows[0], windows[1])
+        new = by_place(path, pairs, cov, done, ends, settings, windows[0], windows[1])
         if turn == 0 and settings.appearance:
             new = _with(new, by_appearance(looks, middle, usable, settings))
         done |= set(zip(new.first.tolist(), new.second.tolist(), new.wide.tolist(), strict=True))
@@ -84,25 +85,18 @@ def closed(
         tried.append(new)
         found.append(matched(scans, keyframe, path, new, settings, tell))
         loops, kept = _agreeing(tried, found, at, total, settings)
+        ends |= set(zip(loops.first[kept].tolist(), loops.second[kept].tolist(), strict=True))
         edges = table_of(loops.first[kept], loops.second[kept], loops.z[kept], loops.cov[kept])
         graph = graph_of(path, keyframe, chain, edges)
         if kept.any():
             graph = _host(graphs.optimize(graph, kernel={LOOPS: graphs.cauchy()}).graph)
-    return _final(graph, tried, found, kept, at, total, chain, keyframe, settings)
+    return _final(graph, loops, kept, keyframe, settings)
 
 
 def _final(
-    graph: Graph,
-    tried: list[Candidates],
-    found: list[Matches],
-    kept: np.ndarray,
-    at: np.ndarray,
-    total: np.ndarray,
-    chain: Table,
-    keyframe: np.ndarray,
-    settings: Settings,
+    graph: Graph, loops: Loops, kept: np.ndarray, keyframe: np.ndarray, settings: Settings
 ) -> Closed:
-    loops, _ = _agreeing(tried, found, at, total, settings)
+    """The optimum without a kernel, of the loops that the graph does not contradict."""
     if kept.any():
         square = np.asarray(graphs.squared_residuals(graph)[LOOPS])
         doubted = square > chi2.ppf(settings.consistency, 3)
@@ -110,9 +104,7 @@ def _final(
         table = graph.tables[LOOPS]
         tables = graph.tables | {LOOPS: table._replace(valid=~doubted)}
         graph = _host(graphs.optimize(graph._replace(tables=tables)).graph)
-    return Closed(
-        graph, loops._replace(first=keyframe[loops.first], second=keyframe[loops.second])
-    )
+    return Closed(graph, loops._replace(first=keyframe[loops.first], second=keyframe[loops.second]))
 
 
 def _with(place: Candidates, pairs: np.ndarray) -> Candidates:
@@ -147,11 +139,10 @@ def _agreeing(
     agree = consistent(at, total, *parts, settings.consistency)
     out = ~clique(agree, by.score[good])
     outcome[good[out]] = LoopOutcome.INCONSISTENT
-    loops = Loops(
-        of.first, of.second, by.z, by.cov, by.score, of.appearance.astype(int), outcome
-    )
+    loops = Loops(of.first, of.second, by.z, by.cov, by.score, of.appearance.astype(int), outcome)
     return loops, outcome == LoopOutcome.KEPT
 
 
 def _host(graph: Graph) -> Graph:
-    return jax.tree.map(np.asarray, graph)
+    found: Graph = jax.tree.map(np.asarray, graph)
+    return found

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -88,11 +89,11 @@ def _submap(
 
 
 def _cov(fit: Any, settings: Settings) -> Float[np.ndarray, "3 3"]:
-    """Of the coordinates of a match: by its lines, and no more than the window in other directions."""
+    """Of the coordinates of a match: by its lines, and by the window where these say nothing."""
     sigma = max(settings.sigma, float(fit.residual)) ** 2 * settings.correlation
     edges = np.diag(1 / np.square([WIDE.distance, WIDE.distance, WIDE.turns * WIDE.turn]))
     cov = np.linalg.inv(np.asarray(fit.information, np.float64) / sigma + edges)
-    return cov + np.diag(np.square(settings.floor))
+    return np.asarray(cov + np.diag(np.square(settings.floor)))
 
 
 def _prepare(points: Array, normals: Array, valid: Array, there: Array) -> tuple[Reference, Any]:
@@ -101,7 +102,7 @@ def _prepare(points: Array, normals: Array, valid: Array, there: Array) -> tuple
 
 
 def _in(window: Window, submap: Reference, levels: Any, scan: Array, valid: Array, z: Array) -> Any:
-    nothing = np.zeros((3, 3), np.float32)
+    nothing = jnp.zeros((3, 3), jnp.float32)
     found = correlate(levels, scan[::2], valid[::2], z, nothing, window)
     return fit_lines(submap, scan, valid, found.pose, z, nothing), found.score, found.other
 
@@ -112,5 +113,3 @@ def _in_narrow(submap: Reference, levels: Any, scan: Array, valid: Array, z: Arr
 
 def _in_wide(submap: Reference, levels: Any, scan: Array, valid: Array, z: Array) -> Any:
     return _in(WIDE, submap, levels, scan, valid, z)
-
-

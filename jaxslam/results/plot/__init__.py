@@ -16,6 +16,7 @@ from jaxslam.results.plot.formats import encode
 from jaxslam.results.plot.geometry import ellipse
 from jaxslam.results.plot.graph import graph_figure
 from jaxslam.results.plot.grids import grid_figure
+from jaxslam.results.plot.loops import loops_figure
 from jaxslam.results.plot.maps import map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
 from jaxslam.results.plot.scene import (
@@ -55,6 +56,7 @@ __all__ = [
     "graph_figure",
     "graph_scene",
     "grid_figure",
+    "loops_figure",
     "map_figure",
     "nees_figure",
     "png",
