@@ -35,6 +35,7 @@ INTRODUCED = {
     "jaxslam.simulation": "Simulated worlds",
     "jaxslam.monte_carlo": "Monte-Carlo campaigns",
     "jaxslam.consistency": "Measures of consistency",
+    "jaxslam.metrics": "Errors of paths and maps",
     "jaxslam.verify": "Verification of Jacobians",
     "jaxslam.catalog": "The filters of a campaign by name",
     "jaxslam.datasets": "Data sets",
