@@ -31,6 +31,7 @@ INTRODUCED = {
     "jaxslam.graphs": "Graphs of poses and points",
     "jaxslam.grids": "Occupancy grids and rays",
     "jaxslam.laser_slam": "Laser SLAM",
+    "jaxslam.matching": "Scan matching",
     "jaxslam.team": "Several robots",
     "jaxslam.simulation": "Simulated worlds",
     "jaxslam.monte_carlo": "Monte-Carlo campaigns",

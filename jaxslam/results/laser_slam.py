@@ -14,11 +14,11 @@ from jaxslam.results import report
 from jaxslam.results.files import csv_text
 from jaxslam.types import Estimate
 
+Files = dict[str, str | Callable[[Path], object]]
 
-def files(
-    solved: Solved, formats: tuple[str, ...] = ("png",), corrected: ArrayLike | None = None
-) -> dict[str, str | Callable[[Path], object]]:
-    """What `results.files.write_files` writes of a result, by name.
+
+def files(solved: Solved) -> Files:
+    """What `results.files.write_files` writes of a result, by name; without figures.
 
     | file | content |
     |---|---|
@@ -26,29 +26,9 @@ def files(
     | `graph.g2o` | the optimized graph of keyframes |
     | `loops.csv` | every loop that was tried, with its outcome |
     | `map.yaml`, `map.pgm` | the map, as ROS has it |
-    | `map_before.png`, `map_after.png` | maps of laser odometry alone, and of the optimum |
-    | `graph.png` | both paths with the loops |
-
-    corrected: (K, 3) poses of reference, which are drawn.
     """
-    from jaxslam.results import plot  # matplotlib is slow to load
-
-    reference = None if corrected is None else np.asarray(corrected, float)
-    pictures = {
-        "map_before": lambda: plot.grid_figure(
-            solved.map_before, poses=solved.odometry, title="Laser odometry, before closing"
-        ),
-        "map_after": lambda: plot.grid_figure(
-            solved.map, poses=solved.poses, title="After closing"
-        ),
-        "graph": lambda: plot.loops_figure(solved, reference),
-    }
-
-    def drawn(make: Callable[[], Any], kind: str) -> Callable[[Path], object]:
-        return lambda path: path.write_bytes(plot.encode(make(), kind))
-
     path = _estimate(solved)
-    out: dict[str, str | Callable[[Path], object]] = {
+    return {
         "trajectory.csv": report.trajectory_csv(solved.time, path),
         "trajectory.tum": report.trajectory_tum(solved.time, path),
         "graph.g2o": g2o.text_of(solved.graph),
@@ -56,10 +36,32 @@ def files(
         "map.yaml": lambda target: write_map(target, solved.map),
         "map.pgm": lambda target: None,  # written with its header
     }
-    for name, make in pictures.items():
-        for kind in formats:
-            out[f"{name}.{kind}"] = drawn(make, kind)
-    return out
+
+
+def figures(
+    solved: Solved, formats: tuple[str, ...] = ("png",), corrected: ArrayLike | None = None
+) -> Files:
+    """`map_before`, `map_after` (maps of laser odometry alone, and of the optimum) and `graph`.
+
+    corrected: (K, 3) poses of reference, drawn beside both paths in `graph`.
+    """
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    reference = None if corrected is None else np.asarray(corrected, float)
+    pictures = {
+        "map_before": lambda: plot.grid_figure(
+            solved.map_before, title="Laser odometry, before closing", width=plot.PAGE
+        ),
+        "map_after": lambda: plot.grid_figure(solved.map, title="After closing", width=plot.PAGE),
+        "graph": lambda: plot.loops_figure(solved, reference),
+    }
+
+    def drawn(make: Callable[[], Any], kind: str) -> Callable[[Path], object]:
+        return lambda path: path.write_bytes(plot.encode(make(), kind))
+
+    return {
+        f"{name}.{kind}": drawn(make, kind) for name, make in pictures.items() for kind in formats
+    }
 
 
 def summary(solved: Solved) -> dict[str, object]:

@@ -16,6 +16,7 @@ from jaxslam.results.plot.formats import encode
 from jaxslam.results.plot.geometry import ellipse
 from jaxslam.results.plot.graph import graph_figure
 from jaxslam.results.plot.grids import grid_figure
+from jaxslam.results.plot.lines import walls_figure
 from jaxslam.results.plot.loops import loops_figure, maps_before_after
 from jaxslam.results.plot.maps import map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
@@ -66,6 +67,7 @@ __all__ = [
     "run_errors_figure",
     "run_map_figure",
     "run_scene",
+    "walls_figure",
     "warm_up",
     "whiteness_figure",
 ]
