@@ -14,6 +14,7 @@ from jaxslam import (
     catalog,
     charts,
     consistency,
+    features,
     filters,
     graphs,
     grids,
@@ -27,6 +28,7 @@ from jaxslam import (
     slots,
     smoothing,
     team,
+    topology,
 )
 from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
@@ -46,6 +48,7 @@ __all__ = [
     "catalog",
     "charts",
     "consistency",
+    "features",
     "filters",
     "graphs",
     "grids",
@@ -69,6 +72,7 @@ __all__ = [
     "stats",
     "team",
     "team_world",
+    "topology",
     "uncertain_poses",
     "verify_jacobians",
 ]

@@ -162,7 +162,7 @@ def fit_line(
 
 
 def _points(angle: Float[np.ndarray, "n"], distance: Float[np.ndarray, "n"]) -> _Points:
-    return distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.asarray(distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
 
 def _runs(angle: np.ndarray, distance: np.ndarray, sigma: float) -> list[Int[np.ndarray, "n"]]:
