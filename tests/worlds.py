@@ -125,9 +125,8 @@ def iterated_on_its_posterior(scenario):
 
     def update(joint, scan, key):
         joint, info = right.update(joint, scan, key)
-        for _ in range(2):
-            joint, _ = right.update(joint, scan, key)
-        return joint, info
+        again = lambda _, joint: right.update(joint, scan, key)[0]  # noqa: E731
+        return jax.lax.fori_loop(0, 2, again, joint), info
 
     return dataclasses.replace(right, update=update)
 
