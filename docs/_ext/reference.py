@@ -30,6 +30,8 @@ INTRODUCED = {
     "jaxslam.smoothing": "Smoothing and batch estimation",
     "jaxslam.graphs": "Graphs of poses and points",
     "jaxslam.grids": "Occupancy grids and rays",
+    "jaxslam.laser_slam": "Laser SLAM",
+    "jaxslam.matching": "Scan matching",
     "jaxslam.features": "Features of scans",
     "jaxslam.topology": "Topological maps",
     "jaxslam.team": "Several robots",

@@ -1,10 +1,11 @@
 """Rooms whose walls a laser sees exactly: segments and circles, without a grid."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.grids.grid import Grid
@@ -21,13 +22,24 @@ class Walls(NamedTuple):
     """both ends (x, y) of each [m]"""
     circles: Float[Array, "C 3"]
     """centre (x, y) and radius of each [m]"""
+    glass: Float[Array, "K"] | None = None
+    """the share of beams that pass each segment, in [0, 1]; None where none is of glass"""
 
 
-def walls(*chains: ArrayLike, circles: ArrayLike = ()) -> Walls:
+def walls(
+    *chains: ArrayLike,
+    circles: ArrayLike = (),
+    glass: Mapping[tuple[int, int], float] | None = None,
+) -> Walls:
     """The walls of some closed chains, each the corners (N, 2) of a polygon [m], and of circles.
 
-    Raises ValueError on a chain that is not at least three finite corners, a circle that is not
-    (x, y, radius) with radius above 0, and on no wall at all.
+    Args:
+        glass: {(chain, side): share of the beams that pass}; side i leads from corner i to the
+            next.
+    Raises:
+        ValueError: a chain that is not at least three finite corners, a circle that is not
+            (x, y, radius) with radius above 0, no wall at all, glass that is of no side, or a share
+            outside [0, 1].
     """
     segments = [np.zeros((0, 2, 2))]
     for k, chain in enumerate(chains):
@@ -41,17 +53,38 @@ def walls(*chains: ArrayLike, circles: ArrayLike = ()) -> Walls:
         np.asarray(circles, np.float64).reshape(-1, 3) if np.size(circles) else np.zeros((0, 3))
     )
     made: Any = Walls(np.concatenate(segments), rounds)  # type: ignore[arg-type]
-    if not all(np.all(np.isfinite(part)) for part in made) or np.any(rounds[:, 2] <= 0):
+    if not all(np.all(np.isfinite(part)) for part in made[:2]) or np.any(rounds[:, 2] <= 0):
         raise ValueError("walls: expected finite numbers and radii above 0")
     if len(made.segments) + len(rounds) == 0:
         raise ValueError("walls: expected at least one wall")
-    return Walls(*made)
+    shares: Any = _shares(segments[1:], glass) if glass else None
+    return Walls(made.segments, made.circles, shares)
+
+
+def _shares(
+    chains: list[np.ndarray], glass: Mapping[tuple[int, int], float]
+) -> Float[np.ndarray, "K"]:
+    """The share of each segment."""
+    shares = [np.zeros(len(chain)) for chain in chains]
+    for (chain, side), share in glass.items():
+        if not (0 <= chain < len(chains) and 0 <= side < len(chains[chain])):
+            raise ValueError(f"walls: glass: chain {chain} has no side {side}")
+        if not 0 <= share <= 1:
+            raise ValueError(f"walls: glass: expected a share in [0, 1], got {share}")
+        shares[chain][side] = share
+    return np.concatenate(shares)
 
 
 def exact_ranges(
-    world: Walls, pose: Float[Array, "3"], angles: Float[Array, "B"], max_range: float | Array
+    world: Walls,
+    pose: Float[Array, "3"],
+    angles: Float[Array, "B"],
+    max_range: float | Array,
+    passes: Bool[Array, "B K"] | None = None,
 ) -> Float[Array, "B"]:
     """The range [m] of each beam to the nearest wall, at most max_range; exact.
+
+    Glass is a wall as any other, but for the segments that a beam `passes`.
 
     With o the origin and e the direction of the beam: the segment from a to b is met at
     r = (a - o) × (b - a)/(e × (b - a)), at the share (a - o) × e/(e × (b - a)) of its length; the
@@ -69,6 +102,7 @@ def exact_ranges(
         safe = jnp.where(parallel == 0, 1.0, parallel)
         r, share = _cross(a, along) / safe, _cross(a, e) / safe
         met = (parallel != 0) & (r > 0) & (share >= 0) & (share <= 1)
+        met = met if passes is None else met & ~passes
         ranges.append(jnp.where(met, r, max_range))
     if len(world.circles):
         c = jnp.asarray(world.circles[:, :2], dtype)[None] - pose[None, None, :2]

@@ -1,10 +1,11 @@
 """The settings of a Kalman-type SLAM filter, and their validation."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from jaxslam.association.known import known
 from jaxslam.charts.euclidean import euclidean
@@ -41,7 +42,7 @@ class EkfSettings:
     """which landmarks make room for new ones"""
     absolute: bool = False
     """every valid measurement corrects the robot, whatever its tag"""
-    reserved: Any = None
+    reserved: PyTree = None
     """(N,) bool: slots that no new landmark may take; None for no such slots"""
 
     @property

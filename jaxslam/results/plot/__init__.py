@@ -17,6 +17,7 @@ from jaxslam.results.plot.geometry import ellipse
 from jaxslam.results.plot.graph import graph_figure
 from jaxslam.results.plot.grids import grid_figure
 from jaxslam.results.plot.lines import walls_figure
+from jaxslam.results.plot.loops import loops_figure, maps_before_after
 from jaxslam.results.plot.maps import map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
 from jaxslam.results.plot.scene import (
@@ -57,7 +58,9 @@ __all__ = [
     "graph_figure",
     "graph_scene",
     "grid_figure",
+    "loops_figure",
     "map_figure",
+    "maps_before_after",
     "nees_figure",
     "png",
     "probe",
