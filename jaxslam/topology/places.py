@@ -33,7 +33,7 @@ class TopologicalMap(NamedTuple):
     label: Int[np.ndarray, "H W"]
     """place of each free cell that a place reaches, -1 elsewhere"""
     center: Float[np.ndarray, "P 2"]
-    """of each place: the point of it furthest from walls [m]"""
+    """of each place: the cell of its skeleton nearest to the mean of them [m]"""
     area: Float[np.ndarray, "P"]
     """[m²]"""
     doors: tuple[Door, ...]
@@ -136,12 +136,18 @@ def _labelled(
             doors.append(Door(where[at], 2 * float(away[at]), (ends[0], ends[1]), cell))
     return TopologicalMap(
         label=place.reshape(shape),
-        center=where[names],
+        center=np.array([_middle(where[starts[of_start == k]]) for k in range(len(names))]),
         area=np.bincount(place[place >= 0], minlength=len(names)) * size**2,
         doors=tuple(doors),
         skeleton=found,
         grid=grid,
     )
+
+
+def _middle(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2"]:
+    """The one of some points nearest to their mean."""
+    off = points - points.mean(axis=0)
+    return np.asarray(points[np.argmin((off**2).sum(axis=1))])
 
 
 def cell_centers(grid: Grid) -> Float[np.ndarray, "n 2"]:
