@@ -33,7 +33,9 @@ OTHERS = {"filters": "ekf", "gate": None, "associate": None, "check_every": None
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of laser logs to `jaxslam run`."""
-    group = parser.add_argument_group("laser logs", "of --dataset carmen; without --map and --localize: laser SLAM")
+    group = parser.add_argument_group(
+        "laser logs", "of --dataset carmen; without --map and --localize: laser SLAM"
+    )
     what = group.add_mutually_exclusive_group()
     what.add_argument(
         "--map",
