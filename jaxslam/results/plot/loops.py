@@ -68,11 +68,12 @@ def _draw(axes: Axes, path: np.ndarray, ends: np.ndarray, reference: np.ndarray 
 
 def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -> Figure:
     """The maps of laser odometry alone and after closing, side by side. width: [in]."""
-    figure, panels = panels_of(width, 0.5 * width + 0.3, 1, 2, share=(False, False))
     known = np.argwhere(np.asarray(solved.map.known) | np.asarray(solved.map_before.known))
     if not len(known):
         known = np.array([[0, 0]])
     low, high = known.min(axis=0), known.max(axis=0) + 1
+    height = min(0.46 * width * float((high - low)[0] / (high - low)[1]), 9.0) + 0.7
+    figure, panels = panels_of(width, height, 1, 2, share=(False, False))
     maps = (solved.map_before, "laser odometry"), (solved.map, "after closing")
     for axes, (grid, text) in zip(panels, maps, strict=True):
         seen = np.asarray(grid.log_odds)[low[0] : high[0], low[1] : high[1]]
