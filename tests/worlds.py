@@ -125,9 +125,8 @@ def iterated_on_its_posterior(scenario):
 
     def update(joint, scan, key):
         joint, info = right.update(joint, scan, key)
-        for _ in range(2):
-            joint, _ = right.update(joint, scan, key)
-        return joint, info
+        again = lambda _, joint: right.update(joint, scan, key)[0]  # noqa: E731
+        return jax.lax.fori_loop(0, 2, again, joint), info
 
     return dataclasses.replace(right, update=update)
 
@@ -150,6 +149,7 @@ def draw(scenario, seed=1):
     return jax.device_get(simulate(scenario, jax.random.key(seed)))
 
 
+@np.errstate(invalid="ignore")  # of a filter without a map
 def judged(truth, estimate, info):
     """What a campaign says of many runs (runs, T, …): {measure: (mean, low, high)}, in NumPy.
 

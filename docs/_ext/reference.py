@@ -30,6 +30,8 @@ INTRODUCED = {
     "jaxslam.smoothing": "Smoothing and batch estimation",
     "jaxslam.graphs": "Graphs of poses and points",
     "jaxslam.grids": "Occupancy grids and rays",
+    "jaxslam.laser_slam": "Laser SLAM",
+    "jaxslam.matching": "Scan matching",
     "jaxslam.team": "Several robots",
     "jaxslam.simulation": "Simulated worlds",
     "jaxslam.monte_carlo": "Monte-Carlo campaigns",

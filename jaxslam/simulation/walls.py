@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.grids.grid import Grid
@@ -129,6 +129,42 @@ def is_free(world: Walls, points: ArrayLike) -> np.ndarray[Any, np.dtype[np.bool
     for x, y, radius in np.asarray(world.circles):
         inside ^= np.hypot(p[..., 0] - x, p[..., 1] - y) < radius
     return inside
+
+
+def wall_lines(
+    world: Walls,
+) -> tuple[Float[np.ndarray, "N 2"], Int[np.ndarray, "K"]]:
+    """The distinct lines (r, α) of the segments, as `sensors.line` has them, and each one's index.
+
+    The normal (cos α, sin α) points into the wall, so a line has the side that it is seen from.
+    Segments on one line with free space on the same side share it. Raises ValueError without a
+    segment, and on one without free space on exactly one side.
+    """
+    ends = np.asarray(world.segments, np.float64)
+    if not len(ends):
+        raise ValueError("wall_lines: expected at least one segment")
+    along = ends[:, 1] - ends[:, 0]
+    length = np.hypot(along[:, 0], along[:, 1])
+    if np.any(length == 0):
+        raise ValueError(f"wall_lines: segment {int(np.argmin(length))} has no length")
+    normal = np.stack([along[:, 1], -along[:, 0]], axis=1) / length[:, None]
+    middle, step = ends.mean(axis=1), 1e-6 * (1 + np.abs(ends).max())
+    before, behind = (is_free(world, middle + side * step * normal) for side in (-1, 1))
+    if np.any(before == behind):
+        raise ValueError(
+            f"wall_lines: segment {int(np.argmax(before == behind))} has no free side, or two"
+        )
+    normal[behind] *= -1
+    r = (normal * middle).sum(axis=1)
+    lines: list[tuple[float, float, float]] = []
+    index = np.zeros(len(ends), int)
+    for k, (x, y, distance) in enumerate(zip(*normal.T, r, strict=True)):
+        apart = [max(abs(x - a), abs(y - b), abs(distance - c)) for a, b, c in lines]
+        index[k] = int(np.argmin(apart)) if apart and min(apart) < 1e-6 else len(lines)
+        if index[k] == len(lines):
+            lines.append((x, y, distance))
+    found = np.array(lines)
+    return np.stack([found[:, 2], np.arctan2(found[:, 1], found[:, 0])], axis=1), index
 
 
 def rasterize(

@@ -2,10 +2,11 @@
 
 import argparse
 import time
+from types import ModuleType
 from typing import Any
 
 from jaxslam.cli.common import summary_table
-from jaxslam.cli.laser import localization, mapping
+from jaxslam.cli.laser import localization, mapping, slam
 from jaxslam.cli.laser.job import Job
 from jaxslam.cli.laser.options import complete, read_log
 from jaxslam.results.campaign_files import check_formats
@@ -15,16 +16,11 @@ from jaxslam.results.files import check_writable, json_text, versions, write_fil
 def run_laser(options: argparse.Namespace, command: str) -> int:
     """Do what the options ask for, print and write the results; returns the exit status."""
     began = time.perf_counter()
-    if options.map is None and options.localize is None:
-        raise ValueError(
-            f"{options.path}: SLAM from a laser log is not there yet: --map known makes a map from "
-            "the poses in the file, --localize MAP.yaml localizes the robot in a map"
-        )
     options = complete(options)
     formats = check_formats("--figures", options.figures.split(","))
     log, left_out = read_log(options)
     check_writable(options.out)
-    job: Job = (mapping.run if options.localize is None else localization.run)(log, options)
+    job: Job = _job_of(options).run(log, options)
     figures = job.figures(formats)
     summary: dict[str, Any] = {
         "dataset": log.name,
@@ -44,3 +40,10 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
     written = write_files(options.out, files)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
+
+
+def _job_of(options: argparse.Namespace) -> ModuleType:
+    """The module whose `run` does what the options ask for."""
+    if options.localize is not None:
+        return localization
+    return slam if options.map is None else mapping

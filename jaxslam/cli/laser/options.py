@@ -33,7 +33,9 @@ OTHERS = {"filters": "ekf", "gate": None, "associate": None, "check_every": None
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of laser logs to `jaxslam run`."""
-    group = parser.add_argument_group("laser logs", "of --dataset carmen")
+    group = parser.add_argument_group(
+        "laser logs", "of --dataset carmen; without --map and --localize: laser SLAM"
+    )
     what = group.add_mutually_exclusive_group()
     what.add_argument(
         "--map",
@@ -80,7 +82,7 @@ def complete(options: argparse.Namespace) -> argparse.Namespace:
         if getattr(options, name) != default:
             raise ValueError(f"--{name.replace('_', '-')}: not of a laser log")
     if options.animate:
-        raise ValueError("--animate: not of a laser log with --map or --localize")
+        raise ValueError("--animate: not of a laser log")
     for_localization = [
         n for n in ("start", "particles", "seed") if getattr(options, n) is not None
     ]

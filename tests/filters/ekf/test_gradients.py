@@ -1,4 +1,4 @@
-"""The gradient of a whole run: through 200 steps, by every parameter of robot and sensor together."""
+"""The gradient of a whole run: by every parameter of robot and sensor, and of every kind of filter."""
 
 import dataclasses
 
@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import worlds
 
-from jaxslam import motion, sensors
+from jaxslam import catalog, motion, sensors
 from jaxslam.filters import ekf_slam
 from jaxslam.math.stats import sigma_gate
 from jaxslam.run import run
@@ -125,3 +126,30 @@ def test_gradients_are_finite_in_float32_with_gate_overflow_and_empty_scans(gate
         assert not np.asarray(slope).any()
     else:
         assert all(counts[[Status.FUSED, Status.BORN, Status.REJECTED, Status.OVERFLOW]])
+
+
+@pytest.mark.parametrize(
+    "name", ["oc", "right_invariant", "robocentric", "square_root", "iterated", "ukf_right"]
+)
+def test_in_reverse_through_a_sequential_update_from_a_start_that_is_known_exactly(name):
+    """By both noises, through predictions, births and corrections in turn, P0 = 0; corrected at
+    once: tests/consistency/test_catalog.py."""
+    world = dataclasses.replace(worlds.ring(3), landmarks=worlds.ring().landmarks[:2])
+    _, log = worlds.draw(world)
+
+    def cost(sigma):
+        models = {
+            "motion": motion.increment(jnp.diag(sigma[:2]) ** 2),
+            "sensor": sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
+        }
+        filter = catalog.FILTERS[name](dataclasses.replace(world, **models), update="sequential")
+        trace = run(filter, log, world.pose, world.pose_cov, KEY)
+        return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()
+
+    at = np.array([0.01, 0.04, 0.05])
+    both = jax.jit(jax.value_and_grad(cost))
+    slope = np.asarray(both(at)[1])
+    steps = 1e-5 * np.diag(at)
+    rise = [(both(at + step)[0] - both(at - step)[0]) / (2 * step.sum()) for step in steps]
+    np.testing.assert_allclose(slope, rise, rtol=1e-5)
+    assert np.all(slope != 0)
