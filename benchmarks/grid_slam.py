@@ -216,7 +216,7 @@ def draw(world, truth, log, trace, out):
     panels[0].set_ylabel("y [m]")
     panels[0].legend(loc="center", fontsize=8)
     out.parent.mkdir(exist_ok=True)
-    figure.savefig(out, dpi=150)
+    figure.savefig(out, dpi=150, bbox_inches="tight")
 
 
 if __name__ == "__main__":
