@@ -122,6 +122,8 @@ def test_two_sightings_merged_are_one_landmark_seen_twice(chart):
 def test_a_square_root_is_merged_too():
     joint = some_joint()
     root = joint._replace(cov=np.linalg.cholesky(joint.cov))
+    found = CLOSEST(root, EUCLIDEAN, 100.0, square_root=True)
+    np.testing.assert_allclose(found, CLOSEST(joint, EUCLIDEAN, 100.0), rtol=1e-9)
     whole = MERGE(joint, EUCLIDEAN, 0, 2)
     merged = MERGE(root, EUCLIDEAN, 0, 2, square_root=True)
     cov = np.asarray(merged.cov)
@@ -252,7 +254,7 @@ def test_refusals_of_merging():
 def test_landmarks_that_differ_stay_two():
     """0.45 m apart, known to centimetres, and seen by turns: only their distance tells them apart.
 
-    In square roots, whose closest pair is that of the covariance (below).
+    In square roots, whose closest pair is that of the covariance (above).
     """
     sensor = sensors.range_bearing(np.diag([0.02, 0.01]) ** 2)
     filter = merging(ekf_slam(MOTION, sensor, 4, covariance="square_root", update="joint"), 0.5)
@@ -268,11 +270,3 @@ def test_landmarks_that_differ_stay_two():
 def ekf_slam_still(filter):
     """Without the noise of motion, which would make the two one in the robot's eyes."""
     return dataclasses.replace(filter, predict=lambda state, u, key: state)
-
-
-def test_the_closest_pair_of_a_root_is_that_of_its_covariance():
-    joint = some_joint()
-    root = joint._replace(cov=np.linalg.cholesky(joint.cov))
-    expected = CLOSEST(joint, EUCLIDEAN, 100.0)
-    found = CLOSEST(root, EUCLIDEAN, 100.0, square_root=True)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)

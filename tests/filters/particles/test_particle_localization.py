@@ -135,9 +135,10 @@ def test_weights_are_the_scans_densities(gate):
 
 def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
     truth, log = history(8)
-    blind = log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
     likeliest = association.maximum_likelihood(1e6)
-    trace = drive(of(60, BLUNT, associate=likeliest), blind, cov=np.diag([0.1, 0.1, 0.05]) ** 2)
+    trace = drive(
+        of(60, BLUNT, associate=likeliest), worlds.nameless(log), cov=np.diag([0.1, 0.1, 0.05]) ** 2
+    )
     np.testing.assert_array_equal(trace.info.slot, log.scan.tag)
     assert np.linalg.norm(trace.estimate.pose[-1, :2] - truth.pose[-1, :2]) < 0.3
 
@@ -323,7 +324,7 @@ def test_runs_of_a_batch_know_nothing_of_each_other_and_float32_stays_float32():
     both, swapped = batch(log, keys), batch(log, keys[::-1])
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[::-1]), both, swapped)
     assert np.all(both.final.pose[0] != both.final.pose[1])
-    single = jax.tree.map(lambda x: x.astype("f4") if x.dtype == float else x, log)
+    single = worlds.narrow(log)
     for leaf in jax.tree.leaves(jax.eval_shape(go, single, KEY)):
         assert leaf.dtype != np.float64
 
