@@ -47,15 +47,6 @@ def chain(first: Poses, steps: Poses) -> Poses:
     return out
 
 
-def transform(pose: Poses, points: Float[np.ndarray, "... B 2"]) -> Float[np.ndarray, "... B 2"]:
-    """Points of the frames of poses, in the frame in which the poses are."""
-    c, s = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
-    x, y = points[..., 0], points[..., 1]
-    return np.stack(
-        [pose[..., 0, None] + c * x - s * y, pose[..., 1, None] + s * x + c * y], axis=-1
-    )
-
-
 def adjoint(pose: Poses) -> Covs:
     """Ad with pose ∘ e = (Ad e) ∘ pose to first order in a small pose e."""
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
@@ -78,11 +69,6 @@ def moved(cov: Covs, by: Poses) -> Covs:
 def composed_cov(cov: Covs, step: Poses, step_cov: Covs) -> Covs:
     """The covariance of the end of z ∘ step, both uncertain and independent."""
     return np.asarray(moved(cov, step) + step_cov)
-
-
-def inverse_cov(cov: Covs, z: Poses) -> Covs:
-    """The covariance of the end of z⁻¹, cov being that of the end of z."""
-    return moved(cov, inverse(z))
 
 
 def at_end(cov: Covs, z: Poses) -> Covs:

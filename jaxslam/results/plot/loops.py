@@ -21,6 +21,9 @@ from jaxslam.results.plot.style import (
     titled,
 )
 
+CELLS = 400
+"""along a side of a map as drawn: walls of one cell stay visible"""
+
 
 def loops_figure(
     solved: Solved,
@@ -65,15 +68,16 @@ def _draw(axes: Axes, path: np.ndarray, ends: np.ndarray, reference: np.ndarray 
 
 def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -> Figure:
     """The maps of laser odometry alone and after closing, side by side. width: [in]."""
-    figure, panels = panels_of(width, 0.5 * width + 0.3, 1, 2, share=(False, False))
     known = np.argwhere(np.asarray(solved.map.known) | np.asarray(solved.map_before.known))
     if not len(known):
         known = np.array([[0, 0]])
     low, high = known.min(axis=0), known.max(axis=0) + 1
+    height = min(0.46 * width * float((high - low)[0] / (high - low)[1]), 9.0) + 0.7
+    figure, panels = panels_of(width, height, 1, 2, share=(False, False))
     maps = (solved.map_before, "laser odometry"), (solved.map, "after closing")
     for axes, (grid, text) in zip(panels, maps, strict=True):
         seen = np.asarray(grid.log_odds)[low[0] : high[0], low[1] : high[1]]
-        shade = np.where(seen == 0, 0.8, 0.5 * (1 - np.tanh(0.5 * seen)))
+        shade = _shade(seen, int(np.ceil(max(seen.shape) / CELLS)))
         left, down = np.asarray(grid.origin)[:2] + float(grid.resolution) * low[::-1]
         right, up = np.asarray(grid.origin)[:2] + float(grid.resolution) * high[::-1]
         axes.grid(visible=False)
@@ -86,3 +90,14 @@ def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -
     if title:
         caption(figure, title, [])
     return figure
+
+
+def _shade(log_odds: np.ndarray, block: int) -> np.ndarray:
+    """White for free, black for occupied, grey for unknown, of blocks of cells by their walls."""
+    rows, columns = (-(-n // block) * block for n in log_odds.shape)
+    whole = np.zeros((rows, columns))
+    whole[: log_odds.shape[0], : log_odds.shape[1]] = log_odds
+    parts = whole.reshape(rows // block, block, columns // block, block)
+    most, least = parts.max(axis=(1, 3)), parts.min(axis=(1, 3))
+    odds = np.where(most > 0, most, least)
+    return np.where(odds == 0, 0.8, 0.5 * (1 - np.tanh(0.5 * odds)))
