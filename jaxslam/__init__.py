@@ -14,6 +14,7 @@ from jaxslam import (
     catalog,
     charts,
     consistency,
+    features,
     filters,
     graphs,
     grids,
@@ -29,6 +30,7 @@ from jaxslam import (
     slots,
     smoothing,
     team,
+    topology,
 )
 from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
@@ -48,6 +50,7 @@ __all__ = [
     "catalog",
     "charts",
     "consistency",
+    "features",
     "filters",
     "graphs",
     "grids",
@@ -73,6 +76,7 @@ __all__ = [
     "stats",
     "team",
     "team_world",
+    "topology",
     "uncertain_poses",
     "verify_jacobians",
 ]

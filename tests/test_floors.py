@@ -17,7 +17,7 @@ FLOORS = [
     "math programs",
     "types protocols slots validation noise derivatives streams records",
     "motion sensors charts linearize association resampling life team",
-    "run filters smoothing graphs grids matching simulation",
+    "run filters smoothing graphs grids matching simulation features topology",
     "consistency monte_carlo verify catalog calibration metrics laser_slam",
     "datasets results cli __main__",
 ]

@@ -144,6 +144,18 @@ def key(seed: int = 0):
     return jax.random.key(seed)
 
 
+def narrow(tree):
+    """The same in float32."""
+    return jax.tree.map(
+        lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, tree
+    )
+
+
+def nameless(log):
+    """The log with tags of nobody."""
+    return log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
+
+
 def draw(scenario, seed=1):
     """A truth and a log of the scenario, in NumPy."""
     return jax.device_get(simulate(scenario, jax.random.key(seed)))

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from benchmarks.scan_matching.honesty import COVARIANCES, MATCHERS, WORLDS, Row
 from jaxslam.results.plot import COLORS, COLUMN, PAGE
 
-MARKS = ("o", "s", "^", "D")
+MARKS = ("o", "s", "v", "^", "D")
 LIMITS = 0.1, 1e3
 
 
@@ -27,7 +27,7 @@ def nees(rows: Sequence[Row]) -> Figure:
             beyond = not LIMITS[0] < row.nees < LIMITS[1]
             panel.plot(
                 np.clip(row.nees, LIMITS[0] * 1.15, LIMITS[1] / 1.15),
-                names.index(row.way) + 0.18 * (k - 1.5),
+                names.index(row.way) + 0.16 * (k - 2),
                 MARKS[k],
                 color=COLORS[k],
                 ms=4,
@@ -44,7 +44,7 @@ def nees(rows: Sequence[Row]) -> Figure:
     axes[0].invert_yaxis()
     figure.supxlabel("NEES over degrees of freedom (1: honest); open marks lie beyond", fontsize=8)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=8, frameon=False)
+    figure.legend(handles, labels, loc="outside upper center", ncols=5, fontsize=8, frameon=False)
     return figure
 
 

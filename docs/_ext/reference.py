@@ -32,6 +32,8 @@ INTRODUCED = {
     "jaxslam.grids": "Occupancy grids and rays",
     "jaxslam.laser_slam": "Laser SLAM",
     "jaxslam.matching": "Scan matching",
+    "jaxslam.features": "Features of scans",
+    "jaxslam.topology": "Topological maps",
     "jaxslam.team": "Several robots",
     "jaxslam.simulation": "Simulated worlds",
     "jaxslam.monte_carlo": "Monte-Carlo campaigns",

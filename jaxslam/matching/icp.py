@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.matching.correspondences import Rule, nearest, weights
 from jaxslam.matching.matcher import Match, Matcher
-from jaxslam.matching.outcome import Limits, concluded, information_of, length_of
+from jaxslam.matching.outcome import Limits, concluded, determined, information_of, length_of
 from jaxslam.matching.points import Points
 from jaxslam.matching.surface import Surface, surface
 from jaxslam.math import se2
@@ -86,6 +86,7 @@ def icp(
             total = pairs.weight.sum()
             middle = pairs.weight @ pairs.moved / jnp.where(total > 0, total, 1.0)
             moved = metric.step(of, pairs, middle)
+            moved = determined(moved, _information(of, pairs, middle), length, limits.condition)
             pivot = se2.from_frame(moved, pose[:2] - middle) + middle
             after = jnp.concatenate([pivot, wrap(pose[2] + moved[2])[None]])
             # A limit cycle of two steps, where pairs alternate, has ended as well.
@@ -103,7 +104,7 @@ def icp(
             residual=at.residual,
             weight=at.weight,
             pair=at.partner,
-            information=_information(of, at, pose),
+            information=_information(of, at, pose[:2]),
             spread=scale,
             iterations=k,
             converged=change <= tolerance,
@@ -122,14 +123,14 @@ def _size(a: Array, b: Array, length: Array) -> Array:
     return jnp.hypot(a[0] - b[0], a[1] - b[1]) + length * jnp.abs(wrap(a[2] - b[2]))
 
 
-def _information(of: Surface, at: Pairs, pose: Array) -> Float[Array, "3 3"]:
-    """Σ w J Jᵀ with J = (n, n·∂(R p)/∂θ) over the pairs whose partner has a line.
+def _information(of: Surface, at: Pairs, pivot: Float[Array, "2"]) -> Float[Array, "3 3"]:
+    """Σ w J Jᵀ with J = (n, n·∂(R p)/∂θ), turned about the pivot, over partners that have a line.
 
     A normal that is turned by noise of variance τ² has E n̂n̂ᵀ = (1 - τ²) nnᵀ + τ² ttᵀ, t along the
     line, which feigns information along a wall; hence the sum of (1 + τ²) n̂n̂ᵀ - τ² ttᵀ.
     """
     n, tilt = of.normal[at.partner], of.tilt[at.partner]
-    arm = at.moved - pose[None, :2]
+    arm = at.moved - pivot[None]
     t = jnp.stack([n[:, 1], -n[:, 0]], axis=-1)
     weight = jnp.where(of.straight[at.partner], at.weight, 0.0)
 

@@ -106,6 +106,23 @@ def weakest_direction(
     return jnp.where(positive, condition, 0.0), eigenvector(a, least) * scale
 
 
+def determined(
+    motion: Float[Array, "3"],
+    information: Float[Array, "3 3"],
+    length: Float[Array, ""],
+    least: float,
+) -> Float[Array, "3"]:
+    """A motion without its part along the weakest direction, where the condition is below `least`.
+
+    So noise does not carry the pose along what the scans do not determine (Zhang, Kaess & Singh
+    2016, "On degeneracy of optimization-based state estimation problems", ICRA).
+    """
+    condition, weakest = weakest_direction(information, length)
+    scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length])
+    along = ((scale * weakest) * (scale * motion)).sum()
+    return jnp.where(condition < least, motion - along * weakest, motion)
+
+
 def extreme_eigenvalues(a: Float[Array, "3 3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The least and the largest eigenvalue of a symmetric matrix.
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import narrow
 
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
@@ -411,7 +412,7 @@ def test_jit_is_no_jit():
 )
 def test_float32_logs_give_float32_outputs_although_float64_is_on(logs, options):
     chart = charts.REGISTRY[options.get("chart", "euclidean")]()
-    single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, take(logs[1], 0))
+    single = narrow(take(logs[1], 0))
     out = jax.eval_shape(runner(5, **(options | {"chart": chart})), single)
     kinds = {
         leaf.dtype for leaf in jax.tree.leaves(out) if jnp.issubdtype(leaf.dtype, jnp.floating)
@@ -487,8 +488,7 @@ def test_augmentation_is_the_limit_of_the_large_prior_which_fails_in_float32():
     assert errors[0] > 50 * errors[1]
     np.testing.assert_allclose(large_prior_update(joint, z, 1e7, float), out.cov, atol=1e-6)
     exact = out.cov[7:9, 7:9]
-    single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, (joint, scan))
-    direct, _ = updater()(*single)
+    direct, _ = updater()(*narrow((joint, scan)))
     assert direct.cov.dtype == np.float32
     np.testing.assert_allclose(direct.cov[7:9, 7:9], exact, rtol=1e-5, atol=1e-6)
     assert np.linalg.eigvalsh(np.asarray(direct.cov, float))[0] > 0

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from reference.plane import mounted, wrap
 
 from jaxslam import motion, sensors
 from jaxslam.simulation.scenarios import (
@@ -51,10 +52,6 @@ def draw(scenario, seed=0, runs=None):
     return jax.device_get(jax.jit(jax.vmap(one))(jax.random.split(key, runs)))
 
 
-def wrap(a):
-    return np.arctan2(np.sin(a), np.cos(a))
-
-
 def nominal_path(scenario):
     pose, path = np.array(scenario.pose, float), []
     for d, turn in np.asarray(scenario.controls):
@@ -77,11 +74,9 @@ def executed_controls(scenario, pose):
 
 def exact_measurements(pose, landmarks=LANDMARKS, mount=MOUNT):
     """(…, T, N, 2) range and bearing from the mounted sensor."""
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    x = pose[..., 0] + c * mount[0] - s * mount[1]
-    y = pose[..., 1] + s * mount[0] + c * mount[1]
-    dx, dy = landmarks[:, 0] - x[..., None], landmarks[:, 1] - y[..., None]
-    bearing = wrap(np.arctan2(dy, dx) - (pose[..., 2] + mount[2])[..., None])
+    frame = mounted(pose, mount)[..., None, :]
+    dx, dy = landmarks[:, 0] - frame[..., 0], landmarks[:, 1] - frame[..., 1]
+    bearing = wrap(np.arctan2(dy, dx) - frame[..., 2])
     return np.stack([np.hypot(dx, dy), bearing], axis=-1)
 
 

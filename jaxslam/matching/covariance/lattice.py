@@ -8,7 +8,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam.matching.covariance.record import MatchCovariance, check_sigma, inverse_of
+from jaxslam.matching.covariance.record import (
+    MatchCovariance,
+    check_sigma,
+    curvature,
+    inverse_of,
+)
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.points import Points
 from jaxslam.math import linalg
@@ -20,7 +25,7 @@ def lattice(
     """The covariance of p(x) ∝ exp(-E(x)/σ²) over a lattice of steps³ poses around the match.
 
     K = Σ p x xᵀ, u = Σ p x, and the covariance K - u uᵀ with Σ p = 1. The lattice is x̂ + L z, z in
-    [-4, 4]³, L Lᵀ the inverse of the match's information over σ² and of the window's: as fine as
+    [-4, 4]³, L Lᵀ the inverse of ∂²E/∂x²/σ² and the window's information: as fine as
     the peak needs, and as wide as the window where nothing else bounds it. Residuals are evaluated
     at each pose: in a grid all that a shift changes counts, with the pairs of an ICP kept.
 
@@ -48,7 +53,9 @@ def lattice(
         prepared = matcher.prepare(reference)
         dtype = found.pose.dtype
         bound = jnp.diag(jnp.asarray(prior, dtype))
-        peak = inverse_of(found.information / jnp.asarray(sigma) ** 2 + bound, bound)
+        variance = jnp.asarray(sigma) ** 2
+        shape = curvature(matcher, prepared, points, found) / variance + bound
+        peak = inverse_of(shape, found.information / variance + bound)
         root = linalg.cholesky(peak)[0]
         offset = jnp.asarray(grid, dtype) @ root.T
 

@@ -34,6 +34,7 @@ from jaxslam.results.plot.scene import (
 )
 from jaxslam.results.plot.single import errors_figure, run_errors_figure
 from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, png, warm_up
+from jaxslam.results.plot.topology import topology_figure
 
 __all__ = [
     "COLORS",
@@ -67,6 +68,7 @@ __all__ = [
     "run_errors_figure",
     "run_map_figure",
     "run_scene",
+    "topology_figure",
     "walls_figure",
     "warm_up",
     "whiteness_figure",

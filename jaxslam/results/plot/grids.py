@@ -55,7 +55,7 @@ def grid_figure(
     values = np.asarray(grid[0])
     frame = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
     rows, columns = (np.arange(n + 1) for n in values.shape)
-    x, y = _world(*frame, columns[None, :] + 0.0 * rows[:, None], rows[:, None] + 0.0 * columns)
+    x, y = world_of(*frame, columns[None, :] + 0.0 * rows[:, None], rows[:, None] + 0.0 * columns)
     inner = width - (0.6 if isinstance(grid, Grid) else 1.3)
     height = inner * np.ptp(y) / np.ptp(x) + 0.8
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
@@ -104,7 +104,7 @@ def grid_figure(
     return figure
 
 
-def _world(
+def world_of(
     origin: np.ndarray, resolution: float, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates in cells as world coordinates [m]."""

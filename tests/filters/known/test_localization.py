@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import draw, judged, ring
+from worlds import draw, judged, nameless, narrow, ring
 
 from jaxslam import association, charts, linearize, run, sensors, simulate
 from jaxslam.filters import dead_reckoning, ekf_slam, localization
@@ -148,8 +148,7 @@ def test_it_finds_its_landmarks_without_tags(method):
     scenario, (_, log) = world()
     make = getattr(association, method)
     associate = make(0.999, NEW) if method == "joint" else make(GATE, NEW)
-    nameless = log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
-    trace = driven(here(associate=associate), nameless)
+    trace = driven(here(associate=associate), nameless(log))
     fused = np.asarray(trace.info.status == Status.FUSED)
     assert fused.mean() > 0.98
     right = np.asarray(trace.info.slot) == np.asarray(log.scan.tag)
@@ -215,11 +214,7 @@ def test_gradient_and_float32():
 
     slope = jax.jit(jax.grad(last))(np.asarray(scenario.landmarks))
     assert np.isfinite(slope).all() and (slope != 0).all()
-    low = jax.tree.map(
-        lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, log
-    )
-    start = START.astype(np.float32), SPREAD.astype(np.float32)
-    trace = run(here(), low, *start, KEY)
+    trace = run(here(), *narrow((log, START, SPREAD)), KEY)
     assert trace.estimate.pose.dtype == trace.final.cov.dtype == jnp.float32
     np.testing.assert_allclose(trace.estimate.pose, driven(here(), log).estimate.pose, atol=1e-3)
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import draw, ring
+from worlds import draw, nameless, ring
 
 from jaxslam import association, charts, linearize, motion, run, sensors, simulate
 from jaxslam.filters import ekf_slam, mapping
@@ -94,9 +94,8 @@ def test_a_prior_for_slam():
 
 def test_without_tags():
     scenario, truth, log = world()
-    nameless = log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
     method = association.joint(0.999, chi2_quantile(0.99999, 2))
-    trace = on_poses(mapping(scenario.sensor, 8, associate=method), truth, nameless)
+    trace = on_poses(mapping(scenario.sensor, 8, associate=method), truth, nameless(log))
     assert (trace.final.alive).sum() == 6
     np.testing.assert_array_equal(trace.info.slot, log.scan.tag)
 
