@@ -53,6 +53,7 @@ def measure(names: tuple[str, ...] = LOGS, draw: bool = True) -> list[Metric]:
         print(f"{name:12}  seconds: {stages}", flush=True)
         limit = 0.05 if name == "intel" else np.inf
         ratio = solved.chi2 / max(solved.dof, 1)
+        off = f"σ too {'small' if ratio > 1 else 'large'} by {max(ratio, 1 / ratio) ** 0.5:.1f}"
         found += [
             Metric(f"{name}, relation error to 10 m [m]", means["laser SLAM"], high=limit),
             Metric(f"{name}, of raw odometry [m]", means["raw odometry"]),
@@ -61,7 +62,7 @@ def measure(names: tuple[str, ...] = LOGS, draw: bool = True) -> list[Metric]:
                 ratio,
                 low=0.33,
                 high=2.0,
-                note=f"σ too {'small' if ratio > 1 else 'large'} by {max(ratio, 1 / ratio) ** 0.5:.1f}",
+                note=off,
             ),
             Metric(f"{name}, processor seconds, all cores", busy),
             Metric(f"{name}, precision of loops", score.precision, low=0.98),

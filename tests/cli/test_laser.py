@@ -89,7 +89,6 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "--map known makes a map from the poses in the file, --localize MAP.yaml"),
         (["--map", "known", "--filters", "seif"], "--filters: not of a laser log"),
         (["--map", "known", "--animate"], "--animate: not of a laser log"),
         (["--map", "known", "--start", "global"], "--start: only with --localize"),
