@@ -1,12 +1,14 @@
 """A small log from raw odometry to its map, and logs with something wrong in them."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 from ring_of_rooms import FAR, SETTINGS, driven, errors
 
 from jaxslam import laser_slam
+from jaxslam.cli import main
 from jaxslam.laser_slam import LoopOutcome
 from jaxslam.results import laser_slam as results
 from jaxslam.results.files import write_files
@@ -123,3 +125,25 @@ def test_its_files(drive, tmp_path):
     np.testing.assert_allclose(rows[:, 1:3], found.poses[:, :2], rtol=1e-8)
     assert len((tmp_path / "loops.csv").read_text().splitlines()) == 1 + len(found.loops.outcome)
     assert results.summary(found)["keyframes"] == len(found.keyframe)
+
+
+def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_path):
+    """`jaxslam run --dataset carmen FILE`, with the result of above in place of a second one."""
+    true, log, found = drive
+    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+    lines = []
+    for k, (pose, ranges) in enumerate(zip(true, np.asarray(log.beams.range), strict=True)):
+        told = " ".join(f"{value:.6f}" for value in pose)
+        lines.append(f"ODOM {told} 0 0 0 {k} host {k}")
+        ranges = " ".join(f"{value:.3f}" for value in ranges)
+        lines.append(f"FLASER 60 {ranges} {told} {told} {k} host {k}")
+    (tmp_path / "ring.log").write_text("\n".join(lines))
+    out = tmp_path / "out"
+    command = ["run", "--dataset", "carmen", str(tmp_path / "ring.log"), "--out", str(out)]
+    assert main([*command, "--figures", "svg"]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["mean relation error to 10 m [m]"] < 0.1
+    kept = laser_slam.closure_score(found, true).kept
+    assert summary["loops that agree with the poses in the file"] == f"{kept} of {kept}"
+    names = {path.name for path in out.iterdir()}
+    assert {"trajectory.tum", "graph.g2o", "map.pgm", "map_before.svg", "graph.svg"} <= names

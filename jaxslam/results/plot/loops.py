@@ -36,7 +36,9 @@ def loops_figure(
 
     reference: (K, 3) poses, drawn in grey, aligned with each path. width: [in].
     """
-    figure, panels = panels_of(width, 0.55 * width, 1, 2, share=(False, False))
+    across, up = np.ptp(solved.poses[:, :2], axis=0) + 1e-6
+    height = 0.46 * width * float(np.clip(up / across, 0.4, 1.5)) + 0.9
+    figure, panels = panels_of(width, height, 1, 2, share=(False, False))
     kept = solved.loops.outcome == LoopOutcome.KEPT
     ends = np.stack([solved.loops.first[kept], solved.loops.second[kept]], axis=1)
     paths = (solved.odometry, "laser odometry"), (solved.poses, "after closing")
