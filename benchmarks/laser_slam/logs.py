@@ -60,7 +60,7 @@ def measure(names: tuple[str, ...] = LOGS, draw: bool = True) -> list[Metric]:
             Metric(
                 f"{name}, chi2 / degrees of freedom",
                 ratio,
-                low=0.33,
+                low=0.5,
                 high=2.0,
                 note=off,
             ),
