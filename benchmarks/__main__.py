@@ -49,8 +49,10 @@ from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import Metric, report
 from benchmarks.graph_consistency.__main__ import measure as measure_graphs
 from benchmarks.grids.__main__ import measure as measure_grids
+from benchmarks.laser_slam.__main__ import measure as measure_laser_slam
 from benchmarks.mrclam.__main__ import measure as measure_mrclam
 from benchmarks.results import measured
+from benchmarks.scan_matching.__main__ import measure as measure_matching
 from benchmarks.speed.__main__ import gated
 from benchmarks.speed.__main__ import measure as measure_speed
 
@@ -99,6 +101,8 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "plain_particles": lambda: plain_particles.measure(8 if quick else 20),
         "grids": measure_grids,
         "grid_localization": lambda: grid_localization.measure(20 if quick else 100),
+        "laser_slam": lambda: measure_laser_slam(quick),
+        "scan_matching": lambda: measure_matching(quick),
         "scaling": scaling.measure,
         "seif": lambda: seif.measure(4 if quick else 10),
         "comparison": lambda: comparison.measure(8 if quick else 16),

@@ -21,7 +21,7 @@ import numpy as np
 
 import jaxslam
 from benchmarks.gate import Metric, alone
-from jaxslam import datasets, se2
+from jaxslam import datasets, metrics
 from jaxslam.filters import delayed_slam
 from jaxslam.filters.delayed.settings import StoredMeasurements
 from jaxslam.types import Status
@@ -53,19 +53,19 @@ def dead_reckoning(data):
 
 def aligned(path, data):
     """The motion onto the ground truth, the path there (T, 2), and its RMSE [m]."""
-    motion = se2.align(path[:, :2], jnp.asarray(data.true_path[:, :2]))
-    path = jax.vmap(se2.from_frame, (None, 0))(motion, path[:, :2])
-    off = np.asarray(path) - data.true_path[:, :2]
-    return motion, np.asarray(path), float(np.sqrt((off**2).sum(axis=1).mean()))
+    motion = metrics.alignment(path[:, :2], data.true_path[:, :2])
+    path = metrics.carried(motion, path[:, :2])
+    off = np.linalg.norm(path - data.true_path[:, :2], axis=1)
+    return motion, path, metrics.statistics(off).rmse
 
 
 def beacons(motion, estimate, data):
     """Where the beacons of the map are in the survey's frame (K, 2), their tags (K,) and errors."""
     alive = np.asarray(estimate.alive)
-    points = jax.vmap(se2.from_frame, (None, 0))(motion, estimate.points[alive])
+    points = metrics.carried(motion, estimate.points[alive])
     tags = np.asarray(estimate.tag)[alive]
-    off = np.linalg.norm(np.asarray(points) - data.landmarks[tags], axis=1)
-    return np.asarray(points), tags, off
+    off = np.linalg.norm(points - data.landmarks[tags], axis=1)
+    return points, tags, off
 
 
 def measure(figure=False):

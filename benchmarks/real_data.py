@@ -18,9 +18,9 @@ import numpy as np
 import jaxslam
 from benchmarks.gate import Metric, alone
 from jaxslam import datasets
-from jaxslam.consistency import align_map
 from jaxslam.datasets import Dataset
 from jaxslam.filters import ekf_slam
+from jaxslam.metrics import align_map
 from jaxslam.types import Status
 
 DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))

@@ -21,8 +21,8 @@ import jaxslam
 from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import datasets, se2
-from jaxslam.consistency import align_map
 from jaxslam.filters import ekf_slam, team_slam
+from jaxslam.metrics import align_map
 from jaxslam.team import poses
 from jaxslam.types import Status
 

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 import jaxslam
 from benchmarks.gate import Metric, report
-from jaxslam import charts, datasets, plot, se2
+from jaxslam import charts, datasets, metrics, plot
 from jaxslam.datasets import Dataset
 from jaxslam.filters import ekf_slam
 from jaxslam.types import Status
@@ -145,17 +145,15 @@ def position_error(z):
 
 def compare(filtered: Solution, batch: Solution) -> dict[str, float]:
     """How far a solution is from the batch's after the best SE(2) motion onto it."""
-    move = se2.align(jnp.asarray(filtered.points), jnp.asarray(batch.points))
-    onto = jax.vmap(se2.from_frame, in_axes=(None, 0))
-    points = onto(move, jnp.asarray(filtered.points))
-    path = onto(move, jnp.asarray(filtered.path[:, :2]))
-    apart = np.linalg.norm(points - batch.points, axis=1)
-    path_apart = np.linalg.norm(path - batch.path[:, :2], axis=1)
+    move = metrics.alignment(filtered.points, batch.points)
+    points = metrics.carried(move, filtered.points) - batch.points
+    path = metrics.carried(move, filtered.path[:, :2]) - batch.path[:, :2]
+    of_map, of_path = (metrics.statistics(np.linalg.norm(gap, axis=1)) for gap in (points, path))
     return {
-        "map RMSE [m]": float(np.sqrt(np.mean(apart**2))),
-        "map max [m]": float(apart.max()),
-        "path RMSE [m]": float(np.sqrt(np.mean(path_apart**2))),
-        "path max [m]": float(path_apart.max()),
+        "map RMSE [m]": of_map.rmse,
+        "map max [m]": of_map.max,
+        "path RMSE [m]": of_path.rmse,
+        "path max [m]": of_path.max,
         "turned by [°]": float(np.rad2deg(move[2])),
         "moved by [m]": float(np.linalg.norm(move[:2])),
     }

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam.charts.left_invariant import left_invariant
 from jaxslam.charts.right_invariant import right_invariant
@@ -164,7 +165,7 @@ def in_pieces(filter: Filter, places: int) -> Filter:
     over the pieces, and flags are true where one of a piece is.
     """
 
-    def update(state: Any, scan: Scan, key: jax.Array) -> tuple[Any, Info]:
+    def update(state: PyTree, scan: Scan, key: jax.Array) -> tuple[PyTree, Info]:
         m = scan.tag.shape[0]
         if m <= places:
             return filter.update(state, scan, key)
@@ -174,7 +175,7 @@ def in_pieces(filter: Filter, places: int) -> Filter:
             wide = jnp.pad(leaf, [(0, pieces * places - m), *[(0, 0)] * (leaf.ndim - 1)])
             return wide.reshape(places, pieces, *leaf.shape[1:]).swapaxes(0, 1)
 
-        def one(state: Any, piece: tuple[Scan, jax.Array]) -> tuple[Any, Info]:
+        def one(state: PyTree, piece: tuple[Scan, jax.Array]) -> tuple[PyTree, Info]:
             return filter.update(state, *piece)
 
         each = jax.tree.map(dealt, scan), jax.random.split(key, pieces)

@@ -10,12 +10,15 @@ parameters; s (K,) landmark parameters that z does not determine (K = 0 if none)
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxslam.math import se2
+from jaxslam.math.angles import wrap
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Log, Scan, Trace, Truth
 
@@ -23,7 +26,7 @@ Array = jax.Array
 
 
 def _check_fields(
-    record: Any,
+    record: PyTree,
     functions: tuple[str, ...],
     names: tuple[str, ...] = (),
     optional: tuple[str, ...] = (),
@@ -88,7 +91,7 @@ NOTHING_FREE = Free(np.zeros(0), np.zeros((0, 0)))  # type: ignore[arg-type]
 class Reduced(NamedTuple):
     """A permanent reduction of a landmark's L parameters to its position (x, y)."""
 
-    sensor: Any
+    sensor: PyTree
     """a Sensor with the same z, whose landmarks are points"""
     ready: Callable[[Array, Array, Array], Array]
     """(pose, l, cov (L, L)) -> () bool"""
@@ -121,6 +124,10 @@ class Sensor:
     embed: Callable[[Array, Array], Array] = lambda pose, point: point
     """(pose, point (2,)) -> l of a landmark at that point, measured first from pose. Default that
     of a point."""
+    carry: Callable[[Array, Array], Array] | None = None
+    """(frame (3,), l) -> l of a landmark given in a frame, in the coordinates that the frame's pose
+    is in. Default, of a landmark whose first two numbers are a place (x, y): the place moves,
+    entries in [rad] turn, and the others stay."""
     free: Free = NOTHING_FREE
     """the prior of s. Default that of a full measurement."""
     observe_jacobians: Callable[[Array, Array], tuple[Array, Array]] | None = None
@@ -132,13 +139,28 @@ class Sensor:
 
     def __post_init__(self) -> None:
         functions = ("observe", "residual", "noise_cov", "invert", "position", "embed")
-        optional = ("observe_jacobians", "invert_jacobians")
+        optional = ("carry", "observe_jacobians", "invert_jacobians")
         _check_fields(self, functions, ("measurements", "landmark"), optional)
         if not isinstance(self.free, Free):
             raise ValueError(
                 f"Sensor {self.name!r}: expected free to be a Free(mean, cov), got "
                 f"{type(self.free).__name__}"
             )
+
+    @property
+    def of_points(self) -> bool:
+        """Whether a landmark is a point (x, y), as some methods need."""
+        return len(self.landmark) == 2 and self.carry is None
+
+    def carried(self, frame: Float[Array, "3"], landmark: Float[Array, "L"]) -> Float[Array, "L"]:
+        """A landmark given in a frame, in the coordinates that the frame's pose is in."""
+        if self.carry is not None:
+            return self.carry(frame, landmark)
+        if len(self.landmark) < 2:
+            return landmark
+        turns = np.array([name.endswith("[rad]") for name in self.landmark[2:]], bool)
+        rest = jnp.where(turns, wrap(landmark[2:] + frame[2]), landmark[2:])
+        return jnp.concatenate([se2.from_frame(frame, landmark[:2]), rest])
 
 
 class Basis(NamedTuple):
@@ -187,9 +209,9 @@ class Here(NamedTuple):
     """estimate of the robot"""
     cov: Array
     """P in the chart: of the robot (3, 3), or for `observe` of robot and landmark (3+L, 3+L)"""
-    slot: Any = None
+    slot: PyTree = None
     """() of the landmark, for `observe`"""
-    landmark: Any = None
+    landmark: PyTree = None
     """(L,) its estimate, for `observe`"""
 
 
@@ -203,9 +225,9 @@ class Linearizer:
     """
 
     name: str
-    init: Callable[[Array, Array], Any]
+    init: Callable[[Array, Array], PyTree]
     """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
-    motion: Callable[[Motion, Array, Here], tuple[Array, Array, Array, Any]]
+    motion: Callable[[Motion, Array, Here], tuple[Array, Array, Array, PyTree]]
     """(motion, u, here) -> the new pose, its derivative by the old one (3, 3), the covariance that
     the noise adds to it (3, 3), memory."""
     observe: Callable[[Sensor, Here], tuple[Array, Array, Array, Array]]
@@ -214,7 +236,7 @@ class Linearizer:
     invert: Callable[[Sensor, Array, Array, Here], tuple[Array, Array, Array]]
     """(sensor, z, tag (), here) -> the new l, its derivative by the pose (L, 3), its covariance for
     a known pose (L, L)."""
-    born: Callable[[Joint, Array], Any]
+    born: Callable[[Joint, Array], PyTree]
     """(joint, born (N,) bool) -> memory, after new landmarks entered the map."""
     euclidean: bool = False
     """whether it is meant for the Euclidean chart and landmarks that are points (x, y) alone."""
@@ -287,9 +309,9 @@ class Life:
     """A rule that decides after each scan which landmarks stay in the map; see `pruning`."""
 
     name: str
-    init: Callable[[Array, Array], Any]
+    init: Callable[[Array, Array], PyTree]
     """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
-    after: Callable[[Joint, Info, Callable[[], Estimate]], tuple[Any, Array]]
+    after: Callable[[Joint, Info, Callable[[], Estimate]], tuple[PyTree, Array]]
     """(joint, info, estimate) -> memory, slots to remove (N,) bool; called after a scan, with its
     info. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
     make_room: Callable[[Joint, Array, Array], Array] | None = None
@@ -305,13 +327,13 @@ class Filter:
     name: str
     control_size: int
     measurement_size: int
-    init: Callable[[Array, Array], Any]
+    init: Callable[[Array, Array], PyTree]
     """(pose, pose_cov (3, 3)) -> S."""
-    predict: Callable[[Any, Array, Array], Any]
+    predict: Callable[[PyTree, Array, Array], PyTree]
     """(S, u, key) -> S."""
-    update: Callable[[Any, Scan, Array], tuple[Any, Info]]
+    update: Callable[[PyTree, Scan, Array], tuple[PyTree, Info]]
     """(S, scan, key) -> S, info."""
-    estimate: Callable[[Any], Estimate]
+    estimate: Callable[[PyTree], Estimate]
     """(S) -> moments in map coordinates."""
     chart: Chart
     places: tuple[int, ...] = ()

@@ -1,11 +1,11 @@
 """The driver of all filters: one `lax.scan` over a log."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
@@ -29,7 +29,7 @@ def run(
     pose_cov: ArrayLike,
     key: jax.Array,
     *,
-    probe: Callable[[Any], Any] | None = None,
+    probe: Callable[[PyTree], PyTree] | None = None,
 ) -> Trace:
     """Run a filter over a log: at each row, predict with the control, then update with the scan.
 
@@ -85,7 +85,7 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
 
 def _drive(
     filter: Filter,
-    probe: Callable[[Any], Any] | None,
+    probe: Callable[[PyTree], PyTree] | None,
     log: Log,
     pose: jax.Array,
     pose_cov: jax.Array,
@@ -100,7 +100,7 @@ def _drive(
     name, most = f"run: {filter.name}", largest(log.control)
     keys = jax.random.split(key, (log.control.shape[0], 2))
 
-    def step(state: Any, row: tuple[Log, jax.Array]) -> tuple[Any, Any]:
+    def step(state: PyTree, row: tuple[Log, jax.Array]) -> tuple[PyTree, PyTree]:
         (control, scan), (key_predict, key_update) = row
         state = same_state(f"{name}: predict", state, filter.predict(state, control, key_predict))
         # Under jit values are not checked before, and a NaN would spread through the whole state.

@@ -5,12 +5,12 @@ So the covariance is positive definite if its alive part is, and every product w
 rows is zero: padding has no effect, and the filter's equations need no mask.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.math.linalg import cholesky, matmul, symmetrize, total, triangular_root
 from jaxslam.math.xla import materialize
@@ -27,13 +27,13 @@ class Joint(NamedTuple):
     alive: Bool[Array, "N"]
     tag: Int[Array, "N"]
     """-1 where dead"""
-    lin: Any
+    lin: PyTree
     """the linearizer's memory"""
-    last: Any = None
+    last: PyTree = None
     """the `Last` motion, in a chart with `motion_apart`"""
-    life: Any = None
+    life: PyTree = None
     """the memory of a `Life`, of a filter that is pruned"""
-    reduced: Any = None
+    reduced: PyTree = None
     """(N,) bool: the slot holds a point (x, y), and padding in the rest of its L coordinates; of
     a sensor whose landmarks may become points"""
     co_observed: jax.Array | None = None
@@ -56,7 +56,7 @@ def empty(
     pose_cov: Float[Array, "3 3"],
     capacity: int,
     landmark_size: int,
-    lin: Any = (),
+    lin: PyTree = (),
     *,
     square_root: bool = False,
     motion_apart: bool = False,

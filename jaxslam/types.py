@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import records, streams
@@ -80,12 +80,12 @@ class Log(NamedTuple):
     @classmethod
     def from_rows(cls, rows: streams.Rows) -> "Log":
         """The log of aligned rows; arrays are NumPy's."""
-        held: Any = rows  # the fields are declared as JAX arrays
+        held: PyTree = rows  # the fields are declared as JAX arrays
         return cls(held.control, Scan(held.z, held.tag, held.valid))
 
     @classmethod
     def from_records(
-        cls, odometry: Any, measurements: Any, motion: Any, sensor: Any
+        cls, odometry: PyTree, measurements: PyTree, motion: PyTree, sensor: PyTree
     ) -> "Recording":
         """The log of lines of odometry and measurements, each with times of its own.
 
@@ -125,7 +125,7 @@ class Recording(NamedTuple):
     """The result of `Log.from_records`."""
 
     log: Log
-    time: Any
+    time: PyTree
     """(T,) the time of each row"""
     tags: tuple[int | str, ...]
     """the names of the landmarks with tags 0, 1, …, N-1, sorted"""
@@ -204,9 +204,9 @@ class Trace(NamedTuple):
     """with leading T, after each update."""
     info: Info
     """with leading T."""
-    final: Any
+    final: PyTree
     """the filter's own state at the end."""
-    probe: Any
+    probe: PyTree
     """results of the caller's probe after each update, leading T; None without one."""
 
 

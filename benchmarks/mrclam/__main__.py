@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
 from benchmarks.gate import Metric, alone
 from benchmarks.mrclam import fit as fitting
 from benchmarks.real_data import DATA
-from jaxslam import datasets, se2
+from jaxslam import datasets, metrics
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.filters import ekf_slam, team_slam
 from jaxslam.math.stats import sigma_gate
@@ -71,12 +70,10 @@ def scored(time, true, known, pose, cov):
     true, pose, cov, time = true[known], pose[known], cov[known], time[known]
     error = pose_error(true, pose)
     nees, regular = block_nees(pose, error, error, cov)["pose"]
-    frame = se2.align(jnp.asarray(pose[:, :2]), jnp.asarray(true[:, :2]))
-    onto = jax.vmap(se2.from_frame, (None, 0))(frame, jnp.asarray(pose[:, :2]))
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     ate, aligned = (
-        float(np.sqrt((gap**2).sum(axis=1).mean()))
-        for gap in (error[:, :2], np.asarray(onto) - true[:, :2])
+        metrics.statistics(metrics.ate(true, pose, align=align).translation).rmse
+        for align in (False, True)
     )
     kept = (each[regular] for each in (time, error, sigma, nees))
     return Scored(*map(np.asarray, kept), ate, aligned)

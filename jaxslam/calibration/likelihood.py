@@ -1,12 +1,12 @@
 """Noises fitted to a log by maximum likelihood, with the likelihood that a filter computes."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
@@ -74,7 +74,7 @@ class _Point(NamedTuple):
 def fit_noise(
     info: Callable[..., Info],
     start: ArrayLike,
-    *data: Any,
+    *data: PyTree,
     names: Sequence[str] | None = None,
     deviation: Sequence[bool] | None = None,
     guess: ArrayLike | None = None,
@@ -192,7 +192,7 @@ def as_associated(log: Log, info: Info) -> Log:
     """
     status = np.asarray(info.status)
     used = (status == Status.FUSED) | (status == Status.BORN)
-    held: Any = np.where(used, np.asarray(info.slot), -1).astype(np.int32)
+    held: PyTree = np.where(used, np.asarray(info.slot), -1).astype(np.int32)
     return log._replace(scan=log.scan._replace(tag=held, valid=used))
 
 
@@ -200,11 +200,11 @@ def _evaluate(
     info: Callable[..., Info],
     q: Float[Array, "P"],
     logged: Bool[Array, "P"],
-    data: tuple[Any, ...],
+    data: tuple[PyTree, ...],
 ) -> tuple[Array, ...]:
     """log L, its gradient, Σ g gᵀ over the rows, NIS and dof."""
 
-    def rows(q: Float[Array, "P"]) -> Any:
+    def rows(q: Float[Array, "P"]) -> PyTree:
         found = info(jnp.where(logged, jnp.exp(jnp.where(logged, q, 0.0)), q), *data)
         fused = found.status == Status.FUSED
         nis = jnp.where(fused, found.nis, 0.0).sum()

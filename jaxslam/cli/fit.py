@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from jaxslam.cli.runtime import cache
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
 from jaxslam.datasets.table.settings_text import changed, fragment
 from jaxslam.records import POSE
-from jaxslam.results.files import check_writable, json_text, versions, write_files
+from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -82,7 +81,7 @@ def _settings(
     return changes, comments
 
 
-def _summary(data: Dataset, result: DatasetFit) -> dict[str, Any]:
+def _summary(data: Dataset, result: DatasetFit) -> Json:
     """What `fit.json` says; what is infinite is null."""
     found = result.found
     rows = zip(

@@ -1,6 +1,5 @@
 """Is a filter honest? Scores of runs, their averages with bands and intervals, and a verdict."""
 
-from jaxslam.consistency.alignment import align_map
 from jaxslam.consistency.bound import (
     RunJacobians,
     conditional_bound,
@@ -43,7 +42,6 @@ __all__ = [
     "Summary",
     "Tally",
     "Verdict",
-    "align_map",
     "condense",
     "conditional_bound",
     "covering_level",

@@ -10,11 +10,11 @@ anywhere here. While P is singular (a start with P0 = 0, or a deviation that is 
 (Bar-Shalom, Li, Kirubarajan 2001, 5.4; Bailey et al. 2006.)
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.consistency.nees import DOF, Nees, block_nees, pose_error
 from jaxslam.consistency.statistics import Statistics
@@ -106,7 +106,7 @@ def score(
         "nis": np.where(fused, info.nis, 0.0).sum(axis=2, dtype=np.float64),
         "nis_dof": np.asarray(info.dof).sum(axis=2, dtype=np.float64),
     }
-    measures: dict[str, tuple[Any, Any]] = dict(found.associations)
+    measures: dict[str, tuple[PyTree, PyTree]] = dict(found.associations)
     sums: dict[str, np.ndarray] = {}
     monitor = monitor_of(trace.final)
     if monitor is not None:
@@ -189,7 +189,7 @@ def _covered(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
     return out
 
 
-def monitor_of(state: Any) -> Monitor | None:
+def monitor_of(state: PyTree) -> Monitor | None:
     """The observability monitor in the state of a `monitored` filter; None in another state."""
     return state.monitor if isinstance(state, Monitored) else None
 

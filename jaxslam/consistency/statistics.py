@@ -3,11 +3,11 @@
 Compiled and called by `monte_carlo.programs`; `score` takes what it returns.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.consistency.associations import associations, identities
 from jaxslam.math import linalg
@@ -61,7 +61,7 @@ def statistics(trace: Trace, truth: Truth, sensor: Sensor) -> Statistics:
     size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
     dtype = estimate.pose.dtype
 
-    def step(sums: _Sums, row: tuple[Estimate, Info, Array]) -> tuple[_Sums, Any]:
+    def step(sums: _Sums, row: tuple[Estimate, Info, Array]) -> tuple[_Sums, PyTree]:
         estimate, info, held = row
         off = points[jnp.maximum(held, 0)] - estimate.points
         nees, regular = _planar_nees(off, estimate.point_covs)
@@ -108,7 +108,7 @@ def statistics(trace: Trace, truth: Truth, sensor: Sensor) -> Statistics:
     )
 
 
-def _numbers(tree: Any) -> Float[Array, "K"]:
+def _numbers(tree: PyTree) -> Float[Array, "K"]:
     """Every floating-point number of a tree, in one row."""
     leaves = map(jnp.asarray, jax.tree.leaves(tree))
     return jnp.concatenate(
@@ -152,7 +152,7 @@ def _white(estimate: Estimate, info: Info) -> list[Array]:
         return rows
     slot = jnp.where(fused, info.slot, -1)
 
-    def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[Any, None]:
+    def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[PyTree, None]:
         row, slot = at
         mine = jnp.arange(count) == slot
         return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None

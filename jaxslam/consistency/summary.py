@@ -5,9 +5,9 @@ Called by `monte_carlo.campaign` on the tally of each filter; reports and plots 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.intervals import LEVEL, Measure, interval, positive_interval
@@ -184,7 +184,7 @@ def _as_reported(name: str, measure: Measure) -> dict[str, Measure]:
     return {name: Measure(*(unit * float(np.sqrt(value)) for value in measure))}
 
 
-def _ratio(total: Any, count: np.ndarray) -> np.ndarray:
+def _ratio(total: PyTree, count: np.ndarray) -> np.ndarray:
     safe = np.where(count > 0, count, 1.0)
     return np.where(count > 0, np.asarray(total, np.float64) / safe, np.nan)
 

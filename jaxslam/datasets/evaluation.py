@@ -2,17 +2,13 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.consistency import align_map
+from jaxslam import metrics
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.map_test import MapTest, judge_map
-from jaxslam.math import se2
-from jaxslam.streams import relative
 from jaxslam.types import Estimate
 
 SPAN = 1.0
@@ -55,17 +51,22 @@ def evaluate(
     errors: dict[str, float] = {}
     after = "" if data.one_frame else " after alignment"
     true = points = test = None
-    if data.true_path is not None:
-        known = np.ones(data.steps, bool) if data.true_at is None else data.true_at
+    known = np.ones(data.steps, bool) if data.true_at is None else np.asarray(data.true_at)
+    if data.true_path is not None and known.any():
         pose, cov = np.asarray(path.pose)[known], np.asarray(path.pose_cov)[known]
-        true = np.asarray(data.true_path, pose.dtype)[known]
-        if not data.one_frame:
-            frame = se2.align(jnp.asarray(true[:, :2]), jnp.asarray(pose[:, :2]))
-            true = np.asarray(jax.vmap(se2.compose, (None, 0))(frame, jnp.asarray(true)))
+        true = np.asarray(data.true_path)[known]
+    if true is not None and not np.isfinite(pose).all():  # the filter failed
+        errors |= {f"ATE{after} [m]": np.nan, f"heading RMSE{after} [deg]": np.nan}
+    elif true is not None:
+        of_path = metrics.ate(pose, true, align=not data.one_frame)
+        true = metrics.carried(of_path.frame, true)
+        errors[f"ATE{after} [m]"] = metrics.statistics(of_path.translation).rmse
+        turn = np.rad2deg(of_path.rotation)
+        errors[f"heading RMSE{after} [deg]"] = metrics.statistics(turn).rmse
+        of_steps = metrics.rpe(true, pose, seconds=SPAN, time=np.asarray(data.time)[known])
+        if len(of_steps.translation):
+            errors[f"RPE over {SPAN:g} s [m]"] = metrics.statistics(of_steps.translation).rmse
         error = pose_error(true, pose)
-        errors[f"ATE{after} [m]"] = _rms(np.hypot(error[:, 0], error[:, 1]))
-        errors[f"heading RMSE{after} [deg]"] = float(np.rad2deg(_rms(error[:, 2])))
-        errors |= _relative_error(np.asarray(data.time)[known], true, pose)
         nees, regular = block_nees(pose, error, error, cov)["pose"]
         if data.one_frame and regular.any():
             errors["pose NEES, mean (3 is honest)"] = float(nees[regular].mean())
@@ -74,16 +75,19 @@ def evaluate(
     if data.landmarks is not None and named.any():
         points = np.asarray(data.landmarks, np.asarray(last.points).dtype)
         tag, found = np.asarray(last.tag)[named], np.asarray(last.points)[named]
-        if data.one_frame:
-            rmse = _rms(np.linalg.norm(found - points[tag], axis=1))
+        if not np.isfinite(found).all():
+            rmse = np.nan
+        elif data.one_frame:
+            rmse = metrics.statistics(np.linalg.norm(found - points[tag], axis=1)).rmse
         else:
-            survey, rmse = align_map(last, data.landmarks)
-            into_map = jax.vmap(se2.to_frame, (None, 0))
-            points = np.asarray(into_map(jnp.asarray(survey), jnp.asarray(points)))
+            rmse = metrics.align_map(last, data.landmarks)[1]
+            frame = metrics.alignment(points[tag], found)
+            points = metrics.carried(frame, points)
         errors[f"map RMSE{after} [m]"] = rmse
         gap = (points[tag] - found)[:, :, None]
         covs = np.asarray(last.point_covs)[named].astype(np.float64)
-        regular = np.linalg.eigvalsh(covs)[:, 0] > 0
+        finite = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(found).all(axis=1)
+        regular = finite & (np.linalg.eigvalsh(np.where(finite[:, None, None], covs, 0))[:, 0] > 0)
         if regular.all():
             survey, among = np.asarray(data.landmarks)[tag], np.flatnonzero(named)
             joint = None if map_cov is None else map_cov[among][:, :, among]
@@ -94,21 +98,3 @@ def evaluate(
             honest = "(2 is honest)" if data.one_frame else "(honest: below 2)"
             errors[f"landmark NEES{after} {honest}"] = float(square.mean())
     return Evaluation(errors, points, true, test)
-
-
-def _relative_error(
-    time: Float[np.ndarray, "K"], true: Float[np.ndarray, "K 3"], pose: Float[np.ndarray, "K 3"]
-) -> dict[str, float]:
-    """RMSE of the translation over `SPAN`, in the frame of its first pose; empty if shorter."""
-    after = np.searchsorted(time, time + SPAN - 1e-6)  # times since 1970 have 2e-7 s
-    start = np.flatnonzero(after < len(time))
-    if not start.size:
-        return {}
-    ends = after[start]
-    steps = [relative(path[start], path[ends])[:, :2] for path in (true, pose)]
-    gap = np.linalg.norm(steps[1] - steps[0], axis=1)
-    return {f"RPE over {SPAN:g} s [m]": _rms(gap)}
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

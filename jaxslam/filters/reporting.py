@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from jaxslam.types import Info, Scan, Status
 
@@ -172,7 +173,7 @@ def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
     return (same & earlier).any(axis=1)
 
 
-def with_extra(info: Info, name: str, record: Any) -> Info:
+def with_extra(info: Info, name: str, record: PyTree) -> Info:
     """The `Info` with a named record of one filter family or wrapper."""
     return info._replace(extra={**(info.extra or {}), name: record})
 

@@ -4,11 +4,11 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam import sensors
 from jaxslam.math import se2
@@ -113,7 +113,7 @@ def from_sensor(sensor: Sensor) -> Factor:
     absolute = not sensor.landmark
 
     def residual(variables: tuple[Array, ...], z: Array) -> Array:
-        landmark: Any = variables[1] if not absolute else z[:0]
+        landmark: PyTree = variables[1] if not absolute else z[:0]
         return sensor.residual(z, sensor.observe(variables[0], landmark))
 
     def predict(pose: Array, z: Array) -> Array:

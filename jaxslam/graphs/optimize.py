@@ -2,12 +2,12 @@
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
@@ -98,11 +98,11 @@ def _solver(model: Model, method: str) -> Callable[..., Solution]:
     solve = over_batch("graphs.optimize", functools.partial(search, model, method))
 
     @jax.custom_jvp
-    def solved(graph: Graph, *shared: Any) -> Solution:
+    def solved(graph: Graph, *shared: PyTree) -> Solution:
         return solve(shared, graph)
 
     @solved.defjvp
-    def slope(primals: Any, tangents: Any) -> tuple[Solution, Any]:
+    def slope(primals: PyTree, tangents: PyTree) -> tuple[Solution, PyTree]:
         graph, plan, *_ = primals
         found = solved(*primals)
         return found, jax.jvp(

@@ -1,4 +1,4 @@
-"""Occupancy grids: maps and their files, distances, rays, beam models, mapping, localization."""
+"""Occupancy grids: maps, files, distances, rays, beam models, mapping, localization, SLAM."""
 
 from jaxslam.grids.beam_models import (
     BeamModel,
@@ -16,6 +16,7 @@ from jaxslam.grids.interpolation import interpolate
 from jaxslam.grids.localization import Clusters, beam_log, clusters, localize
 from jaxslam.grids.mapping import Counts, count, entropy, occupancy, reflection
 from jaxslam.grids.resampling import correlation, crop, resample
+from jaxslam.grids.slam import GridParticles, best_map, grid_slam
 
 __all__ = [
     "BeamModel",
@@ -23,9 +24,11 @@ __all__ = [
     "Counts",
     "Field",
     "Grid",
+    "GridParticles",
     "Mixture",
     "RayMap",
     "beam_log",
+    "best_map",
     "cast",
     "centers",
     "check_grid",
@@ -37,6 +40,7 @@ __all__ = [
     "entropy",
     "fit",
     "gradient",
+    "grid_slam",
     "interpolate",
     "likelihood_field",
     "localize",

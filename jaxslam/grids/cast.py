@@ -1,13 +1,13 @@
 """Ranges to the nearest obstacle of a grid along rays."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam import programs
 from jaxslam.grids.distance import squared_distances
@@ -52,7 +52,7 @@ def ray_map(grid: Grid, *, method: str = "surface", skip: bool = True) -> RayMap
     return programs.call(_ray_map, (_SQUARES[method], skip), grid)
 
 
-def _ray_map(squares: Any, skip: bool, grid: Grid) -> RayMap:
+def _ray_map(squares: PyTree, skip: bool, grid: Grid) -> RayMap:
     solid = jnp.where(grid.known, grid.probability, 0.0) - 0.5
     stops = squares(solid)
     if skip:
@@ -136,7 +136,7 @@ def cast(
     return programs.call(_cast, (), grid, pose, angles, max_range)
 
 
-def _check_rays(pose: Any, angles: Any, max_range: ArrayLike) -> None:
+def _check_rays(pose: Array, angles: Array, max_range: ArrayLike) -> None:
     if pose.ndim < 1 or pose.shape[-1] != 3:
         raise ValueError(f"cast: expected poses (x, y, θ), got shape {shape_told(pose)}")
     if angles.ndim != 1 or angles.size == 0:
@@ -149,7 +149,7 @@ def _check_rays(pose: Any, angles: Any, max_range: ArrayLike) -> None:
         raise ValueError(f"cast: expected one max_range above 0, got {max_range!r}")
 
 
-def _check_on_map(grid: RayMap, pose: Any) -> None:
+def _check_on_map(grid: RayMap, pose: Array) -> None:
     """Raise ValueError on a pose that is not finite or off the map; nothing within a trace."""
     if not is_concrete(grid, pose):
         return
@@ -192,7 +192,7 @@ def _lengths(
 
 
 @_lengths.defjvp
-def _derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
+def _derivative(primals: PyTree, tangents: PyTree) -> tuple[Array, Array]:
     """-n·(dt + r de)/(n·e), of rays that hit something."""
     grid, start, direction, _ = primals
     length, hit = _hits(*primals)
@@ -206,7 +206,7 @@ def _derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return length, jnp.where(hit, -rate * (normal * moved).sum(axis=-1), tangents[3])
 
 
-def _hits(grid: RayMap, start: Array, direction: Array, limit: Array) -> Any:
+def _hits(grid: RayMap, start: Array, direction: Array, limit: Array) -> PyTree:
     """The lengths, and whether something is hit."""
     if grid.ahead.shape[0] == grid.solid.shape[0] + 2:  # its squares are cells
         return march(grid.ahead, None, start, direction, limit)

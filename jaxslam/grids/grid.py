@@ -5,7 +5,7 @@ of the grid, whose pose in the world is `origin`: row 0 is at the bottom. Contin
 (x, y) in cells, as `to_cells` has them, are (0.5, 0.5) at the centre of cell (0, 0).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +69,7 @@ def centers(grid: Grid | Field) -> Float[Array, "H W 2"]:
     return jnp.einsum("ab,hwb->hwa", turn, local) + grid.origin[None, None, :2]
 
 
-def check_grid(name: str, grid: Any) -> None:
+def check_grid(name: str, grid: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless the grid is one.
 
     Refused are log-odds that are no finite table of at least one cell, an origin that is no pose,

@@ -1,10 +1,8 @@
 """Rays through a table of squares: every square that a ray crosses, or long steps where it may."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 STOP, OFF = -1.0, -2.0
 """Squares in which a ray may end, and squares off the map."""
@@ -33,7 +31,7 @@ def march(
 
 
 @march.def_vmap
-def _over_batch(size: int, batched: Any, *arguments: Any) -> tuple[Any, Any]:
+def _over_batch(size: int, batched: PyTree, *arguments: PyTree) -> tuple[PyTree, PyTree]:
     ahead, corners, *rays, limit = arguments
     on_rays = batched[2:4]
     if any(jax.tree.leaves((batched[:2], batched[4]))):  # maps vary

@@ -8,10 +8,10 @@ CPU the calls run in a loop, one matrix each.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 
 def _one_by_one_on_cpu(library: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
@@ -19,7 +19,7 @@ def _one_by_one_on_cpu(library: Callable[..., jax.Array]) -> Callable[..., jax.A
     either = jax.custom_batching.custom_vmap(library)
 
     @either.def_vmap
-    def rule(size: int, batched: Any, *arguments: jax.Array) -> tuple[jax.Array, bool]:
+    def rule(size: int, batched: PyTree, *arguments: jax.Array) -> tuple[jax.Array, bool]:
         axes = tuple(0 if one else None for one in batched)
 
         def loop(*arguments: jax.Array) -> jax.Array:
@@ -45,10 +45,10 @@ _solve = _one_by_one_on_cpu(partial(jax.scipy.linalg.solve_triangular, lower=Tru
 def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
     """L⁻¹ B of a regular lower L (n, n) and B (n, k)."""
 
-    def solve(_: Any, b: jax.Array) -> jax.Array:
+    def solve(_: PyTree, b: jax.Array) -> jax.Array:
         return _solve(factor, b)
 
-    def solve_transposed(_: Any, b: jax.Array) -> jax.Array:
+    def solve_transposed(_: PyTree, b: jax.Array) -> jax.Array:
         return _solve(factor[::-1, ::-1].T, b[::-1])[::-1]
 
     lower = jnp.tril(factor)
@@ -66,7 +66,7 @@ def inverse(matrix: jax.Array) -> jax.Array:
 
 
 @inverse.defjvp
-def _inverse_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+def _inverse_slope(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Array]:
     out = inverse(*primals)
     return out, -out @ tangents[0] @ out
 

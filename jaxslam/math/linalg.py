@@ -8,13 +8,13 @@ behind NaN; hence the unrolled factor below, which reports it and stays finite.
 import functools
 import operator
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, PyTree
 
 from jaxslam.math import batched_linalg
 
@@ -67,7 +67,7 @@ def square(a: Float[Array, "k D"]) -> Float[Array, "D D"]:
 
 
 @square.defjvp
-def _square_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+def _square_slope(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Array]:
     half = gram(tangents[0], primals[0])
     return square(*primals), half + half.T
 
@@ -120,7 +120,7 @@ def _cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Ar
 
 
 @_cholesky.defjvp
-def _cholesky_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _cholesky_slope(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     """dL = L Φ(L⁻¹ dA L⁻ᵀ); the column of a zero pivot stays zero, with 1 used in its place."""
     factor, positive = _cholesky(*primals)
     good = jnp.diagonal(factor) > 0
@@ -156,7 +156,7 @@ def _factor(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 @_factor.defjvp
-def _factor_slope(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+def _factor_slope(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Array]:
     """dL = L Φ(L⁻¹ dA L⁻ᵀ), where Φ keeps the lower triangle and half of the diagonal."""
     factor = _factor(*primals)
     regular = factor[0, 0] > 0
@@ -273,7 +273,7 @@ def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
 
 
 @whitener.defjvp
-def _whitener_slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _whitener_slope(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     """dW = -Φ(W dA Wᵀ) W, with rows and columns of zeros where a pivot is zero."""
     white, positive = whitener(*primals)
     slope = -_lower_half(white @ _mirrored(tangents[0]) @ white.T) @ white
@@ -293,7 +293,7 @@ def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
         return solve_lower(factor, jnp.eye(n, dtype=matrix.dtype)), positive
     every = jnp.arange(n)
 
-    def row(carry: Any, j: jax.Array) -> tuple[Any, Any]:
+    def row(carry: PyTree, j: jax.Array) -> tuple[PyTree, PyTree]:
         rest, ahead = carry
         pivot = rest[j, j]
         good = pivot > tolerance * jnp.abs(matrix[j, j])

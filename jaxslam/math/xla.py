@@ -7,12 +7,13 @@ from typing import Any, TypeVar, cast
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import PyTree
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
 
 
-def no_inline(function: Callable[..., _T], *arguments: Any) -> _T:
+def no_inline(function: Callable[..., _T], *arguments: PyTree) -> _T:
     """function(*arguments), compiled as a separate computation that XLA does not inline.
 
     XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
@@ -22,7 +23,7 @@ def no_inline(function: Callable[..., _T], *arguments: Any) -> _T:
     """
 
     @functools.wraps(function)
-    def whole(*arguments: Any) -> _T:
+    def whole(*arguments: PyTree) -> _T:
         with set_xla_metadata(inlineable="true"):  # functions that it calls
             return function(*arguments)
 
@@ -89,7 +90,7 @@ def anywhere(flag: jax.Array) -> jax.Array:
 
 
 @anywhere.def_vmap
-def _over_batch(_: int, batched: Any, flag: jax.Array) -> tuple[jax.Array, bool]:
+def _over_batch(_: int, batched: PyTree, flag: jax.Array) -> tuple[jax.Array, bool]:
     return anywhere(flag.any(axis=0)), False
 
 

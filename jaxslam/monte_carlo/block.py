@@ -3,10 +3,10 @@
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam.consistency import Measure, Score, condense, mean_pose_nees, positive_interval, score
 from jaxslam.consistency.tally import condensed_sums
@@ -20,7 +20,7 @@ BOUND = "bound"
 """Under this name a block keeps the sums of the conditional bound, and the divergence limit."""
 
 
-Glimpse = Callable[[str, int, Measure | None], Any]
+Glimpse = Callable[[str, int, Measure | None], PyTree]
 """(filter, runs, their mean pose NEES)."""
 
 
@@ -134,14 +134,14 @@ class BlockRunner:
 
 def _on_host(results: FilterResults) -> Trace:
     """What `score` looks at itself, on the host, by run first; the rest is None."""
-    absent: Any = None
+    absent: PyTree = None
     estimate, info = results.estimate, results.info
     by_time = (
         Estimate(estimate.pose, estimate.pose_cov, *[absent] * 4),
         info._replace(innovation=absent, innovation_cov=absent, slot=absent),
         results.information,
     )
-    found: tuple[Estimate, Info, Any] = jax.tree.map(
+    found: tuple[Estimate, Info, PyTree] = jax.tree.map(
         lambda leaf: np.swapaxes(leaf, 0, 1), jax.device_get(by_time)
     )
     final: Monitored | None = None

@@ -156,12 +156,12 @@ class Blockwise:
         self,
         label: str,
         lowered: jax.stages.Lowered,
-        numbers: list[Any],
+        numbers: list[PyTree],
         shapes: PyTree,
         straight: bool,
     ) -> Program:
         options = (quick_options if straight else hot_options)(self._devices[0].platform)
-        compiled: Any = cache.compiled(lowered, self._devices, options)
+        compiled: PyTree = cache.compiled(lowered, self._devices, options)
         arrays = [x for x in numbers if isinstance(x, jax.Array)]
         keys = any(jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in arrays)
         if self._library is not None and not keys:
@@ -189,7 +189,7 @@ class Blockwise:
         jax.monitoring.record_event_duration_secs(RESTORED, time.perf_counter() - began)
         return Made(program, saved.shapes)
 
-    def _with(self, compiled: Program, numbers: list[Any], out: PyTree) -> Program:
+    def _with(self, compiled: Program, numbers: list[PyTree], out: PyTree) -> Program:
         """The program with its numbers, which are put on every device once."""
         there = jax.device_put(numbers, NamedSharding(self._mesh, PartitionSpec()))
 
@@ -220,7 +220,7 @@ def _resized(tree: PyTree, runs: int, axes: Axes) -> PyTree:
     """The shapes of the arrays of a tree, with so many runs."""
     leaves, structure = jax.tree.flatten(tree)
 
-    def resized(leaf: Any, axis: int | None) -> jax.ShapeDtypeStruct:
+    def resized(leaf: PyTree, axis: int | None) -> jax.ShapeDtypeStruct:
         shape = leaf.shape
         if axis is not None:
             shape = (*shape[:axis], runs, *shape[axis + 1 :])

@@ -194,7 +194,7 @@ def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tupl
     if not isinstance(method, Filter):
         return method, euclidean()
 
-    def gained(state: Any) -> jax.Array | None:
+    def gained(state: PyTree) -> jax.Array | None:
         monitor = monitor_of(state)
         return None if monitor is None else monitor.information
 

@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax._src import config as jax_config
 from jax._src import core as jax_core
+from jaxtyping import PyTree
 
 from jaxslam.math.xla import hot_options
 from jaxslam.programs.hoisting import hoisted
@@ -51,7 +52,7 @@ class Kept:
         _ALL.add(self)
         self._room = room
         self._lock = threading.Lock()
-        self._found: OrderedDict[Hashable, Future[Any]] = OrderedDict()
+        self._found: OrderedDict[Hashable, Future[PyTree]] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], _T]) -> _T:
         """The cached result for the key, or that of `make()`; errors are not cached."""
@@ -101,7 +102,7 @@ def clear() -> None:
 class Same:
     """An object as a key, compared by identity and kept alive."""
 
-    def __init__(self, what: Any) -> None:
+    def __init__(self, what: PyTree) -> None:
         self._what = what
 
     def __hash__(self) -> int:
@@ -111,7 +112,7 @@ class Same:
         return isinstance(other, Same) and self._what is other._what
 
 
-def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any) -> _T:
+def call(function: Callable[..., _T], objects: tuple[PyTree, ...], *arguments: PyTree) -> _T:
     """function(*objects, *arguments), computed by a program that is compiled once a structure.
 
     Within a trace, or where JIT is disabled, the plain call.
@@ -136,7 +137,7 @@ def call(function: Callable[..., _T], objects: tuple[Any, ...], *arguments: Any)
     return cast(_T, jax.tree.unflatten(out, run(numbers, *leaves)))
 
 
-def on_device(number: Any) -> jax.Array:
+def on_device(number: PyTree) -> jax.Array:
     """The number or array as `jnp.asarray` has it, which compiles a program for each shape of an
     array of NumPy (jax 0.12). It is a copy: `device_put` may share the memory of its argument.
     """
@@ -145,7 +146,7 @@ def on_device(number: Any) -> jax.Array:
     return jnp.asarray(number)
 
 
-def outside(*values: Any) -> bool:
+def outside(*values: PyTree) -> bool:
     """Whether no trace is active and no leaf is a tracer."""
     return jax_core.trace_state_clean() and not any(
         isinstance(leaf, jax_core.Tracer) for leaf in jax.tree.leaves(values)
@@ -161,9 +162,9 @@ class Shape(NamedTuple):
     """The shape and type of one array that a program is compiled for."""
 
     shape: tuple[int, ...]
-    dtype: Any
+    dtype: PyTree
     weak_type: bool
-    sharding: Any
+    sharding: PyTree
     """where it is committed to devices, else None"""
 
 
@@ -174,8 +175,8 @@ def _shape_of(leaf: jax.Array) -> Shape:
 
 
 def _program(
-    function: Callable[..., Any], tree: Any, shapes: Sequence[Shape]
-) -> tuple[Any, list[Any] | None, Any]:
+    function: Callable[..., Any], tree: PyTree, shapes: Sequence[Shape]
+) -> tuple[PyTree, list[PyTree] | None, PyTree]:
     structs = [
         jax.ShapeDtypeStruct(s.shape, s.dtype, weak_type=s.weak_type, sharding=s.sharding)
         for s in shapes
@@ -193,24 +194,24 @@ def _program(
 class Traced(NamedTuple):
     """A traced function whose constants are inputs."""
 
-    call: Callable[..., list[Any]]
+    call: Callable[..., list[PyTree]]
     """(numbers, *leaves of the arguments) -> leaves of the result"""
-    numbers: list[Any]
-    out: Any
+    numbers: list[PyTree]
+    out: PyTree
     """the tree of the result"""
-    shapes: Any
+    shapes: PyTree
     """the result as `jax.ShapeDtypeStruct`s"""
 
 
-def trace(function: Callable[..., Any], *arguments: Any) -> Traced | None:
+def trace(function: Callable[..., Any], *arguments: PyTree) -> Traced | None:
     """The function with every number it closes over as an argument; None if one is a tracer."""
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     flat, numbers = hoisted(closed)
     if any(isinstance(number, jax_core.Tracer) for number in numbers):
         return None
 
-    def program(numbers: list[Any], *leaves: Any) -> list[Any]:
-        return cast(list[Any], flat(*numbers, *leaves))
+    def program(numbers: list[PyTree], *leaves: PyTree) -> list[PyTree]:
+        return cast(list[PyTree], flat(*numbers, *leaves))
 
     return Traced(program, numbers, jax.tree.structure(shapes), shapes)
 

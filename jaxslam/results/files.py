@@ -10,6 +10,10 @@ import tempfile
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, TypeAlias
+
+Json: TypeAlias = dict[str, Any]
+"""What JSON can hold, by name."""
 
 
 def json_text(content: Mapping[str, object]) -> str:

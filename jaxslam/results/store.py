@@ -14,7 +14,6 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from jaxslam.results.block_file import (
     write_atomically,
     write_block,
 )
+from jaxslam.results.files import Json
 
 __all__ = [
     "FORMAT",
@@ -61,7 +61,7 @@ class Store:
     """
 
     folder: Path
-    settings: dict[str, Any]
+    settings: Json
     runs: int | None = None
     """number of runs that the campaign is to have, if known; it may be extended"""
     campaign: dict[str, str] = field(default_factory=dict)
@@ -246,7 +246,7 @@ def resume(
     return replace(kept, runs=runs)
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> Json:
     """The content of the manifest of a campaign's folder, in any format.
 
     Raises ValueError if there is none, or if the file is no manifest.
@@ -289,9 +289,9 @@ def _write_manifest(
     write_atomically(folder / MANIFEST, text.encode(), new)
 
 
-def _as_stored(settings: Mapping[str, object]) -> dict[str, Any]:
+def _as_stored(settings: Mapping[str, object]) -> Json:
     """Settings as the manifest returns them: tuples become lists, keys strings."""
-    plain: dict[str, Any] = json.loads(json.dumps(dict(settings), allow_nan=False))
+    plain: Json = json.loads(json.dumps(dict(settings), allow_nan=False))
     return plain
 
 
@@ -300,7 +300,7 @@ def _digest(settings: Mapping[str, object]) -> str:
     return hashlib.sha256(canonical_json(settings).encode()).hexdigest()
 
 
-def _differences(there: Mapping[str, Any], here: Mapping[str, Any], above: str = "") -> list[str]:
+def _differences(there: Json, here: Json, above: str = "") -> list[str]:
     """A sentence for each setting that differs, in nested settings, too."""
     found = []
     for key in {**there, **here}:

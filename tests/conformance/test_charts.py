@@ -1,15 +1,19 @@
-"""What every chart owes: run over `charts.REGISTRY`, so a new chart inherits it all."""
+"""What every chart owes: run over `charts.REGISTRY`, so a new chart inherits it all.
+
+That `retract` and `local` undo each other whatever the numbers is a law of test_properties, too.
+"""
 
 from types import SimpleNamespace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from owed import DTYPES, of_rows
+from reference.plane import assert_same_poses, turn
 
 from jaxslam.charts import REGISTRY
-
-DTYPES = [np.float32, np.float64]
 
 
 @pytest.fixture(scope="module", params=REGISTRY)
@@ -26,46 +30,38 @@ def made(request, hard_angles):
     landmark, dl = rng.normal(size=(n, 2)) * 4, rng.normal(size=(n, 2))
     dx[0], dl[0] = 0, 0
 
-    def everything(pose, landmark, dx, dl):
-        moved = chart.retract(pose, landmark, dx, dl)
-        return {
-            "moved": moved,
-            "back": chart.local(pose, landmark, *moved),
-            "slopes": jax.jacfwd(chart.retract, argnums=(0, 1, 2, 3))(pose, landmark, dx, dl),
-            "reverse": jax.grad(total, argnums=(0, 1, 2, 3))(pose, landmark, dx, dl),
-            "basis": () if chart.basis is None else tuple(chart.basis(pose, landmark)),
-        }
-
     def total(*arguments):
         moved = chart.retract(*arguments)
         back = chart.local(*moved, *arguments[:2])
         return sum(jnp.sum(part) for part in (*moved, *back))
 
+    def everything(pose, landmark, dx, dl, other, other_landmark):
+        moved = chart.retract(pose, landmark, dx, dl)
+        away = chart.local(pose, landmark, other, other_landmark)
+        return {
+            "moved": moved,
+            "back": chart.local(pose, landmark, *moved),
+            "away": away,
+            "there": chart.retract(pose, landmark, *away),
+            "slopes": jax.jacfwd(chart.retract, argnums=(0, 1, 2, 3))(pose, landmark, dx, dl),
+            "reverse": jax.grad(total, argnums=(0, 1, 2, 3))(pose, landmark, dx, dl),
+            "basis": () if chart.basis is None else tuple(chart.basis(pose, landmark)),
+        }
+
+    program = of_rows(everything)
+
+    def call(pose=pose, landmark=landmark, dx=dx, dl=dl, other=None, dtype=np.float64):
+        other = (np.roll(pose, 3, axis=0), np.roll(landmark, 3, axis=0)) if other is None else other
+        return program(*(a.astype(dtype) for a in (pose, landmark, dx, dl, *other)))
+
     return SimpleNamespace(
         name=request.param,
         chart=chart,
         cases=(pose, landmark, dx, dl),
-        batched=jax.jit(jax.vmap(everything)),
-        retract=jax.jit(jax.vmap(chart.retract)),
-        local=jax.jit(jax.vmap(chart.local)),
+        call=call,
+        usual=call(),
+        at_zero=call(dx=0 * dx, dl=0 * dl, other=(pose, landmark)),
     )
-
-
-@pytest.fixture(scope="module")
-def out(made):
-    return made.batched(*made.cases)
-
-
-@pytest.fixture(scope="module")
-def at_zero(made):
-    pose, landmark, dx, dl = made.cases
-    return made.batched(pose, landmark, 0 * dx, 0 * dl)
-
-
-def assert_same_poses(actual, expected, atol=1e-12):
-    actual, expected = np.asarray(actual), np.asarray(expected)
-    np.testing.assert_allclose(actual[:, :2], expected[:, :2], atol=atol)
-    np.testing.assert_allclose(np.exp(1j * actual[:, 2]), np.exp(1j * expected[:, 2]), atol=atol)
 
 
 def test_name(made):
@@ -74,54 +70,44 @@ def test_name(made):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_shapes_dtypes_and_finite_derivatives(made, dtype):
-    pose, landmark, dx, dl = (a.astype(dtype) for a in made.cases)
+    pose, landmark = (a.copy() for a in made.cases[:2])
     landmark[1] = pose[1, :2]  # a landmark at the robot
     landmark[2], pose[2] = 0, 0
-    out = made.batched(pose, landmark, dx, dl)
+    out = made.call(pose, landmark, dtype=dtype)
     for pair in ("moved", "back"):
         assert [a.shape for a in out[pair]] == [pose.shape, landmark.shape]
-    for leaf in jax.tree.leaves(out):
-        assert leaf.dtype == dtype
-        assert np.isfinite(leaf).all()
-    heading = out["moved"][0][:, 2]
-    assert np.all(np.abs(heading) <= dtype(np.pi))
+    chex.assert_tree_all_finite(out)
+    assert {leaf.dtype for leaf in jax.tree.leaves(out)} == {np.dtype(dtype)}
+    assert np.all(np.abs(out["moved"][0][:, 2]) <= dtype(np.pi))
 
 
-def test_jit_is_no_jit_and_vmap_is_a_loop(made, out):
+def test_jit_is_no_jit_and_vmap_is_a_loop(made):
     pose, landmark, dx, dl = (jnp.asarray(a[9]) for a in made.cases)
     moved = made.chart.retract(pose, landmark, dx, dl)
-    back = made.chart.local(pose, landmark, *moved)
-    for one, batch in zip((*moved, *back), (*out["moved"], *out["back"]), strict=True):
-        np.testing.assert_allclose(one, batch[9], rtol=1e-12, atol=1e-12)
+    one = {"moved": moved, "back": made.chart.local(pose, landmark, *moved)}
+    batch = {name: jax.tree.map(lambda leaf: leaf[9], made.usual[name]) for name in one}
+    chex.assert_trees_all_close(one, batch, rtol=1e-12, atol=1e-12)
 
 
-def test_local_undoes_retract(made, out):
-    _, _, dx, dl = made.cases
-    np.testing.assert_allclose(out["back"][0], dx, atol=1e-11)
-    np.testing.assert_allclose(out["back"][1], dl, atol=1e-11)
+def test_local_and_retract_undo_each_other(made):
+    pose, landmark, dx, dl = made.cases
+    chex.assert_trees_all_close(made.usual["back"], (dx, dl), atol=1e-11)
+    assert_same_poses(made.usual["there"][0], np.roll(pose, 3, axis=0), 1e-11)
+    np.testing.assert_allclose(made.usual["there"][1], np.roll(landmark, 3, axis=0), atol=1e-11)
 
 
-def test_retract_undoes_local(made):
+def test_zero_error_is_the_place_itself(made):
     pose, landmark, _, _ = made.cases
-    other, other_l = np.roll(pose, 3, axis=0), np.roll(landmark, 3, axis=0)
-    dx, dl = made.local(pose, landmark, other, other_l)
-    back, back_l = made.retract(pose, landmark, np.asarray(dx), np.asarray(dl))
-    assert_same_poses(back, other, 1e-11)
-    np.testing.assert_allclose(back_l, other_l, atol=1e-11)
-
-
-def test_zero_error_is_the_place_itself(made, at_zero):
-    pose, landmark, _, _ = made.cases
-    assert_same_poses(at_zero["moved"][0], pose)
-    np.testing.assert_allclose(at_zero["moved"][1], landmark, atol=1e-12)
-    for part in made.local(pose, landmark, pose, landmark):
+    assert_same_poses(made.at_zero["moved"][0], pose)
+    np.testing.assert_allclose(made.at_zero["moved"][1], landmark, atol=1e-12)
+    for part in made.at_zero["away"]:
         np.testing.assert_allclose(part, np.zeros_like(part), atol=1e-12)
 
 
-def test_basis_is_the_derivative_of_retract_at_zero(made, out, at_zero, differences):
-    (_, _, pose_dx, pose_dl), (_, _, land_dx, land_dl) = at_zero["slopes"]
+def test_basis_is_the_derivative_of_retract_at_zero(made, differences):
+    (_, _, pose_dx, pose_dl), (_, _, land_dx, land_dl) = made.at_zero["slopes"]
     eye3, eye2 = (np.broadcast_to(np.eye(n), (len(pose_dx), n, n)) for n in (3, 2))
-    by_pose, cross, by_landmark = at_zero["basis"] or (eye3, np.zeros_like(land_dx), None)
+    by_pose, cross, by_landmark = made.at_zero["basis"] or (eye3, np.zeros_like(land_dx), None)
     by_landmark = eye2 if by_landmark is None else by_landmark
     np.testing.assert_allclose(by_pose, pose_dx, atol=1e-12)
     np.testing.assert_allclose(cross, land_dx, atol=1e-12)
@@ -130,25 +116,26 @@ def test_basis_is_the_derivative_of_retract_at_zero(made, out, at_zero, differen
     # … and autodiff is differences, at zero and away from it.
     pose, landmark, dx, dl = made.cases
     for arguments, slopes in (
-        ((pose, landmark, 0 * dx, 0 * dl), at_zero["slopes"]),
-        ((pose, landmark, dx, dl), out["slopes"]),
+        ((pose, landmark, 0 * dx, 0 * dl), made.at_zero["slopes"]),
+        (made.cases, made.usual["slopes"]),
     ):
-        for which in (0, 1):
-            for k in (0, 1):
-                auto = np.asarray(slopes[which][2 + k])
-                numeric = differences(lambda *a, w=which: made.retract(*a)[w], arguments, 2 + k)
-                np.testing.assert_allclose(auto, numeric, atol=1e-7)
+        for k in (2, 3):
+            numeric = differences(
+                lambda *a: np.concatenate(made.call(*a)["moved"], axis=1), arguments, k
+            )
+            auto = np.concatenate([slopes[0][k], slopes[1][k]], axis=1)
+            np.testing.assert_allclose(auto, numeric, atol=1e-7)
 
 
-def test_the_pose_does_not_depend_on_the_landmark(made, out):
+def test_the_pose_does_not_depend_on_the_landmark(made):
     pose, landmark, dx, dl = made.cases
-    _, by_landmark, _, by_dl = out["slopes"][0]
+    _, by_landmark, _, by_dl = made.usual["slopes"][0]
     np.testing.assert_array_equal(by_landmark, np.zeros_like(by_landmark))
     np.testing.assert_array_equal(by_dl, np.zeros_like(by_dl))
-    elsewhere = made.retract(pose, landmark[::-1] + 7, dx, dl[::-1] - 3)[0]
-    np.testing.assert_array_equal(elsewhere, made.retract(pose, landmark, dx, dl)[0])
-    dx_elsewhere = made.local(pose, landmark[::-1], *out["moved"][:1], landmark)[0]
-    np.testing.assert_allclose(dx_elsewhere, out["back"][0], atol=1e-13)
+    moved = made.usual["moved"][0]
+    elsewhere = made.call(pose, landmark[::-1] + 7, dx, dl[::-1] - 3, (moved, landmark))
+    np.testing.assert_array_equal(elsewhere["moved"][0], moved)
+    np.testing.assert_allclose(elsewhere["away"][0], made.usual["back"][0], atol=1e-13)
 
 
 def test_euclidean_error_is_the_difference_of_coordinates():
@@ -199,14 +186,14 @@ def test_right_invariant_error_is_unchanged_when_the_world_turns_and_shifts():
     """What gives the chart its name and its use: local(g·x̂, g·x) = Ad_g local(x̂, x), so a turn of
     robot and map together about the origin is the error (0, 0, φ), (0, 0) wherever they are."""
     chart, rng = REGISTRY["right_invariant"](), np.random.default_rng(3)
-    turn = 0.8
-    r = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    angle = 0.8
+    r = turn(angle)
     local = jax.jit(chart.local)
     for _ in range(5):
         pose, landmark = rng.normal(size=3), rng.normal(size=2)
-        turned = np.array([*(r @ pose[:2]), pose[2] + turn])
+        turned = np.array([*(r @ pose[:2]), pose[2] + angle])
         dx, dl = local(pose, landmark, turned, r @ landmark)
-        np.testing.assert_allclose(dx, [0, 0, turn], atol=1e-13)
+        np.testing.assert_allclose(dx, [0, 0, angle], atol=1e-13)
         np.testing.assert_allclose(dl, [0, 0], atol=1e-13)
         shifted = pose + [0.3, -0.2, 0]
         dx, dl = local(pose, landmark, shifted, landmark + [0.3, -0.2])

@@ -53,7 +53,8 @@ def logs(rng, count=LOGS, steps=STEPS, places=PLACES, dtype=np.float64, wild=Tru
 
 def made(name, world=WORLD):
     """A filter of the catalogue, given the true map where it needs one."""
-    candidate = catalog.ALL[name](world)
+    options = {} if WIDE > 1 else TOGETHER.get(name, {})
+    candidate = catalog.ALL[name](world, **options)
     return candidate if isinstance(candidate, Filter) else candidate(worlds.draw(world)[0])
 
 
@@ -91,17 +92,20 @@ def assert_told(log, estimate, info, tame):
 
 
 SUITE = [
-    *("ekf", "ideal", "oc", "right_invariant", "robocentric", "ukf", "square_root"),
+    *("ekf", "ideal", "oc", "right_invariant", "robocentric", "ukf"),
     *("eif_slam", "seif", "fastslam2", "particle_localization", "localization", "dead_reckoning"),
 ]
 """Of filters that share their steps one is in the suite; programs are what a test here costs."""
+
+TOGETHER = {"right_invariant": {"covariance": "square_root"}}
+"""Options of one filter that stand for another filter of the catalogue, too: `square_root`."""
 
 
 @pytest.mark.parametrize("name", catalog.ALL if WIDE > 1 else SUITE)
 def test_what_becomes_of_every_measurement_is_said(name):
     go = jax.jit(drive(made(name)))
     rng = np.random.default_rng(zlib.crc32(name.encode()))
-    for number in range(4 * WIDE):
+    for number in range(4 * WIDE if WIDE > 1 else 2):
         log = logs(rng, wild=number % 2 == 0)
         keys = jax.random.split(jax.random.key(number), LOGS)
         assert_told(log, *jax.device_get(go(log, keys)), tame=number % 2 == 1)
@@ -109,8 +113,7 @@ def test_what_becomes_of_every_measurement_is_said(name):
 
 ODD = {
     "no steps": {"steps": 0},
-    "no places": {"steps": 1, "places": 0},
-    "float32": {"dtype": np.float32},
+    "no places, float32": {"steps": 1, "places": 0, "dtype": np.float32},
 }
 
 
@@ -132,8 +135,7 @@ def test_logs_of_odd_shapes_are_run(name, odd):
     ("tag", "kinds"),
     [
         (np.int8, (np.float32, np.float64)),
-        (np.uint32, (np.float64, np.float32)),
-        (np.int64, (np.float16, np.float64)),
+        (np.uint32, (np.float64, np.float16)),
     ],
 )
 def test_kinds_of_numbers_may_be_mixed(tag, kinds):

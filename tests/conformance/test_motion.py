@@ -1,20 +1,19 @@
-"""What every motion model owes: run over `motion.REGISTRY`, so a new model inherits it all."""
+"""What every motion model owes: run over `motion.REGISTRY`, so a new model inherits it all.
+
+Jacobians, `perturb`, the wrapped heading, purity, dtypes and hard states are what `verify` checks:
+see test_jacobians. That the map may have any frame is a law of test_properties.
+"""
 
 from types import SimpleNamespace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from owed import DTYPES, bad_covariances, of_rows, random_covariance
 
 from jaxslam.motion import REGISTRY
-
-DTYPES = [np.float32, np.float64]
-
-
-def random_covariance(rng, n):
-    root = rng.normal(size=(n, n)) * 0.1
-    return root @ root.T
 
 
 def cases_of(model, hard_angles):
@@ -42,25 +41,43 @@ def made(request, hard_angles):
     """A model of the registry with a random noise covariance, its cases, and one compiled call."""
     factory = REGISTRY[request.param]
     width = len(factory(lambda pose, u: None).noises)
-    cov = random_covariance(np.random.default_rng(1), width)
+    cov = random_covariance(width, 1)
+    weights = np.arange(1.0, width**2 + 1).reshape(width, width)
     model = factory(cov)
+    varying = factory(lambda pose, u: (pose[0] ** 2 + jnp.sum(u**2)) * jnp.eye(width))
 
     def everything(pose, u, w):
-        out = {"step": model.step(pose, u, w), "cov": model.noise_cov(pose, u)}
-        out["forward"] = jax.jacfwd(model.step, argnums=(0, 1, 2))(pose, u, w)
-        total = jax.grad(lambda *a: jnp.sum(model.step(*a)), argnums=(0, 1, 2))
-        out["reverse"] = total(pose, u, w)
-        if model.perturb is not None:
-            out["perturbed"] = model.step(pose, model.perturb(u, w), jnp.zeros_like(w))
-        return out
+        total = jax.grad(lambda cov: jnp.sum(factory(cov).noise_cov(pose, u) * weights))
+        return {
+            "step": model.step(pose, u, w),
+            "cov": model.noise_cov(pose, u),
+            "varying": varying.noise_cov(pose, u),
+            "noise slopes": total(jnp.asarray(cov, pose.dtype)),
+        }
+
+    program = of_rows(everything)
+    cases = cases_of(model, hard_angles)
+
+    def call(pose=cases[0], u=cases[1], w=cases[2], dtype=np.float64):
+        return program(*(np.asarray(row, dtype) for row in (pose, u, w)))
 
     return SimpleNamespace(
         name=request.param,
         factory=factory,
         model=model,
         cov=cov,
-        cases=cases_of(model, hard_angles),
-        batched=jax.jit(jax.vmap(everything)),
+        weights=weights,
+        cases=cases,
+        call=call,
+        usual=call(),
+    )
+
+
+def assert_stands_still(made, **changes):
+    still = made.call(**changes)["step"]
+    np.testing.assert_allclose(still[:, :2], made.cases[0][:, :2], rtol=1e-15)
+    np.testing.assert_allclose(
+        np.exp(1j * still[:, 2]), np.exp(1j * made.cases[0][:, 2]), atol=1e-15
     )
 
 
@@ -72,130 +89,59 @@ def test_record_is_complete(made):
     assert all("[" in unit for unit in (*model.controls, *model.noises))
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_shapes_and_dtypes(made, dtype):
-    pose, u, w = (a.astype(dtype) for a in made.cases)
-    out = made.batched(pose, u, w)
-    count, widths = len(pose), (3, u.shape[1], w.shape[1])
-    assert out["step"].shape == (count, 3)
-    assert out["cov"].shape == (count, w.shape[1], w.shape[1])
-    assert [j.shape for j in out["forward"]] == [(count, 3, n) for n in widths]
-    for leaf in jax.tree.leaves(out):
-        assert leaf.dtype == dtype
-        assert np.isfinite(leaf).all()
-    assert np.all(np.abs(out["step"][:, 2]) <= dtype(np.pi))
+def test_shapes_and_dtypes_and_float32_agrees_with_float64(made):
+    pose, _, w = made.cases
+    for dtype in DTYPES:
+        out = made.call(dtype=dtype)
+        chex.assert_shape(out["step"], pose.shape)
+        chex.assert_shape(out["cov"], (len(pose), w.shape[1], w.shape[1]))
+        chex.assert_tree_all_finite(out)
+        assert {leaf.dtype for leaf in jax.tree.leaves(out)} == {np.dtype(dtype)}
+        assert np.all(np.abs(out["step"][:, 2]) <= dtype(np.pi))
+        turned = np.exp(1j * out["step"][:, 2]) - np.exp(1j * made.usual["step"][:, 2])
+        assert np.abs(turned).max() < 1e-5
+        np.testing.assert_allclose(
+            out["step"][:, :2], made.usual["step"][:, :2], rtol=1e-6, atol=1e-5
+        )
 
 
-def test_float32_agrees_with_float64(made):
-    single = made.batched(*(a.astype("f4") for a in made.cases))
-    double = made.batched(*made.cases)
-    turned = np.exp(1j * single["step"][:, 2]) - np.exp(1j * double["step"][:, 2])
-    assert np.abs(turned).max() < 1e-5
-    np.testing.assert_allclose(single["step"][:, :2], double["step"][:, :2], rtol=1e-6, atol=1e-5)
-    for a, b in zip(single["forward"], double["forward"], strict=True):
-        np.testing.assert_allclose(a, b, atol=3e-6)
-
-
-def test_jit_is_no_jit_and_vmap_is_a_loop(made):
-    batched = made.batched(*made.cases)
-    for i in (0, 1, -1):
-        pose, u, w = (jnp.asarray(a[i]) for a in made.cases)
-        one = made.model.step(pose, u, w)
-        np.testing.assert_allclose(one, batched["step"][i], rtol=1e-13, atol=1e-13)
-        np.testing.assert_array_equal(made.model.noise_cov(pose, u), batched["cov"][i])
-
-
-def test_noise_enters_through_the_control_where_the_model_says_so(made):
-    if made.model.perturb is None:
-        pytest.skip("its noise does not act on the control")
-    out = made.batched(*made.cases)
-    np.testing.assert_allclose(out["perturbed"], out["step"], rtol=1e-13, atol=1e-13)
-    moved = np.abs(
-        np.asarray(out["step"]) - made.batched(*made.cases[:2], 0 * made.cases[2])["step"]
-    )
-    assert moved.max() > 1e-3  # the noise does move the robot
+def test_noise_moves_the_robot(made):
+    still = made.call(w=0 * made.cases[2])["step"]
+    assert np.abs(made.usual["step"] - still).max() > 1e-3
 
 
 def test_no_control_and_no_noise_is_no_motion(made):
-    pose, u, w = made.cases
-    still = np.asarray(made.batched(pose, 0 * u, 0 * w)["step"])
-    np.testing.assert_allclose(still[:, :2], pose[:, :2], rtol=1e-15)
-    np.testing.assert_allclose(np.exp(1j * still[:, 2]), np.exp(1j * pose[:, 2]), atol=1e-15)
+    assert_stands_still(made, u=0 * made.cases[1], w=0 * made.cases[2])
 
 
 def test_no_time_is_no_motion(made):
     """Whatever the velocities and their noise."""
     if "dt [s]" not in made.model.controls:
         pytest.skip("its control is a displacement")
-    pose, u, w = made.cases
-    still = np.asarray(
-        made.batched(pose, u * [c != "dt [s]" for c in made.model.controls], w)["step"]
-    )
-    np.testing.assert_allclose(still[:, :2], pose[:, :2], rtol=1e-15)
-    np.testing.assert_allclose(np.exp(1j * still[:, 2]), np.exp(1j * pose[:, 2]), atol=1e-15)
-
-
-def test_motion_is_the_same_wherever_the_world_puts_its_origin(made):
-    """Robots know no map: step(g ∘ pose, u, w) = g ∘ step(pose, u, w) for any rigid motion g."""
-    pose, u, w = made.cases
-    turn = 0.7
-    r = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-
-    def carry(poses):
-        return np.concatenate([poses[:, :2] @ r.T + [5, -2], poses[:, 2:] + turn], axis=1)
-
-    after = np.asarray(made.batched(carry(pose), u, w)["step"])
-    expected = carry(np.asarray(made.batched(pose, u, w)["step"]))
-    np.testing.assert_allclose(after[:, :2], expected[:, :2], rtol=1e-12, atol=1e-11)
-    np.testing.assert_allclose(np.exp(1j * after[:, 2]), np.exp(1j * expected[:, 2]), atol=1e-12)
+    assert_stands_still(made, u=made.cases[1] * [c != "dt [s]" for c in made.model.controls])
 
 
 def test_noise_covariance_is_the_given_one(made):
-    cov = made.batched(*made.cases)["cov"]
+    cov = made.usual["cov"]
     np.testing.assert_array_equal(cov, np.broadcast_to(made.cov, cov.shape))
 
 
 def test_noise_covariance_may_be_a_function_of_pose_and_control(made):
-    pose, u, _ = (a[0] for a in made.cases)
-    width = len(made.model.noises)
-    model = made.factory(lambda pose, u: (pose[0] ** 2 + jnp.sum(u**2)) * jnp.eye(width))
-    expected = (pose[0] ** 2 + np.sum(u**2)) * np.eye(width)
-    np.testing.assert_allclose(model.noise_cov(pose, u), expected, rtol=1e-14)
-    single = model.noise_cov(jnp.asarray(pose, "f4"), jnp.asarray(u, "f4"))
-    assert single.dtype == np.float32
-    wrong = made.factory(lambda pose, u: jnp.eye(width + 1))
+    pose, u, _ = made.cases
+    scale = pose[:, 0] ** 2 + np.sum(u**2, axis=1)
+    expected = scale[:, None, None] * np.eye(len(made.model.noises))
+    np.testing.assert_allclose(made.usual["varying"], expected, rtol=1e-14)
+    wrong = made.factory(lambda pose, u: jnp.eye(len(made.model.noises) + 1))
     with pytest.raises(ValueError, match=made.name):
-        jax.eval_shape(wrong.noise_cov, pose, u)
+        jax.eval_shape(wrong.noise_cov, pose[0], u[0])
 
 
-def bad_covariances(n):
-    skew = np.eye(n)
-    skew[0, -1] += 0.5
-    broken = np.eye(n)
-    broken[0, 0] = np.nan
-    return {
-        "shape": np.eye(n + 1),
-        "vector": np.ones(n),
-        "scalar": 0.1,
-        "asymmetric": skew if n > 1 else np.array([[np.nan]]),
-        "negative": np.diag([1.0] * (n - 1) + [-0.1]),
-        "nan": broken,
-    }
-
-
-@pytest.mark.parametrize("case", bad_covariances(2))
-def test_bad_noise_covariances_are_refused(made, case):
-    with pytest.raises(ValueError, match=made.name):
-        made.factory(bad_covariances(len(made.model.noises))[case])
+def test_bad_noise_covariances_are_refused(made):
+    for bad in bad_covariances(len(made.model.noises)).values():
+        with pytest.raises(ValueError, match=made.name):
+            made.factory(bad)
 
 
 def test_gradients_reach_the_noise_through_the_factory(made):
-    pose, u, _ = (a[3] for a in made.cases)
-    width = len(made.model.noises)
-
-    def total(cov):
-        noise = made.factory(cov).noise_cov(pose, u)
-        return jnp.sum(noise * jnp.arange(1.0, width**2 + 1).reshape(width, width))
-
-    slope = jax.jit(jax.grad(total))(made.cov)
-    np.testing.assert_allclose(slope, np.arange(1.0, width**2 + 1).reshape(width, width))
+    slopes = made.usual["noise slopes"]
+    np.testing.assert_allclose(slopes, np.broadcast_to(made.weights, slopes.shape))

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from jaxslam import validation
 from jaxslam.math import batched_linalg, linalg
 
-UNROLLED, LAPACK = [1, 2, 3, 4, 5, 6, 7, 8], [9, 20]
+UNROLLED, LAPACK = [1, 2, 3, 6, 8], [9, 20]  # 8 is the largest that is unrolled
 ROWS = 20
 
 
@@ -82,32 +81,33 @@ def test_factor_and_solves_equal_numpy(n):
 
 
 @pytest.mark.parametrize("n", [3, 9])
-def test_solves_take_a_vector_or_a_matrix(n):
-    a, b = jnp.asarray(random_covariances(n, 1)[0]), np.random.default_rng(1).normal(size=(n, 2))
-    for solve in (linalg.solve_lower, lambda a, b: linalg.solve_psd(a, b)[0]):
-        solve = jax.jit(solve)
-        np.testing.assert_allclose(solve(a, b[:, 0]), solve(a, b)[:, 0], rtol=1e-12)
-
-
-@pytest.mark.parametrize("n", [1, 2, 4, 9])
-def test_slope_of_the_log_determinant_is_the_inverse(n):
+def test_a_vector_or_a_matrix_the_lower_triangle_alone_and_the_slope_of_the_log_determinant(n):
     """∂ log|A| = A⁻¹; the factor reads the lower triangle only, so the slope lives there."""
     a = random_covariances(n)
-    log_det = jax.grad(lambda a: 2 * jnp.log(jnp.diagonal(linalg.cholesky(a)[0])).sum())
-    slope = jax.jit(jax.vmap(log_det))(a)
-    np.testing.assert_array_equal(slope, np.tril(slope))
-    unit = np.sqrt(np.einsum("cii->ci", a))
-    unit = unit[:, :, None] * unit[:, None, :]
-    np.testing.assert_allclose(linalg.symmetrize(slope) * unit, np.linalg.inv(a) * unit, rtol=1e-7)
-
-
-@pytest.mark.parametrize("n", [3, 9])
-def test_cholesky_reads_the_lower_triangle_alone(n):
-    a = random_covariances(n, 1)[0]
     spoiled = np.where(np.triu(np.ones((n, n)), 1) > 0, np.nan, a)
-    factor, positive = jax.jit(linalg.cholesky)(spoiled)
-    assert positive
-    np.testing.assert_allclose(factor, np.linalg.cholesky(a), rtol=1e-9)
+    b = np.random.default_rng(1).normal(size=(len(a), n, 2))
+
+    def several(a, b, spoiled):
+        def log_det(a):
+            return 2 * jnp.log(jnp.diagonal(linalg.cholesky(a)[0])).sum()
+
+        vectors = linalg.solve_lower(a, b[:, 0]), linalg.solve_psd(a, b[:, 0])[0]
+        matrices = linalg.solve_lower(a, b), linalg.solve_psd(a, b)[0]
+        return vectors, matrices, linalg.cholesky(spoiled), jax.grad(log_det)(a)
+
+    program = jax.device_get(jax.jit(jax.vmap(several))(a, b, spoiled))
+    vectors, matrices, (factor, positive), slope = program
+    for vector, matrix in zip(vectors, matrices, strict=True):
+        np.testing.assert_allclose(vector, matrix[:, :, 0], rtol=1e-12)
+    assert positive.all()
+    unit = np.sqrt(np.einsum("cii->ci", a))
+    np.testing.assert_allclose(
+        factor / unit[:, :, None], np.linalg.cholesky(a) / unit[:, :, None], rtol=0, atol=1e-10
+    )
+    np.testing.assert_array_equal(slope, np.tril(slope))
+    unit = unit[:, :, None] * unit[:, None, :]
+    slope = (slope + slope.transpose(0, 2, 1)) / 2
+    np.testing.assert_allclose(slope * unit, np.linalg.inv(a) * unit, rtol=1e-7)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6, 9, 20])
@@ -127,7 +127,7 @@ def test_semi_definite_matrices_are_flagged_and_nothing_is_nan(n):
         np.testing.assert_allclose(rebuilt, a, rtol=1e-14)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 9])
+@pytest.mark.parametrize("n", [2, 3, 9])
 def test_gradients_through_semi_definite_matrices_are_finite(n):
     def total(a, b):
         solution, _ = linalg.solve_psd(a, b)
@@ -138,10 +138,10 @@ def test_gradients_through_semi_definite_matrices_are_finite(n):
     slopes = jax.jit(jax.vmap(jax.grad(total, argnums=(0, 1))))(a, np.ones((len(a), n)))
     for slope in slopes:
         assert np.isfinite(slope).all()
-    assert any(np.any(slope) for slope in slopes) == (n in (2, 3))  # n = 1: 0; n = 9: all masked
+    assert any(np.any(slope) for slope in slopes) == (n < 9)  # 9: all masked
 
 
-@pytest.mark.parametrize("n", UNROLLED)
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_whitener_is_the_inverse_of_the_factor(n):
     a = random_covariances(n)
     whiten, flags = whitened(n)(a)
@@ -161,7 +161,7 @@ def test_whitener_as_a_loop_is_the_same_matrix():
     np.testing.assert_allclose(rows[:-1], whiten[:-1], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6])
+@pytest.mark.parametrize("n", [2, 3, 6])
 def test_whitener_of_a_semi_definite_matrix_leaves_out_what_the_factor_leaves_out(n):
     a = semi_definite(n)
     whiten, flags = whitened(n)(a)
@@ -184,7 +184,7 @@ def test_indefinite_and_non_finite_matrices_are_flagged(n):
     np.testing.assert_array_equal(flags, [True, False, False, False, False])
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
+@pytest.mark.parametrize("n", [1, 2, 4])
 def test_inverse_equals_numpy(n):
     a = np.random.default_rng(2).normal(size=(20, n, n))  # not symmetric
     out = jax.jit(jax.vmap(linalg.inverse))(a)
@@ -193,11 +193,11 @@ def test_inverse_equals_numpy(n):
 
 def test_symmetrize():
     a = np.random.default_rng(3).normal(size=(4, 3, 3))
-    np.testing.assert_array_equal(linalg.symmetrize(jnp.asarray(a)), (a + a.transpose(0, 2, 1)) / 2)
+    np.testing.assert_array_equal(jax.jit(linalg.symmetrize)(a), (a + a.transpose(0, 2, 1)) / 2)
 
 
 def test_total_is_the_sum():
-    terms = [jnp.array([1.0, 2.0]), jnp.array([10.0, 20.0]), jnp.array([100.0, 200.0])]
+    terms = np.array([1.0, 2.0]), np.array([10.0, 20.0]), np.array([100.0, 200.0])
     np.testing.assert_array_equal(linalg.total(iter(terms)), [111, 222])
 
 
@@ -206,7 +206,7 @@ def test_total_is_the_sum():
 distance = jax.jit(jax.vmap(linalg.mahalanobis_squared))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 5, 10])
+@pytest.mark.parametrize("n", [1, 3, 10])
 def test_mahalanobis_equals_numpy_at_any_scale(n):
     rng = np.random.default_rng(4)
     root = np.tril(rng.normal(size=(30, n, n)), -1) * 0.3 + np.eye(n)
@@ -312,7 +312,7 @@ def everything(a, b):
     return jnp.concatenate([part.ravel() for part in parts]), positive
 
 
-@pytest.mark.parametrize("n", [4, 9])
+@pytest.mark.parametrize("n", [3, 9])
 def test_a_batch_gives_what_each_of_its_matrices_gives_alone(n):
     a, b = random_covariances(n, count=2), np.random.default_rng(2).normal(size=(2, n, 3))
 
@@ -336,9 +336,32 @@ def test_slopes_of_slopes_equal_differences():
     a = random_covariances(n, count=1)[0]
     unit = np.sqrt(np.diagonal(a))
     a = a / unit / unit[:, None] + np.eye(n)
-    b = np.random.default_rng(3).normal(size=(n, 2))
-    f = jax.jit(lambda a, b: everything((a + a.T) / 2, b)[0])
-    check_grads(f, (a, b), order=2, rtol=1e-4, atol=1e-4)
+    rng = np.random.default_rng(3)
+    b, weights = rng.normal(size=(n, 2)), rng.normal(size=3 * n * n)
+    directions = [(rng.normal(size=(n, n)), rng.normal(size=(n, 2))) for _ in range(2)]
+
+    def weighed(x, y, first, second):
+        """Of a + x D1 + y D2, a weighted sum, its slopes, and the slopes of these."""
+
+        def total(xy):
+            (da, db), (ea, eb) = first, second
+            at = a + xy[0] * (da + da.T) + xy[1] * (ea + ea.T)
+            values = everything(at, b + xy[0] * db + xy[1] * eb)[0]
+            return values @ jnp.resize(weights, values.shape)
+
+        xy = jnp.stack([x, y])
+        return total(xy), jax.grad(total)(xy), jax.jacfwd(jax.grad(total))(xy)
+
+    step = 1e-5
+    grid = np.array([[0, 0], [step, 0], [-step, 0], [0, step], [0, -step]])
+    over = jax.jit(jax.vmap(weighed, (0, 0, None, None)))
+    value, slope, bend = jax.device_get(over(*grid.T, *directions))
+    for k in (0, 1):
+        up, down = 1 + 2 * k, 2 + 2 * k
+        rise = (value[up] - value[down]) / (2 * step)
+        np.testing.assert_allclose(slope[0, k], rise, rtol=1e-4, atol=1e-4)
+        turn = (slope[up] - slope[down]) / (2 * step)
+        np.testing.assert_allclose(bend[0][:, k], turn, rtol=1e-4, atol=1e-4)
 
 
 def test_no_batch_reaches_the_librarys_kernels_on_a_cpu():

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference.plane import assert_same_poses, matrix, pose_of, wrap
 
 from jaxslam.motion import (
     ackermann,
@@ -18,19 +19,6 @@ from jaxslam.motion import (
 )
 
 NO_NOISE = {2: np.zeros((2, 2)), 3: np.zeros((3, 3))}
-
-
-def wrap(angle):
-    """To (-π, π], by complex numbers rather than by the package's formula."""
-    wrapped = np.angle(np.exp(1j * np.asarray(angle)))
-    return np.where(wrapped <= -np.pi, np.pi, wrapped)
-
-
-def assert_same_poses(actual, expected, atol=1e-12):
-    actual, expected = np.asarray(actual), np.asarray(expected)
-    np.testing.assert_allclose(actual[..., :2], expected[..., :2], rtol=0, atol=atol)
-    np.testing.assert_allclose(wrap(actual[..., 2] - expected[..., 2]), 0, atol=atol)
-    assert np.all(np.abs(actual[..., 2]) <= np.pi)
 
 
 def random_poses(rng, count):
@@ -250,18 +238,6 @@ def test_the_final_rotation_turns_and_moves_nothing():
     )
 
 
-def test_many_small_steps_are_one_step():
-    """An arc is exact: n steps of Δt/n make one of Δt, at any turn and at none."""
-    rng = np.random.default_rng(10)
-    pose, u = random_poses(rng, 40), rng.normal(size=(40, 3)) * 2
-    u[::4, 1] = 0
-    w = np.zeros_like(u)
-    n, fine = 16, pose
-    for _ in range(n):
-        fine = move(fine, u / [1, 1, n], w)
-    assert_same_poses(fine, move(pose, u, w), 1e-13)
-
-
 # Through zero turn, and beside the two angles at which a power series ends: 0.5 for sin(x)/x, and
 # 0.5 for its half angle in (1 - cos x)/x.
 TURNS = np.array(
@@ -352,17 +328,8 @@ L, A, B, H = 2.83, 3.78, 0.5, 0.76
 steer = batched(ackermann(NO_NOISE[2]).step)
 
 
-def matrix(x, y, theta):
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s, x], [s, c, y], [0, 0, 1]])
-
-
-def pose_of(frame):
-    return np.array([frame[0, 2], frame[1, 2], np.arctan2(frame[1, 0], frame[0, 0])])
-
-
 def rear_axle(pose, sensor=(A, B)):
-    return pose_of(matrix(*pose) @ np.linalg.inv(matrix(*sensor, 0)))
+    return pose_of(matrix(pose) @ np.linalg.inv(matrix([*sensor, 0])))
 
 
 def speeds(u, wheelbase=L, encoder=H):
@@ -375,7 +342,7 @@ def car_on_an_arc(pose, u, wheelbase=L, sensor=(A, B), encoder=H):
     """The rear axle moves along its circle and carries the sensor along."""
     v, omega = speeds(u, wheelbase, encoder)
     axle = arc(rear_axle(pose, sensor)[None], v, omega, u[2])[0]
-    return pose_of(matrix(*axle) @ matrix(*sensor, 0))
+    return pose_of(matrix(axle) @ matrix([*sensor, 0]))
 
 
 def guivant_nebot_rate(pose, u):
@@ -423,20 +390,6 @@ def test_its_euler_step_is_the_published_model():
     np.testing.assert_allclose(slope, expected, rtol=1e-12, atol=1e-13)
 
 
-def test_the_difference_from_the_published_model_shrinks_with_the_square_of_the_step():
-    pose, u, w = car_cases(15, 50)
-    rate = np.stack([guivant_nebot_rate(p, c) for p, c in zip(pose, u, strict=True)])
-    errors = []
-    for dt in 0.02 / 2 ** np.arange(4):
-        u[:, 2] = dt
-        step = np.asarray(steer(pose, u, w))[:, :2] - (pose + dt * rate)[:, :2]
-        errors.append(np.linalg.norm(step, axis=1))
-    quarters = np.array(errors[:-1]) / errors[1:]
-    assert min(errors[-1]) > 1e-10  # far above rounding
-    np.testing.assert_allclose(quarters, 4, atol=0.15)
-    np.testing.assert_allclose(quarters[-1], 4, atol=0.04)
-
-
 def test_straight_ahead_every_point_of_the_car_moves_alike():
     pose, u, w = car_cases(16, 20)
     u[:, 1] = 0
@@ -447,29 +400,13 @@ def test_straight_ahead_every_point_of_the_car_moves_alike():
     assert_same_poses(steer(pose, u, w), expected, 1e-13)
 
 
-def test_the_rear_axle_drives_a_circle():
-    """Of radius L/tan α, at the left of the axle where α > 0, and is back after 2π/ω."""
-    pose, u, w = car_cases(17, 20)
-    full = 2 * np.pi / np.abs([speeds(c)[1] for c in u])
-    start = np.stack([rear_axle(p) for p in pose])
-    left = np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=1)
-    centre = start[:, :2] + left * (L / np.tan(u[:, 1]))[:, None]
-    for part in (0.1, 0.25, 0.5, 0.8):
-        u[:, 2] = part * full
-        axle = np.stack([rear_axle(p) for p in np.asarray(steer(pose, u, w))])
-        radius = np.linalg.norm(axle[:, :2] - centre, axis=1)
-        np.testing.assert_allclose(radius, L / np.tan(np.abs(u[:, 1])), rtol=1e-12)
-    u[:, 2] = full
-    assert_same_poses(steer(pose, u, w), pose, 1e-11)
-
-
 def test_the_encoders_wheel_rolls_as_far_as_it_says():
     """It stands H to the left of the axle's centre; along its own circle it goes v_e Δt."""
     pose, u, w = car_cases(18, 50)
     after = np.asarray(steer(pose, u, w))
-    wheel = matrix(0, H, 0)
+    wheel = matrix([0, H, 0])
     ends = [
-        np.stack([pose_of(matrix(*rear_axle(p)) @ wheel) for p in poses]) for poses in (pose, after)
+        np.stack([pose_of(matrix(rear_axle(p)) @ wheel) for p in poses]) for poses in (pose, after)
     ]
     chord = np.linalg.norm(ends[1][:, :2] - ends[0][:, :2], axis=1)
     turn = np.array([speeds(c)[1] * c[2] for c in u])

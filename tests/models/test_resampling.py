@@ -41,27 +41,21 @@ def named(request):
     return request.param, REGISTRY[request.param]
 
 
-def test_the_expected_number_of_copies_is_the_weight(named):
+def test_the_number_of_copies_is_the_weight_on_average_and_keeps_its_bound(named):
     """Against P w_j, within 5 standard errors of the multinomial, which has the most variance."""
-    _, method = named
-    with np.errstate(divide="ignore"):
-        found = copies(method, np.log(WEIGHTS) + 700.0, runs=4000)  # of any scale
-    count = len(WEIGHTS)
-    error = np.sqrt(count * WEIGHTS * (1 - WEIGHTS) / 4000)
-    assert np.all(np.abs(found.mean(axis=0) - count * WEIGHTS) <= 5 * error)
-    assert np.all(found[:, 1] == 0)
-
-
-def test_each_keeps_its_bound_on_the_number_of_copies(named):
     name, method = named
     with np.errstate(divide="ignore"):
-        found = copies(method, np.log(WEIGHTS), runs=4000)
+        found = copies(method, np.log(WEIGHTS) + 700.0, runs=4000)  # of any scale
     share = len(WEIGHTS) * WEIGHTS
+    error = np.sqrt(share * (1 - WEIGHTS) / 4000)
+    assert np.all(np.abs(found.mean(axis=0) - share) <= 5 * error)
+    assert np.all(found[:, 1] == 0)
+    near = 1e-9  # of a whole number, which the scale may move by a rounding error
     if name == "systematic":
-        assert np.all(found >= np.floor(share))
-        assert np.all(found <= np.ceil(share))
+        assert np.all(found >= np.floor(share - near))
+        assert np.all(found <= np.ceil(share + near))
     elif name == "residual":
-        assert np.all(found >= np.floor(share))
+        assert np.all(found >= np.floor(share - near))
     elif name == "stratified":
         assert np.all(np.abs(found - share) < 2)
     else:  # the variance of the plain bootstrap, within a fifth
@@ -74,35 +68,39 @@ def test_one_particle_goes_on(named):
         assert np.asarray(chosen(np.array([log_weight]), jax.random.key(0))) == [0]
 
 
-def test_where_all_underflow_all_weigh_the_same(named):
+def test_where_all_underflow_all_weigh_the_same_and_what_is_not_finite_is_not_chosen(named):
+    """And all of the weight may be on one."""
     name, method = named
-    for lost in (-np.inf, np.nan):
-        found = copies(method, np.full(6, lost), runs=2000)
-        np.testing.assert_allclose(found.mean(axis=0), 1.0, atol=0.12)
-        if name in ("systematic", "residual", "stratified"):
-            assert np.all(found == 1)
-
-
-def test_what_is_not_finite_is_not_chosen(named):
-    _, method = named
-    found = copies(method, np.array([-np.inf, 0.0, np.nan, np.inf, 0.0]), runs=200)
-    assert np.all(found[:, [0, 2, 3]] == 0)
-
-
-def test_all_of_the_weight_on_one(named):
-    _, method = named
-    found = copies(method, np.array([-1e5, 0.0, -1e5, -1e5]), runs=50)
-    assert np.all(found == [0, 4, 0, 0])
+    rows = np.array(
+        [
+            [-np.inf] * 5,
+            [np.nan] * 5,
+            [-np.inf, 0.0, np.nan, np.inf, 0.0],
+            [-1e5, 0.0, -1e5, -1e5, -np.inf],
+        ]
+    )
+    over = jax.jit(jax.vmap(jax.vmap(method, (None, 0)), (0, None)))
+    chosen = np.asarray(over(rows, keys_of(2000)))
+    assert chosen.shape == (4, 2000, 5)
+    assert chosen.dtype == np.int32
+    found = (chosen[..., None] == np.arange(5)).sum(axis=2)
+    np.testing.assert_allclose(found[:2].mean(axis=1), 1.0, atol=0.12)
+    if name in ("systematic", "residual", "stratified"):
+        assert np.all(found[:2] == 1)
+    assert np.all(found[2][:, [0, 2, 3]] == 0)
+    assert np.all(found[3] == [0, 5, 0, 0, 0])
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
 def test_both_precisions_many_particles(named, dtype):
     _, method = named
-    log_weights = jnp.asarray(np.random.default_rng(0).normal(size=5000), dtype)
-    ancestors = jax.jit(method)(log_weights, jax.random.key(1))
-    assert ancestors.dtype == jnp.int32
+    log_weights = np.random.default_rng(0).normal(size=5000).astype(dtype)
+    ancestors = np.asarray(jax.jit(method)(log_weights, jax.random.key(1)))
+    assert ancestors.dtype == np.int32
     assert np.all((ancestors >= 0) & (ancestors < 5000))
-    np.testing.assert_array_equal(ancestors, method(log_weights, jax.random.key(1)))
+    if dtype == "f8":
+        eager = method(jnp.asarray(log_weights), jax.random.key(1))
+        np.testing.assert_array_equal(ancestors, eager)
 
 
 def test_normalized_weights_against_plain_arithmetic():

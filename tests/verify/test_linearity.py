@@ -1,5 +1,6 @@
 """The linearity index: closed forms, brute force, units, and the guide's claim on inverse depth."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -157,11 +158,14 @@ def test_no_slope_to_compare_with_is_inf_not_nan():
 def test_whole_numbers_are_as_good_as_any():
     """A pose of integers does not round the control, the landmark or the noise."""
     robot, u, cov = motion.velocity(np.diag([0.1, 0.05, 0.05]) ** 2), [1.5, 0.3, 0.5], np.eye(3) / 9
-    of = jax.jit(lambda pose: motion_linearity(robot, pose, u, cov).hessian_rows)
-    np.testing.assert_array_equal(of(np.array([1, 2, 0])), of(np.array([1.0, 2.0, 0.0])))
     laser, wide = sensors.range_bearing(np.diag([0.1, 0.05]) ** 2), np.eye(5) / 100
-    of = jax.jit(lambda pose: sensor_linearity(laser, pose, [2.5, 0.5], wide).hessian_rows)
-    np.testing.assert_array_equal(of(np.array([0, 0, 1])), of(np.array([0.0, 0.0, 1.0])))
+
+    @jax.jit
+    def both(pose):
+        moved = motion_linearity(robot, pose, u, cov).hessian_rows
+        return moved, sensor_linearity(laser, pose, [2.5, 0.5], wide).hessian_rows
+
+    chex.assert_trees_all_equal(both(np.array([1, 2, 0])), both(np.array([1.0, 2.0, 0.0])))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -184,10 +188,8 @@ def test_jit_vmap_dtype_and_gradient(dtype):
         out = linearity_index(curved, states[0], cov)
         return out.hessian + out.sampled
 
-    slope = jax.jit(jax.grad(worst))(cov)
-    assert np.isfinite(slope).all()
-    singular = jax.jit(jax.grad(worst))(np.diag([0.04, 0.0]).astype(dtype))
-    assert np.isfinite(singular).all()
+    slopes = jax.jit(jax.vmap(jax.grad(worst)))(np.stack([COV, np.diag([0.04, 0.0])]).astype(dtype))
+    assert np.isfinite(slopes).all()
 
 
 @pytest.mark.parametrize("sigma", [1e-3, 1e-6])
@@ -205,20 +207,23 @@ def test_angles_are_compared_on_the_circle():
     """A heading next to the seam bends no more than one far from it."""
     robot = motion.velocity(np.diag([0.1, 0.05, 0.05]) ** 2)
     u, cov = np.array([1.0, 0.3, 0.5]), np.diag([0.1, 0.1, 0.2]) ** 2
-    of = jax.jit(lambda pose: motion_linearity(robot, pose, u, cov))
-    usual, seam = of(np.array([1.0, 2.0, 0.5])), of(np.array([1.0, 2.0, np.pi - 1e-3]))
-    assert usual.sampled_rows[2] < 1e-12
-    assert seam.sampled_rows[2] < 1e-12
+    of = jax.jit(jax.vmap(lambda pose: motion_linearity(robot, pose, u, cov)))
+    assert (
+        of(np.array([[1.0, 2.0, 0.5], [1.0, 2.0, np.pi - 1e-3]])).sampled_rows[:, 2] < 1e-12
+    ).all()
 
     laser = sensors.range_bearing(np.diag([0.1, 0.05]) ** 2)
     pose, cov = np.zeros(3), np.diag([0.01, 0.01, 0.1, 0.01, 0.01]) ** 2
-    of = jax.jit(lambda point: sensor_linearity(laser, pose, point, cov))
-    behind, ahead = of(np.array([-3.0, 1e-9])), of(np.array([3.0, 1e-9]))
-    np.testing.assert_allclose(behind.sampled, ahead.sampled, rtol=0.05)
-    with_noise = jax.jit(
-        lambda point: sensor_linearity(laser, pose, point, cov, with_noise=True).hessian
-    )
-    assert with_noise(np.array([3.0, 0.0])) < ahead.hessian
+
+    @jax.jit
+    @jax.vmap
+    def seen(point):
+        with_noise = sensor_linearity(laser, pose, point, cov, with_noise=True)
+        return sensor_linearity(laser, pose, point, cov), with_noise.hessian
+
+    out, with_noise = seen(np.array([[-3.0, 1e-9], [3.0, 1e-9]]))  # behind and ahead
+    np.testing.assert_allclose(out.sampled[0], out.sampled[1], rtol=0.05)
+    assert with_noise[1] < out.hessian[1]
 
 
 # --- Solà 2.3.6: inverse depth is near-linear where range is not ---------------------------------
@@ -282,6 +287,8 @@ def test_inverse_depth_is_near_linear_where_range_is_not(share):
 def test_bad_input_is_refused(change, why):
     arguments = {"f": curved, "x": X, "cov": COV} | change
     with pytest.raises(ValueError, match=why):
+        if "noise_cov" in change:  # by its shape alone
+            jax.eval_shape(lambda: jaxslam.linearity_index(**arguments))
         jaxslam.linearity_index(**arguments)
 
 

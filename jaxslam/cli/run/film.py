@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,6 +11,7 @@ from jaxslam.cli.run.piecewise import PiecewiseRun
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.evaluation import Evaluation
 from jaxslam.monte_carlo.progress import Progress
+from jaxslam.results.files import Json
 
 
 def film_steps(data: Dataset) -> Int[np.ndarray, "F"]:
@@ -21,7 +21,7 @@ def film_steps(data: Dataset) -> Int[np.ndarray, "F"]:
     return frame_steps(data.steps, time=data.time)
 
 
-def watching(at: Int[np.ndarray, "F"]) -> dict[str, Any]:
+def watching(at: Int[np.ndarray, "F"]) -> Json:
     """The arguments of `run_in_pieces` that keep what films of these steps show."""
     from jaxslam.results import plot  # matplotlib is slow to load
 

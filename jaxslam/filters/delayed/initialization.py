@@ -1,11 +1,11 @@
 """Initialization of a landmark from all its stored measurements, which also correct the map."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.filters.delayed.hypotheses import UncertainPoints, relative_spread, safe_root
 from jaxslam.filters.delayed.state import SIZE, covariance_blocks, covariance_rows
@@ -89,7 +89,7 @@ def initial_estimate(
         by_point = inverse_root @ jnp.where(use[:, None], by_point, 0.0)
         return inverse_root @ value, by_stored, by_point, inverse_root, positive
 
-    def gauss_newton(before: Any, _: None) -> tuple[Any, None]:
+    def gauss_newton(before: PyTree, _: None) -> tuple[PyTree, None]:
         point = before[0]
         terms = whitened(point)
         value, _by_stored, by_point, _inverse_root, positive = terms

@@ -8,13 +8,13 @@ For the most persistent hypothesis that this scan confirmed, at most `per_scan` 
 4. `add_landmark` where accepted; its stored measurements and excluded hypotheses are deleted.
 """
 
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, PyTree
 
 from jaxslam.filters.delayed.hypotheses import (
     closer_than,
@@ -84,7 +84,7 @@ def promote_hypotheses(
     """
     measurements = jnp.arange(len(new.tag))
 
-    def once(carry: Any, _: None) -> tuple[Any, None]:
+    def once(carry: PyTree, _: None) -> tuple[PyTree, None]:
         state, confirmed_by, done = carry
         ready, chosen = _candidate(settings, state, confirmed_by)
         free = ~state.joint.alive[settings.layout.of_landmarks]

@@ -1,11 +1,11 @@
 """The observability monitor: information gained along directions that should stay unobservable."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam import validation
 from jaxslam.filters.ekf.coordinates.linear_system import (
@@ -44,7 +44,7 @@ class Monitor(NamedTuple):
 class Monitored(NamedTuple):
     """The state of a monitored filter."""
 
-    state: Any
+    state: PyTree
     """of the filter itself"""
     monitor: Monitor
 

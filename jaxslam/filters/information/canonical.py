@@ -13,12 +13,12 @@ filters", IJRR 23(7-8), 2004; the Notes, with the corrections of ERRATA.
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.derivatives import observe_jacobians
@@ -287,10 +287,10 @@ def report(
 
 def information_filter(
     settings: InformationSettings,
-    init: Callable[[Array, Array], Any],
-    predict: Callable[[Any, Array, Array], Any],
-    update: Callable[[Any, Scan, Array], tuple[Any, Info]],
-    estimate: Callable[[Any], Estimate],
+    init: Callable[[Array, Array], PyTree],
+    predict: Callable[[PyTree, Array, Array], PyTree],
+    update: Callable[[PyTree, Scan, Array], tuple[PyTree, Info]],
+    estimate: Callable[[PyTree], Estimate],
 ) -> Filter:
     """The `Filter` of these functions, with its error in map coordinates."""
     return Filter(

@@ -1,11 +1,11 @@
 """EKF localization: the robot's pose in a known map."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import slots, validation
@@ -158,7 +158,7 @@ def localization(
     )
 
 
-def _in_map(sensor: Sensor, points: Any, settings: EkfSettings) -> EkfSettings:
+def _in_map(sensor: Sensor, points: PyTree, settings: EkfSettings) -> EkfSettings:
     """The settings for one sensor of known landmarks, or for an absolute sensor."""
     absolute = not sensor.landmark
     linearize = settings.linearize if absolute else _on_map(settings.linearize, sensor, points)
@@ -167,7 +167,7 @@ def _in_map(sensor: Sensor, points: Any, settings: EkfSettings) -> EkfSettings:
     )
 
 
-def _on_map(linearize: Linearizer, sensor: Sensor, points: Any) -> Linearizer:
+def _on_map(linearize: Linearizer, sensor: Sensor, points: PyTree) -> Linearizer:
     """The linearizer with the landmark of a slot as a constant of the sensor."""
 
     def observe(flat: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
@@ -233,7 +233,7 @@ def _never_new(associate: Associate) -> Associate:
 
 def checked_map(
     name: str, sensor: Sensor, landmarks: ArrayLike, tags: ArrayLike | None
-) -> tuple[Any, np.ndarray]:
+) -> tuple[PyTree, np.ndarray]:
     """The landmarks and their tags (N,) int32, or a ValueError that begins with a filter's name."""
     size = len(sensor.landmark)
     if np.ndim(landmarks) != 2 or np.shape(landmarks)[1] != size or np.shape(landmarks)[0] == 0:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.alignment import with_unit_blocks
@@ -181,7 +181,7 @@ def search(
     allowed = candidates & (distance <= levels[1])
     points = PointSets(joint.landmarks[recent], joint.landmarks, own, cov, shared, allowed)
 
-    def compare(_: Any) -> tuple[Array, Closing]:
+    def compare(_: PyTree) -> tuple[Array, Closing]:
         found = match(points, limits)
         likely = _joint_distance(delta, points, found) <= levels[found.explained]
         enough = found.explained >= settings.least

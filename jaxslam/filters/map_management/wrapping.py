@@ -2,9 +2,8 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam import validation
 from jaxslam.filters.ekf.coordinates.linear_system import (
@@ -17,7 +16,7 @@ from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
 
 
-def joint_of(manager: str, filter: Filter, state: Any) -> Joint:
+def joint_of(manager: str, filter: Filter, state: PyTree) -> Joint:
     """The filter's state; ValueError, which names the manager, unless it is a `slots.Joint`."""
     if not isinstance(state, Joint):
         raise ValueError(
@@ -39,7 +38,7 @@ def managed(
     of it.
     """
 
-    def checked(joint: Joint, scan: Scan, found: Any) -> tuple[Joint, Info]:
+    def checked(joint: Joint, scan: Scan, found: PyTree) -> tuple[Joint, Info]:
         found = validation.state_and_info(f"{manager}: {filter.name}", joint, scan, found)
         return manage(found[0], scan, found[1])
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
@@ -167,7 +167,7 @@ def fastslam(
 
 
 def of_each_particle(
-    scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: Any
+    scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: PyTree
 ) -> _T:
     """step(*of_particle, scan=…, settings=…) of every particle."""
     return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)

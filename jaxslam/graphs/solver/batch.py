@@ -1,11 +1,12 @@
 """Graphs in a batch: how a function of one graph runs over many of one pattern."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam.graphs.graph import Graph
 
@@ -22,7 +23,7 @@ def with_batch(tree: _T) -> _T:
     return cast(_T, jax.tree.map(lambda x: jnp.asarray(x)[..., None], tree))
 
 
-def over_batch(name: str, function: Callable[..., _T]) -> Callable[[Any, Any], _T]:
+def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTree], _T]:
     """The function of one graph (shared, own), from one of graphs with a last axis B.
 
     `function(*shared, own)` computes all graphs at once, so that its loops run over tables that the
@@ -31,11 +32,11 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[Any, Any], _
     """
 
     @jax.custom_batching.custom_vmap
-    def whole(shared: Any, own: Any) -> _T:
+    def whole(shared: PyTree, own: PyTree) -> _T:
         return function(*shared, own)
 
     @whole.def_vmap
-    def rule(size: int, batched: Any, shared: Any, own: Any) -> tuple[_T, Any]:
+    def rule(size: int, batched: PyTree, shared: PyTree, own: PyTree) -> tuple[_T, PyTree]:
         if any(jax.tree.leaves(batched[0])):
             raise ValueError(f"{name}: expected one plan and one set of limits for a batch")
 
@@ -63,7 +64,7 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[Any, Any], _
         out = jax.tree.map(unfold, whole(shared, jax.tree.map(fold, own, batched[1])))
         return out, jax.tree.map(lambda _: True, out)
 
-    def single(shared: Any, own: Any) -> _T:
+    def single(shared: PyTree, own: PyTree) -> _T:
         return cast(_T, jax.tree.map(lambda x: x[..., 0], whole(shared, with_batch(own))))
 
     return single

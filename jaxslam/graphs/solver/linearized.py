@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
@@ -67,7 +67,7 @@ def _taken(factor: Factor, who: Array, variables: Variables) -> tuple[Array, ...
     )
 
 
-def _over_rows(function: Callable[..., Any], *arguments: Any) -> Any:
+def _over_rows(function: Callable[..., Any], *arguments: PyTree) -> PyTree:
     """The function of one row of one graph, over rows (first axis) and graphs (last axis)."""
     return jax.vmap(jax.vmap(function, -1, -1))(*arguments)
 

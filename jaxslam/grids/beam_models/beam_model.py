@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.grids.grid import Grid
 from jaxslam.types import Beams
@@ -19,12 +18,12 @@ class BeamModel:
     """A density of the range of each beam, given pose and map."""
 
     name: str
-    prepare: Callable[[Grid], Any]
+    prepare: Callable[[Grid], PyTree]
     """(grid) -> what the model needs of the map, once for all scans: a pytree of arrays"""
-    each: Callable[[Any, Array, Beams], Array]
+    each: Callable[[PyTree, Array, Beams], Array]
     """(prepared, pose (3,) of the robot, beams) -> (B,) log-densities, finite also where a beam is
     not valid"""
-    jacobian: Callable[[Any, Array, Beams], Array] | None = None
+    jacobian: Callable[[PyTree, Array, Beams], Array] | None = None
     """(prepared, pose, beams) -> (B, 3), their derivatives by the pose, derived by hand: `verify`
     compares them with automatic differentiation and differences"""
     mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -33,7 +32,7 @@ class BeamModel:
 
 def log_likelihood(
     model: BeamModel,
-    prepared: Any,
+    prepared: PyTree,
     pose: Float[Array, "3"],
     beams: Beams,
     *,
@@ -68,7 +67,7 @@ def usable_beams(beams: Beams) -> Bool[Array, "B"]:
     return beams.valid & (beams.range >= 0)
 
 
-def check_beams(name: str, beams: Any) -> None:
+def check_beams(name: str, beams: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless beams are one scan.
 
     Ranges, angles and masks must be as many, and outside a trace at least one beam must be usable.

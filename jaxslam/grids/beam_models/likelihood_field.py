@@ -1,11 +1,10 @@
 """Beam end-points against the distance to the nearest obstacle."""
 
 import math
-from typing import Any
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.grids.beam_models.beam_model import BeamModel
 from jaxslam.grids.beam_models.ray_cast import check_weights
@@ -66,14 +65,14 @@ def likelihood_field(
     def total_of(near: Float[Array, "B"]) -> Float[Array, "B"]:
         return jnp.maximum(near + random / max_range, jnp.finfo(near.dtype).tiny)
 
-    def each(field: Any, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def each(field: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         far, ends = ends_of(pose, beams)
         log_near = jnp.log(total_of(near_of(interpolate(field, ends))))
         silent = jnp.asarray(maximum) == 0
         log_far = jnp.where(silent, 0.0, jnp.log(jnp.where(silent, 1.0, maximum)))
         return jnp.where(far, log_far, log_near)
 
-    def jacobian(field: Any, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
+    def jacobian(field: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
         # log(n + r) by d is -n d/σ²/(n + r); the end moves by dt, and by dθ across the arm to it.
         far, ends = ends_of(pose, beams)
         d = interpolate(field, ends)

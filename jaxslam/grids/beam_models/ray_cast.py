@@ -1,14 +1,14 @@
 """The range of a beam against the one that the map predicts: a mixture of four components."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam.grids.beam_models.beam_model import BeamModel
 from jaxslam.grids.cast import RayMap, cast, ray_map
@@ -110,13 +110,13 @@ def ray_cast(
     def prepare(grid: Grid) -> RayMap:
         return ray_map(grid, method=method)
 
-    def each(rays: Any, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def each(rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
         expected = cast(rays, eye, beams.angle, max_range)
         z = jnp.minimum(beams.range, max_range)
         return mixture_log_density(mixture, z, expected, max_range)
 
-    def jacobian(rays: Any, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
+    def jacobian(rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
         """The derivative by z*, times that of z*, for which `cast` has its own rule."""
         frame = jnp.asarray(mount, pose.dtype)
 

@@ -154,7 +154,7 @@ def localize(
         blocked = blocked & active_mask(state)
         state, found = weigh_particles(state, misfit, fit, beams.valid.sum(), settings)
         found = found._replace(blocked=blocked.sum(dtype=jnp.int32))
-        info = _info_of_beams(scan, every, evidence)
+        info = info_of_beams(scan, every, evidence)
         return state, with_extra(info, "particles", found)
 
     def estimate(state: PoseParticles) -> Estimate:
@@ -198,7 +198,7 @@ def _blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
     return ~inside | (jnp.asarray(grid.log_odds > 0)[i, j])
 
 
-def _info_of_beams(scan: Scan, every: int, log_likelihood: Float[Array, ""]) -> Info:
+def info_of_beams(scan: Scan, every: int, log_likelihood: Float[Array, ""]) -> Info:
     """The `Info` of a scan: what became of each beam; a beam has no innovation."""
     m = scan.valid.shape[0]
     taken = jnp.arange(m) % every == 0

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from jaxslam.consistency import DOF, LEVELS
 from jaxslam.monte_carlo import Campaign
+from jaxslam.results.files import Json
 
 NUMBERS = 120_000
 """About as many numbers at most stand in a page, in up to 1 MB."""
@@ -83,7 +84,7 @@ def embedded(campaign: Campaign) -> Curves:
     return Curves(text.replace("<", "\\u003c"), each)
 
 
-def _chart(figure: str, x: str, panels: list[Any], beside: bool = False) -> dict[str, Any]:
+def _chart(figure: str, x: str, panels: list[Any], beside: bool = False) -> Json:
     return {"figure": figure, "x": x, "beside": beside, "panels": panels}
 
 
@@ -101,7 +102,7 @@ class _Panels:
         key: str,
         reference: tuple[str, float] | None = None,
         bound: str = "",
-    ) -> dict[str, Any] | None:
+    ) -> Json | None:
         """A panel over the steps, or None where no filter has such a curve."""
         found = [s.curves.get(key) for s in self.summaries]
         values = [None if curve is None else self._thinned(curve) for curve in found]
@@ -118,7 +119,7 @@ class _Panels:
             ],
             [s.counts["runs"] for s in self.summaries],
         )
-        line: dict[str, Any] | None = None
+        line: Json | None = None
         bounds = [s.curves[bound] for s in self.summaries if bound in s.curves]
         if bounds:
             line = {
@@ -136,7 +137,7 @@ class _Panels:
             "floor": _NOTHING,
         }
 
-    def coverage(self, block: str) -> dict[str, Any]:
+    def coverage(self, block: str) -> Json:
         """The panel of the share of truth within the ellipsoids of a block."""
         return {
             "title": f"{block} (dof {DOF[block]}): share of truth within",
@@ -150,7 +151,7 @@ class _Panels:
             "reference": {"label": "honest", "values": _numbers(np.asarray(LEVELS))},
         }
 
-    def whiteness(self, lags: list[int]) -> dict[str, Any]:
+    def whiteness(self, lags: list[int]) -> Json:
         """The panel of the autocorrelation of innovations; the widest band is drawn."""
         halves = [s.autocorrelation_band for s in self.summaries]
         bands = [[_numbers(-half), _numbers(half)] for half in halves]
@@ -180,7 +181,7 @@ class _Panels:
         ]
 
 
-def _banded(bands: Sequence[list[Any] | None], weights: Sequence[float]) -> dict[str, Any]:
+def _banded(bands: Sequence[list[Any] | None], weights: Sequence[float]) -> Json:
     """Bands without repetition, each filter's place in them, and the place of the drawn one.
 
     Drawn is the band of the filter with the greatest weight.

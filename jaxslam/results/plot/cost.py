@@ -14,6 +14,7 @@ from jaxslam.results.plot.style import (
     TEXT,
     caption,
     curve,
+    every_handle,
     look,
     ordinate,
     panels_of,
@@ -50,7 +51,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             axes.lines[-1].set(markersize=7.0, linestyle="none")
         ordinate(axes, named, 0.2 * width + 0.3)
         _scale(axes, _values(campaign, key), "y")
-    panels[-1].axhline(DOF["pose"], color=INK, lw=0.8, zorder=1.5)
+    honest = panels[-1].axhline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
     panels[-1].set_xlabel("time of a step [µs]")
     if np.isfinite(list(times.values())).any():
         _scale(panels[-1], np.array(list(times.values())), "x")
@@ -59,7 +60,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     else:
         said = "no filter was timed"
         panels[0].text(0.5, 0.5, said, transform=panels[0].transAxes, ha="center", fontsize=TEXT)
-    caption(figure, _title(campaign))
+    caption(figure, _title(campaign), [*every_handle(panels[:1]), honest])
     return figure
 
 
@@ -96,8 +97,8 @@ def _listed(campaign: Campaign, times: dict[str, float], width: float) -> Figure
     panels[0].set_xlabel("time of a step [µs]" if timed else "no filter was timed")
     for axes, named in zip(panels[1:], _LABELS.values(), strict=True):
         axes.set_xlabel(named)
-    panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5)
-    caption(figure, f"{_title(campaign)}; lines: 95 % intervals", [])
+    honest = panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
+    caption(figure, f"{_title(campaign)}; lines: 95 % intervals", [honest])
     return figure
 
 

@@ -1,7 +1,6 @@
 """The figure of a graph before and after its optimization."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -17,6 +16,7 @@ from jaxslam.results.plot.style import (
     INK,
     PAGE,
     SHADE,
+    Look,
     caption,
     every_handle,
     panels_of,
@@ -100,7 +100,7 @@ def _draw(
     worst = np.concatenate([np.zeros((0, 2, 2)), *bad])
     if len(worst):
         axes.add_collection(LineCollection(list(worst), colors=COLORS[1], linewidths=1.4, zorder=5))
-        ring: dict[str, Any] = {
+        ring: Look = {
             "ls": "none",
             "mfc": "none",
             "mec": COLORS[1],
@@ -110,7 +110,7 @@ def _draw(
         }
         label = f"{len(worst)} largest residuals"
         axes.plot(*worst.mean(axis=1).T, marker="o", label=label, **ring)
-    start: dict[str, Any] = {
+    start: Look = {
         "ls": "none",
         "color": INK,
         "mfc": "white",

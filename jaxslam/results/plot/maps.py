@@ -1,7 +1,6 @@
 """Figures of maps: paths, landmarks with covariance ellipses, the truth or a survey."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,6 +17,7 @@ from jaxslam.results.plot.style import (
     INK,
     PAGE,
     SHADE,
+    Look,
     caption,
     every_handle,
     look,
@@ -53,7 +53,8 @@ def map_figure(
 
     Args:
         estimate: with leading T, as in `Trace.estimate`.
-        truth: of a simulated world; or, drawn without alignment,
+        truth: of a simulated world whose landmarks begin with a place (of lines: of
+            `worlds.with_positions`); or, drawn without alignment,
         true_points: (N, 2) landmarks [m], in the order of tags where names is given, and
         true_path: (T, 2 or 3) poses.
         dead_reckoning: (T, 2 or 3) poses; what is far from the rest of the map is not shown.
@@ -164,7 +165,7 @@ def _draw_estimate(axes: Axes, estimate: Estimate, n_sigma: float) -> list[np.nd
             axes.plot(*contour.T, color=color, lw=0.9, label=named, zorder=3)
     if refused:
         axes.set_title(f"{refused} without ellipse", loc="right", fontsize=7, color=INK)
-    ends: dict[str, Any] = {"ls": "none", "color": INK, "zorder": 6}
+    ends: Look = {"ls": "none", "color": INK, "zorder": 6}
     axes.plot(*pose[0, :2], marker="o", mfc="white", mew=1.2, ms=5, label="start", **ends)
     turned = MarkerStyle(_ARROW, transform=Affine2D().rotate(np.nan_to_num(pose[-1, 2])))
     axes.plot(*pose[-1, :2], marker=turned, mec="white", mew=0.6, ms=12, label="end", **ends)

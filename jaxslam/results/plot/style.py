@@ -12,6 +12,9 @@ from matplotlib.figure import Figure as Figure  # re-exported: only this package
 
 Share: TypeAlias = bool | Literal["none", "all", "row", "col"]
 
+Look: TypeAlias = dict[str, Any]
+"""How an artist looks: Matplotlib's properties by name."""
+
 PAGE, COLUMN = 7.16, 3.5
 """Widths [in] of the text and of a column of a two-column paper."""
 
@@ -35,7 +38,7 @@ _FEW = 12
 """A curve of so many values has a mark at each."""
 
 
-def look(i: int) -> dict[str, Any]:
+def look(i: int) -> Look:
     """Options of the line of filter number i: colour, dashes and mark, each another.
 
     Thirty differ in colour and dashes; five differ in dashes and marks alone, without colour.

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from jaxslam.math.xla import quick_jit
 from jaxslam.verify.derivatives.differences import Batch, Quotient, complex_step, quotients
@@ -160,7 +160,7 @@ class _Evaluator:
     def both_modes(self) -> Callable[..., Any]:
         """The function of batches of arguments -> Jacobians by forward and by reverse mode."""
 
-        def both(*arguments: jax.Array) -> Any:
+        def both(*arguments: jax.Array) -> PyTree:
             forward = jax.jacfwd(self.function.call, argnums=self.over)(*arguments)
             return forward, jax.jacrev(self.function.call, argnums=self.over)(*arguments)
 
@@ -188,7 +188,7 @@ class _Evaluator:
             return
         claim = self.function.hand
 
-        def hand(*arguments: Any) -> Any:
+        def hand(*arguments: PyTree) -> PyTree:
             return as_claim(claim(*arguments))
 
         name = f"the Jacobian claimed for {self.function.name}"
@@ -213,7 +213,7 @@ class _Evaluator:
         except (Exception, SystemExit) as error:
             self.checks.append(Check(f"{name} can be used", False, describe_error(error)))
 
-    def _split(self, claim: Any) -> list[Any]:
+    def _split(self, claim: PyTree) -> list[PyTree]:
         """A claimed Jacobian split by argument; raises ValueError on a wrong shape."""
         names = [argument.name for argument in self.function.arguments]
         return split_claim(claim, len(self.function.outputs), names, self.sizes)
@@ -275,7 +275,7 @@ def _worst_gap(methods: dict[str, Values], reference: dict[str, Values]) -> np.n
 def _looped(call: Callable[..., Any]) -> Callable[..., Any]:
     """The function applied state by state, if it cannot be traced; keeps None in tuples."""
 
-    def batch(*arguments: States) -> Any:
+    def batch(*arguments: States) -> PyTree:
         rows = [call(*(jnp.asarray(a[i]) for a in arguments)) for i in range(len(arguments[0]))]
         if isinstance(rows[0], tuple | list):
             return tuple(

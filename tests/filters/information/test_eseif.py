@@ -178,22 +178,6 @@ def test_every_step_is_the_dense_formula():
 # --- whole runs ----------------------------------------------------------------------------------
 
 
-def test_while_nothing_is_cut_it_is_the_eif():
-    ours, theirs = driven("eseif", active=99, links=COUNT - 1), driven("eif_slam")
-    for t in (10, 30, STEPS - 1):
-        (a, info), (b, other) = ours[t], theirs[t]
-        np.testing.assert_allclose(a.pose, b.pose, atol=1e-8)
-        np.testing.assert_array_equal(info.status, other.status)
-        np.testing.assert_allclose(info.nis, other.nis, atol=1e-8)
-        tag = np.asarray(b.tag)
-        there = np.flatnonzero(tag >= 0)
-        order = at(tag[there])
-        close(
-            np.asarray(dense(a))[np.ix_(order, order)], np.asarray(b.omega)[at(there)][:, at(there)]
-        )
-    assert int(a.counts.relocated) == int(a.counts.cut) == 0
-
-
 def test_relocation_is_conservative_over_a_run_and_sparsification_is_not():
     """Without noise in the data all filters linearize at the truth: covariances alone differ."""
     eif, exact, sparse = driven("eif_slam"), driven("eseif", **AREA), driven("seif", **AREA)

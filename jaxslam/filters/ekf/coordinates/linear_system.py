@@ -6,11 +6,11 @@ takes it. Under `jit` what nobody takes costs nothing.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.math import linalg
 from jaxslam.protocols import Chart, Filter
@@ -97,16 +97,16 @@ LinearSystem = tuple[Transition | LinearMeasurements | LinearLandmarks | InTurn,
 class LinearizedSteps:
     """The steps of a filter with the linear system of each; `predict` and `update` are without."""
 
-    predict_linearized: Callable[[Any, Array, Array], tuple[Any, LinearSystem]]
+    predict_linearized: Callable[[PyTree, Array, Array], tuple[PyTree, LinearSystem]]
     """(S, u, key) -> S, system."""
-    update_linearized: Callable[[Any, Scan, Array], tuple[Any, Info, LinearSystem]]
+    update_linearized: Callable[[PyTree, Scan, Array], tuple[PyTree, Info, LinearSystem]]
     """(S, scan, key) -> S, info, system."""
 
-    def predict(self, state: Any, u: Array, key: Array) -> Any:
+    def predict(self, state: PyTree, u: Array, key: Array) -> PyTree:
         """`Filter.predict`."""
         return self.predict_linearized(state, u, key)[0]
 
-    def update(self, state: Any, scan: Scan, key: Array) -> tuple[Any, Info]:
+    def update(self, state: PyTree, scan: Scan, key: Array) -> tuple[PyTree, Info]:
         """`Filter.update`."""
         return self.update_linearized(state, scan, key)[:2]
 

@@ -2,11 +2,9 @@
 and retraction by errors.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam.filters.ekf.coordinates.linear_system import Transition
 from jaxslam.filters.ekf.coordinates.to_points import seen_as
@@ -32,7 +30,7 @@ def estimate_of(
         landmark: Float[Array, "L"],
         own: Float[Array, "L L"],
         by_robot: Float[Array, "L 3"],
-        reduced: Any,
+        reduced: PyTree,
     ) -> tuple[Float[Array, "2"], Float[Array, "2 2"]]:
         position = seen_as(sensor, reduced).position
         by_landmark = jax.jacfwd(position)(landmark)

@@ -5,11 +5,11 @@ one function for each step. Its result, an `Innovation`, serves all forms of the
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam import slots
 from jaxslam.filters.ekf.coordinates.linear_system import Transition, basis_of_each
@@ -201,7 +201,7 @@ def _linearize(
 
     def observe(
         at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "3+L 3+L"]
-    ) -> Any:
+    ) -> PyTree:
         here = Here(whole, chart, pose, cov, at, landmark)
         return settings.linearize.observe(at_slot(sensor, whole, at), here)
 
@@ -242,7 +242,7 @@ def _gate(
     inverse: Float[Array, "m Z Z"],
     definite: Bool[Array, "m"],
     known: Bool[Array, "m"],
-    gate: Any,
+    gate: PyTree,
 ) -> _Gated:
     """The gate: which measurements are fused. inverse: L⁻¹ of each cov = L Lᵀ."""
     distance = (whitened_by(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))

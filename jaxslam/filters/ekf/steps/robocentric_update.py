@@ -1,11 +1,11 @@
 """Sequential corrections of a map and its last motion, which are composed at the end of the scan
 (`Chart.motion_apart`)."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.filters.ekf.coordinates.linear_system import Transition
 from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
@@ -118,7 +118,7 @@ def correct_map_and_motion(
     )
 
     def one(
-        state: MapAndMotion, measurement: tuple[jax.Array, Any]
+        state: MapAndMotion, measurement: tuple[jax.Array, PyTree]
     ) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:
         return _correct_one(state, measurement, rest, settings)
 
@@ -141,7 +141,7 @@ def correct_map_and_motion(
 
 def _correct_one(
     state: MapAndMotion,
-    measurement: tuple[jax.Array, Any],
+    measurement: tuple[jax.Array, PyTree],
     whole: Joint,
     settings: EkfSettings,
 ) -> tuple[MapAndMotion, tuple[jax.Array, jax.Array, Correction]]:

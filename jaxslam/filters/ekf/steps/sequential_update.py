@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
 from jaxslam.filters.ekf.coordinates.robocentric_motion import unmoved
@@ -170,7 +170,7 @@ def correct_group(
         tag=joint.tag[slot],
     )
 
-    def one(local: Joint, measurement: tuple[jax.Array, Any]) -> tuple[Joint, Any]:
+    def one(local: Joint, measurement: tuple[jax.Array, PyTree]) -> tuple[Joint, PyTree]:
         return _correct_local(local, measurement, joint, settings)
 
     # A gradient stores the input of each step, and recomputes the rest.
@@ -186,7 +186,7 @@ def correct_group(
 
 
 def _correct_local(
-    local: Joint, measurement: tuple[jax.Array, Any], whole: Joint, settings: EkfSettings
+    local: Joint, measurement: tuple[jax.Array, PyTree], whole: Joint, settings: EkfSettings
 ) -> tuple[Joint, tuple[jax.Array, jax.Array, Correction]]:
     """A local map corrected by a measurement of its landmark i (), of slot () in the whole map.
 

@@ -1,11 +1,11 @@
 """Particles with a map each: the state of FastSLAM and of mapping from known poses."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
@@ -38,7 +38,7 @@ class SlamParticles(NamedTuple):
     invalid: Bool[Array, "*P"]
     """the last motion gave a pose that was not finite; it was discarded, and the particle has
     weight zero"""
-    life: Any = None
+    life: PyTree = None
     """the memory (P, …) of the filter's `Life`, where it has one"""
 
 

@@ -1,14 +1,12 @@
 """The links of an information filter, as they appear and are cut."""
 
-from typing import Any
-
 import numpy as np
 
 from jaxslam.results.plot.scene.history import History
 from jaxslam.results.plot.scene.layers import segments, weighted_segments
 from jaxslam.results.plot.scene.probe import Links
 from jaxslam.results.plot.scene.render import Layer
-from jaxslam.results.plot.style import COLORS, INK
+from jaxslam.results.plot.style import COLORS, INK, Look
 
 _ROBOT_LINK, _LINK = COLORS[5], COLORS[3]
 
@@ -48,10 +46,10 @@ def link_layers(history: History) -> list[Layer]:
         alive = np.append(True, history.estimate.alive[k])
         gone = lately & ~there & alive[:, None] & alive[None, :]
         cut.append(nodes[np.stack(np.nonzero(gone), axis=1)])
-    look: dict[str, Any] = {"capstyle": "round", "zorder": 2.6}
-    dots: dict[str, Any] = {"color": INK, "lw": 1.0, "ls": (0, (1, 1.2)), "zorder": 2.8}
-    landmarks: dict[str, Any] = look | {"width": 3.0, "label": "link of landmarks"}
-    robots: dict[str, Any] = look | {"width": 5.0, "label": "link to the robot"}
+    look: Look = {"capstyle": "round", "zorder": 2.6}
+    dots: Look = {"color": INK, "lw": 1.0, "ls": (0, (1, 1.2)), "zorder": 2.8}
+    landmarks: Look = look | {"width": 3.0, "label": "link of landmarks"}
+    robots: Look = look | {"width": 5.0, "label": "link to the robot"}
     return [
         weighted_segments(between, weights["between"], color=_LINK, **landmarks),
         weighted_segments(robot, weights["robot"], color=_ROBOT_LINK, **robots),

@@ -1,7 +1,6 @@
 """The scene of one run of a filter: its map, and its robot seen from near."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from jaxslam.results.plot.scene.layers import (
 from jaxslam.results.plot.scene.links import link_layers
 from jaxslam.results.plot.scene.probe import Cloud
 from jaxslam.results.plot.scene.render import Layer, Panel, Scene
-from jaxslam.results.plot.style import COLORS, FAINT, INK
+from jaxslam.results.plot.style import COLORS, FAINT, INK, Look
 
 _NEAR = 1.5
 """What the estimate adds to the limits of the truth: at most this factor."""
@@ -30,7 +29,7 @@ _ROBOT = 0.035
 _MANY = 60
 """With more landmarks their marks are smaller."""
 
-_BEAMS: dict[str, dict[str, Any]] = {
+_BEAMS: dict[str, Look] = {
     "fused": {"color": COLORS[2], "lw": 0.8, "ls": "-"},
     "new": {"color": COLORS[4], "lw": 1.2, "ls": (0, (5, 2))},
     "stored": {"color": COLORS[5], "lw": 0.9, "ls": (0, (6, 1.3, 1.4, 1.3))},
@@ -112,13 +111,13 @@ def _truth(
     """The true map, path and robot, in grey."""
     layers = []
     if points is not None:
-        look: dict[str, Any] = {"ls": "none", "marker": "x", "ms": 5, "mew": 1.0, "zorder": 2}
+        look: Look = {"ls": "none", "marker": "x", "ms": 5, "mew": 1.0, "zorder": 2}
         layers.append(still(points, color=FAINT, label="true landmarks", **look))
     if path is not None:
-        line: dict[str, Any] = {"lw": 1.2, "ls": (0, (4, 2)), "zorder": 2.1}
+        line: Look = {"lw": 1.2, "ls": (0, (4, 2)), "zorder": 2.1}
         named = "truth: path, robot"
         layers.append(track(path, history.step, color=FAINT, label=named, **line))
-        robot: dict[str, Any] = {"fc": "none", "ec": FAINT, "lw": 1.2, "zorder": 5.5}
+        robot: Look = {"fc": "none", "ec": FAINT, "lw": 1.2, "zorder": 5.5}
         layers.append(triangle(path[history.step], size, **robot))
     return layers
 
@@ -137,9 +136,9 @@ def _map(history: History, n_sigma: float) -> list[Layer]:
     _, _, points, covs, alive, _ = history.estimate
     if not np.any(alive):
         return []
-    ring: dict[str, Any] = {"color": COLORS[1], "lw": 1.0, "zorder": 4}
+    ring: Look = {"color": COLORS[1], "lw": 1.0, "zorder": 4}
     size = 3.2 if points.shape[1] <= _MANY else 1.8
-    dots: dict[str, Any] = {"color": COLORS[1], "marker": "o", "ms": size, "zorder": 4.1}
+    dots: Look = {"color": COLORS[1], "marker": "o", "ms": size, "zorder": 4.1}
     return [
         marks(points, alive, label="_", **dots),
         rings(points, covs, alive, n_sigma, label=f"landmark, {n_sigma:g} σ", **ring),
@@ -149,9 +148,9 @@ def _map(history: History, n_sigma: float) -> list[Layer]:
 def _robot(history: History, n_sigma: float, size: float) -> list[Layer]:
     """The path so far, particles, the robot's ellipse, and the robot."""
     pose, cov = history.estimate.pose, history.estimate.pose_cov
-    line: dict[str, Any] = {"color": COLORS[0], "lw": 1.4, "zorder": 3.5}
-    ring: dict[str, Any] = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 5.2}
-    robot: dict[str, Any] = {"fc": COLORS[0], "ec": "white", "lw": 0.6, "zorder": 5}
+    line: Look = {"color": COLORS[0], "lw": 1.4, "zorder": 3.5}
+    ring: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 5.2}
+    robot: Look = {"fc": COLORS[0], "ec": "white", "lw": 0.6, "zorder": 5}
     layers = [track(history.path, history.step, label="estimate: path, robot", **line)]
     if isinstance(history.seen, Cloud):
         layers.append(_particles(history.seen, np.zeros((len(pose), 2)), "particles"))
@@ -165,7 +164,7 @@ def _robot(history: History, n_sigma: float, size: float) -> list[Layer]:
 
 def _particles(seen: Cloud, origin: np.ndarray, label: str) -> Layer:
     """The positions of particles, from an origin (F, 2)."""
-    look: dict[str, Any] = {"color": COLORS[7], "lw": 0, "alpha": 0.6, "zorder": 5.1}
+    look: Look = {"color": COLORS[7], "lw": 0, "alpha": 0.6, "zorder": 5.1}
     at = np.asarray(seen.pose)[..., :2] - origin[:, None]
     return cloud(at, np.asarray(seen.weight), label=label, **look)
 
@@ -176,9 +175,9 @@ def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
     middle, here = np.zeros((len(pose), 1, 2)), np.ones((len(pose), 1), bool)
     contours = ellipses(middle[:, 0], cov[:, 0], n_sigma)
     reach = np.abs(contours[np.isfinite(contours)]).max(initial=0.0)
-    ring: dict[str, Any] = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 4}
+    ring: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 4}
     layers = [rings(middle, cov, here, n_sigma, label=f"robot, {n_sigma:g} σ", **ring)]
-    dot: dict[str, Any] = {"color": COLORS[0], "marker": "+", "ms": 7, "mew": 1.2, "zorder": 5}
+    dot: Look = {"color": COLORS[0], "marker": "+", "ms": 7, "mew": 1.2, "zorder": 5}
     layers.append(marks(middle, here, label="_", **dot))
     if isinstance(history.seen, Cloud):
         layers.insert(0, _particles(history.seen, pose[:, :2], "_"))
@@ -192,11 +191,11 @@ def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
         reach = max(reach, min(far, 3 * reach) if reach > 0 else far)
         half = 1.08 * reach or 1.0
         out = known & (np.abs(off).max(axis=2) > half)
-        cross: dict[str, Any] = {"marker": "X", "ms": 6.5, "zorder": 6, "clip_on": False}
+        cross: Look = {"marker": "X", "ms": 6.5, "zorder": 6, "clip_on": False}
         layers.append(marks(off, known & ~out, label="true position", color=INK, **cross))
         if out.any():
             edge = np.clip(off, -half, half)
-            look: dict[str, Any] = {"label": "true position beyond", "mfc": "white", "mec": INK}
+            look: Look = {"label": "true position beyond", "mfc": "white", "mec": INK}
             layers.append(marks(edge, out, **look, **cross))
     half = 1.08 * reach or 1.0
     return Panel(

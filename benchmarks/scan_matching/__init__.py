@@ -1,0 +1,1 @@
+"""Scan matching held against the truth: see `__main__`."""

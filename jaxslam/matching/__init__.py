@@ -1,0 +1,26 @@
+"""Scan matching: where a scan lies on another or on a map, and how well that is known."""
+
+from jaxslam.matching import covariance
+from jaxslam.matching.correlative import correlative
+from jaxslam.matching.field import field
+from jaxslam.matching.matcher import Match, Matcher, MatchStatus, match
+from jaxslam.matching.point_to_line import point_to_line
+from jaxslam.matching.point_to_point import point_to_point
+from jaxslam.matching.points import Points, moved_along_rays, points, raster, transformed
+
+__all__ = [
+    "Match",
+    "MatchStatus",
+    "Matcher",
+    "Points",
+    "correlative",
+    "covariance",
+    "field",
+    "match",
+    "moved_along_rays",
+    "point_to_line",
+    "point_to_point",
+    "points",
+    "raster",
+    "transformed",
+]

@@ -1,0 +1,64 @@
+"""The closed form with residuals across the surface alone (Bonnabel, Barczyk & Goulette 2016)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxslam.matching.covariance.record import MatchCovariance, check_sigma, inverse_of
+from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.outcome import information_of
+from jaxslam.matching.points import Points
+from jaxslam.matching.surface import surface
+from jaxslam.math import se2
+
+
+def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> MatchCovariance:
+    """A⁻¹ B A⁻¹ with A = Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), and B the noise that reaches Σ w J e.
+
+    A scan that slides along a wall finds other partners, so that the part of a residual along the
+    wall says nothing: the second derivative of point-to-point with its pairs kept counts it as
+    information, whatever the noise. Across the wall a change of partner matters to second order
+    only (Bonnabel, Barczyk & Goulette 2016, "On the covariance of ICP-based scan-matching
+    techniques", ACC). Hence n alone, for both ICPs. A range of the scan moves its residual by n·Ru,
+    u the beam; one of the reference those of all its partners by -n·u:
+
+        B = σ² (Σ_i w_i² (n·R u_i)² J_i J_iᵀ + Σ_j (n_j·u_j)² s_j s_jᵀ),
+
+    s_j the sum of w_i J_i over the partners i of j.
+
+    References are `Points`.
+
+    Args:
+        sigma: standard deviation of a range [m].
+        span, gap: of the lines, as in `point_to_line`.
+    """
+    check_sigma("along_normals", sigma)
+
+    def of(
+        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+    ) -> Float[Array, "3 3"]:
+        del start, key
+        if not isinstance(reference, Points):
+            raise ValueError(
+                f"along_normals: takes a reference of Points, got {type(reference).__name__}"
+            )
+        lines = surface(reference, span, gap)
+        j = jnp.maximum(found.pair, 0)
+        weight = jnp.where(lines.straight[j], found.weight, 0.0)
+        turn = se2.rotation(found.pose[2]).T
+        arm, ray, n = points.position @ turn, points.ray @ turn, lines.normal[j]
+        jacobian = jnp.concatenate(
+            [n, (n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1])[:, None]], axis=1
+        )
+        shape = information_of(jacobian, weight)
+        by_scan = (weight * (n * ray).sum(axis=1))[:, None] * jacobian
+        of_partner = jax.ops.segment_sum(weight[:, None] * jacobian, j, len(reference.valid))
+        by_reference = (lines.normal * reference.ray).sum(axis=1)[:, None] * of_partner
+        noise = by_scan.T @ by_scan + by_reference.T @ by_reference
+        gain = inverse_of(shape, shape, sigma=sigma)
+        return jnp.asarray(sigma) ** 2 * gain @ noise @ gain
+
+    return MatchCovariance("along_normals", of)

@@ -1,0 +1,32 @@
+"""The covariance that a quadratic cost would have: its inverse second derivative."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.matching.covariance.record import MatchCovariance, curvature, inverse_of
+from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.points import Points
+
+
+def hessian() -> MatchCovariance:
+    """s² (∂²E/∂x²)⁻¹ with E = ½ Σ w e² and s² = 2E/(n - 3) of n pairs.
+
+    Right for independent residuals of one variance that the pairs do not follow. Two scans of
+    different density, and pairs that change with the pose, break that.
+    Bengtsson & Baerveldt 2003, "Robot localization based on scan-matching: estimating the
+    covariance matrix for the IDC algorithm", Robotics and Autonomous Systems 44.
+    """
+
+    def of(
+        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+    ) -> Float[Array, "3 3"]:
+        del start, key
+        prepared = matcher.prepare(reference)
+        count = (found.weight > 0).sum()
+        least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(count - 3, 1)
+        shape = curvature(matcher, prepared, points, found)
+        return least * inverse_of(shape, found.information)
+
+    return MatchCovariance("hessian", of)

@@ -1,0 +1,60 @@
+"""The noise of the ranges through the condition that the match is a minimum (Censi 2007)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxslam.matching.covariance.record import (
+    MatchCovariance,
+    check_sigma,
+    curvature,
+    inverse_of,
+    range_count,
+    with_ranges,
+)
+from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.points import Points, moved_along_rays
+
+
+def implicit(sigma: ArrayLike) -> MatchCovariance:
+    """(∂²E/∂x²)⁻¹ (∂²E/∂z∂x) σ² (∂²E/∂z∂x)ᵀ (∂²E/∂x²)⁻¹ with the ranges z of both scans.
+
+    From ∂E/∂x = 0 at the minimum: dx/dz = -(∂²E/∂x²)⁻¹ ∂²E/∂z∂x. The derivatives are those of the
+    matcher's cost by automatic differentiation, through the lines that are fitted to the reference;
+    pairs and weights are kept. Of a grid only the noise of the scan counts.
+    Where pairs follow the scan, as those of point-to-point along a wall, keeping them feigns
+    information (Bonnabel et al. 2016; see `along_normals`).
+
+    Censi 2007, "An accurate closed-form estimate of ICP's covariance", ICRA.
+
+    Args:
+        sigma: standard deviation of a range [m].
+    """
+    check_sigma("implicit", sigma)
+
+    def of(
+        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+    ) -> Float[Array, "3 3"]:
+        del start, key
+        prepared = matcher.prepare(reference)
+
+        def slope(of_reference: Array, of_scan: Array) -> Array:
+            changed = with_ranges(reference, of_reference)
+            there = matcher.prepare(changed) if isinstance(reference, Points) else prepared
+            moved = moved_along_rays(points, of_scan)
+            by_pose: Any = jax.grad(lambda pose: matcher.cost(there, moved, pose, found))(
+                found.pose
+            )
+            return jnp.asarray(by_pose)
+
+        dtype = points.position.dtype
+        zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)
+        by_ranges = jnp.concatenate(jax.jacrev(slope, argnums=(0, 1))(*zeros), axis=1)
+        shape = curvature(matcher, prepared, points, found)
+        gain = inverse_of(shape, found.information, sigma=sigma) @ by_ranges
+        return jnp.asarray(sigma) ** 2 * gain @ gain.T
+
+    return MatchCovariance("implicit", of)

@@ -1,0 +1,100 @@
+"""The record of a way to state the covariance of a match, and what several of them share."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam import programs
+from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.points import Points, moved_along_rays
+from jaxslam.math import linalg
+from jaxslam.validation.numbers import is_concrete
+
+
+@dataclass(frozen=True, eq=False)
+class MatchCovariance:
+    """A covariance of the pose of a match, in its coordinates (x, y, θ)."""
+
+    name: str
+    of: Callable[[Matcher, Any, Points, Match, Array, Array], Array]
+    """(matcher, reference, points, match, start (3,), key) -> (3, 3), finite; the reference is the
+    one that `matcher.prepare` takes. Traceable; of one pair: vmap it."""
+
+
+def covariance(
+    way: MatchCovariance,
+    matcher: Matcher,
+    reference: Any,
+    points: Points,
+    found: Match,
+    start: Any,
+    key: Array,
+) -> Array:
+    """The covariance (3, 3) of a match, by a program that is compiled once a structure.
+
+    With a leading axis on the start, and so on all arrays but the key, (B, 3, 3).
+    """
+    given = reference, points, found, start, key
+    if np.ndim(start) == 2:
+        return programs.call(_many, (way, matcher), *given)
+    return programs.call(_one, (way, matcher), *given)
+
+
+def _one(way: MatchCovariance, matcher: Matcher, *given: Any) -> Array:
+    return way.of(matcher, *given)
+
+
+def _many(
+    way: MatchCovariance,
+    matcher: Matcher,
+    reference: Any,
+    points: Points,
+    found: Match,
+    start: Array,
+    key: Array,
+) -> Array:
+    keys = jax.random.split(key, len(start))
+    each: Any = jax.vmap(lambda *pair: way.of(matcher, *pair))
+    return jnp.asarray(each(reference, points, found, start, keys))
+
+
+def check_sigma(name: str, sigma: Any) -> None:
+    """Raise ValueError unless sigma, of a range [m], is above 0; a tracer is accepted."""
+    if is_concrete(sigma) and not 0 < float(sigma) < np.inf:
+        raise ValueError(f"{name}: expected sigma above 0 [m], got {sigma}")
+
+
+def inverse_of(
+    curvature: Float[Array, "3 3"], otherwise: Float[Array, "3 3"], *, sigma: Any = 1.0
+) -> Float[Array, "3 3"]:
+    """The inverse of a cost's second derivative; where that is not positive definite, of another.
+
+    What neither determines is known to a kilometre or a thousand radians, so that it is finite:
+    (σ/1000)² is added to the diagonal, the curvature being σ² times an information.
+    """
+    floor = (sigma * 1e-3) ** 2 * jnp.eye(3, dtype=curvature.dtype)
+    first, positive = linalg.whitener(linalg.symmetrize(curvature) + floor)
+    second, usable = linalg.whitener(linalg.symmetrize(otherwise) + floor)
+    last = jnp.eye(3, dtype=curvature.dtype) / (sigma * 1e-3)
+    return linalg.square(jnp.where(positive, first, jnp.where(usable, second, last)))
+
+
+def curvature(matcher: Matcher, prepared: Any, points: Points, found: Match) -> Array:
+    """∂²E/∂x² (3, 3) of the matcher's cost at the pose, pairs and weights kept."""
+    by_pose = jax.hessian(lambda pose: matcher.cost(prepared, points, pose, found))
+    return jnp.asarray(by_pose(found.pose))
+
+
+def with_ranges(reference: Any, by: Float[Array, "M"]) -> Any:
+    """The reference with its ranges changed [m], where it is of points; a grid stays."""
+    return moved_along_rays(reference, by) if isinstance(reference, Points) else reference
+
+
+def range_count(reference: Any) -> int:
+    """How many ranges a reference is made of; 0 of a grid."""
+    return len(reference.valid) if isinstance(reference, Points) else 0

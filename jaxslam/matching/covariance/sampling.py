@@ -1,0 +1,95 @@
+"""Covariances by matching again: other starts, other noise."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxslam.matching.covariance.implicit import implicit
+from jaxslam.matching.covariance.record import (
+    MatchCovariance,
+    check_sigma,
+    range_count,
+    with_ranges,
+)
+from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.points import Points, moved_along_rays
+from jaxslam.math import linalg
+from jaxslam.math.angles import wrap
+from jaxslam.validation.numbers import check_count, check_covariance
+
+
+def unscented(sigma: ArrayLike, start_cov: Any) -> MatchCovariance:
+    """What six starts around the start lead to, plus `implicit` of the noise of the ranges.
+
+    The starts are start ± √3 L_k, L Lᵀ = start_cov, with weights 1/6 each: Σ (x_k - x̂)(x_k - x̂)ᵀ/6.
+    It sees wrong minima and directions that the scans do not determine, where a match stays as far
+    off as it began. Brossard, Bonnabel & Barrau 2020, "A new approach to 3D ICP covariance
+    estimation", IEEE Robotics and Automation Letters 5, which adds the bias of the sensor.
+
+    Args:
+        sigma: standard deviation of a range [m].
+        start_cov: (3, 3) covariance of the start.
+    """
+    check_covariance("unscented", start_cov, 3)
+    of_noise = implicit(sigma)
+
+    def of(
+        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+    ) -> Float[Array, "3 3"]:
+        root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
+        sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
+        prepared = matcher.prepare(reference)
+        ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off).pose)(sides)
+        apart = _apart(ends, found.pose)
+        return apart.T @ apart / 6 + of_noise.of(matcher, reference, points, found, start, key)
+
+    return MatchCovariance("unscented", of)
+
+
+def sampling(sigma: ArrayLike, start_cov: Any, samples: int = 30) -> MatchCovariance:
+    """The second moment about the match of matches with noise added, from starts that are drawn.
+
+    Noise N(0, σ²) is added to the ranges of both scans (of a grid: to those of the scan), and
+    N(0, start_cov) to the start. The scans have noise already, so partners lie a little farther
+    apart than in the truth.
+
+    Args:
+        sigma: standard deviation of a range [m].
+        start_cov: (3, 3) covariance of the start.
+        samples: number of matches.
+    """
+    check_sigma("sampling", sigma)
+    check_covariance("sampling", start_cov, 3)
+    check_count("sampling: samples", samples)
+
+    def of(
+        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+    ) -> Float[Array, "3 3"]:
+        root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
+
+        def one(key: Array) -> Array:
+            key_reference, key_scan, key_start = jax.random.split(key, 3)
+            dtype = start.dtype
+            other = reference
+            if isinstance(reference, Points):
+                noise = jax.random.normal(key_reference, (range_count(reference),), dtype)
+                other = with_ranges(reference, jnp.asarray(sigma) * noise)
+            scan = moved_along_rays(
+                points, jnp.asarray(sigma) * jax.random.normal(key_scan, points.valid.shape, dtype)
+            )
+            begin = start + root @ jax.random.normal(key_start, (3,), dtype)
+            return matcher.match(matcher.prepare(other), scan, begin).pose
+
+        ends = jax.vmap(one)(jax.random.split(key, samples))
+        apart = _apart(ends, found.pose)
+        return apart.T @ apart / samples
+
+    return MatchCovariance("sampling", of)
+
+
+def _apart(poses: Float[Array, "S 3"], middle: Float[Array, "3"]) -> Float[Array, "S 3"]:
+    off = poses - middle[None]
+    return off.at[:, 2].set(wrap(off[:, 2]))

@@ -1,0 +1,158 @@
+"""Levenberg's method on the distance field of a grid."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.graphs.solver.kernels import Kernel
+from jaxslam.grids.distance import distance_field
+from jaxslam.grids.grid import Field, Grid
+from jaxslam.grids.interpolation import interpolate
+from jaxslam.matching.correspondences import Rule, weights
+from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.outcome import Limits, concluded, information_of, length_of
+from jaxslam.matching.points import Points
+from jaxslam.math import linalg, se2
+from jaxslam.math.angles import wrap
+
+_DAMPING = (1e-3, 1e-9, 1e9)
+"""At first, at least, at most; relative to the diagonal of the information."""
+
+
+class _At(NamedTuple):
+    """The linearization at a pose."""
+
+    cost: Float[Array, ""]
+    residual: Float[Array, "N"]
+    weight: Float[Array, "N"]
+    information: Float[Array, "3 3"]
+    slope: Float[Array, "3"]
+
+
+def field(
+    *,
+    reach: float = 0.5,
+    kernel: Kernel | None = None,
+    scale: float = 0.1,
+    iterations: int = 50,
+    tolerance: float = 1e-6,
+    fewest: int = 10,
+    least_score: float = 0.5,
+    least_condition: float = 0.01,
+) -> Matcher:
+    """The pose that minimizes Σ ρ(d(T ∘ p_i)²), d the distance to the nearest occupied cell.
+
+    d [m] is truncated at reach, and interpolated between centres of cells, so that the cost is
+    continuous and no pairs are chosen; a point of d >= reach has a constant cost, and no part.
+    Levenberg's method: (A + μ diag A) δ = -Σ w d J, A = Σ w J Jᵀ, J = (∇d, ∇d·∂(R p)/∂θ);
+    a step that does not reduce the cost is not taken, and μ grows tenfold, else it falls tenfold.
+    The reference is a `Grid`; `raster` makes one of points.
+
+    Arguments are those of `point_to_line`.
+    Fitzgibbon 2003, "Robust registration of 2D and 3D point sets", Image and Vision Computing 21.
+
+    Raises ValueError on a number out of range.
+    """
+    if not (reach > 0 and scale > 0 and tolerance > 0) or iterations < 1:
+        raise ValueError(
+            "field: expected reach, scale and tolerance above 0 and iterations >= 1, got "
+            f"{reach}, {scale}, {tolerance}, {iterations}"
+        )
+    rule = Rule(reach, 1.0, kernel, scale)
+    limits = Limits(fewest, least_score, least_condition)
+
+    def at_pose(of: Field, points: Points, pose: Array) -> _At:
+        residual, jacobian = field_residuals(of, points, pose)
+        weight = weights(rule, residual, points.valid & (residual < reach))
+        return _At(
+            cost=_robust_cost(rule, residual, points),
+            residual=residual,
+            weight=weight,
+            information=information_of(jacobian, weight),
+            slope=(weight * residual) @ jacobian,
+        )
+
+    def match(of: Field, points: Points, start: Array) -> Match:
+        length = length_of(points)
+        low, high = _DAMPING[1:]
+
+        def unfinished(state: Any) -> Array:
+            return jnp.asarray((state[0] < iterations) & ~state[4])
+
+        def step(state: Any) -> Any:
+            k, pose, at, damping, _ = state
+            diagonal = jnp.diagonal(at.information)
+            diagonal = jnp.maximum(diagonal, 1e-9 * jnp.maximum(diagonal.max(), 1e-9))
+            move, _ = linalg.solve_psd(at.information + damping * jnp.diag(diagonal), -at.slope)
+            tried = jnp.concatenate([pose[:2] + move[:2], wrap(pose[2] + move[2])[None]])
+            there = at_pose(of, points, tried)
+            better = there.cost < at.cost
+            small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= tolerance
+            pose = jnp.where(better, tried, pose)
+            at = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, at)
+            damping = jnp.clip(jnp.where(better, 0.1 * damping, 10 * damping), low, high)
+            return k + 1, pose, at, damping, small
+
+        first = (
+            jnp.zeros((), jnp.int32),
+            start,
+            at_pose(of, points, start),
+            jnp.asarray(_DAMPING[0], start.dtype),
+            jnp.zeros((), bool),
+        )
+        k, pose, at, _, small = jax.lax.while_loop(unfinished, step, first)
+        return concluded(
+            start,
+            pose,
+            points,
+            residual=at.residual,
+            weight=at.weight,
+            pair=jnp.zeros(at.weight.shape, jnp.int32),
+            information=at.information,
+            spread=scale,
+            iterations=k,
+            converged=small,
+            limits=limits,
+        )
+
+    def cost(of: Field, points: Points, pose: Array, found: Match) -> Array:
+        return field_cost(of, points, pose, found.weight)
+
+    def prepare(grid: Grid) -> Field:
+        return distance_field(grid, truncate=reach)
+
+    return Matcher("field", prepare, match, cost, of_grid=True)
+
+
+def field_residuals(
+    of: Field, points: Points, pose: Float[Array, "3"]
+) -> tuple[Float[Array, "N"], Float[Array, "N 3"]]:
+    """The field [m] at the points of a scan at a pose, and its derivative by the pose.
+
+    J = (∇d, ∇d · (-(R p)_y, (R p)_x)).
+    """
+    arm = points.position @ se2.rotation(pose[2]).T
+    moved = arm + pose[None, :2]
+    d, pull = jax.vjp(lambda p: interpolate(of, p), moved)
+    (slope,) = pull(jnp.ones_like(d))
+    turn = slope[:, 1] * arm[:, 0] - slope[:, 0] * arm[:, 1]
+    return d, jnp.concatenate([slope, turn[:, None]], axis=1)
+
+
+def field_cost(
+    of: Field, points: Points, pose: Float[Array, "3"], weight: Float[Array, "N"]
+) -> Float[Array, ""]:
+    """½ Σ w d²."""
+    moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
+    d = interpolate(of, moved)
+    return 0.5 * (weight * jnp.where(weight > 0, d, 0.0) ** 2).sum()
+
+
+def _robust_cost(rule: Rule, residual: Array, points: Points) -> Float[Array, ""]:
+    """Σ ρ over the valid points, those beyond reach included, so that leaving is no gain."""
+    square = residual**2
+    if rule.kernel is not None:
+        square = rule.scale**2 * rule.kernel.cost(square / rule.scale**2)
+    return jnp.where(points.valid, square, 0.0).sum()

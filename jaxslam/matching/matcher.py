@@ -1,0 +1,151 @@
+"""The record of a matcher and of what it finds; `match` calls one outside traces."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxslam import programs
+from jaxslam.grids.grid import Grid, check_grid
+from jaxslam.matching.points import Points
+from jaxslam.validation.numbers import is_concrete, shape_told
+
+
+class MatchStatus(IntEnum):
+    """The outcome of a match; of several that apply the last counts."""
+
+    CONVERGED = 0
+    """The pose no longer changes."""
+    NOT_CONVERGED = 1
+    """It ended at its limit of iterations."""
+    DEGENERATE = 2
+    """The scans do not determine the motion along `Match.weakest`; the pose is usable across it."""
+    AMBIGUOUS = 3
+    """Another pose of the window, apart from this one, fits almost as well."""
+    UNLIKE = 4
+    """The score is too low: few points have a partner, or they lie far from it."""
+    TOO_FEW = 5
+    """Too few points have a partner; the pose is the start."""
+
+
+class Match(NamedTuple):
+    """Where a scan lies in the frame of its reference."""
+
+    pose: Float[Array, "3"]
+    """T of the scan's frame in the reference's frame, so that T ∘ p lies on the reference"""
+    status: Int[Array, ""]
+    """see `MatchStatus`"""
+    iterations: Int[Array, ""]
+    """steps taken; of `correlative` the blocks of the lattice that were looked at"""
+    residual: Float[Array, ""]
+    """weighted root mean square of the residuals that took part [m]"""
+    inliers: Float[Array, ""]
+    """share of the valid points of the scan that took part, in [0, 1]"""
+    score: Float[Array, ""]
+    """mean of exp(-½ (e/s)²) over the scan's valid points, 0 for one without partner: in [0, 1]"""
+    information: Float[Array, "3 3"]
+    """Σ w J Jᵀ of the residuals across the reference's surface, in metres, by (x, y, θ)"""
+    weakest: Float[Array, "3"]
+    """(dx, dy, dθ), of unit length where dθ is times the RMS range: the least eigenvector of the
+    information"""
+    condition: Float[Array, ""]
+    """its eigenvalue over the largest, lengths in RMS ranges"""
+    pair: Int[Array, "N"]
+    """the partner of each point in the reference, -1 without; in a grid 0 where it took part"""
+    weight: Float[Array, "N"]
+    """of each pair, 0 where it took no part"""
+
+
+@dataclass(frozen=True, eq=False)
+class Matcher:
+    """A way to match a scan to a reference. The functions are pure and of one pair: vmap them."""
+
+    name: str
+    prepare: Callable[[Any], Any]
+    """(reference) -> what the matcher needs of it, once for all scans: a pytree of arrays. The
+    reference is `Points`, or a `Grid` where `of_grid`."""
+    match: Callable[[Any, Points, Array], Match]
+    """(prepared, points, start (3,)) -> match. By while loops: forward derivatives alone."""
+    cost: Callable[[Any, Points, Array, Match], Array]
+    """(prepared, points, pose, match) -> () ½ Σ w e² [m²], the match's pairs and weights kept;
+    differentiable by the pose, the points, and by the reference through `prepare`."""
+    of_grid: bool = False
+
+
+def match(matcher: Matcher, reference: Any, points: Points, start: Any) -> Match:
+    """The match of a scan to a reference, by a program that is compiled once a structure.
+
+    Args:
+        reference: `Points`, or a `Grid` where `matcher.of_grid`; with a leading axis on all of its
+            arrays for many pairs at once, as `points` and `start` then have.
+        start: (3,) where the search begins.
+    Raises:
+        ValueError: a reference of another kind, arrays that do not fit each other, numbers that
+            are not finite. A scan without points is a status.
+    """
+    batch = _checked(matcher, reference, points, start)
+    return programs.call(_many if batch else _one, (matcher,), reference, points, start)
+
+
+def _one(matcher: Matcher, reference: Any, points: Points, start: Array) -> Match:
+    return matcher.match(matcher.prepare(reference), points, start)
+
+
+def _many(matcher: Matcher, reference: Any, points: Points, start: Array) -> Match:
+    return jax.vmap(matcher.match)(prepared_all(matcher, reference), points, start)
+
+
+def prepared_all(matcher: Matcher, references: Any) -> Any:
+    """What the matcher needs of each reference; grids one after another, as loops over cells go
+    slowly side by side."""
+    if matcher.of_grid:
+        return jax.lax.map(matcher.prepare, references)
+    return jax.vmap(matcher.prepare)(references)
+
+
+def _checked(matcher: Any, reference: Any, points: Any, start: Any) -> bool:
+    """Whether there is a leading axis; raises ValueError on what `match` refuses."""
+    if not isinstance(matcher, Matcher):
+        raise ValueError(f"match: expected a Matcher, got {type(matcher).__name__}")
+    kind = Grid if matcher.of_grid else Points
+    if not isinstance(reference, kind):
+        raise ValueError(
+            f"match: {matcher.name} takes a reference of {kind.__name__}, "
+            f"got {type(reference).__name__}"
+        )
+    batch = np.shape(start)[:-1]
+    if len(batch) > 1 or np.shape(start)[-1:] != (3,):
+        raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_told(start)}")
+    check_points("match", points, batch)
+    if isinstance(reference, Points):
+        check_points("match", reference, batch)
+    elif not batch:
+        check_grid("match", reference)
+    elif np.ndim(reference.log_odds) != 3 or len(reference.log_odds) != batch[0]:
+        raise ValueError(
+            f"match: expected {batch[0]} grids, got log-odds of {shape_told(reference.log_odds)}"
+        )
+    if is_concrete(start) and not np.all(np.isfinite(np.asarray(start))):
+        raise ValueError(f"match: expected a finite start, got {np.asarray(start)}")
+    return bool(batch)
+
+
+def check_points(name: str, of: Any, batch: tuple[int, ...] = ()) -> None:
+    """Raise ValueError, which begins with a caller's name, unless they are finite `Points`."""
+    if not isinstance(of, Points):
+        raise ValueError(f"{name}: expected Points, got {type(of).__name__}")
+    shape = np.shape(of.valid)
+    if (
+        len(shape) != len(batch) + 1
+        or shape[:-1] != batch
+        or any(np.shape(part) != (*shape, 2) for part in of[:2])
+    ):
+        told = ", ".join(shape_told(part) for part in of)
+        whole = " x ".join(str(size) for size in (*batch, "N"))
+        raise ValueError(f"{name}: expected {whole} positions, rays and masks, got {told}")
+    if is_concrete(of) and not all(np.all(np.isfinite(np.asarray(part))) for part in of[:2]):
+        raise ValueError(f"{name}: expected finite points; those that are not valid, too")

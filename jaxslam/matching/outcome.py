@@ -1,0 +1,159 @@
+"""What all matchers say of a result: the weakest direction, the score, the status."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam.matching.matcher import Match, MatchStatus
+from jaxslam.matching.points import Points
+from jaxslam.math import linalg
+
+
+class Limits(NamedTuple):
+    """Below which a match gets a status."""
+
+    fewest: int
+    """points with a partner"""
+    score: float
+    """of `Match.score`"""
+    condition: float
+    """of `Match.condition`"""
+
+
+def concluded(
+    start: Float[Array, "3"],
+    pose: Float[Array, "3"],
+    points: Points,
+    *,
+    residual: Float[Array, "N"],
+    weight: Float[Array, "N"],
+    pair: Array,
+    information: Float[Array, "3 3"],
+    spread: float | Array,
+    iterations: Array,
+    converged: Array,
+    limits: Limits,
+    ambiguous: Array | bool = False,
+    score: Array | None = None,
+) -> Match:
+    """The `Match` of a pose that a search ended at, with its status.
+
+    The score is that of the residuals over `spread`, unless given.
+    """
+    took_part = weight > 0
+    total = jnp.maximum(weight.sum(), jnp.finfo(weight.dtype).tiny)
+    count = jnp.maximum(points.valid.sum(), 1)
+    if score is None:
+        closeness = jnp.where(took_part, jnp.exp(-0.5 * (residual / spread) ** 2), 0.0)
+        score = closeness.sum() / count
+    condition, weakest = weakest_direction(information, length_of(points))
+    few = took_part.sum() < limits.fewest
+    status = jnp.asarray(MatchStatus.CONVERGED, jnp.int32)
+    for applies, value in (
+        (~converged, MatchStatus.NOT_CONVERGED),
+        (condition < limits.condition, MatchStatus.DEGENERATE),
+        (ambiguous, MatchStatus.AMBIGUOUS),
+        (score < limits.score, MatchStatus.UNLIKE),
+        (few, MatchStatus.TOO_FEW),
+    ):
+        status = jnp.where(applies, jnp.asarray(value, jnp.int32), status)
+    return Match(
+        pose=jnp.where(few, start, pose),
+        status=status,
+        iterations=iterations,
+        residual=jnp.sqrt((weight * residual**2).sum() / total),
+        inliers=took_part.sum() / count.astype(weight.dtype),
+        score=score,
+        information=information,
+        weakest=weakest,
+        condition=condition,
+        pair=jnp.where(took_part, pair, -1),
+        weight=weight,
+    )
+
+
+def length_of(points: Points) -> Float[Array, ""]:
+    """The root mean square distance of the points from the origin of their frame [m]; 1 of none.
+
+    What an angle is multiplied by where it stands beside lengths.
+    """
+    square = jnp.where(points.valid, (points.position**2).sum(axis=1), 0.0).sum()
+    mean = square / jnp.maximum(points.valid.sum(), 1)
+    return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
+
+
+def information_of(jacobian: Float[Array, "N 3"], weight: Float[Array, "N"]) -> Array:
+    """Σ w J Jᵀ (3, 3)."""
+    return linalg.gram(weight[:, None] * jacobian, jacobian)
+
+
+def weakest_direction(
+    information: Float[Array, "3 3"], length: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+    """The least over the largest eigenvalue, in [0, 1], and the eigenvector of the least.
+
+    The third coordinate is an angle, multiplied by a length [m]. Both are constants for
+    derivatives.
+    """
+    scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
+    a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])
+    least, largest = extreme_eigenvalues(a)
+    positive = largest > 0
+    condition = jnp.clip(least / jnp.where(positive, largest, 1.0), 0.0, 1.0)
+    return jnp.where(positive, condition, 0.0), eigenvector(a, least) * scale
+
+
+def determined(
+    motion: Float[Array, "3"],
+    information: Float[Array, "3 3"],
+    length: Float[Array, ""],
+    least: float,
+) -> Float[Array, "3"]:
+    """A motion without its part along the weakest direction, where the condition is below `least`.
+
+    So noise does not carry the pose along what the scans do not determine (Zhang, Kaess & Singh
+    2016, "On degeneracy of optimization-based state estimation problems", ICRA).
+    """
+    condition, weakest = weakest_direction(information, length)
+    scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length])
+    along = ((scale * weakest) * (scale * motion)).sum()
+    return jnp.where(condition < least, motion - along * weakest, motion)
+
+
+def extreme_eigenvalues(a: Float[Array, "3 3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The least and the largest eigenvalue of a symmetric matrix.
+
+    By the roots of its characteristic polynomial as cosines: with q = tr A/3, p² = |A - q I|²/6
+    and B = (A - q I)/p, they are q + 2 p cos(φ + 2πk/3), 3φ = acos(det B/2) (Smith 1961,
+    "Eigenvalues of a symmetric 3 × 3 matrix", Communications of the ACM 4). Errors are rounding of
+    the largest.
+    """
+    q = jnp.trace(a) / 3
+    b = a - q * jnp.eye(3, dtype=a.dtype)
+    p = jnp.sqrt((b * b).sum() / 6)
+    b = b / jnp.where(p > 0, p, 1.0)
+    half = 0.5 * (b[0] * jnp.cross(b[1], b[2])).sum()
+    phi = jnp.arccos(jnp.clip(half, -1.0, 1.0)) / 3
+    return q + 2 * p * jnp.cos(phi + 2 * np.pi / 3), q + 2 * p * jnp.cos(phi)
+
+
+def eigenvector(a: Float[Array, "3 3"], value: Float[Array, ""]) -> Float[Array, "3"]:
+    """A unit eigenvector of a symmetric matrix: across two rows of A - λI, the largest product.
+
+    Where λ is a double eigenvalue, any vector across one row; of a multiple of I, (1, 0, 0).
+    """
+    rows = a - value * jnp.eye(3, dtype=a.dtype)
+    across = jnp.stack([jnp.cross(rows[i], rows[j]) for i, j in ((0, 1), (1, 2), (2, 0))])
+    size = (across**2).sum(axis=1)
+    row = rows[jnp.argmax((rows**2).sum(axis=1))]
+    tiny = 100 * jnp.finfo(a.dtype).eps
+    norm = (row**2).sum()
+    # Across one row: with the axis of its least entry.
+    axis = jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(row))]
+    lone = jnp.where(norm > 0, jnp.cross(row, axis), jnp.eye(3, dtype=a.dtype)[0])
+    double = size.max() <= (tiny * norm) ** 2
+    vector = jnp.where(double, lone, across[jnp.argmax(size)])
+    return vector / jnp.sqrt((vector**2).sum())

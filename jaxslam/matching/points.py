@@ -1,0 +1,88 @@
+"""The points of a scan, with the directions of their beams; and a grid of them."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.grids.grid import Grid
+from jaxslam.math import se2
+from jaxslam.types import Beams
+
+
+class Points(NamedTuple):
+    """The ends of the beams of a scan, or of several, in one frame; padded, with a mask."""
+
+    position: Float[Array, "N 2"]
+    """[m]; finite also where not valid"""
+    ray: Float[Array, "N 2"]
+    """unit direction of the beam, the derivative of the position by the range: noise is along it"""
+    valid: Bool[Array, "N"]
+    """whether there is a point"""
+
+
+def points(
+    beams: Beams,
+    max_range: ArrayLike,
+    *,
+    min_range: ArrayLike = 0.0,
+    mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> Points:
+    """The ends of the beams in the robot's frame, in the order of the beams.
+
+    A beam that is not valid, has no finite range, or a range not between min_range and max_range
+    [m] (both excluded) gives no point: one of max_range met nothing.
+
+    Args:
+        mount: (3,) pose of the laser on the robot.
+    """
+    r = jnp.asarray(beams.range)
+    valid = beams.valid & (r > min_range) & (r < jnp.asarray(max_range) * (1 - 1e-6))
+    r = jnp.where(valid, r, 1.0)
+    eye = jnp.asarray(mount, r.dtype)
+    heading = eye[2] + beams.angle
+    ray = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
+    return Points(eye[None, :2] + r[:, None] * ray, ray, valid)
+
+
+def transformed(of: Points, pose: Float[Array, "3"]) -> Points:
+    """The same points, given in the frame of a pose, in the coordinates of the pose's own frame."""
+    turn = se2.rotation(pose[2]).T
+    return Points(of.position @ turn + pose[None, :2], of.ray @ turn, of.valid)
+
+
+def moved_along_rays(of: Points, by: Float[Array, "N"]) -> Points:
+    """The points with their ranges changed by so many metres."""
+    return of._replace(position=of.position + by[:, None] * of.ray)
+
+
+def raster(
+    of: Points,
+    resolution: float,
+    half_width: float,
+    *,
+    center: ArrayLike | tuple[float, float] = (0.0, 0.0),
+) -> Grid:
+    """A grid in which the cells that hold a point are occupied, and the others free.
+
+    A square with sides along the axes, of ⌈2 half_width/resolution⌉ cells a side, log-odds ±1.
+    Points outside it are left out. Traceable for given sizes.
+
+    Raises ValueError unless resolution and half_width are above 0 and finite.
+    """
+    if not (0 < resolution < np.inf and 0 < half_width < np.inf):
+        raise ValueError(
+            f"raster: expected resolution and half_width above 0, got {resolution}, {half_width}"
+        )
+    size = int(np.ceil(2 * half_width / resolution - 1e-9))
+    corner = jnp.asarray(center, of.position.dtype) - 0.5 * size * resolution
+    cell = jnp.floor((of.position - corner[None]) / resolution).astype(jnp.int32)
+    inside = of.valid & jnp.all((cell >= 0) & (cell < size), axis=1)
+    row, column = jnp.where(inside[:, None], cell, size).T[::-1]
+    free = jnp.full((size, size), -1.0, of.position.dtype)
+    log_odds = free.at[row, column].set(1.0, mode="drop")
+    origin = jnp.concatenate([corner, jnp.zeros(1, corner.dtype)])
+    made: Any = log_odds, origin, jnp.asarray(resolution, corner.dtype)
+    return Grid(*made)

@@ -1,0 +1,40 @@
+"""Errors of paths and maps against a reference, one set of measures for every data set and
+estimator: absolute and relative errors of a path, errors of relations, alignment, map entropy and
+correlation. On the host, by NumPy in float64.
+"""
+
+from jaxslam.grids import correlation
+from jaxslam.metrics.maps import align_map, map_entropy
+from jaxslam.metrics.paths import PathErrors, alignment, ate, carried
+from jaxslam.metrics.relations import (
+    Errors,
+    Relations,
+    given,
+    joined,
+    relation_errors,
+    relations,
+    revisits,
+    rpe,
+)
+from jaxslam.metrics.statistics import Statistics, statistics, summary
+
+__all__ = [
+    "Errors",
+    "PathErrors",
+    "Relations",
+    "Statistics",
+    "align_map",
+    "alignment",
+    "ate",
+    "carried",
+    "correlation",
+    "given",
+    "joined",
+    "map_entropy",
+    "relation_errors",
+    "relations",
+    "revisits",
+    "rpe",
+    "statistics",
+    "summary",
+]

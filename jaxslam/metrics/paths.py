@@ -1,0 +1,108 @@
+"""The error of a path, pose by pose, against a reference."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+
+class PathErrors(NamedTuple):
+    """The errors of the poses of a path; `statistics` sums them up."""
+
+    translation: Float[np.ndarray, "K"]
+    """distance from the reference [m]"""
+    rotation: Float[np.ndarray, "K"]
+    """size of the angle to the reference [rad], in [0, π]"""
+    frame: Float[np.ndarray, "3"]
+    """pose that carries the path to where it is compared; zeros where it is not moved"""
+
+
+def ate(reference: ArrayLike, estimate: ArrayLike, *, align: bool = True) -> PathErrors:
+    """The absolute trajectory error: of each pose |t̂ - t| and |θ̂ - θ|, on the circle.
+
+    Sturm, Engelhard, Endres, Burgard & Cremers 2012, "A benchmark for the evaluation of RGB-D SLAM
+    systems", IROS; their figure is the RMSE of the translation.
+
+    Args:
+        reference, estimate: (K, 3) poses (x, y, θ); row k of one belongs to row k of the other.
+        align: carry the estimate by the rigid motion that fits its positions best (`alignment`);
+            otherwise both are in one frame.
+    Raises:
+        ValueError: on tables that are not K >= 1 finite poses each.
+    """
+    true, path = pose_pair("ate", reference, estimate)
+    frame = alignment(path[:, :2], true[:, :2]) if align else np.zeros(3)
+    path = carried(frame, path)
+    gap = path - true
+    return PathErrors(np.hypot(gap[:, 0], gap[:, 1]), np.abs(wrapped(gap[:, 2])), frame)
+
+
+def alignment(source: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "3"]:
+    """The pose T that minimizes Σ |T·source_i - target_i|² over rigid motions, without scale.
+
+    As `math.se2.align`, on the host in float64. source, target (N, 2); one point gives θ = 0.
+    Raises ValueError on tables that are not N >= 1 finite points each.
+    """
+    p, q = (_table("alignment", given, 2) for given in (source, target))
+    _same_length("alignment", p, q)
+    p0, q0 = p.mean(axis=0), q.mean(axis=0)
+    a, b = p - p0, q - q0
+    theta = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([q0[0] - c * p0[0] + s * p0[1], q0[1] - s * p0[0] - c * p0[1], theta])
+
+
+def carried(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
+    """Poses (K, 3) or points (K, 2) of a frame, in the coordinates that its pose (3,) is in.
+
+    Headings are wrapped to [-π, π]. Raises ValueError on other shapes and on numbers that are not
+    finite.
+    """
+    x, y, theta = _table("carried", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)[0]
+    table = _table("carried", rows, 3 if np.shape(rows)[-1:] == (3,) else 2)
+    c, s = np.cos(theta), np.sin(theta)
+    out = [x + c * table[:, 0] - s * table[:, 1], y + s * table[:, 0] + c * table[:, 1]]
+    if table.shape[1] == 3:
+        out.append(wrapped(table[:, 2] + theta))
+    return np.stack(out, axis=1)
+
+
+def wrapped(angle: Any) -> Any:
+    """Angles [rad] in [-π, π]; those that are there already stay as they are."""
+    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
+
+
+def pose_pair(
+    caller: str, reference: ArrayLike, estimate: ArrayLike
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3"]]:
+    """Both as finite tables (K, 3) in float64; else a ValueError that begins with the caller."""
+    true, path = (_table(caller, given, 3) for given in (reference, estimate))
+    _same_length(caller, true, path)
+    return true, path
+
+
+def poses_of(caller: str, given: ArrayLike) -> Float[np.ndarray, "K 3"]:
+    """A finite table (K, 3) in float64; else a ValueError that begins with the caller."""
+    return _table(caller, given, 3)
+
+
+def _table(caller: str, given: ArrayLike, columns: int) -> Float[np.ndarray, "K n"]:
+    what = "poses (x, y, θ)" if columns == 3 else "points (x, y)"
+    try:
+        table = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{caller}: expected a table of {what}") from None
+    if table.ndim != 2 or table.shape[1] != columns or len(table) == 0:
+        raise ValueError(f"{caller}: expected at least one of {what}, got shape {table.shape}")
+    bad = ~np.isfinite(table).all(axis=1)
+    if bad.any():
+        raise ValueError(f"{caller}: expected finite {what}, row {int(np.argmax(bad))} is not")
+    return table
+
+
+def _same_length(caller: str, one: np.ndarray, other: np.ndarray) -> None:
+    if len(one) != len(other):
+        raise ValueError(
+            f"{caller}: expected tables of the same length, got {len(one)} and {len(other)} rows"
+        )

@@ -1,0 +1,204 @@
+"""Errors of relative poses: relations that are given, or made from a reference path."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from jaxslam.metrics.paths import pose_pair, poses_of, wrapped
+from jaxslam.streams import relative
+
+Spacing = float | Sequence[float] | None
+
+_ROUNDING = 1e-6
+"""What a spacing may be short by: times since 1970 have 2e-7 s [s, m]"""
+
+
+class Relations(NamedTuple):
+    """Reference poses between rows of a path."""
+
+    first: Int[np.ndarray, "R"]
+    second: Int[np.ndarray, "R"]
+    """rows of the path"""
+    pose: Float[np.ndarray, "R 3"]
+    """of the second row in the frame of the first"""
+
+
+class Errors(NamedTuple):
+    """The errors of relations; `statistics` sums them up."""
+
+    translation: Float[np.ndarray, "R"]
+    """[m]"""
+    rotation: Float[np.ndarray, "R"]
+    """size of the angle [rad], in [0, π]"""
+
+
+def relations(
+    reference: ArrayLike,
+    *,
+    rows: int | None = None,
+    seconds: Spacing = None,
+    metres: Spacing = None,
+    time: ArrayLike | None = None,
+) -> Relations:
+    """The relations of a reference path from each row to the first that is far enough after it.
+
+    A row without one that far after it has no relation; there may be none at all.
+
+    Args:
+        reference: (K, 3) poses, in the order of time.
+        rows: exactly so many rows after.
+        seconds: at least so long after, by the stamps `time` (K,) [s]. Of several spacings, the
+            relations of each, one after the other.
+        metres: at least so far after, along the reference path; as `seconds`.
+    Raises:
+        ValueError: unless exactly one spacing is given, and above 0; on poses that are none, and
+            on stamps that are missing or go back.
+    """
+    path = poses_of("relations", reference)
+    if sum(spacing is not None for spacing in (rows, seconds, metres)) != 1:
+        raise ValueError("relations: expected exactly one of rows, seconds and metres")
+    if (time is None) != (seconds is None):
+        raise ValueError("relations: expected the stamps, time=, with seconds= and nowhere else")
+    if rows is not None and rows != int(rows):
+        raise ValueError(f"relations: expected a whole number of rows, got {rows}")
+    at = travelled(path) if seconds is None else np.asarray(time, np.float64)
+    if rows is not None:
+        at = np.arange(len(path), dtype=np.float64)
+    if at.shape != (len(path),) or not (np.diff(at) >= 0).all():
+        raise ValueError(
+            f"relations: expected stamps ({len(path)},) that do not go back, got {at.shape}"
+        )
+    given = next(spacing for spacing in (rows, seconds, metres) if spacing is not None)
+    spacings = np.atleast_1d(np.asarray(given, np.float64))
+    if spacings.ndim != 1 or not len(spacings) or not (spacings > 0).all():
+        raise ValueError(f"relations: expected spacings above 0, got {given}")
+    pairs = []
+    for spacing in spacings:
+        after = np.searchsorted(at, at + spacing - _ROUNDING * min(1.0, spacing))
+        start = np.flatnonzero(after < len(path))
+        pairs.append((start, after[start]))
+    first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    return _between(path, first, second)
+
+
+def revisits(reference: ArrayLike, *, radius: float, apart: float) -> Relations:
+    """The relations of a reference path between rows that are near in space and not along the path.
+
+    For each row the nearest one before it, at most `radius` [m] away with at least `apart` [m] of
+    path in between; rows without one have no relation. They show whether loops are closed.
+
+    Raises ValueError on poses that are none, and on numbers that are not above 0.
+    """
+    path = poses_of("revisits", reference)
+    if not (radius > 0 and apart > 0):
+        raise ValueError(f"revisits: expected numbers above 0, got {radius} and {apart}")
+    at = travelled(path)
+    before = np.searchsorted(at, at - apart, side="right")  # rows [0, before) are far enough back
+    pairs = []
+    for k in np.flatnonzero(before):
+        off = path[: before[k], :2] - path[k, :2]
+        squared = (off**2).sum(axis=1)
+        nearest = int(np.argmin(squared))
+        if squared[nearest] <= radius**2:
+            pairs.append((nearest, k))
+    found = np.array(pairs, int).reshape(-1, 2)
+    return _between(path, found[:, 0], found[:, 1])
+
+
+def given(
+    time: ArrayLike, first: ArrayLike, second: ArrayLike, pose: ArrayLike, *, tolerance: float
+) -> tuple[Relations, int]:
+    """Relations that a file gives by their stamps, by the rows of a path, and how many are dropped.
+
+    Each stamp takes the row nearest in time; a relation of which one is further than `tolerance`
+    [s] away is dropped.
+
+    Args:
+        time: (K,) stamps of the path [s], which do not go back.
+        first, second: (R,) stamps of the relations.
+        pose: (R, 3) of the second in the frame of the first.
+    Raises:
+        ValueError: on shapes that do not fit, and on stamps of the path that go back.
+    """
+    stamps, of = np.asarray(time, np.float64), poses_of("given", pose)
+    if stamps.ndim != 1 or not len(stamps) or not (np.diff(stamps) >= 0).all():
+        raise ValueError(f"given: expected stamps (K,) that do not go back, got {stamps.shape}")
+    rows, near = [], np.ones(len(of), bool)
+    for wanted in (np.asarray(first, np.float64), np.asarray(second, np.float64)):
+        if wanted.shape != (len(of),):
+            raise ValueError(f"given: expected {len(of)} stamps of relations, got {wanted.shape}")
+        after = np.clip(np.searchsorted(stamps, wanted), 1, max(len(stamps) - 1, 1))
+        after = np.minimum(after, len(stamps) - 1)
+        before = np.maximum(after - 1, 0)
+        row = np.where(wanted - stamps[before] <= stamps[after] - wanted, before, after)
+        near &= np.abs(stamps[row] - wanted) <= tolerance
+        rows.append(row)
+    kept = Relations(rows[0][near], rows[1][near], of[near])
+    return kept, int((~near).sum())
+
+
+def joined(*parts: Relations) -> Relations:
+    """All relations of some sets, one after the other. Raises ValueError without a set."""
+    if not parts:
+        raise ValueError("joined: expected at least one set of relations")
+    return Relations(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+
+
+def relation_errors(of: Relations, estimate: ArrayLike) -> Errors:
+    """The errors of an estimated path over relations, translation and rotation apart.
+
+    With δ̂ the estimated pose of the second row in the frame of the first, and δ the reference: the
+    translation and the rotation of δ⁻¹ ∘ δ̂, so |t̂ - t| and |θ̂ - θ| on the circle. They do not
+    depend on the frames of the two paths, and an early error counts once.
+
+    Kümmerle, Steder, Dornhege, Ruhnke, Grisetti, Stachniss & Kleiner 2009, "On measuring the
+    accuracy of SLAM algorithms", Autonomous Robots 27; they report mean and standard deviation of
+    the errors and of their squares.
+
+    Raises ValueError on poses that are none, and on relations of rows that the path does not have.
+    """
+    path = poses_of("relation_errors", estimate)
+    for rows in (of.first, of.second):
+        if len(rows) and not (rows.min() >= 0 and rows.max() < len(path)):
+            raise ValueError(
+                f"relation_errors: the relations are of rows up to {int(rows.max())}, and the path "
+                f"has {len(path)}"
+            )
+    gap = _between(path, of.first, of.second).pose - of.pose
+    return Errors(np.hypot(gap[:, 0], gap[:, 1]), np.abs(wrapped(gap[:, 2])))
+
+
+def rpe(
+    reference: ArrayLike,
+    estimate: ArrayLike,
+    *,
+    rows: int | None = None,
+    seconds: Spacing = None,
+    metres: Spacing = None,
+    time: ArrayLike | None = None,
+) -> Errors:
+    """The relative pose error: `relation_errors` over the `relations` of the reference path.
+
+    Sturm et al. 2012, as in `ate`; row k of one path belongs to row k of the other. Raises
+    ValueError as those two do.
+    """
+    true, path = pose_pair("rpe", reference, estimate)
+    made = relations(true, rows=rows, seconds=seconds, metres=metres, time=time)
+    return relation_errors(made, path)
+
+
+def travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]:
+    """The length of a path up to each of its poses [m]."""
+    steps = np.diff(path[:, :2], axis=0)
+    return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+
+
+def _between(
+    path: Float[np.ndarray, "K 3"], first: Int[np.ndarray, "R"], second: Int[np.ndarray, "R"]
+) -> Relations:
+    pose = relative(path[first], path[second])
+    pose[:, 2] = wrapped(pose[:, 2])
+    return Relations(first, second, pose)

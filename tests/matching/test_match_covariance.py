@@ -1,0 +1,161 @@
+"""Covariances of a match: the noise through by differences, the truth by many runs, bad input."""
+
+import jax
+import numpy as np
+import pytest
+from scanned_rooms import BEAMS, moved, pairs
+
+from jaxslam import matching, verify_jacobians
+from jaxslam.grids import Field
+from jaxslam.matching import MatchStatus, covariance
+from jaxslam.matching.field import field_residuals
+from jaxslam.matching.points import Points
+from jaxslam.math.stats import chi2_band
+
+SIGMA, RUNS = 0.03, 60
+START_COV = np.diag([0.05, 0.05, 0.03]) ** 2
+LINES = matching.point_to_line(span=2, gap=0.8)
+POINTS = matching.point_to_point(span=2, gap=0.8, least_score=0.2)
+WAYS = {
+    "hessian": covariance.hessian(),
+    "implicit": covariance.implicit(SIGMA),
+    "along_normals": covariance.along_normals(SIGMA, span=2, gap=0.8),
+    "lattice": covariance.lattice(SIGMA, steps=9),
+    "unscented": covariance.unscented(SIGMA, START_COV),
+    "sampling": covariance.sampling(SIGMA, START_COV, 4),
+}
+REFERENCES, SCANS, TRUTH, STARTS = pairs(RUNS, sigma=SIGMA)
+
+
+def all_of(matcher, ways):
+    def one(reference, scan, start, key):
+        found = matcher.match(matcher.prepare(reference), scan, start)
+        given = matcher, reference, scan, found, start, key
+        return found, {name: WAYS[name].of(*given) for name in ways}
+
+    keys = jax.random.split(jax.random.key(0), RUNS)
+    return jax.device_get(jax.jit(jax.vmap(one))(REFERENCES, SCANS, STARTS, keys))
+
+
+@pytest.fixture(scope="module")
+def by_lines():
+    return all_of(LINES, WAYS)
+
+
+def nees(found, cov):
+    error = found.pose - TRUTH
+    return np.mean(np.einsum("ri,rij,rj->r", error, np.linalg.inv(cov), error))
+
+
+def test_the_noise_through_lines_is_honest_and_others_are_not(by_lines):
+    found, covs = by_lines
+    assert np.all(found.status == MatchStatus.CONVERGED)
+    low, high = chi2_band(3, RUNS, 0.999)
+    assert low < nees(found, covs["implicit"]) < high
+    assert low < nees(found, covs["unscented"]) < high
+    # A single variance σ² for residuals that have that of two scans.
+    assert nees(found, covs["lattice"]) > high
+    for cov in covs.values():
+        assert np.all(np.linalg.eigvalsh(cov) > 0)
+
+
+def test_points_with_their_partners_kept_feign_information():
+    found, covs = all_of(POINTS, ("implicit", "along_normals"))
+    assert nees(found, covs["implicit"]) > 30
+    assert nees(found, covs["along_normals"]) < 0.1 * nees(found, covs["implicit"])
+
+
+def least(reference, scan, pair, used):
+    """The pose of the least Σ (n·(T p - m))², lines fitted to each point and its neighbours; pairs
+    kept. By Gauss and Newton, in NumPy."""
+    neighbours = found_neighbours[pair[used]]
+    own = reference[neighbours]
+    middle = own.mean(axis=1)
+    moments = np.einsum("nka,nkb->nab", own - middle[:, None], own - middle[:, None])
+    normal = np.linalg.eigh(moments)[1][:, :, 0]
+    pose = np.zeros(3)
+    for _ in range(20):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        arm = scan[used] @ np.array([[c, s], [-s, c]])
+        e = (normal * (arm + pose[:2] - middle)).sum(axis=1)
+        jacobian = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
+        pose = pose - np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ e)
+    return pose
+
+
+def whole_run(found):
+    """A run all of whose lines have five points."""
+    for k in range(RUNS):
+        j = found.pair[k][found.pair[k] >= 0]
+        steps = np.linalg.norm(np.diff(REFERENCES.position[k], axis=0), axis=1)
+        if np.all((j > 1) & (j < BEAMS - 2)) and np.all(steps < 0.8):
+            return k
+    return pytest.fail("no run whose lines are whole")
+
+
+found_neighbours = (np.arange(BEAMS)[:, None] + np.arange(-2, 3)[None]) % BEAMS
+
+
+def test_the_noise_through_is_that_of_differences(by_lines):
+    """dx/dz of each range of both scans, the minimum computed again with the pairs kept."""
+    found, covs = by_lines
+    k = whole_run(found)
+    used = found.weight[k] > 0
+    p, q = REFERENCES.position[k], SCANS.position[k]
+    np.testing.assert_allclose(least(p, q, found.pair[k], used), found.pose[k], atol=1e-6)
+    gain, h = [], 1e-5
+    for which in range(2):
+        for beam in range(BEAMS):
+            ends = []
+            for sign in (1, -1):
+                parts = [p.copy(), q.copy()]
+                ray = (REFERENCES, SCANS)[which].ray[k, beam]
+                parts[which][beam] += sign * h * ray
+                ends.append(least(*parts, found.pair[k], used))
+            gain.append((ends[0] - ends[1]) / (2 * h))
+    gain = np.array(gain)
+    np.testing.assert_allclose(covs["implicit"][k], SIGMA**2 * gain.T @ gain, rtol=1e-3, atol=1e-10)
+
+
+def test_the_lattice_of_a_quadratic_cost_is_its_inverse(by_lines):
+    found, covs = by_lines
+    prior = np.eye(3) * 0.3**-2
+    k = whole_run(found)
+    used = found.weight[k] > 0
+    arm = moved(SCANS.position[k], found.pose[k])[used] - found.pose[k, :2]
+    own = REFERENCES.position[k][found_neighbours[found.pair[k][used]]]
+    apart = own - own.mean(axis=1, keepdims=True)
+    n = np.linalg.eigh(np.einsum("nka,nkb->nab", apart, apart))[1][:, :, 0]
+    jacobian = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]])
+    expected = np.linalg.inv(jacobian.T @ jacobian / SIGMA**2 + prior)
+    # The turn of the scan is not quadratic, and nine poses from -4 σ to 4 σ sum to 1e-4.
+    np.testing.assert_allclose(covs["lattice"][k], expected, rtol=0.02, atol=3e-7)
+
+
+def test_the_jacobian_of_the_field_is_that_of_autodiff():
+    rng = np.random.default_rng(0)
+    field = Field(rng.uniform(0, 1, (9, 9)), np.array([-2.0, -2.0, 0.3]), np.float64(0.7))
+    position = rng.uniform(-1, 1, (3, 2))
+    scan = Points(position, np.ones((3, 2)), np.ones(3, bool))
+    report = verify_jacobians(
+        lambda pose: field_residuals(field, scan, pose)[0],
+        lambda pose: field_residuals(field, scan, pose)[1],
+        arguments={"pose": ("x [m]", "y [m]", "theta [rad]")},
+        states=[rng.uniform(-0.5, 0.5, (6, 3))],
+        name="field_residuals",
+    )
+    assert report.passed, str(report)
+
+
+@pytest.mark.parametrize(
+    ("call", "reason"),
+    [
+        (lambda: covariance.implicit(0.0), "implicit: expected sigma above 0"),
+        (lambda: covariance.lattice(0.1, steps=1), "lattice: expected steps >= 3"),
+        (lambda: covariance.unscented(0.1, np.eye(2)), "unscented: expected a covariance"),
+        (lambda: covariance.sampling(0.1, np.eye(3), 0), "sampling: samples: expected"),
+    ],
+)
+def test_bad_input_is_refused(call, reason):
+    with pytest.raises(ValueError, match=reason):
+        call()
