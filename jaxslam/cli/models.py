@@ -10,6 +10,7 @@ from functools import partial
 from jaxslam import motion, sensors, verify
 from jaxslam.cli.common import add_out
 from jaxslam.cli.runtime import cache
+from jaxslam.grids import beam_models
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, json_text, versions, write_files
 from jaxslam.verify.inputs import user_files
@@ -44,7 +45,7 @@ def verify_models(options: argparse.Namespace, command: str) -> int:
 
 def _verify_all(verify_one: Callable[..., verify.Report]) -> list[verify.Report]:
     """A report on every registered model, several at a time."""
-    models = motion.REGISTRY | sensors.REGISTRY
+    models = motion.REGISTRY | sensors.REGISTRY | beam_models.REGISTRY
     reports = []
     with (
         Progress(f"{len(models)} models", "models") as progress,

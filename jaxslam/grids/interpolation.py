@@ -34,10 +34,11 @@ def slope(field: Field, points: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
     """
     at = to_cells(field.origin, field.resolution, points) - 0.5
     (a, b, c, d), (u, v) = _around(field.values, at)
-    last = jnp.asarray(field.values.shape[::-1]) - 1
-    within = (at >= 0) & (at <= last)
-    along = jnp.where(within[..., 0], (b - a) * (1 - v) + (d - c) * v, 0.0) / field.resolution
-    across = jnp.where(within[..., 1], (c - a) * (1 - u) + (d - b) * u, 0.0) / field.resolution
+    height, width = field.values.shape
+    x, y = at[..., 0], at[..., 1]
+    along = jnp.where((x >= 0) & (x <= width - 1), (b - a) * (1 - v) + (d - c) * v, 0.0)
+    across = jnp.where((y >= 0) & (y <= height - 1), (c - a) * (1 - u) + (d - b) * u, 0.0)
+    along, across = along / field.resolution, across / field.resolution
     cos, sin = jnp.cos(field.origin[2]), jnp.sin(field.origin[2])
     return jnp.stack([cos * along - sin * across, sin * along + cos * across], axis=-1)
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
+from jaxslam.grids.beam_models import BeamModel
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties
@@ -19,6 +20,7 @@ from jaxslam.verify.comparison import compare_methods
 from jaxslam.verify.derivatives.jacobians import Evaluated, evaluate
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.inputs import samples
+from jaxslam.verify.inputs.beam_models import FAR, beam_function, beam_samples
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.functions import (
     Function,
@@ -34,7 +36,7 @@ from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 from jaxslam.verify.record import Check, Report
 
-Model: TypeAlias = Motion | Sensor | Factor | Callable[..., jax.Array]
+Model: TypeAlias = Motion | Sensor | Factor | BeamModel | Callable[..., jax.Array]
 
 MOUNT = (0.4, -0.3, 0.9)
 """The mount of a sensor made by `build`: off the robot's centre, so that all terms contribute."""
@@ -75,7 +77,9 @@ def verify_jacobians(
     reported with the line in its file, and the remaining checks are run.
 
     Args:
-        model: a `Motion`, a `Sensor`, a `graphs.Factor` or a pure function of vectors.
+        model: a `Motion`, a `Sensor`, a `graphs.Factor`, a `grids.BeamModel` (its log-densities, by
+            the pose and the ranges, in a map without rounding: `inputs.beam_models`), or a pure
+            function of vectors.
         jacobian: of a function, its hand-derived Jacobian. Called with the function's arguments it
             returns a tuple of one (m, n_k) array an argument (None: no claim), or one array: by the
             first argument, or by all of them side by side. Models bring their own.
@@ -108,13 +112,14 @@ def verify_jacobians(
         raise ValueError(f"verify_jacobians: expected count >= 2, got {count}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"verify_jacobians: expected a seed between 0 and 2³²-1, got {seed}")
-    if not (isinstance(model, Motion | Sensor | Factor) or callable(model)):
+    if not (isinstance(model, Motion | Sensor | Factor | BeamModel) or callable(model)):
         raise ValueError(
-            "verify_jacobians: expected a Motion, a Sensor, a Factor or a function of vectors, got "
+            "verify_jacobians: expected a Motion, a Sensor, a Factor, a BeamModel or a function of "
+            f"vectors, got "
             f"{type(model).__name__}"
         )
     if (
-        not isinstance(model, Motion | Sensor | Factor)
+        not isinstance(model, Motion | Sensor | Factor | BeamModel)
         and jacobian is None
         and makes_a_model(model)
     ):
@@ -132,11 +137,17 @@ def verify_jacobians(
         functions = functions_of(model)
     elif isinstance(model, Factor):
         kind, name, functions = "factor", model.name, (factor_function(model),)
+    elif isinstance(model, BeamModel):
+        with _float64():
+            functions = (beam_function(model),)
+        kind, name = "beam model", model.name
     else:
         with _float64():
             functions = (plain_function(model, jacobian, arguments, outputs, name, states),)
         kind, name = "function", functions[0].name
     given = None if states is None else _given_samples(functions[0], states)
+    if given is None and isinstance(model, BeamModel):
+        given = beam_samples(model, count, seed)
     examined = examine(model, functions, given, count, seed)
     with np.errstate(all="ignore"):
         findings = [
@@ -208,7 +219,7 @@ def examine(
         checks: list[Check] = []
         for one in evaluated:
             checks += [*one.checks, *properties.function_checks(one)]
-            if isinstance(model, Motion | Sensor):
+            if isinstance(model, Motion | Sensor | BeamModel):
                 checks += properties.dtype_checks(one)
         checks += _model_checks(model, drawn)
     return Examined(evaluated, tuple(checks))
@@ -219,16 +230,23 @@ def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
     return motion_functions(model) if isinstance(model, Motion) else sensor_functions(model)
 
 
-def build(factory: Callable[..., Motion] | Callable[..., Sensor]) -> Motion | Sensor:
-    """A model made by a factory like those of the registries, with noise 0.01 I.
+def build(factory: Callable[..., Motion | Sensor | BeamModel]) -> Motion | Sensor | BeamModel:
+    """A model made by a factory like those of the registries: with noise 0.01 I, or, of a beam
+    model, with the maximum range of the trial.
 
-    A sensor is mounted off the robot's centre. Raises ValueError where the factory returns neither.
+    A sensor, and a laser, is mounted off the robot's centre. Raises ValueError where the factory
+    returns none of these.
     """
+    parameters = inspect.signature(factory).parameters
+    mounted = {"mount": MOUNT} if "mount" in parameters else {}
+    if "max_range" in parameters:
+        made = factory(max_range=FAR, **mounted)
+        if isinstance(made, BeamModel):
+            return made
     probe = factory(lambda *_: None)
     if not isinstance(probe, Motion | Sensor):
         raise ValueError(f"expected a Motion or a Sensor, got {type(probe).__name__}")
     size = len(probe.noises if isinstance(probe, Motion) else probe.measurements)
-    mounted = {"mount": MOUNT} if "mount" in inspect.signature(factory).parameters else {}
     return factory(0.01 * np.eye(size), **mounted)
 
 

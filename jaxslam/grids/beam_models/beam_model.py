@@ -26,6 +26,8 @@ class BeamModel:
     jacobian: Callable[[PyTree, Array, Beams], Array] | None = None
     """(prepared, pose, beams) -> (B, 3), their derivatives by the pose, derived by hand: `verify`
     compares them with automatic differentiation and differences"""
+    mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0)
+    """(3,) pose of the laser on the robot, which `each` takes into account"""
 
 
 def log_likelihood(

@@ -1,7 +1,8 @@
 """Beam end-points against the distance to the nearest obstacle."""
 
+import math
+
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -57,7 +58,9 @@ def likelihood_field(
         return far, ends
 
     def near_of(d: Float[Array, "B"]) -> Float[Array, "B"]:
-        return jnp.asarray(hit * jnp.exp(-0.5 * (d / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)))
+        return jnp.asarray(
+            hit * jnp.exp(-0.5 * (d / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
+        )
 
     def total_of(near: Float[Array, "B"]) -> Float[Array, "B"]:
         return jnp.maximum(near + random / max_range, jnp.finfo(near.dtype).tiny)
@@ -79,4 +82,4 @@ def likelihood_field(
         turning = by_end[:, 1] * arm[:, 0] - by_end[:, 0] * arm[:, 1]
         return jnp.where(far[:, None], 0.0, jnp.concatenate([by_end, turning[:, None]], axis=1))
 
-    return BeamModel("likelihood_field", prepare, each, jacobian)
+    return BeamModel("likelihood_field", prepare, each, jacobian, mount)

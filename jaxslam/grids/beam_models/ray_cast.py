@@ -1,5 +1,6 @@
 """The range of a beam against the one that the map predicts: a mixture of four components."""
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -54,7 +55,7 @@ def mixture_log_density(
     nothing = expected >= max_range
     star = jnp.where(nothing, 0.5 * max_range, expected)
     mass = ndtr((max_range - star) / sigma) - ndtr(-star / sigma)
-    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi) * mass)
+    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi) * mass)
     # Where max_range is expected, short ones are spread over all of it.
     end = jnp.where(nothing, max_range, jnp.maximum(expected, 1e-6))
     early = jnp.where(z <= end, rate * jnp.exp(-rate * z) / -jnp.expm1(-rate * end), 0.0)
@@ -77,8 +78,8 @@ def density_slope(
     star = jnp.minimum(jnp.maximum(expected, 1e-6), max_range)
     low, high = -star / sigma, (max_range - star) / sigma
     mass = ndtr(high) - ndtr(low)
-    by_mass = (jnp.exp(-0.5 * low**2) - jnp.exp(-0.5 * high**2)) / (sigma * np.sqrt(2 * np.pi))
-    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi) * mass)
+    by_mass = (jnp.exp(-0.5 * low**2) - jnp.exp(-0.5 * high**2)) / (sigma * math.sqrt(2 * math.pi))
+    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi) * mass)
     rest = -jnp.expm1(-rate * star)
     early = jnp.where(z <= star, rate * jnp.exp(-rate * z) / rest, 0.0)
     near = hit * normal + short * early + random / max_range
@@ -127,7 +128,7 @@ def ray_cast(
         by_range: Array = density_slope(mixture, z, expected, max_range)
         return by_range[:, None] * jnp.asarray(by_pose)
 
-    return BeamModel("ray_cast", prepare, each, jacobian)
+    return BeamModel("ray_cast", prepare, each, jacobian, mount)
 
 
 def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:

@@ -79,38 +79,40 @@ _NORMALS = np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1)
 _OFFSETS = np.array([9.0, 8.0, 8.5, 7.5])
 
 
-def beam_samples(count: int, seed: int) -> Samples:
+def beam_samples(model: BeamModel, count: int, seed: int) -> Samples:
     """Poses in the room, with ranges beside the true ones; the first are random, others have
     difficult headings."""
+    mount = np.asarray(model.mount, np.float64)
     rng = np.random.default_rng(seed)
     headings = np.concatenate([rng.uniform(-np.pi, np.pi, count), _HEADINGS])
     labels = ("random",) * count + tuple(f"pose theta = {h:.4g}" for h in _HEADINGS)
-    poses = []
-    for heading in headings:
-        pose = _apart(rng, heading)
-        poses.append(pose)
-    pose = np.array(poses)
-    ranges = _ranges(pose)[0] + 0.15 * rng.normal(size=(len(pose), len(_ANGLES)))
+    pose = np.array([_apart(rng, heading, mount) for heading in headings])
+    ranges = _ranges(pose, mount)[0] + 0.15 * rng.normal(size=(len(pose), len(_ANGLES)))
     return Samples((pose, ranges), labels)
 
 
-def _apart(rng: np.random.Generator, heading: float) -> Float[np.ndarray, "3"]:
+def _apart(
+    rng: np.random.Generator, heading: float, mount: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
     """A pose with this heading from which no beam ends near a corner of the room."""
     while True:
         pose = np.array([*rng.uniform(-3, 3, 2), heading])
-        if _ranges(pose[None])[1].min() > _CORNER:
+        if _ranges(pose[None], mount)[1].min() > _CORNER:
             return pose
 
 
 def _ranges(
-    pose: Float[np.ndarray, "S 3"],
+    pose: Float[np.ndarray, "S 3"], mount: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "S B"], Float[np.ndarray, "S B"]]:
     """The exact range of each beam, and the distance of its end from the next wall's line."""
-    heading = pose[:, 2, None] + _ANGLES
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    arm = np.stack([c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]], axis=1)
+    eye = (pose[:, :2] + arm)[:, None]
+    heading = pose[:, 2, None] + mount[2] + _ANGLES
     e = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     towards = e @ _NORMALS.T
-    room = (_OFFSETS - pose[:, None, :2] @ _NORMALS.T) / np.where(towards > 1e-9, towards, np.nan)
+    room = (_OFFSETS - eye @ _NORMALS.T) / np.where(towards > 1e-9, towards, np.nan)
     ranges = np.nanmin(room, axis=-1)
-    ends = pose[:, None, :2] + ranges[..., None] * e
+    ends = eye + ranges[..., None] * e
     gaps = np.sort(_OFFSETS - ends @ _NORMALS.T, axis=-1)
     return ranges, gaps[..., 1]

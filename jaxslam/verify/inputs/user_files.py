@@ -12,6 +12,7 @@ from types import ModuleType
 from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
+from jaxslam.grids.beam_models import BeamModel
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, line_of
@@ -71,8 +72,9 @@ def recorded_prints() -> Iterator[PrintRecorder]:
 def load(target: str) -> list[Target]:
     """The models and functions that `file.py` or `file.py:name` defines, in the order of the file.
 
-    These are objects of the types `Motion`, `Sensor` and `graphs.Factor`; factories annotated to
-    return a motion or a sensor, whose only required parameter is a noise covariance; and functions
+    These are objects of the types `Motion`, `Sensor`, `graphs.Factor` and `grids.BeamModel`;
+    factories annotated to return a motion or a sensor, whose only required parameter is a noise
+    covariance; and functions
     f with a function f_jacobian (or f_jacobians), whose entries may be named as
     f_arguments = {"pose": ("x [m]", …), …} and f_outputs = ("range [m]", …), and their states given
     as f_states = (array (S, n), …).
@@ -187,7 +189,7 @@ def import_file(path: Path) -> ModuleType:
 def _target(module: ModuleType, name: str) -> Target | None:
     """What a name of the module stands for, or None where there is nothing to verify."""
     value = getattr(module, name)
-    if isinstance(value, Motion | Sensor | Factor):
+    if isinstance(value, Motion | Sensor | Factor | BeamModel):
         return Target(name, value)
     if not callable(value) or isinstance(value, type):
         return None

@@ -1,0 +1,261 @@
+"""Localization in grids: `python -m benchmarks.grid_localization [--runs 100] [--part logs]`.
+
+`office`: the likelihood-field filter on the same draws for each exponent of the likelihood, in a
+map made from another drive: does the 95 % set of its particles cover the truth in 95 % of the
+steps? Then from anywhere. `logs`: the Intel lab and Freiburg's building 101, raw odometry and scans
+against the corrected poses, in a map made from other scans of the same log: of its first half, and
+of every second scan; and from anywhere. The folder is JAXSLAM_DATA, by default ../shared/data;
+logs that are not there are left out.
+"""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.consistency.markdown import table
+from benchmarks.gate import Metric, alone
+from benchmarks.real_data import DATA
+from jaxslam import consistency, datasets, grids, motion, run
+from jaxslam.consistency.nees import pose_error
+from jaxslam.simulation import laser, walls
+from jaxslam.simulation.scenarios import office
+
+EXPONENTS = (1.0, 0.5, 0.2, 0.1, 0.05)
+BEAMS, CELL = 60, 0.05
+START = np.diag([0.1, 0.1, 0.05]) ** 2
+SKIP = 5  # scored steps, of 4 each, until the start is forgotten
+FOUND = 0.5, np.pi / 6  # [m], [rad]
+LOGS = {"intel": "intel-corrected.log", "freiburg-101": "freiburg-101-corrected.log"}
+FAR = 30.0
+ALPHA = (0.05, 0.03, 0.02, 0.01)
+"""Noise of raw odometry, from its differences from the corrected poses: 6 cm, 7 cm and 4° a step of
+0.7 m, and some."""
+
+
+def single(tree):
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
+
+
+def office_map():
+    """The map of another drive through the office, with 180 beams."""
+    world = office()
+    log = laser.scan_world(world, jax.random.key(1000))
+    frame = walls.rasterize(world.walls, CELL)
+    shape, far = frame.log_odds.shape, world.laser.max_range
+    counts = grids.count(shape, frame.origin, CELL, log.pose, log.beams, max_range=far)
+    return single(grids.occupancy(counts))
+
+
+def tempering(runs, particles=500, sigma=0.03, seeds=10):
+    """The table over exponents, from a known start; σ is that of the laser and of half a cell."""
+    world, grid = office(beams=BEAMS), office_map()
+    model = grids.likelihood_field(sigma, max_range=world.laser.max_range)
+    rows, covered = [], []
+    for exponent in EXPONENTS:
+        filter = grids.localize(
+            grid, model, world.motion, particles, least=particles, exponent=exponent
+        )
+        key = jax.random.key(0)
+        scores = consistency.judge_localization(world, filter, runs, key, start_cov=START, every=4)
+        found = consistency.summarize_localization(scores, skip=SKIP, limit=FOUND)
+        again = consistency.judge_localization(
+            world, filter, seeds, key, start_cov=0 * START, same_log=True, every=4
+        )
+        spread = float(np.median(consistency.seed_spread(again)[SKIP:]))
+        covered.append(found.coverage.value)
+        rows.append(
+            [
+                f"{exponent:g}",
+                told(found.coverage),
+                told(found.nees),
+                f"{1e3 * found.energy.value:.1f}",
+                f"{1e3 * found.rmse.value:.1f}" if found.rmse else "-",
+                f"{np.degrees(found.heading):.2f}",
+                f"{spread:.2f}",
+                f"{np.asarray(scores.ess)[:, SKIP:].mean():.0f}",
+                f"{found.lost:.0%}",
+            ]
+        )
+        print(rows[-1], flush=True)
+    header = ["exponent", "coverage of the 95 % set", "NEES (3)", "energy score [mm]"]
+    header += ["position RMSE [mm]", "median heading error [°]", "spread over seeds", "ESS", "lost"]
+    print(f"\noffice, {runs} runs, {particles} particles, σ = {sigma} m, {BEAMS} beams\n")
+    print(table(header, rows), flush=True)
+    honest = honest_exponent(covered)
+    gap = [abs(value - 0.95) for value in covered]
+    return [
+        Metric("office: coverage without tempering", covered[0]),
+        Metric("office: coverage nearest to 0.95", covered[int(np.argmin(gap))], 0.9, 0.99),
+        Metric("office: exponent whose sets cover 95 %, interpolated", honest),
+    ]
+
+
+def told(measure):
+    if measure is None:
+        return "-"
+    return f"{measure.value:.3g} [{measure.low:.3g}, {measure.high:.3g}]"
+
+
+def honest_exponent(covered):
+    """Where coverage crosses 0.95, linear in the logarithm of the exponent; NaN if it does not."""
+    values, logs = np.array(covered), np.log(EXPONENTS)
+    for k in range(len(values) - 1):
+        low, high = values[k : k + 2]
+        if low < 0.95 <= high:
+            return float(np.exp(logs[k] + (0.95 - low) / (high - low) * (logs[k + 1] - logs[k])))
+    return float("nan")
+
+
+def anywhere(runs, particles=5000):
+    """The office from anywhere: when found, how many are lost."""
+    world = office(beams=BEAMS // 2)
+    model = grids.likelihood_field(0.2, max_range=world.laser.max_range)
+    filter = grids.localize(
+        office_map(), model, world.motion, particles,
+        start="uniform", exponent=0.1, forget=(0.05, 0.5),
+    )  # fmt: skip
+    scores = consistency.judge_localization(world, filter, runs, jax.random.key(0), every=4)
+    found = consistency.summarize_localization(scores, limit=FOUND)
+    after = found.found[np.isfinite(found.found)]
+    return [
+        Metric("office, anywhere: share of runs found", 1 - found.lost, low=0.95),
+        Metric("office, anywhere: median time to converge [s]", float(np.median(after))),
+        Metric("office, anywhere: its 90 % quantile [s]", float(np.quantile(after, 0.9))),
+        Metric("office, anywhere: energy score [m]", found.energy.value),
+    ]
+
+
+def read(name):
+    path = DATA / "carmen" / LOGS[name]
+    stored = path.exists() or path.with_name(path.name + ".gz").exists()
+    return datasets.carmen(path, max_range=FAR) if stored else None
+
+
+def map_of(log, rows):
+    """The map from some scans of a log at their corrected poses."""
+    low, high = log.corrected[:, :2].min(axis=0) - 10.0, log.corrected[:, :2].max(axis=0) + 10.0
+    width, height = np.ceil((high - low) / CELL).astype(int)
+    beams = jax.tree.map(lambda part: part[rows], log.beams)
+    frame = (int(height), int(width)), (*low, 0.0), CELL
+    counts = grids.count(*frame, log.corrected[rows], beams, max_range=FAR, no_return=0.0)
+    return single(grids.occupancy(counts))
+
+
+def log_of(log, rows, beams=BEAMS):
+    """Raw odometry between some scans, and these with so many beams, in float32."""
+    step = max(1, log.beams.range.shape[1] // beams)
+    taken = jax.tree.map(lambda part: part[rows][:, ::step], log.beams)
+    return single_log(grids.beam_log(motion.odometry_controls(log.raw[rows]), taken))
+
+
+def single_log(log):
+    return jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, log)
+
+
+def filter_of(grid, particles, sigma=0.1, **options):
+    moves = motion.odometry(motion.odometry_noise(ALPHA))
+    return grids.localize(
+        grid, grids.likelihood_field(sigma, max_range=FAR), moves, particles, **options
+    )
+
+
+def tracking(name, particles=2000, seeds=5):
+    """Errors from a known start, of the first half's map and of every second scan's."""
+    log = read(name)
+    if log is None:
+        return []
+    count = len(log.corrected)
+    half, odd = np.arange(count // 2, count), np.arange(1, count, 2)
+    rows, metrics = [], []
+    for label, mapped, driven in (
+        ("first half", np.arange(count // 2), half),
+        ("every second scan", np.arange(0, count, 2), odd),
+    ):
+        grid = map_of(log, mapped)
+        filter = filter_of(grid, particles, exponent=0.2, forget=(0.05, 0.5))
+        own, start = log_of(log, driven), log.corrected[driven[0]].astype(np.float32)
+        cov = np.diag([0.1, 0.1, 0.05]).astype(np.float32) ** 2
+        errors = []
+        for seed in range(seeds):
+            trace = run(filter, own, start, cov, jax.random.key(seed))
+            errors.append(pose_error(log.corrected[driven], np.asarray(trace.estimate.pose)))
+        off = np.hypot(*np.moveaxis(np.array(errors)[..., :2], -1, 0))
+        turn = np.degrees(np.abs(np.array(errors)[..., 2]))
+        places = log.corrected[mapped][:, :2]
+        near = np.array([np.hypot(*(places - p[:2]).T).min() for p in log.corrected[driven]]) < 2.0
+        for where, at in (("all scans", near | True), ("within 2 m of the map's scans", near)):
+            values = np.median(off[:, at]), np.median(turn[:, at]), np.quantile(off[:, at], 0.9)
+            rows.append(
+                [name, label, where, f"{at.mean():.0%}", *(f"{value:.3f}" for value in values)]
+            )
+            gates = (0.10, 1.5) if where == "all scans" else (np.inf, np.inf)
+            metrics += [
+                Metric(f"{name}, {label}, {where}: median error [m]", values[0], high=gates[0]),
+                Metric(f"{name}, {label}, {where}: median error [°]", values[1], high=gates[1]),
+            ]
+    header = ["log", "map from", "scored", "share", "median [m]", "median [°]", "90 % [m]"]
+    print(
+        f"\n{particles} particles, {BEAMS} beams, {seeds} seeds\n{table(header, rows)}", flush=True
+    )
+    return metrics
+
+
+def found_in(name, seeds=100, particles=5000, steps=100):
+    """From anywhere at places all along the log, in the map of every second scan."""
+    log = read(name)
+    if log is None:
+        return []
+    grid = map_of(log, np.arange(0, len(log.corrected), 2))
+    driven = np.arange(1, len(log.corrected), 2)
+    filter = filter_of(grid, particles, 0.2, start="uniform", exponent=0.1, forget=(0.05, 0.5))
+    starts = np.linspace(0, len(driven) - steps, seeds).astype(int)
+    errors, seconds = [], 0.0
+    for seed, first in enumerate(starts):
+        rows = driven[first : first + steps]
+        began = time.process_time()
+        trace = run(filter, log_of(log, rows, 45), np.zeros(3, np.float32),
+                    np.eye(3, dtype=np.float32), jax.random.key(seed))  # fmt: skip
+        pose = np.asarray(trace.estimate.pose)
+        seconds += (time.process_time() - began) * (seed > 0)  # the first compiles
+        errors.append(pose_error(log.corrected[rows], pose))
+    error = np.array(errors)
+    wrong = (np.hypot(error[..., 0], error[..., 1]) > 2 * FOUND[0]) | (
+        np.abs(error[..., 2]) > FOUND[1]
+    )
+    late = wrong[:, -10:].mean(axis=1) > 0.5
+    first = np.argmax(~wrong, axis=1)
+    rate = particles * steps * (seeds - 1) / seconds / 1e6
+    return [
+        Metric(
+            f"{name}, anywhere: found, of {seeds} starts", float((~late).sum()), low=0.95 * seeds
+        ),
+        Metric(
+            f"{name}, anywhere: median scans until first within 1 m", float(np.median(first[~late]))
+        ),
+        Metric(f"{name}: million particles a processor second, 45 beams", rate),
+    ]
+
+
+def measure(runs=100, part="office,logs"):
+    """The metrics of the parts named."""
+    wanted, metrics = part.split(","), []
+    if "office" in wanted:
+        metrics += tempering(runs) + anywhere(runs)
+    if "logs" in wanted:
+        for name in LOGS:
+            metrics += tracking(name)
+        metrics += found_in("intel", seeds=runs)
+    return metrics
+
+
+if __name__ == "__main__":
+    raise SystemExit(
+        alone(
+            "grid_localization",
+            measure,
+            runs={"type": int, "default": 100},
+            part={"default": "office,logs"},
+        )
+    )
