@@ -29,7 +29,9 @@ from benchmarks import (
     gradient,
     graph_files,
     graph_speed,
+    grid_slam,
     kill,
+    lines,
     monte_carlo_localization,
     plain_particles,
     plaza,
@@ -48,6 +50,7 @@ from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import Metric, report
 from benchmarks.graph_consistency.__main__ import measure as measure_graphs
 from benchmarks.grids.__main__ import measure as measure_grids
+from benchmarks.laser_slam.__main__ import measure as measure_laser_slam
 from benchmarks.mrclam.__main__ import measure as measure_mrclam
 from benchmarks.results import measured
 from benchmarks.scan_matching.__main__ import measure as measure_matching
@@ -98,7 +101,10 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "fastslam": lambda: fastslam.measure(4 if quick else 20, (10, 100)),
         "plain_particles": lambda: plain_particles.measure(8 if quick else 20),
         "grids": measure_grids,
+        "grid_slam": lambda: grid_slam.measure(2 if quick else 6),
+        "laser_slam": lambda: measure_laser_slam(quick),
         "scan_matching": lambda: measure_matching(quick),
+        "lines": lambda: lines.measure(10 if quick else 100),
         "scaling": scaling.measure,
         "seif": lambda: seif.measure(4 if quick else 10),
         "comparison": lambda: comparison.measure(8 if quick else 16),

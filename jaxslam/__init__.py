@@ -14,9 +14,11 @@ from jaxslam import (
     catalog,
     charts,
     consistency,
+    features,
     filters,
     graphs,
     grids,
+    laser_slam,
     life,
     linearize,
     matching,
@@ -28,6 +30,7 @@ from jaxslam import (
     slots,
     smoothing,
     team,
+    topology,
 )
 from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
@@ -47,9 +50,11 @@ __all__ = [
     "catalog",
     "charts",
     "consistency",
+    "features",
     "filters",
     "graphs",
     "grids",
+    "laser_slam",
     "life",
     "linearity",
     "linearity_index",
@@ -71,6 +76,7 @@ __all__ = [
     "stats",
     "team",
     "team_world",
+    "topology",
     "uncertain_poses",
     "verify_jacobians",
 ]

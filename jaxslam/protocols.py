@@ -13,9 +13,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxslam.math import se2
+from jaxslam.math.angles import wrap
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Log, Scan, Trace, Truth
 
@@ -121,6 +124,10 @@ class Sensor:
     embed: Callable[[Array, Array], Array] = lambda pose, point: point
     """(pose, point (2,)) -> l of a landmark at that point, measured first from pose. Default that
     of a point."""
+    carry: Callable[[Array, Array], Array] | None = None
+    """(frame (3,), l) -> l of a landmark given in a frame, in the coordinates that the frame's pose
+    is in. Default, of a landmark whose first two numbers are a place (x, y): the place moves,
+    entries in [rad] turn, and the others stay."""
     free: Free = NOTHING_FREE
     """the prior of s. Default that of a full measurement."""
     observe_jacobians: Callable[[Array, Array], tuple[Array, Array]] | None = None
@@ -132,13 +139,28 @@ class Sensor:
 
     def __post_init__(self) -> None:
         functions = ("observe", "residual", "noise_cov", "invert", "position", "embed")
-        optional = ("observe_jacobians", "invert_jacobians")
+        optional = ("carry", "observe_jacobians", "invert_jacobians")
         _check_fields(self, functions, ("measurements", "landmark"), optional)
         if not isinstance(self.free, Free):
             raise ValueError(
                 f"Sensor {self.name!r}: expected free to be a Free(mean, cov), got "
                 f"{type(self.free).__name__}"
             )
+
+    @property
+    def of_points(self) -> bool:
+        """Whether a landmark is a point (x, y), as some methods need."""
+        return len(self.landmark) == 2 and self.carry is None
+
+    def carried(self, frame: Float[Array, "3"], landmark: Float[Array, "L"]) -> Float[Array, "L"]:
+        """A landmark given in a frame, in the coordinates that the frame's pose is in."""
+        if self.carry is not None:
+            return self.carry(frame, landmark)
+        if len(self.landmark) < 2:
+            return landmark
+        turns = np.array([name.endswith("[rad]") for name in self.landmark[2:]], bool)
+        rest = jnp.where(turns, wrap(landmark[2:] + frame[2]), landmark[2:])
+        return jnp.concatenate([se2.from_frame(frame, landmark[:2]), rest])
 
 
 class Basis(NamedTuple):

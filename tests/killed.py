@@ -21,7 +21,7 @@ from jaxslam import filters, store
 from jaxslam.cli.runtime.library import ProgramFolder
 from jaxslam.monte_carlo import monte_carlo
 
-RUNS, BLOCK = 400, 2
+RUNS, BLOCK = 240, 2
 FULL = 28
 """Exit code of a process whose disk was full."""
 _IDENTITY = {"campaign": "toy"}

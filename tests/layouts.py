@@ -8,10 +8,16 @@ _COMPUTATION = re.compile(r"(?:ENTRY )?%?([\w.\-]+) \(.*\) -> .*\{$")
 _INSTRUCTION = re.compile(r"\s+(ROOT )?%([\w.\-]+) = (\([^=]*?\)|\S+) ([\w\-]+)\((.*)$")
 
 
-def wrong_layouts():
-    """Calls in the kept programs with another layout than their computation was compiled for, which
-    give wrong numbers (jaxlib 0.12)."""
-    texts = (kept.result().as_text() for kept in cache._BY_TEXT._found.values())
+def kept_programs():
+    """The keys of the programs that are kept."""
+    return set(cache._BY_TEXT._found)
+
+
+def wrong_layouts(before=()):
+    """Calls in the kept programs, but for those of `before`, with another layout than their
+    computation was compiled for, which give wrong numbers (jaxlib 0.12)."""
+    kept = cache._BY_TEXT._found.items()
+    texts = (made.result().as_text() for key, made in kept if key not in before)
     return [one for text in texts for one in mismatches(text)[0]]
 
 

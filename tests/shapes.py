@@ -45,19 +45,40 @@ def checked(function):
         if name in hints
     ]
 
+    known = set()
+    """Shapes that fit: of the arguments, and of the arguments with the result."""
+
+    def check(values):
+        for value, (_, name, hint) in zip(values, given, strict=True):
+            if value is not None and not _fits(value, hint):
+                raise TypeError(f"{function.__qualname__}: {name} is no {hint}: {_told(value)}")
+
     @functools.wraps(function)
     def call(*args, **kwargs):
-        with ONE_SCOPE:
-            for i, name, hint in given:
-                value = args[i] if i < len(args) else kwargs.get(name)
-                if value is not None and not _fits(value, hint):
-                    raise TypeError(f"{function.__qualname__}: {name} is no {hint}: {_told(value)}")
-            found = function(*args, **kwargs)
-            if returned is not None and not _fits(found, returned):
-                raise TypeError(f"{function.__qualname__}: returns no {returned}: {_told(found)}")
-            return found
+        values = [args[i] if i < len(args) else kwargs.get(name) for i, name, _ in given]
+        shapes = tuple(map(_shape, values))
+        if shapes not in known:
+            with ONE_SCOPE:
+                check(values)
+            known.add(shapes)
+        found = function(*args, **kwargs)
+        if returned is not None and (shapes, _shape(found)) not in known:
+            with ONE_SCOPE:
+                check(values)
+                if not _fits(found, returned):
+                    told = f"returns no {returned}: {_told(found)}"
+                    raise TypeError(f"{function.__qualname__}: {told}")
+            known.add((shapes, _shape(found)))
+        return found
 
     return call
+
+
+def _shape(value):
+    """All that `_fits` looks at; the same shapes are looked at once."""
+    if isinstance(value, tuple):
+        return tuple(map(_shape, value))
+    return type(value), getattr(value, "shape", None), getattr(value, "dtype", None)
 
 
 def _is_array(hint):

@@ -27,22 +27,24 @@ after a test."""
 HEAVY = tuple(
     f"tests/{folder}/test_{name}.py"
     for folder, names in (
-        ("monte_carlo", "monte_carlo"),
-        ("filters/delayed", "delayed_slam"),
-        ("filters/multi_robot", "team_slam"),
         ("consistency", "catalog"),
+        ("monte_carlo", "monte_carlo"),
+        ("filters/multi_robot", "team_slam"),
         ("filters/particles", "fastslam"),
-        ("programs", "programs"),
-        ("cli", "cli"),
-        ("equivalence", "information"),
-        ("filters/ekf", "gradients"),
+        ("filters/delayed", "delayed_slam"),
         ("models", "suite"),
-        ("filters/information", "seif eseif"),
-        ("simulation", "spurious"),
-        ("filters/ekf", "wild to_points"),
-        ("equivalence", "ekf"),
+        ("monte_carlo", "processes"),
+        ("conformance", "fuzzed_logs"),
+        ("smoothing", "smoothing fixed_lag"),
+        ("equivalence", "information ekf"),
+        ("programs", "programs"),
         ("filters/particles", "particle_localization"),
-        ("smoothing", "smoothing"),
+        ("filters/ekf", "gradients"),
+        ("filters/information", "seif eseif"),
+        ("filters/map_management", "relocalization merging"),
+        ("simulation", "spurious"),
+        ("cli", "cli"),
+        ("filters/ekf", "to_points wild"),
     )
     for name in names.split()
 )

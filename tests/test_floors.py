@@ -17,8 +17,8 @@ FLOORS = [
     "math programs",
     "types protocols slots validation noise derivatives streams records",
     "motion sensors charts linearize association resampling life team",
-    "run filters smoothing graphs grids matching simulation",
-    "consistency monte_carlo verify catalog calibration metrics",
+    "run filters smoothing graphs grids matching simulation features topology",
+    "consistency monte_carlo verify catalog calibration metrics laser_slam",
     "datasets results cli __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}

@@ -23,11 +23,18 @@ def check(log):
 def changed(field, row, value):
     """The good log with one row of one field replaced."""
     log = good_log()
-    table = (log.control if field == "control" else getattr(log.scan, field)).copy()
+    table = getattr(log if field == "control" else log.scan, field).copy()
     table[row] = value
-    if field == "control":
-        return log._replace(control=table)
-    return log._replace(scan=log.scan._replace(**{field: table}))
+    return replaced(**{field: table})
+
+
+def replaced(**fields):
+    """The good log with other fields, of its own or of its scan."""
+    log, own = (
+        good_log(),
+        {name: fields.pop(name) for name in ("control", "scan") if name in fields},
+    )
+    return log._replace(scan=log.scan._replace(**fields))._replace(**own)
 
 
 def test_a_good_log_passes():
@@ -36,30 +43,17 @@ def test_a_good_log_passes():
     check(jax.tree.map(lambda a: a.astype(np.float32) if a.dtype == float else a, good_log()))
 
 
+NO_Z = "log.scan.z: a valid measurement is"
 BAD_VALUES = {
     "control nan": (changed("control", (2, 1), np.nan), r"log.control is not finite \(row 2\)"),
     "control inf": (changed("control", (3, 0), np.inf), r"log.control is not finite \(row 3\)"),
-    "z nan": (
-        changed("z", (1, 2, 0), np.nan),
-        r"log.scan.z: a valid measurement is not finite \(row 1, slot 2\)",
-    ),
-    "z inf": (
-        changed("z", (0, 0, 1), -np.inf),
-        r"log.scan.z: a valid measurement is not finite \(row 0, slot 0\)",
-    ),
-    "control beyond": (
-        changed("control", (2, 0), -5e61),
-        r"log.control is beyond ±4.5e\+61 \(row 2\)",
-    ),
-    "z beyond": (
-        changed("z", (1, 2, 0), 1e70),
-        r"log.scan.z: a valid measurement is beyond ±4.5e\+61 \(row 1, slot 2\)",
-    ),
+    "z nan": (changed("z", (1, 2, 0), np.nan), rf"{NO_Z} not finite \(row 1, slot 2\)"),
+    "z inf": (changed("z", (0, 0, 1), -np.inf), rf"{NO_Z} not finite \(row 0, slot 0\)"),
+    "control beyond": (changed("control", (2, 0), -5e61), r"control is beyond ±4.5e\+61 \(row 2\)"),
+    "z beyond": (changed("z", (1, 2, 0), 1e70), rf"{NO_Z} beyond ±4.5e\+61 \(row 1, slot 2\)"),
     "tag -2": (changed("tag", (3, 1), -2), r"log.scan.tag: a tag is below -1 \(row 3, slot 1\)"),
     "tag 2**32": (
-        good_log()._replace(
-            scan=good_log().scan._replace(tag=good_log().scan.tag.astype(np.int64) + 2**32)
-        ),
+        replaced(tag=good_log().scan.tag.astype(np.int64) + 2**32),
         r"log.scan.tag: a tag is beyond int32 \(row 0, slot 0\)",
     ),
     "repeated": (
@@ -95,58 +89,26 @@ def test_padding_may_hold_anything_and_unknown_tags_may_repeat():
 
 
 BAD_SHAPES = {
-    "control size": (
-        good_log()._replace(control=np.zeros((4, 2))),
-        r"log.control: expected shape \(T, 3\), got \(4, 2\)",
-    ),
-    "control rank": (
-        good_log()._replace(control=np.zeros(3)),
-        r"log.control: expected shape \(T, 3\), got \(3,\)",
-    ),
-    "control kind": (
-        good_log()._replace(control=np.zeros((4, 3), int)),
-        r"log.control: expected floating values, got int64",
-    ),
-    "z size": (
-        good_log()._replace(scan=good_log().scan._replace(z=np.ones((4, 3, 1)))),
-        r"log.scan.z: expected shape \(4, 3, 2\), got \(4, 3, 1\)",
-    ),
-    "z kind": (
-        good_log()._replace(scan=good_log().scan._replace(z=np.ones((4, 3, 2), bool))),
-        r"log.scan.z: expected floating values, got bool",
-    ),
-    "steps": (
-        good_log()._replace(scan=good_log(5).scan),
-        r"log.scan.z: expected shape \(4, 3, 2\), got \(5, 3, 2\)",
-    ),
-    "tag rank": (
-        good_log()._replace(scan=good_log().scan._replace(tag=np.zeros(4, int))),
-        r"log.scan.tag: expected shape \(4, M\), got \(4,\)",
-    ),
-    "no scan": (good_log()._replace(scan=None), r"expected a Scan\(z, tag, valid\), got NoneType"),
-    "no array": (
-        good_log()._replace(scan=good_log().scan._replace(valid=None)),
-        r"log.scan.valid: expected shape \(4, 3\), got None",
-    ),
-    "tag kind": (
-        good_log()._replace(scan=good_log().scan._replace(tag=np.zeros((4, 3)))),
-        r"log.scan.tag: expected integer values, got float64",
-    ),
-    "valid kind": (
-        good_log()._replace(scan=good_log().scan._replace(valid=np.ones((4, 3), int))),
-        r"log.scan.valid: expected bool.* values, got int64",
-    ),
-    "valid places": (
-        good_log()._replace(scan=good_log().scan._replace(valid=np.ones((4, 2), bool))),
-        r"log.scan.valid: expected shape \(4, 3\), got \(4, 2\)",
-    ),
-}
+    "control size": ({"control": np.zeros((4, 2))}, r"control: expected shape \(T, 3\), got \(4, 2\)"),
+    "control rank": ({"control": np.zeros(3)}, r"control: expected shape \(T, 3\), got \(3,\)"),
+    "control kind": ({"control": np.zeros((4, 3), int)}, "control: expected floating values, got int64"),
+    "z size": ({"z": np.ones((4, 3, 1))}, r"scan.z: expected shape \(4, 3, 2\), got \(4, 3, 1\)"),
+    "z kind": ({"z": np.ones((4, 3, 2), bool)}, "scan.z: expected floating values, got bool"),
+    "steps": ({"scan": good_log(5).scan}, r"scan.z: expected shape \(4, 3, 2\), got \(5, 3, 2\)"),
+    "tag rank": ({"tag": np.zeros(4, int)}, r"scan.tag: expected shape \(4, M\), got \(4,\)"),
+    "no scan": ({"scan": None}, r"expected a Scan\(z, tag, valid\), got NoneType"),
+    "no array": ({"valid": None}, r"scan.valid: expected shape \(4, 3\), got None"),
+    "tag kind": ({"tag": np.zeros((4, 3))}, "scan.tag: expected integer values, got float64"),
+    "valid kind": ({"valid": np.ones((4, 3), int)}, "scan.valid: expected bool.* values, got int64"),
+    "valid places": ({"valid": np.ones((4, 2), bool)}, r"valid: expected shape \(4, 3\), got \(4, 2\)"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("traced", [False, True], ids=["concrete", "traced"])
 @pytest.mark.parametrize("case", BAD_SHAPES)
 def test_bad_shapes_and_kinds_are_refused_traced_or_not(case, traced):
-    log, message = BAD_SHAPES[case]
+    fields, message = BAD_SHAPES[case]
+    log = replaced(**fields)
     with pytest.raises(ValueError, match=f"^drive: .*{message}"):
         if traced:
             jax.eval_shape(check, log)

@@ -1,4 +1,17 @@
-"""What a verification found, by name."""
+"""What a verification found, by name; and how a suite of them is compiled."""
+
+import pytest
+
+from jaxslam.math import xla
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quickly():
+    """What `quick_jit` compiles, compiled as all of the suite is: its own options ask for more, and
+    take a quarter longer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(xla, "quick_options", lambda platform: None)
+        yield
 
 
 def by_name(report, name):

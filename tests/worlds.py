@@ -125,9 +125,8 @@ def iterated_on_its_posterior(scenario):
 
     def update(joint, scan, key):
         joint, info = right.update(joint, scan, key)
-        for _ in range(2):
-            joint, _ = right.update(joint, scan, key)
-        return joint, info
+        again = lambda _, joint: right.update(joint, scan, key)[0]  # noqa: E731
+        return jax.lax.fori_loop(0, 2, again, joint), info
 
     return dataclasses.replace(right, update=update)
 
@@ -145,11 +144,24 @@ def key(seed: int = 0):
     return jax.random.key(seed)
 
 
+def narrow(tree):
+    """The same in float32."""
+    return jax.tree.map(
+        lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, tree
+    )
+
+
+def nameless(log):
+    """The log with tags of nobody."""
+    return log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
+
+
 def draw(scenario, seed=1):
     """A truth and a log of the scenario, in NumPy."""
     return jax.device_get(simulate(scenario, jax.random.key(seed)))
 
 
+@np.errstate(invalid="ignore")  # of a filter without a map
 def judged(truth, estimate, info):
     """What a campaign says of many runs (runs, T, …): {measure: (mean, low, high)}, in NumPy.
 

@@ -2,9 +2,9 @@
 
 Censi's experiment (square, corridor, circular room; σ = 0.03 m; 300 runs) and `office`: pairs of
 scans at random poses of the world's path, the second up to 0.2 m, 0.1 m and 0.1 rad from the first,
-starts with σ of 0.05 m, 0.05 m and 0.03 rad. NEES of every matcher with every covariance (of grids:
-60 runs), over the directions that the exact world says the scans determine, and errors beside the
-Cramér-Rao bound.
+starts with σ of 0.05 m, 0.05 m and 0.03 rad. NEES of every matcher with every covariance
+(matchers of grids: 60 runs), over the directions that the exact world says the scans determine,
+and errors beside the Cramér-Rao bound.
 Then 361-beam scans: matches a second and core, errors at σ = 0.01 m, errors over iterations.
 Draws `figures/scan_matching_nees.png` and `figures/scan_matching_convergence.png`.
 """

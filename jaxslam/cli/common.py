@@ -1,9 +1,9 @@
-"""Helpers of all commands: look-up by name, and folders among the options."""
+"""Helpers of all commands: look-up by name, options of several, summaries as text."""
 
 import argparse
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 _T = TypeVar("_T")
 
@@ -60,3 +60,36 @@ def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more:
         metavar="FORMATS",
         help=f"formats of figures, of {','.join(formats)}; comma-separated (default: png{more})",
     )
+
+
+def summary_table(columns: dict[str, dict[str, Any]]) -> str:
+    """Summaries side by side, a row an entry; names above them where there are several."""
+    rows = list(dict.fromkeys(key for column in columns.values() for key in column))
+    head = [["", *columns]] if len(columns) > 1 else []
+    lines = head + [
+        [
+            row,
+            *(
+                _shown(column.get(row, 0 if row.startswith("status: ") else "-"))
+                for column in columns.values()
+            ),
+        ]
+        for row in rows
+    ]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    return "\n".join(
+        "  ".join(
+            [*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]]
+        ).replace("\n", "\n" + " " * (widths[0] + 2))
+        for line in lines
+    )
+
+
+def _shown(value: object) -> str:
+    """A value of the summary as it is printed."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
+    if isinstance(value, list):
+        lines = all(isinstance(part, str) for part in value)
+        return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"

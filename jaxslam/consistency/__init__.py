@@ -10,6 +10,16 @@ from jaxslam.consistency.bound import (
 )
 from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.intervals import LEVEL, Measure, interval, lopsided, positive_interval
+from jaxslam.consistency.localization import (
+    LocalizationScores,
+    LocalizationSummary,
+    covering_level,
+    energy_score,
+    judge_localization,
+    score_localization,
+    seed_spread,
+    summarize_localization,
+)
 from jaxslam.consistency.nees import DOF, mean_pose_nees, own_error_of
 from jaxslam.consistency.score import LANDMARK_DOF, LEVELS, Score, monitor_of, score
 from jaxslam.consistency.statistics import LAGS, Statistics, statistics
@@ -23,6 +33,8 @@ __all__ = [
     "LANDMARK_DOF",
     "LEVEL",
     "LEVELS",
+    "LocalizationScores",
+    "LocalizationSummary",
     "Measure",
     "RunJacobians",
     "Score",
@@ -32,11 +44,14 @@ __all__ = [
     "Verdict",
     "condense",
     "conditional_bound",
+    "covering_level",
     "credibility",
+    "energy_score",
     "final_covariance",
     "interval",
     "jacobians_at_truth",
     "judge",
+    "judge_localization",
     "lopsided",
     "mean_pose_nees",
     "monitor_of",
@@ -45,7 +60,10 @@ __all__ = [
     "posterior_bound",
     "power_of",
     "score",
+    "score_localization",
+    "seed_spread",
     "statistics",
     "summarize",
+    "summarize_localization",
     "van_trees",
 ]

@@ -1,4 +1,4 @@
-"""Occupancy grids: the map and its files, distance fields, rays, beam models, mapping."""
+"""Occupancy grids: maps, files, distances, rays, beam models, mapping, localization, SLAM."""
 
 from jaxslam.grids.beam_models import (
     BeamModel,
@@ -13,19 +13,26 @@ from jaxslam.grids.distance import distance_field, gradient
 from jaxslam.grids.files import read_map, write_map
 from jaxslam.grids.grid import Field, Grid, centers, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolate
+from jaxslam.grids.localization import Clusters, beam_log, clusters, localize
 from jaxslam.grids.mapping import Counts, count, entropy, occupancy, reflection
 from jaxslam.grids.resampling import correlation, crop, resample
+from jaxslam.grids.slam import GridParticles, best_map, grid_slam
 
 __all__ = [
     "BeamModel",
+    "Clusters",
     "Counts",
     "Field",
     "Grid",
+    "GridParticles",
     "Mixture",
     "RayMap",
+    "beam_log",
+    "best_map",
     "cast",
     "centers",
     "check_grid",
+    "clusters",
     "correlation",
     "count",
     "crop",
@@ -33,8 +40,10 @@ __all__ = [
     "entropy",
     "fit",
     "gradient",
+    "grid_slam",
     "interpolate",
     "likelihood_field",
+    "localize",
     "log_likelihood",
     "occupancy",
     "ray_cast",

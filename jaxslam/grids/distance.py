@@ -75,6 +75,7 @@ def squared_distances(occupied: Bool[Array, "H W"]) -> Int[Array, "H W"]:
     return jnp.where(occupied.any(), squared.T, nothing)
 
 
+@jax.custom_batching.custom_vmap
 def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
     """For each place of a row, a column here, the parabola that is lowest there."""
     width, rows = column.shape
@@ -121,3 +122,11 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
     lowest = jnp.zeros((width + 1, rows), jnp.int32)
     lowest = lowest.at[first, row[None, :]].max(parabola.reshape(width, rows))
     return jax.lax.cummax(lowest, axis=0)[:width]
+
+
+@_envelope.def_vmap
+def _of_all(size: int, _: object, columns: Int[Array, "P W H"]) -> tuple[Array, bool]:
+    """The rows of all tables of a batch together: a loop of each table's own would copy all."""
+    _, width, rows = columns.shape
+    found = _envelope(jnp.swapaxes(columns, 0, 1).reshape(width, size * rows))
+    return jnp.swapaxes(found.reshape(width, size, rows), 0, 1), True

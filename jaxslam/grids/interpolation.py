@@ -21,13 +21,36 @@ def interpolated(values: Float[Array, "H W"], at: Float[Array, "*n 2"]) -> Float
 
     f = a (1-u)(1-v) + b u (1-v) + c (1-u) v + d u v on the unit square of the four entries around.
     """
+    (a, b, c, d), (u, v) = _around(values, at)
+    bottom, top = a + u * (b - a), c + u * (d - c)
+    return bottom + v * (top - bottom)
+
+
+def slope(field: Field, points: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+    """The gradient of `interpolate` by the point, in the world's x and y, derived by hand.
+
+    ∂f/∂u = (b - a)(1-v) + (d - c) v and ∂f/∂v = (c - a)(1-u) + (d - b) u, over the resolution and
+    turned by the heading of the grid; 0 along an axis on which the point is off the centres.
+    """
+    at = to_cells(field.origin, field.resolution, points) - 0.5
+    (a, b, c, d), (u, v) = _around(field.values, at)
+    last = jnp.asarray(field.values.shape[::-1]) - 1
+    within = (at >= 0) & (at <= last)
+    along = jnp.where(within[..., 0], (b - a) * (1 - v) + (d - c) * v, 0.0) / field.resolution
+    across = jnp.where(within[..., 1], (c - a) * (1 - u) + (d - b) * u, 0.0) / field.resolution
+    cos, sin = jnp.cos(field.origin[2]), jnp.sin(field.origin[2])
+    return jnp.stack([cos * along - sin * across, sin * along + cos * across], axis=-1)
+
+
+def _around(
+    values: Float[Array, "H W"], at: Float[Array, "*n 2"]
+) -> tuple[tuple[Array, Array, Array, Array], tuple[Array, Array]]:
+    """The four entries a, b, c, d around (x, y), and where between them it is: (u, v)."""
     height, width = values.shape
     values = jnp.asarray(values)
     x, y = jnp.clip(at[..., 0], 0, width - 1), jnp.clip(at[..., 1], 0, height - 1)
     j = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, max(width - 2, 0))
     i = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, max(height - 2, 0))
     right, up = jnp.minimum(j + 1, width - 1), jnp.minimum(i + 1, height - 1)
-    u, v = x - j, y - i
-    a, b, c, d = values[i, j], values[i, right], values[up, j], values[up, right]
-    bottom, top = a + u * (b - a), c + u * (d - c)
-    return bottom + v * (top - bottom)
+    entries = values[i, j], values[i, right], values[up, j], values[up, right]
+    return entries, (x - j, y - i)

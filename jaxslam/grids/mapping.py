@@ -105,49 +105,83 @@ def _count(
     free: Array,
     mount: Array,
 ) -> Counts:
-    height, width = shape
-    nowhere = height * width
-
     def add(total: PyTree, row: tuple[Array, Beams]) -> tuple[PyTree, None]:
         hits, misses, outside, unusable = total
         pose, scan = row
+        eye = se2.compose(pose, mount)[None]
+        hits, misses, lost = add_scan(
+            hits, misses, shape, origin, resolution, eye, scan, max_range, free
+        )
         usable = usable_beams(scan)
-        eye = se2.compose(pose, mount)
-        far = scan.range >= max_range
-        length = jnp.where(far, free, jnp.where(usable, scan.range, 0.0))
-        heading = eye[2] + scan.angle
-        e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
-        ends = to_cells(origin, resolution, eye[None, :2] + length[:, None] * e)
-        start = to_cells(origin, resolution, eye[:2])
-        inside = (start >= 0).all() & (start[0] < width) & (start[1] < height)
-        live = usable & inside & ~(far & (free <= 0))
-        misses, last = _cross(misses, start, ends, live, shape)
-        on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
-        at = jnp.where(live & on_map, last, nowhere)
-        hits = hits.at[at].add((~far).astype(jnp.int32), mode="drop")
-        misses = misses.at[at].add(far.astype(jnp.int32), mode="drop")
-        outside = outside + (usable & ~inside).sum(dtype=jnp.int32)
+        outside = outside + lost.sum(dtype=jnp.int32)
         return (hits, misses, outside, unusable + (~usable).sum(dtype=jnp.int32)), None
 
-    none = jnp.zeros(nowhere, jnp.int32)
+    none = jnp.zeros(shape[0] * shape[1], jnp.int32)
     zero = jnp.zeros((), jnp.int32)
     total, _ = jax.lax.scan(add, (none, none, zero, zero), (poses, beams))
     return Counts(total[0].reshape(shape), total[1].reshape(shape), origin, resolution, *total[2:])
 
 
+def add_scan(
+    hits: Int[Array, "PHW"],
+    misses: Int[Array, "PHW"],
+    shape: tuple[int, int],
+    origin: Float[Array, "3"],
+    resolution: Array,
+    eyes: Float[Array, "P 3"],
+    scan: Beams,
+    max_range: ArrayLike,
+    free: ArrayLike,
+) -> tuple[Int[Array, "PHW"], Int[Array, "PHW"], Int[Array, "P"]]:
+    """The counts of P maps, one after the other in a flat array, with one scan from P poses.
+
+    Also the usable beams of each pose that say nothing, since it is off the map. All beams of all
+    maps are treated together, since a loop of each map's own would copy all counts in each step.
+
+    Args:
+        eyes: poses of the laser. free: as `no_return` of `count`.
+    """
+    height, width = shape
+    nowhere = hits.shape[0]
+    usable = usable_beams(scan)
+    far = scan.range >= max_range
+    length = jnp.where(far, free, jnp.where(usable, scan.range, 0.0))
+    heading = eyes[:, 2:] + scan.angle[None]
+    e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
+    ends = to_cells(origin, resolution, eyes[:, None, :2] + length[None, :, None] * e)
+    start = to_cells(origin, resolution, eyes[:, :2])
+    inside = (start >= 0).all(axis=1) & (start[:, 0] < width) & (start[:, 1] < height)
+    said = usable & ~(far & (jnp.asarray(free) <= 0))
+    live = (said[None] & inside[:, None]).reshape(-1)
+    first = jnp.broadcast_to(start[:, None], ends.shape).reshape(-1, 2)
+    ends = ends.reshape(-1, 2)
+    map_of = height * width * jnp.arange(len(eyes), dtype=jnp.int32)
+    base = jnp.repeat(map_of, scan.range.shape[0])
+    misses, last = _cross(misses, first, ends, live, base, shape)
+    on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
+    at = jnp.where(live & on_map, base + last, nowhere)
+    hit = jnp.tile(~far, len(eyes))
+    hits = hits.at[at].add(hit.astype(jnp.int32), mode="drop")
+    misses = misses.at[at].add((~hit).astype(jnp.int32), mode="drop")
+    lost = jnp.where(inside, 0, usable.sum(dtype=jnp.int32))
+    return hits, misses, lost
+
+
 def _cross(
-    misses: Array, start: Array, ends: Array, live: Array, shape: tuple[int, int]
+    misses: Array, start: Array, ends: Array, live: Array, base: Array, shape: tuple[int, int]
 ) -> tuple[Array, Array]:
     """Add one to each cell from start up to, without, that of the end; and the latter's index.
 
-    A beam crosses as many lines of the table as there are between the two cells.
+    A beam crosses as many lines of the table as there are between the two cells. base: where the
+    map of each beam begins.
     """
     height, width = shape
-    delta = ends - start[None, :]
+    nowhere = misses.shape[0]
+    delta = ends - start
     forward = jnp.where(delta >= 0, 1, -1)
     first = jnp.floor(start).astype(jnp.int32)
     last = jnp.floor(ends).astype(jnp.int32)
-    steps = jnp.where(live, jnp.abs(last - first[None, :]).sum(axis=1), 0)
+    steps = jnp.where(live, jnp.abs(last - first).sum(axis=1), 0)
     slope = jnp.where(delta != 0, 1.0 / jnp.where(delta != 0, delta, 1.0), 0.0)
 
     def unfinished(state: tuple[Array, ...]) -> Array:
@@ -157,17 +191,16 @@ def _cross(
         misses, cell, done = state
         going = done < steps
         inside = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
-        at = jnp.where(going & inside, cell[:, 1] * width + cell[:, 0], height * width)
+        at = jnp.where(going & inside, base + cell[:, 1] * width + cell[:, 0], nowhere)
         misses = misses.at[at].add(1, mode="drop")
         # The share of the beam up to the next line of each axis; none where the end is reached.
-        crossing = (cell + (forward > 0) - start[None, :]) * slope
+        crossing = (cell + (forward > 0) - start) * slope
         crossing = jnp.where(cell == last, jnp.inf, crossing)
         across = crossing[:, 0] < crossing[:, 1]
         move = jnp.stack([across, ~across], axis=1) * forward
         return misses, jnp.where(going[:, None], cell + move, cell), done + going
 
-    cells = jnp.broadcast_to(first, last.shape)
-    begin: tuple[Array, ...] = (misses, cells, jnp.zeros_like(steps))
+    begin: tuple[Array, ...] = (misses, first, jnp.zeros_like(steps))
     misses, *_ = jax.lax.while_loop(unfinished, step, begin)
     return misses, last[:, 1] * width + last[:, 0]
 

@@ -37,7 +37,7 @@ from jaxslam.monte_carlo.progress import Progress
 from jaxslam.monte_carlo.record import Campaign, Interrupted
 from jaxslam.monte_carlo.together import gathered, share
 from jaxslam.protocols import Candidate
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.simulation.worlds import Scenario, with_positions
 from jaxslam.types import Estimate, Truth
 from jaxslam.validation import check_record
 from jaxslam.validation.numbers import check_count, check_key
@@ -228,7 +228,10 @@ def _summed_up(plan: Plan, tallies: dict[str, Tally], work: "_Work", seconds: fl
         seconds=seconds,
         compile_seconds=work.compile_seconds,
         step_seconds={name: seconds / steps for name, seconds in work.run_seconds.items()},
-        first=work.first,
+        first={
+            name: (jax.device_get(with_positions(scenario.sensor, truth)), estimate)
+            for name, (truth, estimate) in work.first.items()
+        },
         run_numbers=tallies[BOUND].numbers(),
     )
 

@@ -41,7 +41,8 @@ class Campaign:
     process computed while nothing was being compiled (where there are none, over all), several of
     which are at work at once; without filters of which it was none."""
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
-    """Run 0 by filter, host arrays; of those that this process did not run there is none."""
+    """Run 0 by filter, host arrays; of those that this process did not run there is none. For
+    landmarks that are no points, the truth has their positions."""
     run_numbers: np.ndarray = field(default_factory=lambda: np.arange(0))
     """(runs,) the number of each run, in the order of `Summary.per_run`; run i has key
     fold_in(key, i)"""

@@ -4,7 +4,12 @@ from collections.abc import Callable
 
 from jaxslam.motion.ackermann import ackermann
 from jaxslam.motion.increment import increment
-from jaxslam.motion.odometry import odometry, odometry_control, odometry_noise
+from jaxslam.motion.odometry import (
+    odometry,
+    odometry_control,
+    odometry_controls,
+    odometry_noise,
+)
 from jaxslam.motion.pose_increment import pose_increment
 from jaxslam.motion.substeps import substeps
 from jaxslam.motion.unicycle import unicycle
@@ -26,6 +31,7 @@ __all__ = [
     "increment",
     "odometry",
     "odometry_control",
+    "odometry_controls",
     "odometry_noise",
     "pose_increment",
     "substeps",

@@ -3,7 +3,9 @@
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
@@ -23,7 +25,8 @@ def odometry(noise_cov: NoiseCov) -> Motion:
 
         pose ← (x + (trans+w2) cos h, y + (trans+w2) sin h, wrap(h + rot2 + w3)).
 
-    `odometry_control` gives u between two poses, `odometry_noise` a covariance that grows with u.
+    `odometry_control` gives u between two poses, `odometry_controls` along a path, and
+    `odometry_noise` a covariance that grows with u.
     Thrun, Burgard & Fox, Probabilistic Robotics (2005), ch. 5.4.
 
     Args:
@@ -105,3 +108,27 @@ def odometry_control(before: Array, after: Array) -> Array:
     trans, bearing = se2.polar(se2.to_frame(before, after[:2]))
     rot1 = wrap(bearing)  # arctan2 of (-0, x < 0) is -π, which no wrapped angle is
     return jnp.stack([rot1, trans, wrap(after[2] - before[2] - rot1)])
+
+
+def odometry_controls(path: ArrayLike) -> Float[np.ndarray, "T 3"]:
+    """The controls (T, 3) of `odometry` along a path of poses (T, 3), in NumPy; row 0 is no motion.
+
+    As `odometry_control` from pose to pose, but a robot that moves backward, with the translation
+    in the half plane behind it, gets a negative trans in place of two turns by π, which
+    `odometry_noise` would count as turning.
+
+    Raises ValueError unless the path is one of finite poses.
+    """
+    poses = np.asarray(path, np.float64)
+    if poses.ndim != 2 or poses.shape[1] != 3 or not np.isfinite(poses).all():
+        raise ValueError(f"odometry_controls: expected finite poses (T, 3), got {poses.shape}")
+    moved = np.diff(poses, axis=0)
+    c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    ahead, left = c * moved[:, 0] + s * moved[:, 1], c * moved[:, 1] - s * moved[:, 0]
+    way = np.where(ahead < 0, -1.0, 1.0)
+    rot1 = np.arctan2(way * left, way * ahead)
+    rot2 = moved[:, 2] - rot1
+    rot2 = rot2 - 2 * np.pi * np.ceil((rot2 - np.pi) / (2 * np.pi))
+    controls = np.zeros_like(poses)
+    controls[1:] = np.column_stack([rot1, way * np.hypot(ahead, left), rot2])
+    return controls

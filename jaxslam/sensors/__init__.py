@@ -6,6 +6,7 @@ from jaxslam.protocols import Sensor
 from jaxslam.sensors.bearing_inverse_depth import bearing_inverse_depth
 from jaxslam.sensors.bearing_only import bearing_only
 from jaxslam.sensors.compass import compass
+from jaxslam.sensors.line import line
 from jaxslam.sensors.position_fix import position_fix
 from jaxslam.sensors.range_bearing import range_bearing
 from jaxslam.sensors.range_bearing_signature import range_bearing_signature
@@ -17,6 +18,7 @@ REGISTRY: dict[str, Callable[..., Sensor]] = {
     "bearing_inverse_depth": bearing_inverse_depth,
     "bearing_only": bearing_only,
     "compass": compass,
+    "line": line,
     "position_fix": position_fix,
     "range_bearing": range_bearing,
     "range_bearing_signature": range_bearing_signature,
@@ -30,6 +32,7 @@ __all__ = [
     "bearing_inverse_depth",
     "bearing_only",
     "compass",
+    "line",
     "position_fix",
     "range_bearing",
     "range_bearing_signature",

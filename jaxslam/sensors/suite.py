@@ -92,7 +92,7 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
     grounded = [part.sensor for part in made if not part.absolute]
     first = grounded[0] if grounded else made[0].sensor
     for sensor in grounded[1:]:
-        if sensor.landmark != first.landmark or len(sensor.landmark) != 2:
+        if sensor.landmark != first.landmark or not sensor.of_points:
             raise ValueError(
                 f"suite: expected sensors that share landmarks (x, y), got {first.landmark} of "
                 f"{first.name} and {sensor.landmark} of {sensor.name}"
@@ -112,6 +112,7 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
         invert=not_one,
         position=first.position,
         embed=first.embed,
+        carry=first.carry,
         reduced=first.reduced,
         parts=made,
     )

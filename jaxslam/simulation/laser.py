@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
@@ -72,19 +72,34 @@ class LaserLog(NamedTuple):
     """with leading T"""
 
 
-def true_ranges(laser: Laser, walls: Walls, pose: Float[Array, "3"]) -> Float[Array, "B"]:
-    """The exact ranges [m] of a laser on a robot at a pose, at most max_range."""
+def true_ranges(
+    laser: Laser,
+    walls: Walls,
+    pose: Float[Array, "3"],
+    passes: Bool[Array, "B K"] | None = None,
+) -> Float[Array, "B"]:
+    """The exact ranges [m] of a laser on a robot at a pose, at most max_range.
+
+    passes: which segments each beam goes through, as through glass; None for none.
+    """
     eye = se2.compose(pose, jnp.asarray(laser.mount, pose.dtype))
-    return exact_ranges(walls, eye, jnp.asarray(laser.angles, pose.dtype), laser.max_range)
+    return exact_ranges(walls, eye, jnp.asarray(laser.angles, pose.dtype), laser.max_range, passes)
 
 
 def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Beams:
     """A random scan: exact ranges with N(0, σ²) on those below max_range, less the dropouts.
 
-    A noisy range lies within [0, max_range].
+    A noisy range lies within [0, max_range]. Where walls are of glass, each beam passes each such
+    segment with the probability that `Walls.glass` says, and meets what is behind it.
     """
-    exact = true_ranges(laser, walls, pose)
-    key_noise, key_drop = jax.random.split(key)
+    if walls.glass is None:
+        key_noise, key_drop = jax.random.split(key)
+        exact = true_ranges(laser, walls, pose)
+    else:
+        key_noise, key_drop, key_glass = jax.random.split(key, 3)
+        share = jnp.asarray(walls.glass, pose.dtype)
+        drawn = jax.random.uniform(key_glass, (np.size(laser.angles), len(share)), pose.dtype)
+        exact = true_ranges(laser, walls, pose, drawn < share[None])
     noise = laser.sigma * jax.random.normal(key_noise, exact.shape, exact.dtype)
     noisy = jnp.clip(exact + noise, 0.0, laser.max_range)
     valid = jax.random.uniform(key_drop, exact.shape) >= laser.dropout

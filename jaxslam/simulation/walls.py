@@ -1,10 +1,11 @@
 """Rooms whose walls a laser sees exactly: segments and circles, without a grid."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.grids.grid import Grid
@@ -21,13 +22,24 @@ class Walls(NamedTuple):
     """both ends (x, y) of each [m]"""
     circles: Float[Array, "C 3"]
     """centre (x, y) and radius of each [m]"""
+    glass: Float[Array, "K"] | None = None
+    """the share of beams that pass each segment, in [0, 1]; None where none is of glass"""
 
 
-def walls(*chains: ArrayLike, circles: ArrayLike = ()) -> Walls:
+def walls(
+    *chains: ArrayLike,
+    circles: ArrayLike = (),
+    glass: Mapping[tuple[int, int], float] | None = None,
+) -> Walls:
     """The walls of some closed chains, each the corners (N, 2) of a polygon [m], and of circles.
 
-    Raises ValueError on a chain that is not at least three finite corners, a circle that is not
-    (x, y, radius) with radius above 0, and on no wall at all.
+    Args:
+        glass: {(chain, side): share of the beams that pass}; side i leads from corner i to the
+            next.
+    Raises:
+        ValueError: a chain that is not at least three finite corners, a circle that is not
+            (x, y, radius) with radius above 0, no wall at all, glass that is of no side, or a share
+            outside [0, 1].
     """
     segments = [np.zeros((0, 2, 2))]
     for k, chain in enumerate(chains):
@@ -41,17 +53,38 @@ def walls(*chains: ArrayLike, circles: ArrayLike = ()) -> Walls:
         np.asarray(circles, np.float64).reshape(-1, 3) if np.size(circles) else np.zeros((0, 3))
     )
     made: Any = Walls(np.concatenate(segments), rounds)  # type: ignore[arg-type]
-    if not all(np.all(np.isfinite(part)) for part in made) or np.any(rounds[:, 2] <= 0):
+    if not all(np.all(np.isfinite(part)) for part in made[:2]) or np.any(rounds[:, 2] <= 0):
         raise ValueError("walls: expected finite numbers and radii above 0")
     if len(made.segments) + len(rounds) == 0:
         raise ValueError("walls: expected at least one wall")
-    return Walls(*made)
+    shares: Any = _shares(segments[1:], glass) if glass else None
+    return Walls(made.segments, made.circles, shares)
+
+
+def _shares(
+    chains: list[np.ndarray], glass: Mapping[tuple[int, int], float]
+) -> Float[np.ndarray, "K"]:
+    """The share of each segment."""
+    shares = [np.zeros(len(chain)) for chain in chains]
+    for (chain, side), share in glass.items():
+        if not (0 <= chain < len(chains) and 0 <= side < len(chains[chain])):
+            raise ValueError(f"walls: glass: chain {chain} has no side {side}")
+        if not 0 <= share <= 1:
+            raise ValueError(f"walls: glass: expected a share in [0, 1], got {share}")
+        shares[chain][side] = share
+    return np.concatenate(shares)
 
 
 def exact_ranges(
-    world: Walls, pose: Float[Array, "3"], angles: Float[Array, "B"], max_range: float | Array
+    world: Walls,
+    pose: Float[Array, "3"],
+    angles: Float[Array, "B"],
+    max_range: float | Array,
+    passes: Bool[Array, "B K"] | None = None,
 ) -> Float[Array, "B"]:
     """The range [m] of each beam to the nearest wall, at most max_range; exact.
+
+    Glass is a wall as any other, but for the segments that a beam `passes`.
 
     With o the origin and e the direction of the beam: the segment from a to b is met at
     r = (a - o) × (b - a)/(e × (b - a)), at the share (a - o) × e/(e × (b - a)) of its length; the
@@ -69,6 +102,7 @@ def exact_ranges(
         safe = jnp.where(parallel == 0, 1.0, parallel)
         r, share = _cross(a, along) / safe, _cross(a, e) / safe
         met = (parallel != 0) & (r > 0) & (share >= 0) & (share <= 1)
+        met = met if passes is None else met & ~passes
         ranges.append(jnp.where(met, r, max_range))
     if len(world.circles):
         c = jnp.asarray(world.circles[:, :2], dtype)[None] - pose[None, None, :2]
@@ -95,6 +129,42 @@ def is_free(world: Walls, points: ArrayLike) -> np.ndarray[Any, np.dtype[np.bool
     for x, y, radius in np.asarray(world.circles):
         inside ^= np.hypot(p[..., 0] - x, p[..., 1] - y) < radius
     return inside
+
+
+def wall_lines(
+    world: Walls,
+) -> tuple[Float[np.ndarray, "N 2"], Int[np.ndarray, "K"]]:
+    """The distinct lines (r, α) of the segments, as `sensors.line` has them, and each one's index.
+
+    The normal (cos α, sin α) points into the wall, so a line has the side that it is seen from.
+    Segments on one line with free space on the same side share it. Raises ValueError without a
+    segment, and on one without free space on exactly one side.
+    """
+    ends = np.asarray(world.segments, np.float64)
+    if not len(ends):
+        raise ValueError("wall_lines: expected at least one segment")
+    along = ends[:, 1] - ends[:, 0]
+    length = np.hypot(along[:, 0], along[:, 1])
+    if np.any(length == 0):
+        raise ValueError(f"wall_lines: segment {int(np.argmin(length))} has no length")
+    normal = np.stack([along[:, 1], -along[:, 0]], axis=1) / length[:, None]
+    middle, step = ends.mean(axis=1), 1e-6 * (1 + np.abs(ends).max())
+    before, behind = (is_free(world, middle + side * step * normal) for side in (-1, 1))
+    if np.any(before == behind):
+        raise ValueError(
+            f"wall_lines: segment {int(np.argmax(before == behind))} has no free side, or two"
+        )
+    normal[behind] *= -1
+    r = (normal * middle).sum(axis=1)
+    lines: list[tuple[float, float, float]] = []
+    index = np.zeros(len(ends), int)
+    for k, (x, y, distance) in enumerate(zip(*normal.T, r, strict=True)):
+        apart = [max(abs(x - a), abs(y - b), abs(distance - c)) for a, b, c in lines]
+        index[k] = int(np.argmin(apart)) if apart and min(apart) < 1e-6 else len(lines)
+        if index[k] == len(lines):
+            lines.append((x, y, distance))
+    found = np.array(lines)
+    return np.stack([found[:, 2], np.arctan2(found[:, 1], found[:, 0])], axis=1), index
 
 
 def rasterize(

@@ -245,6 +245,13 @@ def side_by_side(scans: list[tuple[Scan, Array]], size_z: int) -> tuple[Scan, In
     return scan, jnp.stack([missed for _, missed in scans]).sum(axis=0)
 
 
+def with_positions(sensor: Sensor, truth: Truth) -> Truth:
+    """The truth with positions (N, 2) for landmarks that are no points, as figures need them."""
+    if sensor.of_points or not sensor.landmark:
+        return truth
+    return truth._replace(landmarks=jax.vmap(sensor.position)(jnp.asarray(truth.landmarks)))
+
+
 def drawn_near(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
     """A random pose, from the normal distribution of that mean and covariance (3, 3)."""
     start = pose + _draw(jnp.asarray(cov, pose.dtype), _normals(key, pose))

@@ -126,7 +126,7 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
     usual = [i for i, label in enumerate(seen.labels) if label in NOMINAL]
     pose = seen.values[0][usual]
     point = pose[:, :2] + np.roll(pose[:, :2], 1, axis=0) / 2 + 1
-    if "given" in seen.labels and len(sensor.landmark) == 2:
+    if "given" in seen.labels and sensor.of_points:
         point = seen.values[1]
     mean = np.asarray(sensor.free.mean, np.float64)
     spread = np.sqrt(np.diagonal(np.asarray(sensor.free.cov, np.float64)))

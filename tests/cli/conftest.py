@@ -1,13 +1,24 @@
 import jax
 import pytest
 
-from jaxslam import cli
+from jaxslam import cli, plot
 
 
 @pytest.fixture(scope="session", autouse=True)
 def devices():
     """Those of tests/conftest.py are made before a command can ask for another number."""
     jax.devices()
+
+
+@pytest.fixture
+def undrawn():
+    """Figures are made and their files are written, but they are not drawn.
+
+    `test_the_module_runs_as_a_program` draws them.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plot, "encode", lambda figure, kind: kind.encode())
+        yield
 
 
 @pytest.fixture

@@ -230,8 +230,8 @@ def test_commands_keep_programs_unless_told_not_to(
         return 0
 
     (tmp_path / "file").write_text("")
-    for name in ("verify_models", "run_dataset"):
-        monkeypatch.setattr(cli, name, work)
+    monkeypatch.setattr(cli.models, "verify_models", work)
+    monkeypatch.setattr(cli.run.options, "run_dataset", work)
     assert cli.main([*command, *(option.format(tmp_path) for option in options)]) == 0
     said = capsys.readouterr()
     assert len(entries(tmp_path)) == kept

@@ -11,7 +11,7 @@ import jax
 import pytest
 from worlds import three_parameters
 
-from jaxslam import catalog, cli
+from jaxslam import catalog, cli, scenarios
 from jaxslam.cli.runtime import devices
 from jaxslam.monte_carlo import Interrupted
 from jaxslam.results import campaign_files, files
@@ -19,16 +19,17 @@ from jaxslam.results import campaign_files, files
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
 
-def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch):
+def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch, undrawn):
     out, filmed = tmp_path / "results", []
 
     def write_films(*given):
         filmed.append(given)
-        return {"ekf": SimpleNamespace(player=lambda: "<p>the film of ekf</p>")}
+        return {"localization": SimpleNamespace(player=lambda: "<p>the film of it</p>")}
 
     monkeypatch.setattr(cli.consistency.command, "write_films", write_films)
-    asked = ["--filters", "ekf,ideal", "--seed", "4", "--animate", "--out", str(out)]
-    assert cli.main([*QUICK, *asked]) == 0
+    asked = ["--filters", "dead_reckoning,localization", "--no-bound", "--seed", "4", "--animate"]
+    shape = ["--block", "1", "--devices", "1"]
+    assert cli.main([*QUICK, *asked, *shape, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "verdict" in printed
     assert "published" not in printed  # of 2500 steps, and these are 8
@@ -53,14 +54,14 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
     }
     found = json.loads((out / "consistency.json").read_text())
     assert (found["runs"], found["steps"], found["seed"]) == (3, 8, 4)
-    assert list(found["filters"]) == ["ekf", "ideal"]
+    assert list(found["filters"]) == ["dead_reckoning", "localization"]
     assert found["command"].startswith("jaxslam consistency --scenario circle")
-    assert "<p>the film of ekf</p>" in (out / "report.html").read_text(encoding="utf-8")
+    assert "<p>the film of it</p>" in (out / "report.html").read_text(encoding="utf-8")
     ((folder, world, filters, *rest),) = filmed
     assert (folder, world.name, list(filters), rest) == (
         out,
         "circle",
-        ["ekf", "ideal"],
+        ["dead_reckoning", "localization"],
         [4, "float64"],
     )
 
@@ -136,7 +137,7 @@ def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refuse
     monkeypatch.setattr(
         cli.consistency.command, "monte_carlo", lambda *a, **k: pytest.fail("work was begun")
     )
-    monkeypatch.setitem(cli.SCENARIOS, "signs", lambda steps: three_parameters())
+    monkeypatch.setitem(scenarios.SCENARIOS, "signs", lambda steps: three_parameters())
     asked = ["consistency", "--scenario", "signs", "--steps", "5", "--filters", "ekf,fej"]
     parts = ("filter 'fej' cannot run scenario 'ring'", "range_bearing_signature")
     refused([*asked, "--out", tmp_path], *parts)
@@ -190,6 +191,7 @@ def test_the_module_runs_as_a_program_in_float32_and_imports_late_what_draws(tmp
     assert {"matplotlib", "scipy.stats"}.isdisjoint(modules.split())
     assert "The filters ran in float32: for float64" in said
     assert json.loads((tmp_path / "consistency.json").read_text())["dtype"] == "float32"
+    assert (tmp_path / "nees.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_closed_pipe_ends_the_command_silently(tmp_path, monkeypatch, capfd):
@@ -197,6 +199,6 @@ def test_a_closed_pipe_ends_the_command_silently(tmp_path, monkeypatch, capfd):
     os.close(read)
     with os.fdopen(write, "w") as closed, monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", closed)
-        patch.setattr(cli, "verify_models", lambda *a: print("report") or 0)
+        patch.setattr(cli.models, "verify_models", lambda *a: print("report") or 0)
         assert cli.main(["verify", "--out", str(tmp_path)]) == 141
     assert capfd.readouterr().err == ""

@@ -28,9 +28,12 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
         plot, "map_figure", lambda *a, **more: drawn.update(more) or draw(*a, **more)
     )
     data = write_bonn(tmp_path / "bonn")
-    assert cli.main(["run", "--dataset", "bonn", str(data), "--out", str(out)]) == 0
+    run = ["run", "--dataset", "bonn", str(data), "--check-every", "2", "--out", str(out)]
+    assert cli.main(run) == 0
+    assert jax.config.jax_enable_x64
     printed = capsys.readouterr().out
     assert "fused 4, born 2, rejected 0" in printed
+    assert "at 2 of 2 checked steps" in printed
     assert {path.name for path in out.iterdir()} == {
         "trajectory.csv",
         "trajectory.tum",
@@ -74,19 +77,21 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("dataset", "spoil", "message"),
+    ("asked", "spoil", "message"),
     [
-        ("moon", "", "unknown dataset 'moon'"),
-        ("bonn", "SENSOR 1 oops 0", "sensor_data.dat:10: "),
-        ("victoria_park", "", "victoria_park"),
+        (["moon"], "", "unknown dataset 'moon'"),
+        (["bonn"], "SENSOR 1 oops 0", "sensor_data.dat:10: "),
+        (["victoria_park"], "", "victoria_park"),
+        (["bonn", "--check-every", "-1"], "", "--check-every: expected at least 0"),
     ],
 )
-def test_a_bad_data_set_exits_with_2_and_writes_nothing(tmp_path, refused, dataset, spoil, message):
+def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, asked, spoil, message):
     data = write_bonn(tmp_path / "victoria_park")
     with (data / "sensor_data.dat").open("a") as file:
         file.write(spoil + "\n")
     out = tmp_path / "out"
-    refused(["run", "--dataset", dataset, data, "--out", out], message)
+    dataset, *options = asked
+    refused(["run", "--dataset", dataset, data, *options, "--out", out], message)
     assert not out.exists()
 
 
@@ -94,16 +99,6 @@ def test_a_covariance_is_judged_on_the_host():
     assert positive_definite(np.diag([1.0, 1e-12]))
     assert not positive_definite(np.diag([1.0, -1e-12]))
     assert not positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
-
-
-def test_the_command_says_in_how_many_steps_it_looked(tmp_path, capsys, refused):
-    run = ["run", "--dataset", "bonn", str(write_bonn(tmp_path / "bonn")), "--out"]
-    assert cli.main([*run, str(tmp_path / "a"), "--check-every", "2"]) == 0
-    assert "at 2 of 2 checked steps" in capsys.readouterr().out
-    message = "--check-every: expected at least 0"
-    refused([*run, tmp_path / "b", "--check-every", "-1"], message)
-    assert not (tmp_path / "b").exists()
-    assert jax.config.jax_enable_x64
 
 
 def write_table(tmp_path):

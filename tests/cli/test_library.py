@@ -6,7 +6,7 @@ import numpy as np
 import worlds
 
 import jaxslam
-from jaxslam import programs
+from jaxslam import filters, programs
 from jaxslam.cli.runtime import cache, library
 from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.monte_carlo import monte_carlo
@@ -35,20 +35,26 @@ def test_a_campaign_runs_from_what_another_has_compiled():
 
     def campaign(candidate, kept):
         found = monte_carlo(
-            there, {"ekf": candidate}, 4, worlds.key(), block=4, library=kept, dtype=np.float64
+            there,
+            {"reckoning": candidate},
+            4,
+            worlds.key(),
+            block=4,
+            library=kept,
+            dtype=np.float64,
         )
-        return found.filters["ekf"]
+        return found.filters["reckoning"]
 
     def watched(truth):
         traced.append(1)
-        return worlds.ekf(there)
+        return filters.dead_reckoning(there.motion, there.sensor)
 
     with cache.jax_settings(jax_compilation_cache_dir=None):
         first = campaign(watched, shelf)
     names = set(shelf.content)
     assert {name.partition(",")[0] for name in names} == {
         "draw",
-        "drive ekf",
+        "drive reckoning",
         "statistics",
         "jacobians",
     }

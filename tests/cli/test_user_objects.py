@@ -131,7 +131,7 @@ def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(min
 
 
 def test_a_campaign_of_a_file_is_resumed_while_the_file_computes_the_same(
-    mine, tmp_path, capsys, refused
+    mine, tmp_path, capsys, refused, undrawn
 ):
     out = tmp_path / "out"
     asked = ["--scenario", f"{mine}:short", "--filters", f"{mine}:blind"]

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from owed import DTYPES, of_rows
+from reference.plane import assert_same_poses, turn
 
 from jaxslam.charts import REGISTRY
 
@@ -61,12 +62,6 @@ def made(request, hard_angles):
         usual=call(),
         at_zero=call(dx=0 * dx, dl=0 * dl, other=(pose, landmark)),
     )
-
-
-def assert_same_poses(actual, expected, atol=1e-12):
-    actual, expected = np.asarray(actual), np.asarray(expected)
-    np.testing.assert_allclose(actual[:, :2], expected[:, :2], atol=atol)
-    np.testing.assert_allclose(np.exp(1j * actual[:, 2]), np.exp(1j * expected[:, 2]), atol=atol)
 
 
 def test_name(made):
@@ -191,14 +186,14 @@ def test_right_invariant_error_is_unchanged_when_the_world_turns_and_shifts():
     """What gives the chart its name and its use: local(g·x̂, g·x) = Ad_g local(x̂, x), so a turn of
     robot and map together about the origin is the error (0, 0, φ), (0, 0) wherever they are."""
     chart, rng = REGISTRY["right_invariant"](), np.random.default_rng(3)
-    turn = 0.8
-    r = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    angle = 0.8
+    r = turn(angle)
     local = jax.jit(chart.local)
     for _ in range(5):
         pose, landmark = rng.normal(size=3), rng.normal(size=2)
-        turned = np.array([*(r @ pose[:2]), pose[2] + turn])
+        turned = np.array([*(r @ pose[:2]), pose[2] + angle])
         dx, dl = local(pose, landmark, turned, r @ landmark)
-        np.testing.assert_allclose(dx, [0, 0, turn], atol=1e-13)
+        np.testing.assert_allclose(dx, [0, 0, angle], atol=1e-13)
         np.testing.assert_allclose(dl, [0, 0], atol=1e-13)
         shifted = pose + [0.3, -0.2, 0]
         dx, dl = local(pose, landmark, shifted, landmark + [0.3, -0.2])

@@ -31,19 +31,6 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
         return run(filter, Log(scaled, scan), np.zeros(3), np.zeros((3, 3)), KEY).info
 
     found = calibrate(info, np.zeros(2))
-
-    def wider(p):
-        """As a suite has it whose other sensor measures more."""
-        plain = info(p)
-        return plain._replace(
-            innovation=jnp.pad(plain.innovation, [(0, 0), (0, 0), (0, 1)]),
-            innovation_cov=jnp.pad(plain.innovation_cov, [(0, 0), (0, 0), (0, 1), (0, 1)]),
-        )
-
-    again = calibrate(wider, np.zeros(2))
-    np.testing.assert_array_equal(again.dof, found.dof)
-    np.testing.assert_allclose(again.misfit, found.misfit, rtol=1e-12)
-    np.testing.assert_allclose(again.parameters, found.parameters, rtol=1e-12)
     shared = np.minimum(*np.indices((steps, steps))) + 1
     for axis in range(2):
         # Unknowns l and p; the first has no prior.
@@ -126,6 +113,19 @@ def test_what_is_empty_does_not_count_and_a_number_will_do():
     np.testing.assert_allclose(found.path[1], [2.5])
     assert found.converged
     assert not calibrate(lambda p: plain(p[0] ** 2 - 4.0), 1.0, iterations=1).converged
+
+    def wider(p):
+        """As a suite has it whose other sensor measures more."""
+        info = plain(p[0] ** 2 - 4.0)
+        return info._replace(
+            innovation=jnp.pad(info.innovation, [(0, 0), (0, 0), (0, 1)]),
+            innovation_cov=jnp.pad(info.innovation_cov, [(0, 0), (0, 0), (0, 1), (0, 1)]),
+        )
+
+    again = calibrate(wider, 1.0)
+    np.testing.assert_array_equal(again.dof, found.dof)
+    np.testing.assert_allclose(again.misfit, found.misfit, rtol=1e-12)
+    np.testing.assert_allclose(again.parameters, found.parameters, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """The measures against plain NumPy, and the verdict against filters known to be honest or not."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
@@ -11,6 +10,7 @@ from jaxslam import consistency
 from jaxslam.types import Estimate, Info, Status, Trace, Truth
 
 STEPS, PLACES, SLOTS = 12, 2, 3
+TOGETHER = 40
 SENSOR = worlds.ring().sensor
 
 
@@ -55,9 +55,18 @@ def _statistics(trace, truth):
 
 
 def scored(trace, truth, own_error_of=None):
-    found, on = jax.tree.map(np.asarray, (trace, truth)), jax.tree.map(jnp.asarray, (trace, truth))
-    own = None if own_error_of is None else np.asarray(own_error_of(*on))
-    return consistency.score(*found, jax.device_get(_statistics(*on)), own)
+    """The scores of all runs. Their statistics are by one program, of `TOGETHER` runs: repeated, so
+    that they are a multiple of it."""
+    given = jax.tree.map(np.asarray, (trace, truth))
+    own = None if own_error_of is None else np.asarray(own_error_of(*given))
+    runs = len(given[1].pose)
+    more = jax.tree.map(lambda leaf: leaf[np.arange(-runs % TOGETHER + runs) % runs], given)
+    found = [
+        jax.device_get(_statistics(*jax.tree.map(lambda leaf: leaf[at : at + TOGETHER], more)))
+        for at in range(0, runs, TOGETHER)
+    ]
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts)[:runs], *found)
+    return consistency.score(*given, joined, own)
 
 
 def summed(trace, truth, limit=1e9):

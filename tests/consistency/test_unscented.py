@@ -1,12 +1,9 @@
-"""The unscented transform against its textbook sums, and the UKF's limits."""
-
-import dataclasses
+"""The unscented transform against its textbook sums; `test_catalog` has the filters that use it."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_catalog import around, drive_monitored
 
 from jaxslam import linearize
 from jaxslam.linearize.unscented import by_variables, regress
@@ -53,18 +50,6 @@ def test_of_an_affine_function_nothing_is_left_over():
     np.testing.assert_allclose(by_variables(out.slope, jnp.asarray(root)), a, atol=1e-12)
     np.testing.assert_allclose(out.mean, 0, atol=1e-15)
     np.testing.assert_allclose(out.rest, 0, atol=1e-15)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_pose_known_exactly_and_both_dtypes(dtype):
-    world, truth, log = around(noise=0.01)
-    log = jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, log)
-    drawn = dataclasses.replace(world, pose_cov=np.zeros((3, 3))), truth, log
-    trace = drive_monitored(drawn, "ukf")
-    usual = drive_monitored(drawn, "ekf")
-    assert trace.estimate.pose.dtype == dtype
-    assert np.isfinite(trace.estimate.pose_cov).all()
-    np.testing.assert_allclose(trace.estimate.pose, usual.estimate.pose, atol=5e-3)
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.5, -1e-3])

@@ -7,19 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import draw
 
 from jaxslam import charts, linearize, sensors
 from jaxslam.filters import compressed_ekf_slam, ekf_slam
 from jaxslam.filters.ekf.compressed_ekf_slam import opened, up_to_date
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.worlds import simulate
-from jaxslam.types import Scan, Status
+from jaxslam.types import Status
 
 KEY = jax.random.key(4)
-CAPACITY = 24
-ROOM = 16
-"""slots fewer than the landmarks of the tour"""
+CAPACITY = 16
+"""fewer than the landmarks of the tour"""
 STEPS, PLACES = 120, 6
 
 
@@ -32,32 +31,39 @@ def tour():
         places=PLACES,
     )
     near = dataclasses.replace(near, controls=np.asarray(near.controls)[:STEPS])
-    draw = jax.jit(jax.vmap(partial(simulate, near)))
-    return near, jax.device_get(draw(jax.random.split(KEY, 2)))[1]
+    logs = [draw(near, seed)[1] for seed in range(2)]
+    return near, jax.tree.map(lambda *leaves: np.stack(leaves), *logs)
+
+
+GATED = {"births": 1, "gate": 9.0, "iterations": 2}
+CASES = {
+    "in turn": (PLACES, GATED),
+    "at once": (
+        9,
+        {"update": "joint", "covariance": "joseph", "linearize": linearize.unscented()},
+    ),
+}
 
 
 @cache
-def driver(area, capacity=ROOM, **options):
-    """A jitted function of a log to its trace, by the ordinary filter where area is None."""
+def drivers(case):
+    """The ordinary filter and the compressed one, both as a program of two logs to their traces."""
     world, _ = tour()
-    if area is None:
-        filter = ekf_slam(world.motion, world.sensor, capacity, **options)
-    else:
-        filter = compressed_ekf_slam(world.motion, world.sensor, capacity, area=area, **options)
+    area, options = CASES[case]
+    plain = ekf_slam(world.motion, world.sensor, CAPACITY, **options)
+    compressed = compressed_ekf_slam(world.motion, world.sensor, CAPACITY, area=area, **options)
 
-    def probe(state):
-        return state.slot if area else state
+    def drive(filter, probe, log):
+        trace = run(filter, log, world.pose, world.pose_cov, KEY, probe=probe)
+        return trace, trace.final if filter is plain else up_to_date(trace.final)
 
-    def drive(log):
-        return run(filter, log, world.pose, world.pose_cov, KEY, probe=probe)
-
-    return drive
+    probes = (plain, lambda state: state), (compressed, lambda state: state.slot)
+    return [jax.jit(jax.vmap(partial(drive, *which))) for which in probes]
 
 
 @cache
-def driven(area, capacity=ROOM, **options):
-    """The traces of both logs."""
-    return jax.device_get(jax.jit(jax.vmap(driver(area, capacity, **options)))(tour()[1]))
+def driven(case):
+    return [jax.device_get(drive(tour()[1])) for drive in drivers(case)]
 
 
 def assert_same(a, b, rtol=1e-9):
@@ -66,49 +72,35 @@ def assert_same(a, b, rtol=1e-9):
         np.testing.assert_allclose(left, right, rtol=0, atol=rtol * scale)
 
 
-@pytest.mark.parametrize(
-    ("area", "options"),
-    [
-        (PLACES, {}),
-        (9, {"births": 1, "gate": 9.0, "iterations": 2}),
-        (9, {"update": "joint", "covariance": "joseph", "linearize": "unscented"}),
-    ],
-)
-def test_the_same_as_the_ordinary_filter(area, options):
-    options = dict(options)
-    if "linearize" in options:
-        options["linearize"] = getattr(linearize, options["linearize"])()
-    capacity = CAPACITY if options else ROOM
-    plain, compressed = driven(None, capacity, **options), driven(area, capacity, **options)
+@pytest.mark.parametrize("case", CASES)
+def test_the_same_as_the_ordinary_filter(case):
+    """Also where the map is full."""
+    (plain, joint), (compressed, whole) = driven(case)
     assert_same(plain.estimate, compressed.estimate)
     assert_same(plain.info, compressed.info, rtol=1e-7)  # a NIS divides by what noise is left
-    whole = jax.jit(jax.vmap(up_to_date))(compressed.final)
-    assert_same(plain.final, whole)
+    assert_same(joint, whole)
     chosen = np.asarray(compressed.probe)
-    left = (np.diff(chosen, axis=1) != 0).any(axis=2).sum(axis=1)
-    assert (left > 4).all()
-    assert (np.asarray(plain.final.alive).sum(axis=1) > area).all()
-
-
-def test_a_full_map_drops_what_the_ordinary_filter_drops():
-    plain, compressed = driven(None), driven(PLACES)
-    assert (np.asarray(plain.info.status) == Status.OVERFLOW).any()
-    np.testing.assert_array_equal(plain.info.status, compressed.info.status)
-    assert_same(plain.estimate, compressed.estimate)
+    assert ((np.diff(chosen, axis=1) != 0).any(axis=2).sum(axis=1) > 4).all()  # areas left
+    assert (joint.alive.sum(axis=1) > CASES[case][0]).all()
+    assert (plain.info.status == Status.OVERFLOW).any()
 
 
 def test_a_run_does_not_depend_on_the_runs_beside_it():
-    batch = driven(PLACES)
-    alone = jax.jit(driver(PLACES))(jax.tree.map(lambda x: x[0], tour()[1]))
-    np.testing.assert_array_equal(batch.probe[0], alone.probe)
-    assert_same(jax.tree.map(lambda x: x[0], batch.estimate), alone.estimate, rtol=1e-12)
+    log = jax.tree.map(lambda leaf: leaf[::-1].copy(), tour()[1])
+    log.scan.valid[0] = False  # beside it nothing is seen
+    run_of, other = drivers("in turn")[1](log)[0], driven("in turn")[1][0]
+    np.testing.assert_array_equal(run_of.probe[1], other.probe[0])
+    beside, alone = (
+        jax.tree.map(lambda x, i=i: x[i], t.estimate) for t, i in ((run_of, 1), (other, 0))
+    )
+    assert_same(beside, alone, rtol=1e-12)
 
 
 def test_from_a_map_at_hand():
     world, logs = tour()
     rest = jax.tree.map(lambda x: x[0, STEPS - 20 :], logs)
-    small = compressed_ekf_slam(world.motion, world.sensor, ROOM, area=PLACES)
-    plain = jax.tree.map(lambda x: x[0], driven(None))
+    small = compressed_ekf_slam(world.motion, world.sensor, CAPACITY, area=PLACES, **GATED)
+    plain, final = jax.tree.map(lambda x: x[0], driven("in turn")[0])
     joint = jax.tree.map(lambda x: x[STEPS - 21], plain.probe)
 
     @jax.jit
@@ -119,7 +111,7 @@ def test_from_a_map_at_hand():
 
         return up_to_date(jax.lax.scan(step, opened(joint, PLACES), rest)[0])
 
-    assert_same(plain.final, go_on(joint))
+    assert_same(final, go_on(joint))
 
 
 def test_gradients_pass_through_a_change_of_area():
@@ -128,7 +120,7 @@ def test_gradients_pass_through_a_change_of_area():
 
     def loss(sigma):
         sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
-        filter = compressed_ekf_slam(world.motion, sensor, CAPACITY, area=PLACES)
+        filter = compressed_ekf_slam(world.motion, sensor, CAPACITY, area=PLACES, update="joint")
         trace = run(filter, log, world.pose, world.pose_cov, KEY, probe=lambda state: state.slot)
         points = (trace.estimate.points[-1] ** 2).sum()
         return points + trace.info.log_likelihood.sum(), trace.probe
@@ -162,16 +154,3 @@ def test_refusals(options, message):
         filter = compressed_ekf_slam(world.motion, sensor, CAPACITY, **options)
         state = jax.eval_shape(filter.init, jnp.zeros(3), jnp.eye(3))
         jax.eval_shape(filter.update, state, jax.tree.map(lambda x: x[0, 0], logs).scan, KEY)
-
-
-def test_an_empty_scan_and_one_landmark():
-    world, _ = tour()
-    filter = compressed_ekf_slam(world.motion, world.sensor, 1, area=1)
-    state = jax.jit(filter.init)(np.zeros(3), np.eye(3))
-    update, estimate = jax.jit(filter.update), jax.jit(filter.estimate)
-    scan = Scan(np.array([[2.0, 0.1]]), np.array([7]), np.array([True]))
-    born, info = update(state, scan, KEY)
-    assert info.status[0] == Status.BORN
-    after, info = update(born, jax.tree.map(lambda x: x[:0], scan), KEY)
-    assert info.status.shape == (0,)
-    assert_same(estimate(after), estimate(born))

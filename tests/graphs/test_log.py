@@ -13,7 +13,6 @@ from reference import graph as plain
 
 from jaxslam import graphs, motion, sensors, simulate
 from jaxslam.graphs import Ending
-from jaxslam.smoothing import batch_map
 from jaxslam.types import Log, Scan
 
 KEY = jax.random.key(0)
@@ -53,65 +52,70 @@ def solved(known=False):
     return here, log, jax.device_get(graph), factors, solution
 
 
-def test_it_has_the_optimum_of_the_batch():
-    """With a known start; `test_it_has_the_optimum_of_scipy` has another."""
-    here, log, graph, _, solution = solved(known=True)
-    assert solution.status == Ending.CONVERGED and list(graph.tables) == ["motion", "sensor"]
-    batch = batch_map(here.motion, here.sensor, 6, START, np.zeros((3, 3)), tolerance=1e-9)(
-        log, KEY
-    )
-    np.testing.assert_allclose(solution.chi2, 2 * batch.final.cost, rtol=1e-10)
-    off = np.array(solution.graph.poses)[1:] - batch.estimate.pose
-    np.testing.assert_allclose(off[:, :2], 0, atol=1e-8)
-    np.testing.assert_allclose(plain.wrap(off[:, 2]), 0, atol=1e-8)
-    np.testing.assert_array_equal(solution.graph.poses[0], START)
-    points, alive, tag = (
-        np.asarray(part)[-1]
-        for part in (batch.estimate.points, batch.estimate.alive, batch.estimate.tag)
-    )
-    mine = np.asarray(solution.graph.points)[np.searchsorted(graph.point_id, tag[alive])]
-    np.testing.assert_allclose(mine, points[alive], atol=1e-8)
+def turned(pose, u):
+    """`motion.odometry`, from its equation."""
+    h = pose[2] + u[0]
+    return np.array([pose[0] + u[1] * np.cos(h), pose[1] + u[1] * np.sin(h), h + u[2]])
 
 
-def test_it_has_the_optimum_of_scipy():
-    """Over noises and points, as in the batch, but from the equations in NumPy."""
-    _, log, graph, _, solution = solved()
-    root = np.linalg.cholesky(START_COV)
+def optimum(log, points, step, sigma_w, start, root=None):
+    """(cost, poses, points) by SciPy over noises and points, as in the batch, but from the equations
+    in NumPy; root: of the covariance of the start, which else is known."""
+    free, size = 0 if root is None else 3, len(sigma_w)
+    ends = free, free + STEPS * size
+
+    def path(x):
+        poses = [start if root is None else start + root @ x[:3]]
+        for u, w in zip(log.control, x[ends[0] : ends[1]].reshape(-1, size), strict=True):
+            poses.append(step(poses[-1], u + sigma_w * w))
+        return poses
 
     def residuals(x):
-        pose, out = START + root @ x[:3], [x]
-        noise, points = x[3 : 3 + 3 * STEPS].reshape(-1, 3), x[3 + 3 * STEPS :].reshape(-1, 2)
-        out = [x[: 3 + 3 * STEPS]]
-        for t, (u, w) in enumerate(zip(log.control, SIGMA_W * noise, strict=True)):
-            rot1, trans, rot2 = u + w
-            h = pose[2] + rot1
-            pose = np.array([pose[0] + trans * np.cos(h), pose[1] + trans * np.sin(h), h + rot2])
-            for z, tag, there in zip(*(part[t] for part in log.scan), strict=True):
+        points, out = x[ends[1] :].reshape(-1, 2), [x[: ends[1]]]
+        for pose, *scan in zip(path(x)[1:], *log.scan, strict=True):
+            for z, tag, there in zip(*scan, strict=True):
                 if there:
                     off = z - ekf_slam.range_bearing(pose, points[tag])[0]
                     out.append(np.array([off[0], plain.wrap(off[1])]) / SIGMA_Z)
         return np.concatenate(out)
 
-    start = np.concatenate([np.zeros(3 + 3 * STEPS), graph.points.ravel()])
-    found = scipy.optimize.least_squares(
-        residuals, start, "3-point", ftol=1e-15, xtol=1e-15, gtol=1e-12
-    )
-    np.testing.assert_allclose(solution.chi2, 2 * found.cost, rtol=1e-10)
-    points = found.x[3 + 3 * STEPS :].reshape(-1, 2)
+    begun = np.concatenate([np.zeros(ends[1]), points.ravel()])
+    ending = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-12}
+    found = scipy.optimize.least_squares(residuals, begun, "3-point", **ending)
+    return found.cost, np.array(path(found.x)), found.x[ends[1] :].reshape(-1, 2)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_it_has_the_optimum_of_scipy(known):
+    """That of `batch_map`, which `test_smoothing` holds against SciPy as well."""
+    _, log, graph, _, solution = solved(known)
+    assert solution.status == Ending.CONVERGED
+    assert list(graph.tables) == ["motion", *["prior"] * (not known), "sensor"]
+    root = None if known else np.linalg.cholesky(START_COV)
+    cost, poses, points = optimum(log, graph.points, turned, SIGMA_W, np.array(START), root)
+    np.testing.assert_allclose(solution.chi2, 2 * cost, rtol=1e-10)
     np.testing.assert_allclose(solution.graph.points, points, atol=1e-6)
+    off = solution.graph.poses - poses
+    np.testing.assert_allclose(off[:, :2], 0, atol=1e-6)
+    np.testing.assert_allclose(plain.wrap(off[:, 2]), 0, atol=1e-6)
+    if known:
+        np.testing.assert_array_equal(solution.graph.poses[0], START)
 
 
 def test_a_motion_of_two_noises_is_a_soft_constraint():
-    """The optimum comes to that of the batch by the square of the slack."""
-    here = worlds.ring(STEPS)
+    """The optimum comes to that of the constraint by the square of the slack."""
+    here = dataclasses.replace(worlds.ring(STEPS), sensor=world().sensor)
     log = jax.device_get(simulate(here, KEY)[1])
-    models = here.motion, here.sensor
-    batch = batch_map(*models, 6, here.pose, np.zeros((3, 3)), tolerance=1e-9)(log, KEY)
     off = []
     for slack in (1e-3, 1e-4):
-        made = graphs.of_log(log, *models, here.pose, np.zeros((3, 3)), slack=slack)
-        solution = graphs.optimize(*made, tolerance=1e-16)
-        off.append(np.abs(solution.graph.poses[1:] - batch.estimate.pose).max())
+        models = here.motion, here.sensor, here.pose, np.zeros((3, 3))
+        graph, factors = graphs.of_log(log, *models, slack=slack)
+        solution = graphs.optimize(graph, factors, tolerance=1e-16)
+        if not off:
+            step = lambda pose, u: ekf_slam.increment(pose, u)[0]  # noqa: E731
+            poses = optimum(log, np.asarray(graph.points), step, [0.01, 0.01], np.zeros(3))[1]
+        apart = solution.graph.poses - poses
+        off.append(max(np.abs(apart[:, :2]).max(), np.abs(plain.wrap(apart[:, 2])).max()))
     assert off[0] < 1e-3
     assert 0.5 < off[0] / off[1] / 100 < 1.5
 

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.stats
+from reference.plane import wrap
 
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
@@ -23,10 +24,6 @@ MOUNT = np.array([0.4, -0.3, 2.0])
 START, SPREAD = np.array([1.0, -2.0, 2.8]), np.diag([0.3, 0.2, 0.1]) ** 2
 CONTROLS = np.tile([0.3, 0.15], (STEPS, 1))  # a whole turn and more
 CONTROLS[30:40, 1] = 0.03  # slowly where the compass is near its seam
-
-
-def wrap(angle):
-    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
 
 
 # --- the pose-only EKF, written from the equations ----------------------------------------------

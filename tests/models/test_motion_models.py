@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference.plane import assert_same_poses, matrix, pose_of, wrap
 
 from jaxslam.motion import (
     ackermann,
@@ -18,19 +19,6 @@ from jaxslam.motion import (
 )
 
 NO_NOISE = {2: np.zeros((2, 2)), 3: np.zeros((3, 3))}
-
-
-def wrap(angle):
-    """To (-π, π], by complex numbers rather than by the package's formula."""
-    wrapped = np.angle(np.exp(1j * np.asarray(angle)))
-    return np.where(wrapped <= -np.pi, np.pi, wrapped)
-
-
-def assert_same_poses(actual, expected, atol=1e-12):
-    actual, expected = np.asarray(actual), np.asarray(expected)
-    np.testing.assert_allclose(actual[..., :2], expected[..., :2], rtol=0, atol=atol)
-    np.testing.assert_allclose(wrap(actual[..., 2] - expected[..., 2]), 0, atol=atol)
-    assert np.all(np.abs(actual[..., 2]) <= np.pi)
 
 
 def random_poses(rng, count):
@@ -340,17 +328,8 @@ L, A, B, H = 2.83, 3.78, 0.5, 0.76
 steer = batched(ackermann(NO_NOISE[2]).step)
 
 
-def matrix(x, y, theta):
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s, x], [s, c, y], [0, 0, 1]])
-
-
-def pose_of(frame):
-    return np.array([frame[0, 2], frame[1, 2], np.arctan2(frame[1, 0], frame[0, 0])])
-
-
 def rear_axle(pose, sensor=(A, B)):
-    return pose_of(matrix(*pose) @ np.linalg.inv(matrix(*sensor, 0)))
+    return pose_of(matrix(pose) @ np.linalg.inv(matrix([*sensor, 0])))
 
 
 def speeds(u, wheelbase=L, encoder=H):
@@ -363,7 +342,7 @@ def car_on_an_arc(pose, u, wheelbase=L, sensor=(A, B), encoder=H):
     """The rear axle moves along its circle and carries the sensor along."""
     v, omega = speeds(u, wheelbase, encoder)
     axle = arc(rear_axle(pose, sensor)[None], v, omega, u[2])[0]
-    return pose_of(matrix(*axle) @ matrix(*sensor, 0))
+    return pose_of(matrix(axle) @ matrix([*sensor, 0]))
 
 
 def guivant_nebot_rate(pose, u):
@@ -425,9 +404,9 @@ def test_the_encoders_wheel_rolls_as_far_as_it_says():
     """It stands H to the left of the axle's centre; along its own circle it goes v_e Δt."""
     pose, u, w = car_cases(18, 50)
     after = np.asarray(steer(pose, u, w))
-    wheel = matrix(0, H, 0)
+    wheel = matrix([0, H, 0])
     ends = [
-        np.stack([pose_of(matrix(*rear_axle(p)) @ wheel) for p in poses]) for poses in (pose, after)
+        np.stack([pose_of(matrix(rear_axle(p)) @ wheel) for p in poses]) for poses in (pose, after)
     ]
     chord = np.linalg.norm(ends[1][:, :2] - ends[0][:, :2], axis=1)
     turn = np.array([speeds(c)[1] * c[2] for c in u])

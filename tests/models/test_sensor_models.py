@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference.plane import mounted, wrap
 
 from jaxslam import motion, sensors
 from jaxslam.filters import ekf_slam
@@ -14,24 +15,10 @@ MOUNT = np.array([0.4, -0.3, 0.9])
 VARIANCE = np.array([[0.02**2]])
 
 
-def wrap(angle):
-    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
-
-
-def turn(theta):
-    """R(θ) (C, 2, 2)."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
-
-
-def rotated(theta, vector):
-    return np.einsum("...ij,...j->...i", turn(theta), vector)
-
-
 def sensor_frame(pose, mount=MOUNT):
     """t_S (C, 2) and θ_S (C,)."""
-    at = pose[:, :2] + rotated(pose[:, 2], np.broadcast_to(mount[:2], pose[:, :2].shape))
-    return at, pose[:, 2] + mount[2]
+    frame = mounted(pose, mount)
+    return frame[:, :2], frame[:, 2]
 
 
 def bearing_of(v, theta):

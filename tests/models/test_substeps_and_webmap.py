@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +35,7 @@ MODELS = {
 }
 
 
-@pytest.fixture(params=MODELS)
+@pytest.fixture(scope="module", params=MODELS)
 def case(request):
     """The single model, the model of substeps, a pose, controls (n, U) and noises (n, W)."""
     single, u = MODELS[request.param]
@@ -42,38 +43,28 @@ def case(request):
     return single, substeps(single, COUNT), np.array([1.0, -2.0, 3.0]), np.array(u), w
 
 
-def test_substeps_is_the_loop_of_single_steps(case):
+def test_substeps_is_the_loop_of_single_steps_with_its_noise_and_jacobians(case):
+    """The covariance is the model's own along the nominal path; hand Jacobians are the chain rule."""
     single, whole, pose, u, w = case
-    expected = jnp.asarray(pose)
-    for k in range(COUNT):
-        expected = single.step(expected, u[k], w[k])
-    actual = jax.jit(whole.step)(pose, u.ravel(), w.ravel())
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-14)
-
-
-def test_noise_covariance_is_the_models_own_along_the_nominal_path(case):
-    single, whole, pose, u, w = case
+    one = jax.jit(lambda pose, u, w: (single.step(pose, u, w), single.noise_cov(pose, u)))
     size = w.shape[1]
-    expected = np.zeros((COUNT * size, COUNT * size))
-    at = jnp.asarray(pose)
+    moved, nominal, expected = pose, pose, np.zeros((w.size, w.size))
     for k in range(COUNT):
         block = slice(k * size, (k + 1) * size)
-        expected[block, block] = single.noise_cov(at, u[k])
-        at = single.step(at, u[k], jnp.zeros(size))
+        moved, _ = one(moved, u[k], w[k])
+        nominal, expected[block, block] = one(nominal, u[k], np.zeros(size))
+
+    def everything(*arguments):
+        by_autodiff = jax.jacfwd(whole.step, argnums=(0, 1, 2))(*arguments)
+        noise = whole.noise_cov(*arguments[:2])
+        return whole.step(*arguments), noise, whole.jacobians(*arguments), by_autodiff
+
+    step, noise, by_hand, by_autodiff = jax.jit(everything)(pose, u.ravel(), w.ravel())
+    np.testing.assert_allclose(step, moved, rtol=0, atol=1e-14)
     assert np.all(np.diagonal(expected) > 0)
-    actual = jax.jit(whole.noise_cov)(pose, u.ravel())
-    np.testing.assert_allclose(actual, expected, rtol=1e-14, atol=0)
-
-
-def test_hand_jacobians_are_the_chain_rule(case):
-    single, whole, pose, u, w = case
-    arguments = (pose, u.ravel(), w.ravel())
-    assert whole.jacobians is not None
-    by_hand = jax.jit(whole.jacobians)(*arguments)
-    by_autodiff = jax.jit(jax.jacfwd(whole.step, argnums=(0, 1, 2)))(*arguments)
-    for hand, autodiff, n in zip(by_hand, by_autodiff, (3, u.size, w.size), strict=True):
-        assert hand.shape == (3, n)
-        np.testing.assert_allclose(hand, autodiff, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(noise, expected, rtol=1e-14, atol=0)
+    assert [part.shape for part in by_hand] == [(3, n) for n in (3, u.size, w.size)]
+    chex.assert_trees_all_close(by_hand, by_autodiff, rtol=0, atol=1e-13)
 
 
 def test_perturbed_controls_move_as_the_noise_does():
@@ -81,9 +72,10 @@ def test_perturbed_controls_move_as_the_noise_does():
     whole, pose, u = substeps(single, COUNT), np.array([1.0, -2.0, 3.0]), np.ravel(u)
     w = 0.1 * np.random.default_rng(1).normal(size=2 * COUNT)
     assert whole.perturb is not None
-    moved = whole.perturb(jnp.asarray(u), jnp.asarray(w))
+    moved = np.asarray(jax.jit(whole.perturb)(u, w))
     assert np.any(moved != u)
-    np.testing.assert_array_equal(whole.step(pose, moved, 0 * w), whole.step(pose, u, w))
+    step = jax.jit(whole.step)
+    np.testing.assert_array_equal(step(pose, moved, 0 * w), step(pose, u, w))
 
 
 def test_what_the_model_lacks_substeps_lack():
@@ -107,27 +99,22 @@ def test_names_are_numbered_and_keep_their_units(case):
 
 def test_float32_stays(case):
     _, whole, pose, u, w = case
-    pose, u, w = (jnp.asarray(a, jnp.float32) for a in (pose, u.ravel(), w.ravel()))
-    out = [
-        jax.eval_shape(whole.step, pose, u, w),
-        jax.eval_shape(whole.noise_cov, pose, u),
-        *jax.eval_shape(whole.jacobians, pose, u, w),
-    ]
-    if whole.perturb is not None:
-        out.append(jax.eval_shape(whole.perturb, u, w))
-    for array in out:
-        assert array.dtype == jnp.float32
+    pose, u, w = (a.astype(np.float32) for a in (pose, u.ravel(), w.ravel()))
+    calls = [(whole.step, (pose, u, w)), (whole.noise_cov, (pose, u))]
+    calls += [(whole.jacobians, (pose, u, w)), (whole.perturb, (u, w))]
+    out = [jax.eval_shape(function, *given) for function, given in calls if function is not None]
+    assert {array.dtype for array in jax.tree.leaves(out)} == {np.dtype(np.float32)}
 
 
 def test_gradients_reach_the_models_parameters():
-    @jax.jit
     def end(wheelbase):
         model = substeps(motion.ackermann(Q, wheelbase=wheelbase), COUNT)
         u = jnp.asarray(MODELS["ackermann"][1]).ravel()
         return jnp.sum(model.step(jnp.zeros(3), u, jnp.zeros(2 * COUNT)))
 
-    slope = jax.grad(end)(2.0)
-    np.testing.assert_allclose(slope, (end(2.0 + 1e-6) - end(2.0 - 1e-6)) / 2e-6, rtol=1e-7)
+    lengths = np.array([2.0, 2.0 + 1e-6, 2.0 - 1e-6])
+    (_, above, below), slope = jax.jit(jax.vmap(jax.value_and_grad(end)))(lengths)
+    np.testing.assert_allclose(slope[0], (above - below) / 2e-6, rtol=1e-7)
 
 
 @pytest.mark.parametrize("count", [0, -1, 2.0, True, None])
@@ -268,10 +255,8 @@ def test_ekf_slam_runs_on_it():
     scenario = webmap(20)
     landmarks = np.asarray(scenario.landmarks)
     ekf = ekf_slam(scenario.motion, scenario.sensor, len(landmarks), **scenario.filter_options)
-    truth, log = simulate(scenario, jax.random.key(1))
-    go = jax.jit(lambda log: run(ekf, log, scenario.pose, scenario.pose_cov, jax.random.key(2)))
-    trace = jax.device_get(go(log))
-    for leaf in jax.tree.leaves((trace.estimate, trace.info)):
-        assert np.isfinite(leaf).all()
+    truth, log = jax.device_get(simulate(scenario, jax.random.key(1)))
+    trace = run(ekf, log, scenario.pose, scenario.pose_cov, jax.random.key(2))
+    chex.assert_tree_all_finite((trace.estimate, trace.info))
     assert np.hypot(*(trace.estimate.pose - truth.pose)[-1, :2]) < 1
     assert trace.estimate.alive[-1].sum() == len(set(log.scan.tag[log.scan.valid].tolist()))

@@ -59,7 +59,7 @@ def test_blocks_follow_the_memory_of_an_accelerator():
     assert fits("gpu", 10**11) == 4096
 
 
-@pytest.mark.parametrize(("devices", "workers"), [(1, 2), (4, 1), (2, 3)])
+@pytest.mark.parametrize(("devices", "workers"), [(1, 2), (2, 3)])
 def test_workers_do_not_change_a_bit_and_devices_what_rounding_does(in_fours, devices, workers):
     heard = []
     campaign = campaign_of(
@@ -239,7 +239,8 @@ def test_a_campaign_is_the_loop_over_its_runs(in_fours):
 
 
 def test_another_seed_is_another_campaign(in_fours):
-    other = monte_carlo(WORLD, {"ekf": EKF}, 10, worlds.key(1), block=4, bound=True)
+    options = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
+    other = monte_carlo(WORLD, {"ekf": EKF}, 10, worlds.key(1), **options)
     ours = in_fours.filters["ekf"].measures["rmse_position"].value
     assert abs(other.filters["ekf"].measures["rmse_position"].value / ours - 1) > 1e-3
 
@@ -253,7 +254,7 @@ def test_another_key_noise_map_or_more_runs_compile_nothing():
     same, other = worlds.scaled(1.0, WORLD.steps), worlds.scaled(1.07, WORLD.steps)
     first = campaign(same, 3, 0)
     with worlds.compilations() as count:
-        for there, runs, seed in ((same, 3, 1), (same, 40, 0), (other, 3, 0)):
+        for there, runs, seed in ((same, 3, 1), (same, 9, 0), (other, 3, 0)):
             found = campaign(there, runs, seed)
             assert found.runs == runs
             assert found.filters["ekf"].measures != first.filters["ekf"].measures
@@ -281,7 +282,8 @@ def test_blocks_share_one_trace():
     ekf = filters.ekf_slam(watched, WORLD.sensor, 6)
     counts = []
     for runs in (4, 10):
-        monte_carlo(WORLD, {"ekf": ekf}, runs, worlds.key(), block=4, bound=True)
+        options = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
+        monte_carlo(WORLD, {"ekf": ekf}, runs, worlds.key(), **options)
         counts.append(len(traces))
     assert counts[0] == counts[1] > 0  # the second campaign traces nothing
 
@@ -296,24 +298,27 @@ def test_float32_sees_the_worlds_of_float64(in_fours):
 
 
 def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
+    reckoning = filters.dead_reckoning(WORLD.motion, WORLD.sensor)
+
     def poisoned(joint, scan, key):
-        joint, info = EKF.update(joint, scan, key)
+        joint, info = reckoning.update(joint, scan, key)
         # A scan that starts with a long range in about half of the runs.
-        bad = scan.z[0, 0] > jnp.where(joint.alive.all(), 3.9, jnp.inf)
+        bad = scan.z[0, 0] > 3.68
         return joint._replace(pose=jnp.where(bad, jnp.nan, joint.pose)), info
 
     candidates = {
         "ekf": EKF,
-        "poisoned": dataclasses.replace(EKF, update=poisoned),
+        "poisoned": dataclasses.replace(reckoning, update=poisoned),
         "small": filters.ekf_slam(WORLD.motion, WORLD.sensor, 4),
         "always lost": dataclasses.replace(
-            EKF, predict=lambda joint, u, key: joint._replace(pose=joint.pose * jnp.nan)
+            reckoning, predict=lambda joint, u, key: joint._replace(pose=joint.pose * jnp.nan)
         ),
     }
     campaign = campaign_of(candidates)
     same(campaign.filters["ekf"], in_fours.filters["ekf"])
     poisoned = campaign.filters["poisoned"]
     assert poisoned.counts["runs"] + poisoned.counts["not_finite"] == 10
+    assert 0 < poisoned.counts["not_finite"] < 10
     assert all(np.isfinite(m.value) for m in poisoned.measures.values())
     assert campaign.filters["small"].counts["overflow"] == 10 * WORLD.steps * 2
     lost = campaign.filters["always lost"]
@@ -326,7 +331,7 @@ def test_a_world_without_noise_does_not_diverge():
         WORLD,
         motion=motion.increment(np.zeros((2, 2))),
     )
-    campaign = monte_carlo(still, {"ekf": worlds.ekf(still)}, 3, worlds.key(), block=4)
+    campaign = worlds.campaign(still, {"ekf": worlds.ekf(still)}, 3)
     assert campaign.filters["ekf"].verdict == "undecided"
     assert campaign.filters["ekf"].counts["divergent"] == 0
 
@@ -342,7 +347,7 @@ def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
         return joint, info._replace(status=jnp.full_like(info.status, Status.SINGULAR))
 
     candidates = {"a": reckoning, "b": dataclasses.replace(reckoning, update=singular)}
-    found = monte_carlo(still, candidates, 2, worlds.key(), block=4, devices=jax.devices()[:1])
+    found = worlds.campaign(still, candidates, 2)
     a, b = (found.filters[name].doubts for name in candidates)
     assert not any("without noise" in doubt for doubt in a)
     assert "bearing [rad] of range_bearing without noise" in b[-1]
@@ -373,7 +378,7 @@ def lineup():
         "right_invariant": catalog.FILTERS["right_invariant"](WORLD),
         "ideal": catalog.ideal(WORLD),
     } | {name: make(WORLD) for name, make in worlds.WRONG.items()}
-    return monte_carlo(WORLD, candidates, 200, worlds.key(), block=LARGE).filters
+    return monte_carlo(WORLD, candidates, LARGE, worlds.key(), block=LARGE).filters
 
 
 @pytest.mark.parametrize("name", ["ekf", "right_invariant", "ideal"])

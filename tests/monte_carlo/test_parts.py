@@ -12,7 +12,7 @@ import worlds
 
 from jaxslam import cli, filters, store
 from jaxslam.monte_carlo import monte_carlo
-from jaxslam.results import block_file
+from jaxslam.results import block_file, campaign_files
 
 WORLD = worlds.ring(20)
 RECKONING = filters.dead_reckoning(WORLD.motion, WORLD.sensor)
@@ -129,6 +129,14 @@ def test_of_two_that_create_a_campaign_one_is_refused(tmp_path, monkeypatch):
 
 
 ASKED = ["--scenario", "circle", "--filters", "dead_reckoning", "--steps", "12", "--block", "2"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def undrawn():
+    """Reports have no figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(campaign_files, "_drawings", lambda *_: {})
+        yield
 
 
 def command(out, *more):

@@ -343,7 +343,7 @@ def test_filters_without_a_number_and_single_steps_can_be_drawn(draw, count):
         times = dict.fromkeys(filters, 1e-4)
         found = drawn.campaign([], steps, filters=filters, step_seconds=times)
         figure = draw(found)
-        assert plot.png(figure, 40).startswith(b"\x89PNG")
+        figure.draw_without_rendering()
         if not (draw is plot.cost_figure and len(filters) > 5):  # there they are tick labels
             assert all(name in plot.describe(figure) for name in filters)
 

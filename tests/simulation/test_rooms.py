@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam.simulation.laser import Laser, observability, scan, scan_world
+from jaxslam.simulation.laser import Laser, observability, scan, scan_world, true_ranges
 from jaxslam.simulation.scenarios import ROOMS, circular_room, corridor, office, square
 from jaxslam.simulation.walls import exact_ranges, is_free, rasterize, walls
 
@@ -128,9 +128,32 @@ def test_maximum_likelihood_estimates_reach_the_cramer_rao_bound():
     assert abs(nees.mean() - 3) < 4 * np.sqrt(6 / 400) + 0.1
 
 
+def test_beams_pass_glass_as_often_as_it_says():
+    """Of the beams on the east end of the corridor; those that pass meet nothing."""
+    world, plain = office(beams=720, glass=0.7), office(beams=720)
+    pose = np.array([9.0, 4.1, 0.2])
+    exact = np.asarray(true_ranges(plain.laser, plain.walls, pose))
+    heading = pose[2] + np.asarray(plain.laser.angles)
+    ends = pose[:2] + exact[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    on_glass = (np.abs(ends[:, 0] - 12.0) < 1e-9) & (ends[:, 1] > 3.2) & (ends[:, 1] < 5.0)
+    assert on_glass.sum() > 40
+    keys = jax.random.split(jax.random.key(0), 20)
+    beams = jax.jit(jax.vmap(lambda key: scan(world.laser, world.walls, pose, key)))(keys)
+    valid, ranges = np.asarray(beams.valid), np.asarray(beams.range)
+    through = ranges == 8.0
+    n = valid[:, on_glass].sum()
+    share = (through & valid)[:, on_glass].sum() / n
+    assert abs(share - 0.7) < 5 * np.sqrt(0.21 / n)
+    met = valid & ~through & (exact < 7.9)
+    assert np.abs(ranges - exact)[met].max() < 0.12
+    assert not np.any((through & valid)[:, ~on_glass & (exact < 7.9)])
+
+
 @pytest.mark.parametrize(
     ("call", "reason"),
     [
+        (lambda: walls([[0, 0], [1, 0], [0, 1]], glass={(0, 3): 0.5}), "chain 0 has no side 3"),
+        (lambda: walls([[0, 0], [1, 0], [0, 1]], glass={(0, 1): 1.5}), "share in"),
         (lambda: walls(), "walls: expected at least one wall"),
         (lambda: walls([[0, 0], [1, 1]]), "walls: expected chain 0 of at least three corners"),
         (lambda: walls(circles=[[0, 0, 0]]), "walls: expected finite numbers and radii above 0"),

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from jaxslam.simulation.scenarios import (
-    SCENARIOS,
     cloister_noisy,
     explore,
     loop,
@@ -88,10 +87,3 @@ def test_a_stationary_robot_stands_still_and_an_explorer_never_returns():
 def test_the_noisy_cloister_has_places_enough():
     truth, _ = draw(cloister_noisy(steps=60))
     assert truth.missed.sum() == 0
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-@pytest.mark.parametrize("steps", [0, 2.5])
-def test_a_bad_number_of_steps_is_refused(name, steps):
-    with pytest.raises(ValueError, match="steps"):
-        SCENARIOS[name](steps)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from reference.plane import mounted, wrap
 
 from jaxslam import motion, sensors
 from jaxslam.simulation.scenarios import (
@@ -51,10 +52,6 @@ def draw(scenario, seed=0, runs=None):
     return jax.device_get(jax.jit(jax.vmap(one))(jax.random.split(key, runs)))
 
 
-def wrap(a):
-    return np.arctan2(np.sin(a), np.cos(a))
-
-
 def nominal_path(scenario):
     pose, path = np.array(scenario.pose, float), []
     for d, turn in np.asarray(scenario.controls):
@@ -77,12 +74,17 @@ def executed_controls(scenario, pose):
 
 def exact_measurements(pose, landmarks=LANDMARKS, mount=MOUNT):
     """(…, T, N, 2) range and bearing from the mounted sensor."""
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    x = pose[..., 0] + c * mount[0] - s * mount[1]
-    y = pose[..., 1] + s * mount[0] + c * mount[1]
-    dx, dy = landmarks[:, 0] - x[..., None], landmarks[:, 1] - y[..., None]
-    bearing = wrap(np.arctan2(dy, dx) - (pose[..., 2] + mount[2])[..., None])
+    frame = mounted(pose, mount)[..., None, :]
+    dx, dy = landmarks[:, 0] - frame[..., 0], landmarks[:, 1] - frame[..., 1]
+    bearing = wrap(np.arctan2(dy, dx) - frame[..., 2])
     return np.stack([np.hypot(dx, dy), bearing], axis=-1)
+
+
+def measurement_noise(truth, log):
+    """z less what is exact, of worlds in which everything is in view."""
+    noise = log.scan.z - exact_measurements(truth.pose)
+    noise[..., 1] = wrap(noise[..., 1])
+    return noise
 
 
 def whiten(noise, cov):
@@ -129,19 +131,15 @@ def test_motion_noise_has_its_covariance(drawn):
 
 def test_measurement_noise_has_its_covariance(drawn):
     _, truth, log = drawn
-    noise = log.scan.z - exact_measurements(truth.pose)
-    noise[..., 1] = wrap(noise[..., 1])
     assert log.scan.valid.all()
     assert np.abs(log.scan.z[..., 1]).max() <= np.pi
-    assert_standard_normal(whiten(noise, R))
+    assert_standard_normal(whiten(measurement_noise(truth, log), R))
 
 
 def test_noise_is_independent_over_time_places_runs_and_sources(drawn):
     scenario, truth, log = drawn
     w = whiten(motion_noise(*drawn), Q)
-    v = log.scan.z - exact_measurements(truth.pose)
-    v[..., 1] = wrap(v[..., 1])
-    v = whiten(v, R)
+    v = whiten(measurement_noise(truth, log), R)
     assert_uncorrelated(w[:, 1:], w[:, :-1])
     assert_uncorrelated(v[:, 1:, 0], v[:, :-1, 0])
     assert_uncorrelated(v[:, :, 0], v[:, :, 1])
@@ -179,11 +177,9 @@ def test_noise_may_depend_on_control_and_measurement():
     truth, log = draw(scenario, runs=10)
     noise = motion_noise(scenario, truth, log)
     assert_standard_normal(noise / np.abs(controls * [0.1, 0.2]))
-    exact = exact_measurements(truth.pose)
-    noise = log.scan.z - exact
-    noise[..., 1] = wrap(noise[..., 1])
-    sigma = np.stack([0.05 * exact[..., 0], np.full(exact.shape[:-1], 0.01)], axis=-1)
-    assert_standard_normal(noise / sigma)
+    exact = exact_measurements(truth.pose)[..., 0]
+    sigma = np.stack([0.05 * exact, np.full(exact.shape, 0.01)], axis=-1)
+    assert_standard_normal(measurement_noise(truth, log) / sigma)
 
 
 @pytest.mark.parametrize("noise_on", ["robot", "odometry"])

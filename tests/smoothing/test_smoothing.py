@@ -414,66 +414,6 @@ def test_costs_fall():
     assert costs[-1] == trace.final.cost < costs[0]
 
 
-def test_the_batch_is_gtsams_optimum():
-    """The same factors, with Jacobians by hand, through GTSAM's graph and optimizer."""
-    gtsam = pytest.importorskip("gtsam")
-    world, log, trace, _, _ = solved()
-    pose_key, point_key = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
-    diagonal = gtsam.noiseModel.Diagonal.Sigmas
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.NonlinearEqualityPose2(pose_key(0), gtsam.Pose2(*world.pose)))
-    values.insert(pose_key(0), gtsam.Pose2(*world.pose))
-
-    def of(pose):
-        return np.array([pose.x(), pose.y(), pose.theta()])
-
-    def turn(theta):
-        c, s = np.cos(theta), np.sin(theta)
-        return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-
-    def moved(u):
-        def error(this, values, jacobians):
-            a, b = (of(values.atPose2(key)) for key in list(this.keys()))
-            back = turn(a[2]).T
-            step = back @ (b - a)
-            if jacobians is not None:
-                by_a = -back
-                by_a[:2, 2] = step[1], -step[0]
-                jacobians[0], jacobians[1] = by_a @ turn(a[2]), back @ turn(b[2])
-            off = step - u
-            return np.array([off[0], off[1], plain.wrap(off[2])])
-
-        return error
-
-    def seen(z):
-        def error(this, values, jacobians):
-            pose, point = of(values.atPose2(this.keys()[0])), values.atPoint2(this.keys()[1])
-            h, by_pose, by_point = plain.range_bearing(pose, point)
-            if jacobians is not None:
-                jacobians[0], jacobians[1] = by_pose @ turn(pose[2]), by_point
-            return np.array([h[0] - z[0], plain.wrap(h[1] - z[1])])
-
-        return error
-
-    pose = np.asarray(world.pose, float)
-    for t, u in enumerate(log.control):
-        keys = [pose_key(t), pose_key(t + 1)]
-        graph.add(gtsam.CustomFactor(diagonal(SIGMA_W), keys, moved(u)))
-        pose = composed(pose, u)
-        values.insert(pose_key(t + 1), gtsam.Pose2(*pose))
-        for z, tag, there in zip(log.scan.z[t], log.scan.tag[t], log.scan.valid[t], strict=True):
-            if there:
-                keys = [pose_key(t + 1), point_key(int(tag))]
-                graph.add(gtsam.CustomFactor(diagonal(SIGMA_Z), keys, seen(z)))
-    for i, point in enumerate(world.landmarks):
-        values.insert(point_key(i), point)
-    for _ in range(20):
-        values = values.retract(graph.linearize(values).optimize())
-    np.testing.assert_allclose(graph.error(values), trace.final.cost, rtol=1e-10)
-    path = np.array([of(values.atPose2(pose_key(t + 1))) for t in range(10)])
-    np.testing.assert_allclose(trace.estimate.pose, path, rtol=0, atol=1e-8)
-
-
 # --- many worlds --------------------------------------------------------------------------------
 
 

@@ -26,7 +26,7 @@ INVERTED = "observe undoes invert, whatever is free"
 
 NOISE = "noise covariance"
 
-# A model, a fault of what no Jacobian depends on, and the checks that must fail, no others.
+# A model, a fault that no Jacobian shows, and the checks that must fail, no others.
 BESIDE_JACOBIANS = {
     "residual with the wrong sign": (
         LASER,
@@ -38,6 +38,14 @@ BESIDE_JACOBIANS = {
         LASER,
         {"residual": lambda z, z_hat: LASER.residual(z, z_hat) + 0.1},
         ["the residual is zero at equality", "the residual is antisymmetric", DIFFERENCE, INVERTED],
+    ),
+    "inverse that ignores the prior": (
+        CAMERA,
+        {
+            "invert": lambda pose, z, s: CAMERA.invert(pose, z, 3 + 0 * s),
+            "invert_jacobians": None,
+        },
+        [OBSERVED],
     ),
     "negative variance": (
         LASER,
@@ -68,14 +76,6 @@ OF_FUNCTIONS = {
         {"invert": UNMOUNTED.invert, "invert_jacobians": UNMOUNTED.invert_jacobians},
         [OBSERVED, INVERTED],
     ),
-    "inverse that ignores the prior": (
-        CAMERA,
-        {
-            "invert": lambda pose, z, s: CAMERA.invert(pose, z, 3 + 0 * s),
-            "invert_jacobians": None,
-        },
-        [OBSERVED],
-    ),
     "dtype": (
         INCREMENT,
         {"step": lambda *a: INCREMENT.step(*a) + np.zeros(3)},
@@ -86,10 +86,11 @@ OF_FUNCTIONS = {
 
 @pytest.fixture(scope="module")
 def states():
-    """Of the two models, as `verify_jacobians` draws them."""
+    """Of the models, as `verify_jacobians` draws them."""
     functions = motion_functions(INCREMENT)
     moved = samples.argument_samples(functions[0].arguments, 24, 0)
-    return {"range_bearing": samples.sensor_samples(LASER, 24, 0), "increment": (moved,)}
+    seen = {sensor.name: samples.sensor_samples(sensor, 24, 0) for sensor in (LASER, CAMERA)}
+    return {"increment": (moved,), **seen}
 
 
 @pytest.mark.parametrize("fault", BESIDE_JACOBIANS)

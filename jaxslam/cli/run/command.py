@@ -11,11 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam.cli.common import pick
+from jaxslam.cli.common import pick, summary_table
+from jaxslam.cli.laser.command import run_laser
+from jaxslam.cli.laser.options import READERS as LASER_LOGS
+from jaxslam.cli.laser.options import refuse_laser_options
 from jaxslam.cli.run.film import film_steps, films, watching
 from jaxslam.cli.run.filters import chosen, with_options
 from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
-from jaxslam.datasets import READERS, Dataset
+from jaxslam.datasets import READERS, Dataset, Reader
 from jaxslam.datasets.evaluation import Evaluation, evaluate
 from jaxslam.datasets.map_test import joint_map_cov
 from jaxslam.monte_carlo.progress import Progress
@@ -29,10 +32,13 @@ from jaxslam.types import Estimate, Status
 
 def run_dataset(options: argparse.Namespace, command: str) -> int:
     """Run filters over the data set, print and write their results; returns the exit status."""
+    if options.dataset in LASER_LOGS:
+        return run_laser(options, command)
+    refuse_laser_options(options)
     if options.check_every is not None and options.check_every < 0:
         raise ValueError(f"--check-every: expected at least 0, got {options.check_every}")
     formats = check_formats("--figures", options.figures.split(","))
-    data = pick("dataset", options.dataset, READERS)(options.path, options.robot)
+    data = _reader(options.dataset)(options.path, options.robot)
     data = with_options(data, options)
     filters = chosen(data, options.filters)
     check_writable(options.out)
@@ -52,12 +58,12 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     }
     several = len(runs) > 1
     if several:
-        print(_table({"": summary}), end="\n\n")
-        print(_table({name: _flat(run.summary) for name, run in runs.items()}))
+        print(summary_table({"": summary}), end="\n\n")
+        print(summary_table({name: _flat(run.summary) for name, run in runs.items()}))
         summary["filters"] = {name: run.summary for name, run in runs.items()}
     else:
         summary |= next(iter(runs.values())).summary
-        print(_table({"": summary}))
+        print(summary_table({"": summary}))
     files: dict[str, str | Callable[[Path], object]] = {}
     for name, run in runs.items():
         suffix = f"-{name}" if several else ""
@@ -71,6 +77,10 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     written = write_files(options.out, files)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
+
+
+def _reader(name: str) -> Reader:
+    return pick("dataset", name, READERS, f", {', '.join(LASER_LOGS)}")
 
 
 class _Run(NamedTuple):
@@ -201,36 +211,3 @@ def _flat(summary: Json) -> Json:
     pose = {f"final {n}": value for n, value in zip(names, summary["final pose"], strict=True)}
     rows = {key: summary[key] for key in summary if key not in ("status", "final pose")}
     return counts | rows | pose
-
-
-def _table(columns: dict[str, Json]) -> str:
-    """Summaries side by side, a row an entry; names above them where there are several."""
-    rows = list(dict.fromkeys(key for column in columns.values() for key in column))
-    head = [["", *columns]] if len(columns) > 1 else []
-    lines = head + [
-        [
-            row,
-            *(
-                _shown(column.get(row, 0 if row.startswith("status: ") else "-"))
-                for column in columns.values()
-            ),
-        ]
-        for row in rows
-    ]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
-    return "\n".join(
-        "  ".join(
-            [*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]]
-        ).replace("\n", "\n" + " " * (widths[0] + 2))
-        for line in lines
-    )
-
-
-def _shown(value: object) -> str:
-    """A value of the summary as it is printed."""
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
-    if isinstance(value, list):
-        lines = all(isinstance(part, str) for part in value)
-        return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
-    return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"

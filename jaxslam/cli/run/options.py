@@ -5,6 +5,7 @@ import argparse
 from jaxslam.catalog import ALL
 from jaxslam.cli import films
 from jaxslam.cli.common import add_dtype, add_figures, add_out
+from jaxslam.cli.laser import options as laser_options
 from jaxslam.cli.run.command import run_dataset
 from jaxslam.cli.runtime import cache
 from jaxslam.datasets import READERS
@@ -14,7 +15,8 @@ from jaxslam.results.campaign_files import FORMATS
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam run`."""
-    parser.add_argument("--dataset", required=True, help=f"one of: {', '.join(READERS)}")
+    known = ", ".join([*READERS, *laser_options.READERS])
+    parser.add_argument("--dataset", required=True, help=f"one of: {known}")
     parser.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
     parser.add_argument(
         "--robot",
@@ -50,4 +52,5 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     cache.add_options(parser)
     add_dtype(parser, " of the filter")
     add_out(parser)
+    laser_options.add_options(parser)
     parser.set_defaults(command=run_dataset)

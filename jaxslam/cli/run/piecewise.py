@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.protocols import Filter
-from jaxslam.types import Estimate, Log
+from jaxslam.types import Estimate, Info, Log
 
 State: TypeAlias = Any
 """A filter's own state, a pytree."""
 
-Rows: TypeAlias = tuple[tuple[jax.Array, ...], Any]
+Rows: TypeAlias = tuple[tuple[Any, ...], Any]
 """What is kept of each step, and of the steps to watch: arrays with leading T."""
 
 CHECKS = 20
@@ -46,6 +46,8 @@ class PiecewiseRun(NamedTuple):
     """the whole estimates (F, …) after the steps to watch, where there are such, and"""
     watched: Any = None
     """what `watch` returned of the states there"""
+    kept: Any = None
+    """what `keep` returned of the info of each step, leading T"""
 
 
 def run_in_pieces(
@@ -60,6 +62,7 @@ def run_in_pieces(
     seed: int = 0,
     at: Int[np.ndarray, "F"] | None = None,
     watch: Callable[[State], Any] = lambda state: None,
+    keep: Callable[[Info], Any] = lambda info: None,
 ) -> PiecewiseRun:
     """Predict and update row by row, as `run` does, for a log whose values have been checked.
 
@@ -74,6 +77,7 @@ def run_in_pieces(
         seed: of the random numbers of a particle filter.
         at: the steps to watch, from 0, in order: the whole estimate after each is kept, and what
             `watch` makes of the filter's own state. Default none.
+        keep: called with the info of each step.
     """
     total = log.control.shape[0]
     every = max(1, -(-total // CHECKS)) if every is None else every
@@ -85,7 +89,7 @@ def run_in_pieces(
         state = filter.predict(state, row.control, to_predict)
         state, info = filter.update(state, row.scan, to_update)
         now = filter.estimate(state)
-        kept = info.status, info.slot, info.nis, info.dof, info.log_likelihood
+        kept = info.status, info.slot, info.nis, info.dof, info.log_likelihood, keep(info)
         return state, ((now.pose, now.pose_cov, *kept), None if at is None else (now, watch(state)))
 
     @jax.jit
@@ -111,7 +115,7 @@ def run_in_pieces(
         until = min(until, done + size)
         rows = jax.tree.map(lambda leaf, a=done, b=until: _padded(leaf[a:b], size), log)
         state, kept, last = piece(state, rows, jnp.asarray(until - done), jnp.asarray(done))
-        pieces.append([np.asarray(part)[: until - done] for part in kept[0]])
+        pieces.append(jax.tree.map(lambda leaf, n=until - done: np.asarray(leaf)[:n], kept[0]))
         if at is not None:
             mine = at[(at >= done) & (at < until)] - done
             films.append(jax.tree.map(lambda leaf, a=mine: np.asarray(leaf)[a], kept[1]))
@@ -120,8 +124,8 @@ def run_in_pieces(
         if every and (done % every == 0 or done == total):
             checked.append(done)
             passed.append(check(state))
-    pose, cov, status, slot, nis, dof, log_likelihood = (
-        np.concatenate(parts) for parts in zip(*pieces, strict=True)
+    pose, cov, status, slot, nis, dof, log_likelihood, told = jax.tree.map(
+        lambda *parts: np.concatenate(parts), *pieces
     )
     path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
     estimates, watched = (
@@ -140,6 +144,7 @@ def run_in_pieces(
         passed=passed,
         estimates=estimates,
         watched=watched,
+        kept=told,
     )
 
 

@@ -1,6 +1,7 @@
 """Reader and writer of occupancy grids as ROS has them: a flat YAML file and a PGM image."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +51,18 @@ def load(path: str | Path) -> Grid:
 def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
     """Write a map file and its image; `grids.write_map` says how."""
     path = Path(path)
+    if path.suffix != ".yaml" or path.stem == "":
+        raise ValueError(f"write_map: expected a path NAME.yaml, got {path}")
+    return write_files(path.parent, files(path.stem, grid, mode))
+
+
+def files(
+    stem: str, grid: Grid, mode: str = "trinary"
+) -> dict[str, str | Callable[[Path], object]]:
+    """The map file STEM.yaml and its image STEM.pgm, as `write_files` takes them."""
     check_grid("write_map", grid)
     if mode not in _MODES:
         raise ValueError(f'write_map: expected mode "trinary" or "scale", got {mode!r}')
-    if path.suffix != ".yaml" or path.stem == "":
-        raise ValueError(f"write_map: expected a path NAME.yaml, got {path}")
     log_odds = np.asarray(grid.log_odds, np.float64)[::-1]
     if mode == "trinary":
         occupied, free = 0.65, 0.196
@@ -65,12 +73,11 @@ def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
         image, levels = _levels(log_odds)
     numbers = ", ".join(repr(float(value)) for value in np.asarray(grid.origin))
     text = (
-        f"image: {path.stem}.pgm\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
+        f"image: {stem}.pgm\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
         f"origin: [{numbers}]\nnegate: 0\noccupied_thresh: {occupied}\nfree_thresh: {free}\n"
     )
     data = pgm_bytes(image, levels)
-    image_file = {f"{path.stem}.pgm": lambda target: target.write_bytes(data)}
-    return write_files(path.parent, {path.name: text, **image_file})
+    return {f"{stem}.yaml": text, f"{stem}.pgm": lambda target: target.write_bytes(data)}
 
 
 def _log_odds(p: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -138,7 +138,7 @@ def delayed_settings(
     name = "delayed_slam"
     validation.check_models(name, motion, sensor)
     validation.check_parts(name, associate=associate)
-    if len(sensor.measurements) != 1 or len(sensor.landmark) != 2:
+    if len(sensor.measurements) != 1 or not sensor.of_points:
         raise ValueError(
             f"{name}: expected a sensor of one bearing or one range of points (x, y), got "
             f"{sensor.name} with {sensor.measurements} of {sensor.landmark}"

@@ -144,7 +144,7 @@ def triangulation_of(sensor: Sensor) -> Triangulation:
 
 
 def _check(name: str, sensor: Sensor, measurement: str, angle: float) -> None:
-    if sensor.measurements != (measurement,) or len(sensor.landmark) != 2:
+    if sensor.measurements != (measurement,) or not sensor.of_points:
         raise ValueError(
             f"{name}: expected a sensor of one {measurement} of points (x, y), got {sensor.name} "
             f"with {sensor.measurements} of {sensor.landmark}"

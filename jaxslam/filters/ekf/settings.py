@@ -91,7 +91,7 @@ def check_chart(sensor: Sensor, chart: Chart) -> None:
     pose, landmark = jnp.zeros(3), jnp.zeros(len(sensor.landmark))
     try:
         _, moved = jax.eval_shape(chart.retract, pose, landmark, pose, landmark)
-        fits = moved.shape == landmark.shape
+        fits = moved.shape == landmark.shape and (chart.landmark_size != 2 or sensor.of_points)
     except (IndexError, TypeError, ValueError):
         fits = False
     if not fits and landmark.size == 0:
@@ -110,7 +110,7 @@ def check_settings(settings: EkfSettings) -> None:
     """Raise ValueError unless sensor, chart, linearizer and covariance form are compatible."""
     sensor, chart, linearize = settings.sensor, settings.chart, settings.linearize
     check_chart(sensor, chart)
-    if linearize.euclidean and (chart.basis is not None or len(sensor.landmark) != 2):
+    if linearize.euclidean and (chart.basis is not None or not sensor.of_points):
         raise ValueError(
             f"ekf_slam: the linearizer {linearize.name} is for the Euclidean chart and landmarks "
             f"(x, y), not for the chart {chart.name} and the landmarks of {sensor.name}"

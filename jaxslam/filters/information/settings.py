@@ -61,7 +61,7 @@ class SparseSettings(InformationSettings):
         super().__post_init__()
         for option in ("active", "links", "passive", "sweeps"):
             check_count(f"{self.name}: {option}", getattr(self, option))
-        if len(self.sensor.landmark) != 2:
+        if not self.sensor.of_points:
             raise ValueError(
                 f"{self.name}: expected landmarks (x, y), got {self.sensor.landmark} of "
                 f"{self.sensor.name}"

@@ -42,14 +42,16 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
         probability: of the test, that two estimates of one landmark are merged.
     Raises:
         ValueError: on no filter, a reach not above 0, a probability outside 0 to 1, landmarks whose
-            parameters are not unique (an inverse depth); from `init`, on another state.
+            parameters are not unique (an inverse depth) or no place (a line); from `init`, on
+            another state.
     """
     validation.check_record("merging", "filter", filter, Filter)
     if not reach > 0:
         raise ValueError(f"merging: expected a reach above 0, got {reach}")
     if not 0 < probability < 1:
         raise ValueError(f"merging: expected 0 < probability < 1, got {probability}")
-    if len(filter.landmark) < 2 or "rho [1/m]" in filter.landmark:
+    unique = len(filter.landmark) > 1 and all(name.endswith("[m]") for name in filter.landmark[:2])
+    if not unique or "rho [1/m]" in filter.landmark:
         raise ValueError(
             f"merging: landmarks of {filter.name} with parameters {filter.landmark} cannot be "
             "merged: equal parameters do not mean equal positions"

@@ -44,10 +44,11 @@ def seen_points(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[
     """A scan as points in the robot's frame, and their covariances.
 
     p = position(invert(0, z)), P = J R Jᵀ with J = ∂p/∂z; zeros and identity where not valid.
-    Raises ValueError for a sensor without landmarks, or one whose measurement leaves the position
-    open (K > 0).
+    Raises ValueError for a sensor without landmarks, of landmarks that are no places (lines), or
+    one whose measurement leaves the position open (K > 0).
     """
-    if len(sensor.landmark) == 0 or np.shape(sensor.free.mean)[0] > 0:
+    no_place = len(sensor.landmark) == 0 or sensor.carry is not None
+    if no_place or np.shape(sensor.free.mean)[0] > 0:
         raise ValueError(f"seen_points: expected a sensor that measures points, got {sensor.name}")
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
     origin, rest = jnp.zeros(3, z.dtype), jnp.zeros(0, z.dtype)

@@ -75,7 +75,7 @@ def check_sensors(robots: Sequence[Robot]) -> None:
     """Raise ValueError unless landmarks are points, and unstarted robots can be initialized."""
     for b, robot in enumerate(robots):
         for part in robot.sensors.parts:
-            if len(part.sensor.landmark) not in (0, 2):
+            if part.sensor.landmark and not part.sensor.of_points:
                 raise ValueError(
                     f"team_slam: expected landmarks (x, y), got {part.sensor.landmark} of "
                     f"{part.sensor.name}"
@@ -90,4 +90,4 @@ def check_sensors(robots: Sequence[Robot]) -> None:
 
 def measures_points(sensor: Sensor) -> bool:
     """Whether one measurement determines a point (x, y), given the pose."""
-    return len(sensor.landmark) == 2 and np.shape(sensor.free.mean) == (0,)
+    return sensor.of_points and np.shape(sensor.free.mean) == (0,)

@@ -7,38 +7,34 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.known.localization import checked_map
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
-from jaxslam.filters.particles.proposal import sample_motion
-from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
+from jaxslam.filters.particles.pose_steps import predict_particles, weigh_particles
 from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import (
     MonteCarloSettings,
+    check_start,
     checked_box,
     checked_least,
     known_map_sensors,
 )
 from jaxslam.filters.particles.states.moments import weighted_nis
-from jaxslam.filters.particles.states.particle_info import ParticleInfo
 from jaxslam.filters.particles.states.pose_state import (
-    ParticleEvents,
     PoseParticles,
-    active_mask,
     draw_start,
     initial_pose_particles,
-    no_events,
     pose_particle_moments,
 )
+from jaxslam.filters.particles.states.region import box_region
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.protocols import Associate, Differentiable, Filter, Motion, Resample, Sensor
-from jaxslam.resampling.kld import bins_of, enough
 from jaxslam.resampling.systematic import systematic
-from jaxslam.resampling.weights import effective_size, normalized
+from jaxslam.resampling.weights import normalized
 from jaxslam.sensors.suite import Suite
 from jaxslam.types import Estimate, Info, Scan
 
@@ -129,17 +125,22 @@ def particle_localization(
     """
     validation.check_models("particle_localization", motion, sensor)
     points, names = checked_map("particle_localization", sensor, landmarks, tags)
+    check_start("particle_localization", start)
+    if start == "uniform" and box is None:
+        raise ValueError("particle_localization: expected a box with a uniform start, got none")
+    limits = None if box is None else checked_box("particle_localization", box)
     settings = MonteCarloSettings(
+        name="particle_localization",
         motion=motion,
         particles=particles,
-        box=checked_box(box, start),
+        region=None if limits is None else box_region(limits),
         start=start,
         resample=resample,
         threshold=threshold,
         bins=bins,
         error=error,
         confidence=confidence,
-        least=checked_least(particles, least),
+        least=checked_least("particle_localization", particles, least),
         rates=forget,
         slack=slack,
     )
@@ -157,20 +158,9 @@ def particle_localization(
         log_likelihood = normalized(state.log_weight + likelihood.log_density.sum(axis=1))[1]
         # Besides d², a weight has the term log |2πR|, which is the same for all.
         misfit = 0.5 * likelihood.counted.sum(axis=1)
-        weight, some = weight_poses(state, misfit)
-        ess = effective_size(weight)
-        info = info_of_scan(scan, likelihood, weight, log_likelihood)
-        found = ParticleInfo(
-            ess=ess, underflow=~some, active=state.active, **state.events._asdict()
-        )
-        state = update_averages(state, misfit, likelihood.measured[0].sum(), settings)
-        lost = settings.injects & (state.injection > 0)
-        state = state._replace(
-            log_weight=weight,
-            best=jnp.argmax(weight).astype(jnp.int32),
-            due=(ess < threshold * state.active) | lost,
-            events=no_events(),
-        )
+        measured = likelihood.measured[0].sum()
+        state, found = weigh_particles(state, misfit, misfit, measured, settings)
+        info = info_of_scan(scan, likelihood, state.log_weight, log_likelihood)
         return state, with_extra(info, "particles", found)
 
     def estimate(state: PoseParticles) -> Estimate:
@@ -197,16 +187,6 @@ def particle_localization(
     )
 
 
-def weight_poses(
-    state: PoseParticles, misfit: Float[Array, "P"]
-) -> tuple[Float[Array, "P"], Bool[Array, ""]]:
-    """Log-weights log w exp(-misfit) with Σ w = 1, equal where all underflow, and whether any
-    weight was left."""
-    weight, _, some = normalized(state.log_weight - misfit)
-    even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
-    return jnp.where(some, weight, even), some
-
-
 def info_of_scan(
     scan: Scan,
     likelihood: ScanLikelihood,
@@ -226,40 +206,4 @@ def info_of_scan(
         innovation_cov=own.innovation_cov,
         log_likelihood=log_likelihood,
         exhausted=likelihood.exhausted.any(),
-    )
-
-
-def predict_particles(
-    state: PoseParticles, u: Float[Array, "U"], key: Array, settings: MonteCarloSettings
-) -> PoseParticles:
-    """The particles resampled where due and moved, as many as the KLD bound requires."""
-    key_start, key_renew, key_noise = jax.random.split(key, 3)
-    state = draw_start(state, key_start, settings)
-    due, particles = state.due, settings.particles
-    drawn = resample_and_inject(state, key_renew, settings)
-    old = jnp.where(due, drawn.pose, state.pose)
-    moved = sample_motion(settings.motion, old, u, key_noise)
-    good = jnp.isfinite(moved).all(axis=1)
-    pose = jnp.where(good[:, None], moved, old)
-    bins = bins_of(pose, settings.bins)
-    count, few = enough(bins, settings.least, settings.error, settings.confidence)
-    active = jnp.where(due, count, state.active)
-    used = jnp.arange(particles) < active
-    log_weight = jnp.where(used, drawn.log_weight, -jnp.inf)
-    # The sum becomes 1; its gradient is the resampling method's.
-    log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
-    log_weight = jnp.where(due, log_weight, state.log_weight)
-    before = state.events
-    return state._replace(
-        pose=pose,
-        log_weight=jnp.where(good, log_weight, -jnp.inf),
-        active=active,
-        due=jnp.asarray(False),
-        injection=jnp.zeros_like(state.injection),
-        events=ParticleEvents(
-            resampled=before.resampled | due,
-            injected=before.injected + (due & drawn.injected & used).sum().astype(jnp.int32),
-            invalid=before.invalid + (used & ~good).sum().astype(jnp.int32),
-            capped=before.capped | (due & few),
-        ),
     )

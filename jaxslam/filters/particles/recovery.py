@@ -1,4 +1,4 @@
-"""Recovery of a kidnapped robot: injection of particles from the whole box.
+"""Recovery of a kidnapped robot: injection of particles from anywhere it may be.
 
 Thrun, Burgard & Fox, "Probabilistic Robotics", table 8.3, augmented MCL.
 """
@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.particles.settings import MonteCarloSettings
-from jaxslam.filters.particles.states.pose_state import PoseParticles, draw_uniform_poses
+from jaxslam.filters.particles.states.pose_state import PoseParticles
 from jaxslam.resampling.weights import survivors
 
 
@@ -25,7 +25,8 @@ def update_averages(
     """The state with updated likelihood averages and the injection probability.
 
     Args:
-        misfit: Σ d²/2 of each particle.
+        misfit: of each particle: Σ d²/2, or the negative log-likelihood of the scan; a constant
+            does not matter, since only the ratio of the averages does.
         measured: how many measurements the scan has.
     """
     if settings.rates is None:
@@ -55,23 +56,24 @@ class DrawnPoses(NamedTuple):
     pose: Float[Array, "P 3"]
     log_weight: Float[Array, "P"]
     injected: Bool[Array, "P"]
-    """drawn from the box"""
+    """drawn from the whole region"""
 
 
 def resample_and_inject(
     state: PoseParticles, key: Array, settings: MonteCarloSettings
 ) -> DrawnPoses:
-    """Poses resampled by weight or, with the state's injection probability, drawn from the box."""
+    """Poses resampled by weight or, with the state's injection probability, drawn from the
+    region."""
     particles = settings.particles
-    key_resample, key_order, key_which, key_box = jax.random.split(key, 4)
+    key_resample, key_order, key_which, key_anywhere = jax.random.split(key, 4)
     ancestor, log_weight = survivors(settings.resample, state.log_weight, key_resample)
     # Ancestors ascend, and only the first so many may be used.
     order = jax.random.permutation(key_order, particles)
     pose, log_weight = state.pose[ancestor[order]], log_weight[order]
-    if not settings.injects:
+    if settings.region is None or settings.rates is None:
         return DrawnPoses(pose, log_weight, jnp.zeros(particles, bool))
     injected = jax.random.uniform(key_which, (particles,), pose.dtype) < state.injection
-    anywhere = draw_uniform_poses(jnp.asarray(settings.box, pose.dtype), particles, key_box)
+    anywhere = settings.region.draw(particles, key_anywhere, pose.dtype)
     return DrawnPoses(
         jnp.where(injected[:, None], anywhere, pose),
         jnp.where(injected, -math.log(particles), log_weight),

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam import validation
 from jaxslam.association.known import known as known_association
+from jaxslam.filters.particles.states.region import Region
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Differentiable, Life, Motion, Resample, Sensor
 from jaxslam.sensors.suite import Suite
@@ -60,15 +61,16 @@ class KnownMapSensor(AssociationSettings):
 
 @dataclass(frozen=True, eq=False)
 class MonteCarloSettings:
-    """The settings of the particles of `particle_localization`: origin and number.
+    """The settings of particles in a known map: origin, number, resampling and recovery.
 
-    Raises ValueError on invalid numbers.
+    Raises ValueError, which begins with the filter's name, on invalid numbers.
     """
 
+    name: str
     motion: Motion
     particles: int
-    box: np.ndarray | None
-    """(2, 2) lowest and highest (x, y)"""
+    region: Region | None
+    """where the robot may be"""
     start: Literal["gaussian", "uniform"]
     resample: Resample | Differentiable
     threshold: float
@@ -81,7 +83,7 @@ class MonteCarloSettings:
     slack: float
 
     def __post_init__(self) -> None:
-        name, bins, rates = "particle_localization", self.bins, self.rates
+        name, bins, rates = self.name, self.bins, self.rates
         check_resampling(name, self.resample, self.threshold)
         if np.shape(bins) != (3,) or not all(np.isfinite(b) and b > 0 for b in bins):
             raise ValueError(f"{name}: expected bins of three sizes above 0, got {bins!r}")
@@ -100,8 +102,8 @@ class MonteCarloSettings:
 
     @property
     def injects(self) -> bool:
-        """Whether recovery injects particles from the whole box."""
-        return self.box is not None and self.rates is not None
+        """Whether recovery injects particles from the whole region."""
+        return self.region is not None and self.rates is not None
 
 
 def particle_map_settings(
@@ -161,9 +163,8 @@ def check_resampling(name: str, resample: Any, threshold: float) -> None:
         raise ValueError(f"{name}: expected a threshold from 0 to 1, got {threshold}")
 
 
-def checked_least(particles: int, least: int | None) -> int:
+def checked_least(name: str, particles: int, least: int | None) -> int:
     """The least number of particles, which by default is 50, or the capacity."""
-    name = "particle_localization"
     validation.check_count(f"{name}: particles", particles)
     if least is None:
         return min(_LEAST, particles)
@@ -173,18 +174,17 @@ def checked_least(particles: int, least: int | None) -> int:
     return least
 
 
-def checked_box(box: ArrayLike | None, start: str) -> np.ndarray | None:
-    """The box (2, 2), if there is one; a uniform start needs it."""
-    name = "particle_localization"
-    if start not in ("gaussian", "uniform"):
-        raise ValueError(f'{name}: expected start "gaussian" or "uniform", got {start!r}')
-    if box is None:
-        if start == "uniform":
-            raise ValueError(f"{name}: expected a box with a uniform start, got none")
-        return None
+def checked_box(name: str, box: ArrayLike) -> np.ndarray:
+    """The box (2, 2), rows its lowest and highest (x, y); ValueError where it has no inside."""
     limits = np.asarray(box, np.float64)
     if limits.shape != (2, 2) or not np.isfinite(limits).all() or not (limits[1] > limits[0]).all():
         raise ValueError(
             f"{name}: expected a box of shape (2, 2), its lowest and highest (x, y), got {box!r}"
         )
     return limits
+
+
+def check_start(name: str, start: str) -> None:
+    """Raise ValueError unless a start is one of the two."""
+    if start not in ("gaussian", "uniform"):
+        raise ValueError(f'{name}: expected start "gaussian" or "uniform", got {start!r}')

@@ -23,6 +23,9 @@ class BeamModel:
     each: Callable[[PyTree, Array, Beams], Array]
     """(prepared, pose (3,) of the robot, beams) -> (B,) log-densities, finite also where a beam is
     not valid"""
+    jacobian: Callable[[PyTree, Array, Beams], Array] | None = None
+    """(prepared, pose, beams) -> (B, 3), their derivatives by the pose, derived by hand: `verify`
+    compares them with automatic differentiation and differences"""
 
 
 def log_likelihood(

@@ -3,13 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.grids.beam_models.beam_model import BeamModel
 from jaxslam.grids.beam_models.ray_cast import check_weights
 from jaxslam.grids.distance import distance_field
 from jaxslam.grids.grid import Field, Grid
-from jaxslam.grids.interpolation import interpolate
+from jaxslam.grids.interpolation import interpolate, slope
 from jaxslam.math import se2
 from jaxslam.types import Beams
 
@@ -45,20 +45,38 @@ def likelihood_field(
     def prepare(grid: Grid) -> Field:
         return distance_field(grid, truncate=truncate)
 
-    def each(field: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def ends_of(pose: Array, beams: Beams) -> tuple[Bool[Array, "B"], Float[Array, "B 2"]]:
+        """Which beams have max_range, and the ends of the others."""
         eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
         far = beams.range >= max_range
         ranges = jnp.where(far, 0.0, beams.range)
-        heading = eye[2] + beams.angle
-        ends = jnp.stack(
-            [eye[0] + ranges * jnp.cos(heading), eye[1] + ranges * jnp.sin(heading)], -1
-        )
-        d = interpolate(field, ends)
-        near = hit * jnp.exp(-0.5 * (d / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-        least = jnp.finfo(d.dtype).tiny
-        log_near = jnp.log(jnp.maximum(near + random / max_range, least))
+        # In the frame of the laser, which poses of a `vmap` share, and turned: no sine a beam.
+        ahead, left = ranges * jnp.cos(beams.angle), ranges * jnp.sin(beams.angle)
+        c, s = jnp.cos(eye[2]), jnp.sin(eye[2])
+        ends = jnp.stack([eye[0] + c * ahead - s * left, eye[1] + s * ahead + c * left], -1)
+        return far, ends
+
+    def near_of(d: Float[Array, "B"]) -> Float[Array, "B"]:
+        return jnp.asarray(hit * jnp.exp(-0.5 * (d / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)))
+
+    def total_of(near: Float[Array, "B"]) -> Float[Array, "B"]:
+        return jnp.maximum(near + random / max_range, jnp.finfo(near.dtype).tiny)
+
+    def each(field: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        far, ends = ends_of(pose, beams)
+        log_near = jnp.log(total_of(near_of(interpolate(field, ends))))
         silent = jnp.asarray(maximum) == 0
         log_far = jnp.where(silent, 0.0, jnp.log(jnp.where(silent, 1.0, maximum)))
         return jnp.where(far, log_far, log_near)
 
-    return BeamModel("likelihood_field", prepare, each)
+    def jacobian(field: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
+        # log(n + r) by d is -n d/σ²/(n + r); the end moves by dt, and by dθ across the arm to it.
+        far, ends = ends_of(pose, beams)
+        d = interpolate(field, ends)
+        near = near_of(d)
+        by_end = (-near * d / sigma**2 / total_of(near))[:, None] * slope(field, ends)
+        arm = ends - pose[None, :2]
+        turning = by_end[:, 1] * arm[:, 0] - by_end[:, 0] * arm[:, 1]
+        return jnp.where(far[:, None], 0.0, jnp.concatenate([by_end, turning[:, None]], axis=1))
+
+    return BeamModel("likelihood_field", prepare, each, jacobian)

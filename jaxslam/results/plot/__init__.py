@@ -16,6 +16,8 @@ from jaxslam.results.plot.formats import encode
 from jaxslam.results.plot.geometry import ellipse
 from jaxslam.results.plot.graph import graph_figure
 from jaxslam.results.plot.grids import grid_figure
+from jaxslam.results.plot.lines import walls_figure
+from jaxslam.results.plot.loops import loops_figure, maps_before_after
 from jaxslam.results.plot.maps import map_figure, run_map_figure
 from jaxslam.results.plot.nees import nees_figure
 from jaxslam.results.plot.scene import (
@@ -32,6 +34,7 @@ from jaxslam.results.plot.scene import (
 )
 from jaxslam.results.plot.single import errors_figure, run_errors_figure
 from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, png, warm_up
+from jaxslam.results.plot.topology import topology_figure
 
 __all__ = [
     "COLORS",
@@ -55,7 +58,9 @@ __all__ = [
     "graph_figure",
     "graph_scene",
     "grid_figure",
+    "loops_figure",
     "map_figure",
+    "maps_before_after",
     "nees_figure",
     "png",
     "probe",
@@ -63,6 +68,8 @@ __all__ = [
     "run_errors_figure",
     "run_map_figure",
     "run_scene",
+    "topology_figure",
+    "walls_figure",
     "warm_up",
     "whiteness_figure",
 ]

@@ -1,5 +1,6 @@
 """Figures of occupancy grids, with poses and beams in them."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ def grid_figure(
     *,
     poses: ArrayLike | None = None,
     beams: Beams | None = None,
+    others: Mapping[str, ArrayLike] | None = None,
     label: str = "",
     title: str = "",
     width: float = PAGE / 2,
@@ -41,6 +43,7 @@ def grid_figure(
         grid: a map; or a `Field`, as a distance field, whose values are shown in colours.
         poses: (T, 2 or 3) drawn as a path with its end.
         beams: a scan from the last pose.
+        others: other paths by name, drawn thin, as a reference.
         label: of the scale of a field.
         width: [in].
     Raises:
@@ -52,7 +55,7 @@ def grid_figure(
     values = np.asarray(grid[0])
     frame = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
     rows, columns = (np.arange(n + 1) for n in values.shape)
-    x, y = _world(*frame, columns[None, :] + 0.0 * rows[:, None], rows[:, None] + 0.0 * columns)
+    x, y = world_of(*frame, columns[None, :] + 0.0 * rows[:, None], rows[:, None] + 0.0 * columns)
     inner = width - (0.6 if isinstance(grid, Grid) else 1.3)
     height = inner * np.ptp(y) / np.ptp(x) + 0.8
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
@@ -75,6 +78,8 @@ def grid_figure(
         bar.ax.tick_params(labelsize=TEXT)
         bar.outline.set_linewidth(0.6)
         handles = []
+    for (name, other), color in zip((others or {}).items(), COLORS[1:], strict=False):
+        axes.plot(*np.asarray(other)[:, :2].T, color=color, lw=0.7, label=name, zorder=4)
     if path is not None:
         axes.plot(*path[:, :2].T, color=COLORS[0], lw=1.2, label="path", zorder=3)
         end: Look = {
@@ -99,7 +104,7 @@ def grid_figure(
     return figure
 
 
-def _world(
+def world_of(
     origin: np.ndarray, resolution: float, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates in cells as world coordinates [m]."""

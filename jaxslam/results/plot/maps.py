@@ -53,7 +53,8 @@ def map_figure(
 
     Args:
         estimate: with leading T, as in `Trace.estimate`.
-        truth: of a simulated world; or, drawn without alignment,
+        truth: of a simulated world whose landmarks begin with a place (of lines: of
+            `worlds.with_positions`); or, drawn without alignment,
         true_points: (N, 2) landmarks [m], in the order of tags where names is given, and
         true_path: (T, 2 or 3) poses.
         dead_reckoning: (T, 2 or 3) poses; what is far from the rest of the map is not shown.

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from jaxslam.simulation.scenarios.circle import circle
 from jaxslam.simulation.scenarios.cloister import cloister, cloister_landmarks, cloister_noisy
 from jaxslam.simulation.scenarios.explore import explore
+from jaxslam.simulation.scenarios.lines import office_lines, square_lines
 from jaxslam.simulation.scenarios.loop import loop, loop_bearing, loop_landmarks
 from jaxslam.simulation.scenarios.rooms import ROOMS, circular_room, corridor, office, square
 from jaxslam.simulation.scenarios.stationary import stationary
@@ -19,6 +20,8 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "explore": explore,
     "loop": loop,
     "loop_bearing": loop_bearing,
+    "office_lines": office_lines,
+    "square_lines": square_lines,
     "stationary": stationary,
     "webmap": webmap,
 }
@@ -39,7 +42,9 @@ __all__ = [
     "loop_bearing",
     "loop_landmarks",
     "office",
+    "office_lines",
     "square",
+    "square_lines",
     "stationary",
     "webmap",
 ]

@@ -12,11 +12,14 @@ SPEED, TURN, STEP = 0.5, np.deg2rad(45.0), 0.25
 """Speed [m/s], rate of turn [rad/s] and interval [s] of the robot in these worlds."""
 
 
-def office(beams: int = 180) -> LaserWorld:
+def office(beams: int = 180, glass: float = 0.0) -> LaserWorld:
     """A corridor of 12 m with six rooms, doors of 1 m, two cabinets; the robot visits three rooms.
 
     Rooms that are nearly alike: a robot that may be anywhere has several hypotheses. Laser all
     around, σ = 2 cm, 8 m, 2 % dropouts.
+
+    glass: the share of beams that pass the east end of the corridor, a wall of glass; there is
+    nothing behind it.
     """
     lower = [(0.0, 3.6, 1.8), (3.8, 7.8, 5.0), (8.0, 12.0, 10.2)]
     upper = [(0.0, 4.6, 2.6), (4.8, 8.2, 7.2), (8.4, 12.0, 9.6)]
@@ -24,6 +27,7 @@ def office(beams: int = 180) -> LaserWorld:
     for left, right, door in lower:  # (x from, x to, middle of the door)
         outline += [(door - 0.5, 3.2), (door - 0.5, 3.0), (left, 3.0), (left, 0.0), (right, 0.0)]
         outline += [(right, 3.0), (door + 0.5, 3.0), (door + 0.5, 3.2)]
+    east = len(outline)
     outline += [(12.0, 3.2), (12.0, 5.0)]
     for left, right, door in reversed(upper):
         outline += [(door + 0.5, 5.0), (door + 0.5, 5.2), (right, 5.2), (right, 8.0), (left, 8.0)]
@@ -32,7 +36,8 @@ def office(beams: int = 180) -> LaserWorld:
     cabinets = [_box(6.6, 0.6, 7.4, 1.4), _box(0.6, 6.9, 1.5, 7.4)]
     stops = [(0.8, 4.1), (1.8, 4.1), (1.8, 1.5), (1.8, 4.1), (7.2, 4.1), (7.2, 6.6), (7.2, 4.1)]
     stops += [(10.2, 4.1), (10.2, 1.5), (10.2, 4.1), (0.8, 4.1)]
-    return _world("office", walls(outline, *cabinets), stops, beams, 8.0)
+    made = walls(outline, *cabinets, glass={(0, east): glass} if glass else None)
+    return _world("office", made, stops, beams, 8.0)
 
 
 def corridor(beams: int = 180) -> LaserWorld:

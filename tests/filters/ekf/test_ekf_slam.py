@@ -1,6 +1,5 @@
 """EKF-SLAM's bookkeeping: what becomes of each measurement, likelihoods and their gradients, refusals."""
 
-import dataclasses
 import functools
 
 import jax
@@ -9,9 +8,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxslam import charts, motion, sensors, slots
+from jaxslam import motion, sensors, slots
 from jaxslam.filters import ekf_slam
-from jaxslam.protocols import Free
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
@@ -77,53 +75,34 @@ def assert_finite(*trees):
 # --- what becomes of a measurement --------------------------------------------------------------
 
 
-def test_an_empty_scan_changes_nothing():
-    joint = with_landmarks(2)
-    after, info = updater()(joint, scan_of())
-    assert_unchanged(joint, after)
-    assert list(info.status) == [Status.EMPTY] * PLACES
+DROPPED = {  # landmarks in a map with room for three, what is measured, what becomes of it
+    "an empty scan": (2, [], []),
+    "a full map": (
+        3,
+        [(40, 2.0, 1.0), (41, 3.0, 1.5)],
+        [Status.OVERFLOW, Status.OVERFLOW],
+    ),
+    "room for one": (2, [(40, 2.0, 1.0), (41, 3.0, 1.5)], [Status.BORN, Status.OVERFLOW]),
+    "a new tag twice": (0, [(5, 2.0, 0.3), (5, 9.0, 2.0)], [Status.BORN, Status.REPEATED]),
+    "an unknown identity": (1, [(-1, 2.0, 0.3)], [Status.UNMATCHED]),
+}
+
+
+@pytest.mark.parametrize("case", DROPPED)
+def test_what_is_dropped_is_told_and_leaves_no_trace(case):
+    """The state is as after a scan without it. Quotas of births: tests/equivalence/test_reference.py."""
+    count, seen, wanted = DROPPED[case]
+    joint = with_landmarks(count) if count else start()
+    after, info = updater()(joint, scan_of(*seen))
+    assert list(info.status) == wanted + [Status.EMPTY] * (PLACES - len(seen))
+    born = [s for s, status in zip(seen, wanted, strict=True) if status == Status.BORN]
+    assert_unchanged(updater()(joint, scan_of(*born))[0] if born else joint, after)
+    assert list(after.tag[count : count + len(born)]) == [tag for tag, *_ in born]
+    assert list(info.slot) == [count] * len(born) + [-1] * (PLACES - len(born))
+    overflows = wanted.count(Status.OVERFLOW)
+    assert (bool(info.overflow), int(info.tally(Status.OVERFLOW))) == (overflows > 0, overflows)
     assert float(info.log_likelihood) == 0
     assert not info.dof.any()
-    assert list(info.slot) == [-1] * PLACES
-
-
-def test_a_full_map_counts_what_overflows_and_stays_as_it_is():
-    joint = with_landmarks(3)
-    after, info = updater()(joint, scan_of((40, 2.0, 1.0), (41, 3.0, 1.5)))
-    assert_unchanged(joint, after)
-    assert list(info.status) == [Status.OVERFLOW, Status.OVERFLOW, Status.EMPTY]
-    assert info.overflow
-    assert int(info.tally(Status.OVERFLOW)) == 2
-    assert list(info.slot) == [-1] * PLACES
-    joint = with_landmarks(2)
-    after, info = updater()(joint, scan_of((40, 2.0, 1.0), (41, 3.0, 1.5)))
-    assert list(info.status) == [Status.BORN, Status.OVERFLOW, Status.EMPTY]
-    assert list(info.slot) == [2, -1, -1]
-    assert list(after.tag) == [0, 1, 40]
-
-
-def test_births_beyond_the_quota_are_deferred():
-    both = scan_of((5, 2.0, 0.3), (6, 3.0, -1.0))
-    first, info = updater(births=1)(start(), both)
-    assert list(info.status) == [Status.BORN, Status.DEFERRED, Status.EMPTY]
-    assert list(first.tag) == [5, -1, -1]
-    second, info = updater(births=1)(first, both)
-    assert list(info.status) == [Status.FUSED, Status.BORN, Status.EMPTY]
-    assert list(second.tag) == [5, 6, -1]
-
-
-def test_a_new_tag_twice_in_a_scan_is_born_once():
-    twice, info = updater()(start(), scan_of((5, 2.0, 0.3), (5, 9.0, 2.0)))
-    assert list(info.status) == [Status.BORN, Status.REPEATED, Status.EMPTY]
-    once, _ = updater()(start(), scan_of((5, 2.0, 0.3)))
-    assert_unchanged(once, twice)
-
-
-def test_an_unknown_identity_is_unmatched():
-    joint = with_landmarks(1)
-    after, info = updater()(joint, scan_of((-1, 2.0, 0.3)))
-    assert_unchanged(joint, after)
-    assert int(info.status[0]) == Status.UNMATCHED
 
 
 @pytest.mark.parametrize("update", ["sequential", "joint"])
@@ -369,20 +348,6 @@ def test_bad_options_are_refused(case):
         ekf_slam(MOTION, SENSOR, **({"capacity": 3} | options))
 
 
-def test_a_chart_that_does_not_fit_the_landmarks_is_refused():
-    tall = dataclasses.replace(
-        SENSOR,
-        landmark=("x", "y", "height"),
-        free=Free(jnp.zeros(1), jnp.eye(1)),
-        observe=lambda pose, landmark: SENSOR.observe(pose, landmark[:2]),
-        invert=lambda pose, z, s: jnp.concatenate([SENSOR.invert(pose, z, s[:0]), s]),
-        position=lambda landmark: landmark[:2],
-    )
-    with pytest.raises(ValueError, match="right_invariant does not act on the 3-parameter"):
-        ekf_slam(MOTION, tall, 3, chart=charts.right_invariant())
-    assert ekf_slam(MOTION, tall, 3).name == "ekf_slam"
-
-
 def good_log(steps=3):
     z = np.tile([[2.0, 0.3], [3.0, -1.0], [1.5, 2.5]], (steps, 1, 1))
     tag = np.tile(np.arange(3, dtype=np.int32), (steps, 1))
@@ -393,37 +358,6 @@ def spoiled(field, row, value):
     log = jax.tree.map(np.array, good_log())
     (log.control if field == "control" else getattr(log.scan, field))[row] = value
     return log
-
-
-BAD_RUNS = {
-    "control size": (good_log()._replace(control=np.zeros((3, 3))), {}, "log.control"),
-    "no z column": (
-        good_log()._replace(scan=good_log().scan._replace(z=np.zeros((3, 3, 1)))),
-        {},
-        "log.scan.z",
-    ),
-    "control nan": (spoiled("control", (1, 0), np.nan), {}, r"log.control is not finite \(row 1\)"),
-    "z nan": (
-        spoiled("z", (2, 1, 1), np.nan),
-        {},
-        r"valid measurement is not finite \(row 2, slot 1\)",
-    ),
-    "tags repeat": (spoiled("tag", (0, 1), 0), {}, r"tag repeats within the scan \(row 0\)"),
-    "pose shape": (good_log(), {"pose": np.zeros(2)}, r"pose \(x, y, θ\) of shape \(3,\)"),
-    "pose nan": (good_log(), {"pose": np.array([0, np.nan, 0])}, "initial pose is not finite"),
-    "cov shape": (good_log(), {"pose_cov": np.eye(2)}, r"pose_cov: .*shape \(3, 3\)"),
-    "cov negative": (good_log(), {"pose_cov": -np.eye(3)}, "pose_cov: .*positive semi-definite"),
-    "cov asymmetric": (good_log(), {"pose_cov": np.tri(3)}, "pose_cov: .*not symmetric"),
-    "cov nan": (good_log(), {"pose_cov": np.full((3, 3), np.nan)}, "pose_cov: .*NaN"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_RUNS)
-def test_bad_runs_are_refused(case):
-    log, arguments, message = BAD_RUNS[case]
-    arguments = {"pose": np.zeros(3), "pose_cov": np.eye(3)} | arguments
-    with pytest.raises(ValueError, match=message):
-        run(ekf_slam(MOTION, SENSOR, 3), log, key=KEY, **arguments)
 
 
 @pytest.fixture(scope="module")
@@ -473,15 +407,15 @@ def test_what_is_not_finite_and_escapes_the_check_under_jit_is_dropped(good_trac
     np.testing.assert_array_equal(expected.info.log_likelihood, trace.info.log_likelihood)
 
 
-@pytest.mark.parametrize("update", ["sequential", "joint"])
-@pytest.mark.parametrize(("steps", "places"), [(0, 2), (3, 0)])
-def test_a_log_without_rows_or_without_places_is_a_log(update, steps, places):
+def test_a_log_without_rows_is_a_log():
+    """Without places: tests/equivalence/test_information.py."""
+    steps, places = 0, 2
     scan = Scan(
         np.zeros((steps, places, 2)),
         np.full((steps, places), -1, np.int32),
         np.zeros((steps, places), bool),
     )
-    filter = ekf_slam(MOTION, sensors.range_bearing(R), 1, update=update)
+    filter = ekf_slam(MOTION, sensors.range_bearing(R), 1, update="joint")
     trace = run(filter, Log(np.zeros((steps, 2)), scan), np.zeros(3), np.zeros((3, 3)), KEY)
     assert trace.estimate.pose.shape == (steps, 3)
     assert not trace.info.log_likelihood.any()

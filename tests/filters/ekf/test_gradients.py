@@ -1,4 +1,4 @@
-"""The gradient of a whole run: through 200 steps, by every parameter of robot and sensor together."""
+"""The gradient of a whole run: by every parameter of robot and sensor, and of every kind of filter."""
 
 import dataclasses
 
@@ -6,13 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import worlds
 
-from jaxslam import motion, sensors
+from jaxslam import charts, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
+from jaxslam.filters.ekf.settings import EkfSettings
+from jaxslam.filters.ekf.steps.predict import propagate
+from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
 from jaxslam.math.stats import sigma_gate
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
+from jaxslam.slots import Joint
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)
@@ -113,7 +118,7 @@ def test_gradients_are_finite_in_float32_with_gate_overflow_and_empty_scans(gate
         valid[::3] = False
     elif case == "no measurement at all":
         valid[:] = False
-    single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, log)
+    single = worlds.narrow(log)
     single = single._replace(scan=single.scan._replace(valid=valid))
     (total, status), slope = gated(AT.astype("f4"), single)
     assert slope.dtype == np.float32
@@ -125,3 +130,39 @@ def test_gradients_are_finite_in_float32_with_gate_overflow_and_empty_scans(gate
         assert not np.asarray(slope).any()
     else:
         assert all(counts[[Status.FUSED, Status.BORN, Status.REJECTED, Status.OVERFLOW]])
+
+
+FORMS = {
+    "sigma points": {"chart": charts.right_invariant(), "linearize": linearize.unscented()},
+    "square root": {"covariance": "square_root"},
+    "robocentric": {"chart": charts.robocentric()},
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_in_reverse_through_a_motion_and_corrections_in_turn(name):
+    """By both noises, from a pose that is known exactly. Corrected at once, and with births:
+    tests/consistency/test_catalog.py."""
+    points, slot = np.array([[2.0, 1.0], [1.0, -2.0]]), np.array([0, 1, 0])
+    root = np.diag([0.0, 0, 0, 0.1, 0.2, 0.1, 0.3])
+    cov = root if name == "square root" else root @ root
+    joint = Joint(np.array([0.1, 0.2, 0.3]), points, cov, np.ones(2, bool), np.arange(2), ())
+    z = np.array([[1.9, 0.1], [2.2, -1.5], [1.8, 0.12]])
+
+    def cost(sigma, joint):
+        sensor = sensors.range_bearing(jnp.diag(sigma[2:]) ** 2)
+        settings = EkfSettings(sensor, **FORMS[name])
+        robot = motion.increment(jnp.diag(sigma[:2]) ** 2)
+        joint, _ = propagate(joint, jnp.array([0.2, 0.1]), robot, settings)
+        joint, done = correct_in_turn(joint, z, slot, np.ones(3, bool), settings)
+        return done.log_likelihood.sum() + joint.pose.sum() + (joint.cov**2).sum()
+
+    at = np.array([0.01, 0.04, 0.05, 0.02])
+    both = jax.jit(jax.value_and_grad(cost))
+    slope = np.asarray(both(at, joint)[1])
+    steps = 1e-3 * np.diag(at)  # sigma points round at 1e-8
+    rise = [
+        (both(at + step, joint)[0] - both(at - step, joint)[0]) / (2 * step.sum()) for step in steps
+    ]
+    np.testing.assert_allclose(slope, rise, rtol=5e-5, atol=1e-3)
+    assert np.all(slope != 0)

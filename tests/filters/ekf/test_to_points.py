@@ -55,6 +55,11 @@ def driven(filter, log, **options):
 CHARTS = {"euclidean": charts.euclidean, "right_invariant": lambda: right_invariant(rays=True)}
 
 
+FORMS = pytest.mark.parametrize(
+    ("name", "square_root"), [("euclidean", False), ("right_invariant", True)]
+)
+
+
 def state_of(joint):
     return joint
 
@@ -75,8 +80,7 @@ def joint_of(name="euclidean", square_root=False):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[14]), states)
 
 
-@pytest.mark.parametrize("square_root", [False, True])
-@pytest.mark.parametrize("name", CHARTS)
+@FORMS
 def test_the_covariance_goes_through_the_derivative_of_position(name, square_root):
     joint = joint_of(name, square_root)
     which = np.array([True, False, True, False])
@@ -113,14 +117,14 @@ def slope_of(name):
     return jax.jit(lambda *at: jax.jacfwd(errors)(jnp.zeros(19), *at))
 
 
-@pytest.mark.parametrize("square_root", [False, True])
-def test_nothing_to_reduce_changes_nothing(square_root):
-    joint = joint_of("euclidean", square_root)
+@FORMS
+def test_nothing_to_reduce_changes_nothing(name, square_root):
+    joint = joint_of(name, square_root)
     same = REDUCE(joint, np.zeros(4, bool), SENSOR, square_root)
     chex.assert_trees_all_equal(same, joint)
 
 
-@pytest.mark.parametrize("options", [{}, {"linearize": unscented()}, {"update": "joint"}])
+@pytest.mark.parametrize("options", [{}, {"linearize": unscented(), "update": "joint"}])
 def test_a_reduced_map_is_filtered_as_one_of_points(options):
     """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
     log = a_log()
@@ -164,8 +168,7 @@ def test_a_reduced_map_is_filtered_as_one_of_points(options):
     np.testing.assert_array_equal(wide.cov[np.ix_(rest, keep)], 0)
 
 
-@pytest.mark.parametrize("square_root", [False, True])
-@pytest.mark.parametrize("name", CHARTS)
+@FORMS
 def test_a_run_turns_rays_into_points_where_the_index_allows(name, square_root):
     trace = traced(name, square_root, 0.1)
     became = trace.info.extra["points"].reduced

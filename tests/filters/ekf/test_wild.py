@@ -15,7 +15,7 @@ from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Log, Scan, Status
 
-STEPS, PLACES = 1000, 4
+STEPS, PLACES = 400, 4
 MOTION = motion.increment(np.diag([0.01, 0.01]) ** 2)
 SENSOR = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2)
 GATE, NEW = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
@@ -29,7 +29,7 @@ METHODS = {name: (name, GATE, NEW) for name in MAKERS} | {
     "gates of 0 and ∞": ("nearest", 0.0, np.inf),
     "gates of ∞": ("nearest", np.inf, np.inf),
 }
-CASES = [(method, 6) for method in METHODS] + [("nearest", 1), ("joint", 1)]
+CASES = [(method, 6) for method in METHODS] + [("joint", 1)]
 
 
 @cache
@@ -125,6 +125,6 @@ def test_what_the_worlds_hold_is_found(method):
 def test_clutter_alone_confirms_nothing_for_long():
     trace = go("joint", 6, "nothing but clutter")
     removed = trace.info.extra["pruning"].removed.sum()
-    assert removed > 50  # it comes and goes …
+    assert removed > 20  # it comes and goes …
     confirmed = np.asarray(trace.final.life.confirmed) & np.asarray(trace.final.alive)
     assert confirmed.sum() <= 2  # … and little of it is believed

@@ -67,12 +67,5 @@ def close(a, b, tolerance=1e-8):
     np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.abs(b).max())
 
 
-def narrow(tree):
-    """The same in float32."""
-    return jax.tree.map(
-        lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, tree
-    )
-
-
 def dtypes(tree):
     return {str(leaf.dtype) for leaf in jax.tree.leaves(tree)}

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import draw, ring
+from worlds import draw, nameless, ring
 
 from jaxslam import association, charts, linearize, motion, run, sensors, simulate
 from jaxslam.filters import ekf_slam, mapping
@@ -31,7 +31,7 @@ def on_poses(filter, truth, log):
     return jax.device_get(run(filter, log._replace(control=truth.pose), *start))
 
 
-@pytest.mark.parametrize("options", [{}, {"gate": 4.0}, {"births": 1}])
+@pytest.mark.parametrize("options", [{}, {"gate": 4.0, "births": 1}])
 def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     scenario, truth, log = world()
     capacity = 8
@@ -94,12 +94,10 @@ def test_a_prior_for_slam():
 
 def test_without_tags():
     scenario, truth, log = world()
-    gates = chi2_quantile(0.999, 2), chi2_quantile(0.99999, 2)
-    nameless = log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
-    for method in (association.nearest(*gates), association.joint(0.999, gates[1])):
-        trace = on_poses(mapping(scenario.sensor, 8, associate=method), truth, nameless)
-        assert (trace.final.alive).sum() == 6
-        np.testing.assert_array_equal(trace.info.slot, log.scan.tag)
+    method = association.joint(0.999, chi2_quantile(0.99999, 2))
+    trace = on_poses(mapping(scenario.sensor, 8, associate=method), truth, nameless(log))
+    assert (trace.final.alive).sum() == 6
+    np.testing.assert_array_equal(trace.info.slot, log.scan.tag)
 
 
 def test_a_full_map_refuses():

@@ -1,7 +1,7 @@
 """Several robots in one map: against a plain reference, alone, unknown to each other, in campaigns."""
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 
 import chex
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference.team import Team
-from worlds import draw, judged, nees, ring
+from worlds import draw, judged, narrow, nees, ring
 
 import jaxslam
 from jaxslam import charts, filters, motion, sensors, team
@@ -258,8 +258,8 @@ RUNS = 100
 
 
 @cache
-def hundred(first):
-    """Truths of two robots and logs of 100 runs; robot 1 sees landmarks from step `first` on."""
+def hundred(report, first):
+    """Truth of one of two robots and logs of 100 runs; robot 1 sees landmarks from a step on."""
     eyes = sensors.range_bearing(R1, mount=MOUNT)
     sight = between_ranges(0.0, 3.2)
     other = Part(eyes, 1, every=2, sees="robots")
@@ -267,23 +267,16 @@ def hundred(first):
         team.Robot(motion.increment(Q), suite(Part(eyes, 6, start=start, visible=sight), other), at)
         for start, at in ((0, None), (first, STARTS[1]))
     ]
-    reports = [world(robots, 30, report=b) for b in range(2)]
-
-    @jax.jit
-    @jax.vmap
-    def draws(key):
-        truths, logs = zip(*(simulate(scenario, key) for scenario in reports), strict=True)
-        return truths, logs[0]
-
-    return robots, reports, *jax.device_get(draws(jax.random.split(jax.random.key(2), RUNS)))
+    scenario = world(robots, 30, report=report)
+    keys = jax.random.split(jax.random.key(2), RUNS)
+    return robots, scenario, *jax.device_get(jax.jit(jax.vmap(partial(simulate, scenario)))(keys))
 
 
 @cache
-def many(name):
-    """One program of a filter for 100 logs; `probe` has the estimates of both robots."""
-    robots, (scenario, _), *_ = hundred(0)
-    start = robots if name == "known" else unknown(robots)
-    report = [team_slam(start, 8, report=b, update="joint") for b in range(2)]
+def many():
+    """One program of a filter for 100 logs, both robots unknown; `probe` has the estimates of both."""
+    robots, scenario, *_ = hundred(0, 0)
+    report = [team_slam(unknown(robots), 8, report=b, update="joint") for b in range(2)]
 
     def go(log):
         return jaxslam.run(
@@ -298,22 +291,21 @@ def many(name):
     return jax.jit(jax.vmap(go))
 
 
-@pytest.mark.parametrize("name", ["known", "unknown"])
 @pytest.mark.parametrize(("report", "first"), [(0, 0), (1, 10)])
-def test_every_robot_is_honest(report, first, name):
-    """The pose NEES of each of two robots over 100 runs, started from known and unknown places.
+def test_every_robot_is_honest(report, first):
+    """The pose NEES of each of two robots over 100 runs, started from unknown places.
 
     In the second world robot 1 sees landmarks only later, so that it enters by mutual sight.
     """
-    *_, truths, logs = hundred(first)
-    trace = many(name)(logs)
-    found = judged(truths[report], trace.probe[report], trace.info)
+    *_, truth, logs = hundred(report, first)
+    trace = many()(logs)
+    found = judged(truth, trace.probe[report], trace.info)
     assert found["error_position"][0] < 0.15
     assert not (np.asarray(trace.info.status) == Status.UNMATCHED).any()
     for measure, dof in (("nees_pose", 3.0), ("nees_landmarks", 2.0)):
         mean, low, high = found[measure]
         assert low < dof < high, (measure, mean)
-        assert nees_at_worst(truths[report], trace.probe[report]) < 50
+        assert nees_at_worst(truth, trace.probe[report]) < 50
 
 
 def nees_at_worst(truth, estimate):
@@ -324,7 +316,7 @@ def nees_at_worst(truth, estimate):
 
 def test_a_team_in_a_campaign():
     """With the cheapest of filters: campaigns draw, bound and score worlds of teams."""
-    scenario = hundred(10)[1][1]
+    scenario = hundred(1, 10)[1]
     still = filters.dead_reckoning(scenario.motion, scenario.sensor)
     campaign = jaxslam.monte_carlo(scenario, {"still": still}, 2, jax.random.key(2))
     assert campaign.filters["still"].counts["runs"] == 2
@@ -332,7 +324,7 @@ def test_a_team_in_a_campaign():
 
 def test_a_world_is_the_same_whatever_is_reported():
     robots = crew(3)
-    scenarios = [world(robots, 5, report=b) for b in range(3)]
+    scenarios = [world(robots, 5, report=b) for b in (0, 2)]
 
     @jax.jit
     def all_of_them(key):
@@ -340,14 +332,21 @@ def test_a_world_is_the_same_whatever_is_reported():
         return truths, logs, team_world.histories(scenarios[0], robots, key)
 
     truths, logs, (starts, paths, _) = all_of_them(jax.random.key(0))
-    for log in logs[1:]:
-        jax.tree.map(np.testing.assert_array_equal, log, logs[0])
-    for b, truth in enumerate(truths):
+    chex.assert_trees_all_equal(*logs)
+    for b, truth in zip((0, 2), truths, strict=True):
         np.testing.assert_array_equal(truth.pose, paths[b])
         np.testing.assert_array_equal(truth.start, starts[b])
 
 
-def test_gradients_are_finite():
+def driven_by(theta, log):
+    """A run of two robots, one from an unknown place, by all parameters of their models."""
+    eyes = sensors.range_bearing(jnp.diag(theta[:2]) ** 2, mount=theta[2:5])
+    robot = team.Robot(motion.increment(jnp.diag(theta[5:7]) ** 2), suite((eyes, 4)))
+    filter = team_slam([robot, robot], 8, update="joint")
+    return jaxslam.run(filter, log, np.zeros(3), NOTHING, jax.random.key(0))
+
+
+def test_gradients_are_finite_and_float32_is_near():
     """Through births, corrections and the way in by two landmarks."""
     eyes = sensors.range_bearing(R1, mount=MOUNT)
     sight = suite(Part(eyes, 4, visible=between_ranges(0.0, 3.2)))
@@ -355,24 +354,18 @@ def test_gradients_are_finite():
     _, log = draw(scenario, 0)
 
     def loss(theta):
-        eyes = sensors.range_bearing(jnp.diag(theta[:2]) ** 2, mount=theta[2:5])
-        robot = team.Robot(motion.increment(jnp.diag(theta[5:7]) ** 2), suite((eyes, 4)))
-        robots = [robot, robot]
-        trace = jaxslam.run(team_slam(robots, 8), log, scenario.pose, NOTHING, jax.random.key(0))
-        return trace.info.log_likelihood.sum()
+        trace = driven_by(theta, log)
+        return trace.info.log_likelihood.sum(), trace
 
-    slope = jax.jit(jax.grad(loss))(jnp.array([0.05, 0.02, 0.1, 0.0, 0.3, 0.01, 0.01]))
+    theta = np.array([0.05, 0.02, 0.1, 0.0, 0.3, 0.01, 0.01])
+    slope, double = jax.device_get(jax.jit(jax.grad(loss, has_aux=True))(theta))
     assert np.isfinite(slope).all()
-    assert (np.asarray(slope) != 0).all()
-
-
-def test_float32():
-    *_, logs = hundred(0)
-    single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, logs)
-    a, b = (jax.device_get(many("unknown")(each)) for each in (logs, single))
-    assert b.final.cov.dtype == jnp.float32
-    np.testing.assert_allclose(a.estimate.pose, b.estimate.pose, atol=2e-4)
-    np.testing.assert_array_equal(a.info.status, b.info.status)
+    assert (slope != 0).all()
+    found = jax.device_get(jax.jit(driven_by)(*narrow((theta, log))))
+    assert found.final.cov.dtype == jnp.float32
+    np.testing.assert_allclose(found.estimate.pose, double.estimate.pose, atol=2e-4)
+    np.testing.assert_array_equal(found.info.status, double.info.status)
+    assert (double.info.status == Status.BORN).sum() > 2
 
 
 def compass_only():

@@ -1,7 +1,7 @@
 """FastSLAM: against plain NumPy, against the EKF where that is right, and at its limits."""
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 
 import chex
 import jax
@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import association, life, monte_carlo, motion, programs, resampling, sensors
+from jaxslam import association, life, motion, programs, resampling, sensors
+from jaxslam.consistency.score import _counted
 from jaxslam.filters import fastslam
 from jaxslam.filters.particles.states import moments
 from jaxslam.filters.particles.states.slam_state import SlamParticles
@@ -22,28 +23,41 @@ MOUNT = np.array([0.1, -0.05, 0.3])  # of worlds.ring
 R = np.diag([0.05, 0.02]) ** 2
 
 
-def of(world, count, capacity=6, **options):
+STEPS, COUNT = 6, 2000
+"""of the runs, which share a program for each proposal"""
+RING = worlds.ring(100)
+RING = dataclasses.replace(
+    RING, controls=RING.controls[:STEPS], pose_cov=np.diag([0.05, 0.05, 0.02]) ** 2
+)
+STILL = dataclasses.replace(
+    RING, motion=motion.increment(np.zeros((2, 2))), pose_cov=np.zeros((3, 3))
+)
+"""with a robot that moves exactly as told"""
+
+
+def of(world=RING, count=COUNT, capacity=6, **options):
     return fastslam(world.motion, world.sensor, capacity, count, **options)
 
 
-def drive(world, filter, seed=1, probe=None):
-    truth, log = worlds.draw(world, seed)
-    trace = run(filter, log, world.pose, world.pose_cov, KEY, probe=probe)
-    return jax.device_get(trace), truth, log
+def drive(filter, log, world=RING, key=KEY):
+    return run(filter, log, world.pose, world.pose_cov, key)
 
 
-def still(steps=4):
-    """The ring with a robot that moves exactly as told."""
-    return dataclasses.replace(worlds.ring(steps), motion=motion.increment(np.zeros((2, 2))))
-
-
-STEPS, COUNT = 30, 12
-"""Of the runs that share a program."""
+@cache
+def driven(world="ring", proposal="measurement", **options):
+    """Of one world, trace, truth and log."""
+    world = {"ring": RING, "still": STILL}[world]
+    truth, log = worlds.draw(world)
+    filter = of(world, proposal=proposal, **options)
+    return jax.device_get(drive(filter, log, world)), truth, log
 
 
 def updated(filter, state, scan):
     """One update, by a program that filters of one structure share."""
     return jax.device_get(programs.call(filter.update, (), state, scan, KEY))
+
+
+PROPOSALS = pytest.mark.parametrize("proposal", ["motion", "measurement"])
 
 
 # --- against plain NumPy ------------------------------------------------------------------------
@@ -79,19 +93,19 @@ def mapped_by_hand(poses, log):
     return maps, log_likelihood
 
 
-@pytest.mark.parametrize("proposal", ["motion", "measurement"])
-def test_one_particle_without_process_noise_maps_from_the_known_path(proposal):
-    world = still(40)
-    trace, truth, log = drive(world, of(world, 1, proposal=proposal))
+@PROPOSALS
+def test_particles_without_process_noise_map_from_the_known_path(proposal):
+    """All are as one."""
+    trace, truth, log = driven("still", proposal)
     np.testing.assert_allclose(trace.estimate.pose, truth.pose, atol=1e-12)
     maps, log_likelihood = mapped_by_hand(np.asarray(truth.pose), log)
     assert len(maps) == 6
-    for slot, tag in enumerate(np.asarray(trace.final.tag[0])):
-        np.testing.assert_allclose(trace.final.landmarks[0, slot], maps[tag][0], atol=1e-9)
+    for slot, tag in enumerate(trace.final.tag[0]):
+        for each in (trace.final.landmarks[0, slot], trace.estimate.points[-1, slot]):
+            np.testing.assert_allclose(each, maps[tag][0], atol=1e-9)
         np.testing.assert_allclose(trace.final.covs[0, slot], maps[tag][1], atol=1e-9)
-        np.testing.assert_allclose(trace.estimate.points[-1, slot], maps[tag][0], atol=1e-9)
     np.testing.assert_allclose(trace.info.log_likelihood.sum(), log_likelihood, atol=1e-8)
-    assert np.all(np.asarray(trace.estimate.pose_cov) == 0)
+    np.testing.assert_allclose(trace.estimate.pose_cov, 0, atol=1e-24)
     assert not np.any(trace.info.extra["particles"].resampled)
 
 
@@ -159,7 +173,7 @@ def test_the_map_is_a_mixture_by_slot_where_tags_agree():
     state.alive[other[1], 0], state.tag[other[1], 0] = False, -1
     state.tag[:, 1] = -1  # unknown: the most likely particle's own
     state.alive[best, 2], state.tag[best, 2] = False, -1
-    out = jax.jit(partial(moments.slam_estimate, sensor=worlds.ring(1).sensor))(state)
+    out = jax.jit(partial(moments.slam_estimate, sensor=RING.sensor))(state)
     keep = np.array([p not in other[:2] for p in range(7)])
     w = np.exp(state.log_weight) * keep
     w = w / w.sum()
@@ -188,37 +202,30 @@ def test_headings_that_cancel_have_no_mean_and_no_nan():
 # --- against the EKF, on worlds where linearization does no harm ---------------------------------
 
 
-@pytest.mark.parametrize("proposal", ["motion", "measurement"])
+@PROPOSALS
 def test_many_particles_are_the_posterior_of_the_ekf(proposal):
-    """Mean within 5 standard errors, covariance within 15 %, and the evidence of the log."""
-    world = dataclasses.replace(worlds.ring(100), pose_cov=np.diag([0.05, 0.05, 0.02]) ** 2)
-    world = dataclasses.replace(world, controls=world.controls[:6])
-    filter = of(world, 4000, proposal=proposal)
-    ours, _, log = drive(world, filter)
-    theirs = run(worlds.ekf(world), log, world.pose, world.pose_cov, KEY)
-    mean, cov = np.asarray(theirs.estimate.pose[-1]), np.asarray(theirs.estimate.pose_cov[-1])
-    error = np.asarray(ours.estimate.pose[-1]) - mean
-    assert np.all(np.abs(error) < 5 * np.sqrt(cov.diagonal() / 1000))  # ESS may be a quarter of P
-    np.testing.assert_allclose(
-        np.asarray(ours.estimate.pose_cov[-1]).diagonal(), cov.diagonal(), rtol=0.15
-    )
-    points = np.asarray(ours.estimate.points[-1] - theirs.estimate.points[-1])
-    spread = np.sqrt(np.einsum("nii->ni", np.asarray(theirs.estimate.point_covs[-1])))
-    assert np.all(np.abs(points) < 0.2 * spread)
-    np.testing.assert_allclose(
-        np.einsum("nii->ni", np.asarray(ours.estimate.point_covs[-1])), spread**2, rtol=0.2
-    )
+    """Mean within 5 standard errors, covariance within a quarter, and the evidence of the log."""
+    ours, _, log = driven(proposal=proposal)
+    theirs = jax.device_get(drive(worlds.ekf(RING), log))
+    mean, cov = theirs.estimate.pose[-1], theirs.estimate.pose_cov[-1]
+    error = ours.estimate.pose[-1] - mean
+    assert np.all(np.abs(error) < 5 * np.sqrt(cov.diagonal() / 500))  # ESS may be a quarter of P
+    np.testing.assert_allclose(ours.estimate.pose_cov[-1].diagonal(), cov.diagonal(), rtol=0.25)
+    points = ours.estimate.points[-1] - theirs.estimate.points[-1]
+    variance = np.einsum("nii->ni", theirs.estimate.point_covs[-1])
+    assert np.all(np.abs(points) < 0.2 * np.sqrt(variance))
+    of_points = np.einsum("nii->ni", ours.estimate.point_covs[-1])
+    np.testing.assert_allclose(of_points, variance, rtol=0.25)
     np.testing.assert_allclose(
         ours.info.log_likelihood.sum(), theirs.info.log_likelihood.sum(), atol=0.3
     )
-    assert np.all(np.asarray(ours.final.pose_cov) == 0)
-    np.testing.assert_allclose(np.exp(np.asarray(ours.final.log_weight)).sum(), 1.0, rtol=1e-12)
+    assert np.all(ours.final.pose_cov == 0)
+    np.testing.assert_allclose(np.exp(ours.final.log_weight).sum(), 1.0, rtol=1e-12)
 
 
 def test_the_start_is_reported_before_anything_is_drawn():
-    world = worlds.ring(2)
     cov = np.diag([0.1, 0.2, 0.3])
-    filter = of(world, 5)
+    filter = of(count=5)
     out = jax.jit(lambda *start: filter.estimate(filter.init(*start)))(np.array([1.0, 2, 3]), cov)
     np.testing.assert_allclose(out.pose, [1, 2, 3], atol=1e-12)
     np.testing.assert_allclose(out.pose_cov, cov, atol=1e-12)
@@ -228,17 +235,9 @@ def test_the_start_is_reported_before_anything_is_drawn():
 # --- association of each particle ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "method",
-    [association.maximum_likelihood(16.0), association.joint(0.9999)],
-    ids=["maximum_likelihood", "joint"],
-)
-def test_unknown_identities_of_landmarks_far_apart_give_the_same_filter(method):
-    world = worlds.ring(STEPS)
-    known, _, log = drive(world, of(world, COUNT))
-    blind = log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
-    filter = of(world, COUNT, associate=method)
-    unknown = jax.device_get(run(filter, blind, world.pose, world.pose_cov, KEY))
+def test_unknown_identities_of_landmarks_far_apart_give_the_same_filter():
+    known, _, log = driven()
+    unknown = jax.device_get(drive(of(associate=association.joint(0.9999)), worlds.nameless(log)))
     assert np.all(unknown.estimate.alive.sum(axis=1)[-1] == 6)
     np.testing.assert_allclose(unknown.estimate.pose, known.estimate.pose, atol=1e-9)
     np.testing.assert_allclose(unknown.final.landmarks, known.final.landmarks, atol=1e-9)
@@ -249,7 +248,7 @@ def test_unknown_identities_of_landmarks_far_apart_give_the_same_filter(method):
 # --- what a scan may do -------------------------------------------------------------------------
 
 
-def scan_of(rows, places=2):
+def scan_of(rows, places=4):
     """A scan of (tag, range, bearing) rows, padded."""
     z, tag = np.zeros((places, 2)), np.full(places, -1, np.int32)
     for i, (name, *value) in enumerate(rows):
@@ -275,64 +274,48 @@ def known_map(tags):
 
 
 def test_particles_of_different_maps_with_full_tables_lose_what_they_must_and_count_it():
-    world = worlds.ring(1)
-    filter = of(world, 3, capacity=2, threshold=0.0)
-    state = known_map([[0, 1], [0, -1], [5, 6]])
-    state, info = updated(filter, state, scan_of([(1, 2.0, -0.4), (7, 3.0, 0.5)]))
-    np.testing.assert_array_equal(state.lost, [1, 1, 2])
-    np.testing.assert_array_equal(state.tag, [[0, 1], [0, 1], [5, 6]])
+    maps = [[0, 1, 2, 3], [0, 2, 3, -1], [5, 6, 8, 9], [5, 6, 8, 9]]
+    scan = scan_of([(1, 2.0, -0.4), (7, 3.0, 0.5)])
+    state, info = updated(of(count=4, capacity=4, threshold=1e-9), known_map(maps), scan)
+    np.testing.assert_array_equal(state.lost, [1, 1, 2, 2])
+    np.testing.assert_array_equal(state.tag, [maps[0], [0, 2, 3, 1], *maps[2:]])
     assert np.all(state.alive)
-    assert np.isfinite(np.asarray(state.log_weight)).all()
+    assert np.isfinite(state.log_weight).all()
     assert not info.extra["particles"].resampled
-    best = int(state.best)
-    wanted = [
-        [Status.FUSED, Status.OVERFLOW],
-        [Status.BORN, Status.OVERFLOW],
-        [Status.OVERFLOW] * 2,
-    ]
-    np.testing.assert_array_equal(info.status, wanted[best])
+    wanted = [[Status.FUSED, Status.OVERFLOW], [Status.BORN, Status.OVERFLOW]]
+    wanted += [[Status.OVERFLOW] * 2] * 2
+    np.testing.assert_array_equal(info.status[:2], wanted[int(state.best)])
     assert info.overflow
 
 
 def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
     """A measurement so far off that no particle gives it a density above zero."""
-    world = worlds.ring(1)
-    filter = of(world, 3, capacity=2)
-    start = known_map([[0, 1]] * 3)
+    filter, start = of(count=4, capacity=4, threshold=0.5), known_map([[0, 1, -1, -1]] * 4)
     after, info = updated(filter, start, scan_of([(0, 1e200, 0.0)]))
     assert info.extra["particles"].underflow
     assert not info.extra["particles"].resampled
-    np.testing.assert_array_equal(info.status, [Status.REJECTED, Status.EMPTY])
-    np.testing.assert_allclose(np.exp(after.log_weight), 1 / 3)
+    np.testing.assert_array_equal(info.status, [Status.REJECTED] + [Status.EMPTY] * 3)
+    np.testing.assert_allclose(np.exp(after.log_weight), 1 / 4)
     np.testing.assert_array_equal(after.landmarks, start.landmarks)
-    assert np.all(np.abs(np.asarray(after.pose - start.pose)) < 1.0)  # drawn, and no more
+    assert np.all(np.abs(after.pose - start.pose) < 1.0)  # drawn, and no more
     assert info.log_likelihood == 0.0
-    out = jax.jit(filter.estimate)(after)
-    chex.assert_tree_all_finite((info, out))
+    chex.assert_tree_all_finite((info, jax.jit(filter.estimate)(after)))
     _, info = updated(filter, start, scan_of([(0, 0.9, -0.4)]))
     assert not info.extra["particles"].underflow
 
 
-def strict():
-    """With a gate and a quota of births; one program for both."""
-    world = worlds.ring(1)
-    return of(world, 4, capacity=3, gate=16.0, births=1)
-
-
-def test_a_gate_drops_an_outlier_and_says_so():
-    after, info = updated(strict(), known_map([[0, 1, -1]] * 4), scan_of([(0, 3.0, 0.0)], 4))
+def test_a_gate_drops_an_outlier_and_births_have_a_quota_and_a_tag_is_born_once():
+    strict, start = of(count=4, capacity=4, gate=16.0, births=1), known_map([[0, 1, -1, -1]] * 4)
+    after, info = updated(strict, start, scan_of([(0, 3.0, 0.0)]))
     np.testing.assert_array_equal(info.status, [Status.REJECTED] + [Status.EMPTY] * 3)
     assert info.nis[0] > 16
     assert info.dof[0] == 0
     np.testing.assert_array_equal(after.landmarks[:, 0], np.tile([1.0, 0.0], (4, 1)))
-
-
-def test_births_have_a_quota_and_a_tag_is_born_once():
     rows = [(3, 1.0, 0.0), (3, 1.0, 0.1), (4, 2.0, 0.0)]
-    after, info = updated(strict(), known_map([[0, -1, -1]] * 4), scan_of(rows, 4))
+    after, info = updated(strict, start, scan_of(rows))
     wanted = [Status.BORN, Status.REPEATED, Status.DEFERRED, Status.EMPTY]
     np.testing.assert_array_equal(info.status, wanted)
-    np.testing.assert_array_equal(after.tag, [[0, 3, -1]] * 4)
+    np.testing.assert_array_equal(after.tag, [[0, 1, 3, -1]] * 4)
 
 
 def test_negative_evidence_removes_a_landmark_from_every_map():
@@ -342,7 +325,7 @@ def test_negative_evidence_removes_a_landmark_from_every_map():
     gone = (log.scan.tag == 5) & (np.arange(6) > 0)[:, None]
     log = log._replace(scan=log.scan._replace(valid=log.scan.valid & ~gone))
     filter = of(world, 8, life=life.existence(lambda pose, landmark: jnp.asarray(True)))
-    trace = jax.device_get(run(filter, log, world.pose, world.pose_cov, KEY))
+    trace = jax.device_get(drive(filter, log, world))
     assert trace.final.life.log_odds.shape == (8, 6)
     np.testing.assert_array_equal(np.sort(trace.final.tag), [[-1, 0, 1, 2, 3, 4]] * 8)
     # log(0.1/0.9) a miss: at the second the odds fall below 0.05/0.95
@@ -359,27 +342,25 @@ def test_negative_evidence_removes_a_landmark_from_every_map():
 # --- resampling within the filter ----------------------------------------------------------------
 
 
-def test_it_resamples_where_the_threshold_says():
-    world = worlds.ring(STEPS)
+def test_it_resamples_where_the_threshold_says_and_it_is_counted():
     # ESS is at least 1, so this is never; 0 itself would be another program.
-    never, _, _ = drive(world, of(world, COUNT, threshold=1e-9))
-    often, _, _ = drive(world, of(world, COUNT, threshold=0.5))
-    assert not np.any(never.info.extra["particles"].resampled)
-    ess = np.asarray(often.info.extra["particles"].ess)
-    np.testing.assert_array_equal(often.info.extra["particles"].resampled, ess < COUNT / 2)
-    assert 0 < np.sum(ess < COUNT / 2) < STEPS
-    assert np.all((ess > 1 - 1e-9) & (ess < COUNT + 1e-9))
-    assert never.info.extra["particles"].ess[-1] < often.info.extra["particles"].ess[-1]
-    assert np.ptp(often.final.log_weight) == 0 or not often.info.extra["particles"].resampled[-1]
+    never, often = (driven(proposal="motion", threshold=t)[0] for t in (1e-9, 0.5))
+    told, of_never = often.info.extra["particles"], never.info.extra["particles"]
+    assert not np.any(of_never.resampled)
+    np.testing.assert_array_equal(told.resampled, told.ess < COUNT / 2)
+    assert 0 < np.sum(told.resampled) < STEPS
+    assert np.all((told.ess > 1 - 1e-9) & (told.ess < COUNT + 1e-9))
+    assert of_never.ess[-1] < told.ess[-1]
+    assert np.ptp(often.final.log_weight) == 0 or not told.resampled[-1]
+    counts = _counted(jax.tree.map(lambda leaf: leaf[None], often.info))  # of one run
+    assert (counts["resampled"], counts["underflow"]) == (told.resampled.sum(), 0)
 
 
 @jax.jit
 def resampled_by(number, state, scan):
     """An update with the method of that number: one program for all."""
     methods = [resampling.REGISTRY[name] for name in sorted(resampling.REGISTRY)]
-    filter = of(
-        worlds.ring(1), 3, capacity=2, resample=lambda *a: jax.lax.switch(number, methods, *a)
-    )
+    filter = of(count=3, capacity=2, resample=lambda *a: jax.lax.switch(number, methods, *a))
     return filter.update(state, scan, KEY)
 
 
@@ -403,70 +384,59 @@ def test_any_method_resamples_whole_particles(name):
 
 
 def test_a_batch_is_a_loop_and_keys_matter():
-    world = worlds.ring(STEPS)
-    filter = of(world, COUNT)
-    logs = [worlds.draw(world, seed)[1] for seed in range(2)]
-    # Five scans: over more of them what rounding does grows beyond the tolerance.
-    few = np.arange(STEPS)[:, None] < 5
-    logs = [log._replace(scan=log.scan._replace(valid=log.scan.valid & few)) for log in logs]
+    logs = [worlds.draw(RING, seed)[1] for seed in range(2)]
     keys = list(jax.random.split(jax.random.key(3), 2))
-
-    def go(log, key):
-        return run(filter, log, world.pose, world.pose_cov, key)
-
-    both = jax.jit(jax.vmap(go))(
+    filter = of()
+    both = jax.jit(jax.vmap(lambda log, key: drive(filter, log, key=key)))(
         *(jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (logs, keys))
     )
-    alone = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(list(map(go, logs, keys))))
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-11), both, alone)
-    other = jax.device_get(go(logs[0], keys[1]))
-    assert np.all(alone.final.pose[0] != other.final.pose)
+    alone = [jax.device_get(drive(filter, logs[i], key=keys[i])) for i in range(2)]
+    for i in range(2):
+        mine = jax.tree.map(lambda leaf, i=i: leaf[i], both)
+        chex.assert_trees_all_close(mine, alone[i], rtol=1e-9, atol=1e-11)
+    other = jax.device_get(drive(filter, logs[0], key=keys[1]))
+    assert np.all(alone[0].final.pose != other.final.pose)
 
 
-@pytest.mark.parametrize("proposal", ["motion", "measurement"])
+@PROPOSALS
 def test_float32_stays_float32_and_near(proposal):
-    world = still(40)
-    # Without process noise particles are alike, so one says what three do.
-    double, _, log = drive(world, of(world, 1, proposal=proposal))
-    filter = of(world, 3, proposal=proposal)
-    single = jax.tree.map(lambda x: x.astype("f4") if x.dtype == float else x, log)
-    trace = jax.device_get(run(filter, single, world.pose, world.pose_cov, KEY))
-    for leaf in jax.tree.leaves((trace.estimate, trace.info, trace.final)):
+    double, _, log = driven("still")
+    single = worlds.narrow(log)
+    filter = of(STILL, proposal=proposal)
+    go = partial(drive, filter, world=STILL)
+    for leaf in jax.tree.leaves(jax.eval_shape(go, single)):
         assert leaf.dtype != np.float64
-        chex.assert_tree_all_finite(leaf)
-    np.testing.assert_allclose(trace.estimate.points, double.estimate.points, atol=2e-4)
+    if proposal == "measurement":  # with a proposal that weighs nothing they are the same
+        trace = jax.device_get(go(single))
+        chex.assert_tree_all_finite(trace)
+        np.testing.assert_allclose(trace.estimate.points, double.estimate.points, atol=2e-4)
 
 
-@pytest.mark.parametrize("proposal", ["motion", "measurement"])
-def test_gradients_are_finite_from_a_start_that_is_known_exactly(proposal):
-    """By both noises, through predictions, resampling and births, P0 = 0."""
-    world = worlds.ring(4)
-    _, log = worlds.draw(world)
+@PROPOSALS
+def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
+    """By both noises, in reverse through a motion, corrections, a birth and resampling, P0 = 0."""
+    start = known_map([[0, 1, -1, -1]] * 4)._replace(
+        pose_cov=np.zeros((4, 3, 3)), log_weight=np.log([0.7, 0.1, 0.1, 0.1])
+    )
+    start = jax.tree.map(jnp.asarray, start)
+    scan = scan_of([(0, 1.1, -0.35), (1, 2.05, -0.42), (7, 3.0, 0.5)])
+    method = resampling.stop_gradient() if proposal == "motion" else resampling.systematic
 
     def cost(sigma):
-        ours = dataclasses.replace(
-            world,
-            motion=motion.increment(jnp.diag(sigma[:2]) ** 2),
-            sensor=sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
-        )
-        method = resampling.stop_gradient() if proposal == "motion" else resampling.systematic
-        filter = of(ours, 4, proposal=proposal, resample=method)
-        trace = run(filter, log, world.pose, world.pose_cov, KEY)
-        return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()
+        models = {
+            "motion": motion.increment(jnp.diag(sigma[:2]) ** 2),
+            "sensor": sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2), mount=MOUNT),
+        }
+        world = dataclasses.replace(RING, **models)
+        filter = of(world, 4, capacity=4, proposal=proposal, resample=method, threshold=1.0)
+        state, info = filter.update(filter.predict(start, jnp.array([0.1, 0.05]), KEY), scan, KEY)
+        return info.log_likelihood + filter.estimate(state).pose_cov.sum(), info
 
-    slope = jax.jit(jax.grad(cost))(np.array([0.01, 0.04, 0.05]))
+    slope, info = jax.jit(jax.grad(cost, has_aux=True))(np.array([0.01, 0.04, 0.05]))
     assert np.isfinite(slope).all()
     assert np.all(slope != 0)
-
-
-def test_a_campaign_counts_resamplings():
-    world = worlds.ring(8)
-    fast = {"fast": of(world, 5, proposal="motion")}
-    campaign = monte_carlo(world, fast, 2, KEY, workers=1)
-    counts = campaign.filters["fast"].counts
-    assert counts["runs"] == 2
-    assert counts["resampled"] > 0
-    assert counts["underflow"] == 0
+    assert info.extra["particles"].resampled
+    np.testing.assert_array_equal(info.status[:3], [Status.FUSED] * 2 + [Status.BORN])
 
 
 @pytest.mark.parametrize(
@@ -490,7 +460,6 @@ def test_a_campaign_counts_resamplings():
     ],
 )
 def test_bad_input_is_refused(change, why):
-    world = worlds.ring(1)
-    arguments = {"motion": world.motion, "sensor": world.sensor, "capacity": 6, "particles": 5}
+    arguments = {"motion": RING.motion, "sensor": RING.sensor, "capacity": 6, "particles": 5}
     with pytest.raises(ValueError, match=why):
         fastslam(**(arguments | change))

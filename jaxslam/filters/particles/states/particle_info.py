@@ -22,6 +22,10 @@ class ParticleInfo(NamedTuple):
     active: Int[Array, "*T"] | None = None
     """particles in use, of a filter that chooses their number"""
     injected: Int[Array, "*T"] | None = None
-    """particles drawn from the whole box before this step's motion, to find a lost robot"""
+    """particles drawn from wherever the robot may be before this step's motion, to find a lost
+    one"""
     capped: Bool[Array, "*T"] | None = None
     """the wanted number of particles was above the capacity"""
+    blocked: Int[Array, "*T"] | None = None
+    """particles in use that are off the map or in an occupied cell, of a filter in a grid; they
+    have weight zero"""

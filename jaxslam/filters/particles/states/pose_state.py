@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.filters.particles.settings import MonteCarloSettings
 from jaxslam.filters.particles.states.moments import weighted_pose_moments
 from jaxslam.filters.particles.states.slam_state import draw_pose
-from jaxslam.math.angles import wrap
+from jaxslam.math.xla import change_where
 
 
 class ParticleEvents(NamedTuple):
@@ -19,7 +19,7 @@ class ParticleEvents(NamedTuple):
 
     resampled: Bool[Array, ""]
     injected: Int[Array, ""]
-    """drawn from the box"""
+    """drawn from the whole region"""
     invalid: Int[Array, ""]
     """with a non-finite pose after the motion"""
     capped: Bool[Array, ""]
@@ -47,7 +47,7 @@ class PoseParticles(NamedTuple):
     due: Bool[Array, ""]
     """to be resampled before the next motion"""
     injection: Float[Array, ""]
-    """the probability of each particle to be drawn from the whole box then"""
+    """the probability of each particle to be drawn from the whole region then"""
     events: ParticleEvents
 
 
@@ -60,10 +60,12 @@ def no_events() -> ParticleEvents:
 def initial_pose_particles(
     pose: Float[Array, "3"], start_cov: Float[Array, "3 3"], settings: MonteCarloSettings
 ) -> PoseParticles:
-    """The initial state: P copies of the pose, to be drawn from N(pose, start_cov) or the box."""
+    """The initial state: P copies of the pose, to be drawn from N(pose, start_cov) or the
+    region."""
     kind, particles = pose.dtype, settings.particles
     if settings.start == "uniform":
-        pose, start_cov = uniform_pose_moments(jnp.asarray(settings.box, kind))
+        assert settings.region is not None
+        pose, start_cov = settings.region.moments(kind)
     zero, no = jnp.zeros((), kind), jnp.asarray(False)
     return PoseParticles(
         pose=jnp.broadcast_to(pose, (particles, 3)),
@@ -82,13 +84,15 @@ def initial_pose_particles(
 
 def draw_start(state: PoseParticles, key: Array, settings: MonteCarloSettings) -> PoseParticles:
     """The state with its initial poses drawn, if not done before."""
-    if settings.start == "uniform":
-        box = jnp.asarray(settings.box, state.pose.dtype)
-        first = draw_uniform_poses(box, settings.particles, key)
-    else:
-        first = draw_gaussian_poses(state.pose, state.start_cov, key)
+
+    def drawn(poses: Float[Array, "P 3"]) -> Float[Array, "P 3"]:
+        if settings.start == "uniform":
+            assert settings.region is not None
+            return settings.region.draw(settings.particles, key, poses.dtype)
+        return draw_gaussian_poses(poses, state.start_cov, key)
+
     return state._replace(
-        pose=jnp.where(state.fresh, first, state.pose),
+        pose=change_where(state.fresh, drawn, state.pose),
         start_cov=jnp.zeros_like(state.start_cov),
         fresh=jnp.asarray(False),
     )
@@ -113,21 +117,3 @@ def draw_gaussian_poses(
     """Poses drawn from N(pose_p, cov); cov may be singular or zero."""
     normals = jax.random.normal(key, pose.shape, pose.dtype)
     return jax.vmap(draw_pose, (0, None, 0))(pose, cov, normals)
-
-
-def draw_uniform_poses(box: Float[Array, "2 2"], count: int, key: Array) -> Float[Array, "P 3"]:
-    """Poses drawn uniformly in a box, rows its lowest and highest (x, y), with any heading."""
-    share = jax.random.uniform(key, (count, 3), box.dtype)
-    low, high = box[0][None], box[1][None]
-    heading = wrap(2 * math.pi * share[:, 2:])
-    return jnp.concatenate([low + (high - low) * share[:, :2], heading], axis=1)
-
-
-def uniform_pose_moments(
-    box: Float[Array, "2 2"],
-) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Mean and covariance of `draw_uniform_poses`; the heading, uniform, gets 0 ± π/√3."""
-    width = box[1] - box[0]
-    mean = jnp.concatenate([0.5 * (box[0] + box[1]), jnp.zeros(1, box.dtype)])
-    variance = jnp.concatenate([width**2, jnp.full(1, 4 * math.pi**2, box.dtype)]) / 12
-    return mean, jnp.diag(variance)

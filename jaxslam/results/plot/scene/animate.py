@@ -17,7 +17,7 @@ from jaxslam.results.plot.scene.render import render
 from jaxslam.results.plot.scene.run_scene import run_scene
 from jaxslam.results.plot.style import PAGE
 from jaxslam.run import run
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, simulate, with_positions
 from jaxslam.types import Log, Trace, Truth
 from jaxslam.validation import check_record
 
@@ -104,4 +104,5 @@ def animate_world(
         trace = run(method, log, scenario.pose, scenario.pose_cov, of_filter, probe=probe)
     else:
         trace = method(log, of_filter)
-    return animate(trace, log, truth, **({"title": scenario.name} | options))
+    shown = with_positions(scenario.sensor, truth)
+    return animate(trace, log, shown, **({"title": scenario.name} | options))

@@ -1,0 +1,1 @@
+"""Laser SLAM of public logs and of a simulated office: see `__main__`."""

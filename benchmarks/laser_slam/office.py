@@ -1,0 +1,93 @@
+"""Is the covariance of laser odometry honest? Runs through a simulated office."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from benchmarks.gate import Metric
+from jaxslam import laser_slam, scenarios
+from jaxslam.laser_slam import ScanLog, Settings, poses
+from jaxslam.simulation.laser import scan_world
+
+EVERY = 4
+"""Scans of the world of which one is used: half a metre, or 45°."""
+SETTINGS = Settings(beams=90, max_range=8.0, key_distance=0.3, loop_gap=15, submap_every=2)
+
+
+def logs(runs: int, beams: int = 90):
+    """Pairs (true poses, log)."""
+    world = scenarios.office(beams=beams)
+    for run in range(runs):
+        history = jax.tree.map(np.asarray, scan_world(world, jax.random.key(run)))
+        speed, turn, interval = history.control.T
+        zero = np.zeros_like(speed)
+        steps = np.stack([speed * interval, zero, turn * interval], axis=1)
+        # The step of a unicycle: along an arc, whose chord is turned by half of the turn.
+        half = 0.5 * steps[:, 2]
+        length = steps[:, 0] * np.sinc(half / np.pi)
+        steps[:, 0], steps[:, 1] = length * np.cos(half), length * np.sin(half)
+        raw = poses.chain(np.asarray(world.pose, float), steps)[1:]
+        kept = np.arange(0, len(raw), EVERY)
+        beams_of = jax.tree.map(lambda part: part[kept], history.beams)
+        time = np.cumsum(interval)[kept]
+        # The robot is where the first scan is: all paths start there.
+        true = history.pose[kept]
+        start = poses.compose(true[0], poses.inverse(raw[kept][0]))
+        yield true, ScanLog(time, beams_of, poses.compose(start, raw[kept]), 8.0)
+
+
+def nees(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    return np.einsum("ki,kij,kj->k", error, np.linalg.inv(cov), error)
+
+
+def steps_of(odometry, true):
+    """NEES of each match relative to its keyframe."""
+    rows = np.flatnonzero(odometry.matched)
+    z = poses.between(true[odometry.base[rows]], true[rows])
+    return nees(poses.between(odometry.z[rows], z), odometry.cov[rows])
+
+
+def path_of(odometry, true):
+    """NEES of the keyframes by the chain of matches."""
+    keys = odometry.keyframe
+    total = poses.along(odometry.poses[keys], odometry.cov[keys[1:]])
+    zero = np.zeros(len(keys) - 1, int)
+    cov = poses.relative_cov(total, odometry.poses[keys], zero, np.arange(1, len(keys)))
+    return nees(poses.between(odometry.poses[keys[1:]], true[keys[1:]]), cov)
+
+
+def measure(runs: int = 10) -> list[Metric]:
+    found: dict[str, list[np.ndarray]] = {}
+    chi2, position = [], {}
+    for true, log in logs(runs):
+        for name, reference in (("scan to scan", 1), ("scan to submap", SETTINGS.reference)):
+            settings = dataclasses.replace(SETTINGS, reference=reference)
+            scans = laser_slam.scans_of(log, settings)
+            steps = laser_slam.steps_of(log.raw, settings)
+            odometry = laser_slam.laser_odometry(scans, steps, settings, log.raw[0])
+            found.setdefault(f"{name}: a match", []).append(steps_of(odometry, true))
+            found.setdefault(f"{name}: the path", []).append(path_of(odometry, true))
+            off = np.hypot(*(odometry.poses - true)[:, :2].T)
+            position.setdefault(name, []).append(np.sqrt((off**2).mean()))
+        solved = laser_slam.solve(log, SETTINGS)
+        # The marginals are of coordinates; the first pose is certain.
+        keys = solved.keyframe[1:]
+        error = solved.poses[keys] - true[keys]
+        error[:, 2] = poses.wrapped(error[:, 2])
+        found.setdefault("graph with loops: the path", []).append(nees(error, solved.cov[keys]))
+        off = np.hypot(*(solved.poses - true)[:, :2].T)
+        position.setdefault("graph with loops", []).append(np.sqrt((off**2).mean()))
+        chi2.append(solved.chi2 / max(solved.dof, 1))
+    print("office, NEES (3 is honest)    mean of runs      median of all    RMSE of position [m]")
+    metrics = []
+    for name, runs_of in found.items():
+        means = np.array([each.mean() for each in runs_of])
+        half = 1.96 * means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else np.nan
+        middle = np.median(np.concatenate(runs_of))
+        where = name.split(":")[0]
+        rmse = f"{np.mean(position[where]):.3f}" if name.endswith("path") else ""
+        print(f"{name:28}  {means.mean():7.2f} ± {half:5.2f}  {middle:12.2f}    {rmse:>12}")
+        metrics.append(Metric(f"office, NEES, {name}", means.mean(), note="3 is honest"))
+    metrics.append(Metric("office, chi2 / degrees of freedom", np.mean(chi2), note="1 is honest"))
+    return metrics

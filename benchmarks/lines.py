@@ -1,0 +1,143 @@
+"""Walls from a laser's scans: segments, and EKF-SLAM with the lines and each one's covariance.
+
+    python -m benchmarks.lines [--runs 100] [--rooms square,office]
+
+In exact rooms (180 beams, σ = 2 cm, 2 % dropouts) every n-th scan is divided into segments; each
+line enters the EKF with the covariance of its own fit. Which wall a line is of is told by the true
+pose (the world's wall ids); lines that are of no wall are counted and left out. NEES of the lines
+against the walls (honest: 2), NEES of the pose (3) and NIS/dof (1) of the EKF.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.gate import Metric, alone
+from jaxslam import features, filters, scenarios, sensors
+from jaxslam.consistency.nees import mean_pose_nees
+from jaxslam.math.stats import t_quantile
+from jaxslam.simulation import laser, walls
+from jaxslam.types import Beams, Scan
+
+PLACES, FAR = 16, (0.4, 0.3)
+"""Measurement slots of a scan; from its wall a line is at most so far, [m] and [rad]."""
+
+
+def lines_of(world, lines, pose, beams: Beams):
+    """z, cov, tag, valid of one scan in PLACES rows; NEES of its lines; how many are of no wall."""
+    found = features.segments(beams, sigma=world.laser.sigma, max_range=world.laser.max_range)
+    x, y, theta = pose
+    normal = np.stack([np.cos(lines[:, 1]), np.sin(lines[:, 1])])
+    true = np.stack([lines[:, 0] - [x, y] @ normal, lines[:, 1] - theta], axis=1)
+    gap = found.line[:, None] - true[None]
+    gap[..., 1] = np.angle(np.exp(1j * gap[..., 1]))
+    tag = (np.abs(gap) / FAR).sum(axis=2).argmin(axis=1)
+    gap = gap[np.arange(len(tag)), tag]
+    mine = (np.abs(gap) < FAR).all(axis=1)
+    # A wall in two pieces is measured once, by the longer one.
+    for k in np.argsort(-found.size):
+        mine[k] &= not (mine & (tag == tag[k]) & (found.size > found.size[k])).any()
+    rows = np.flatnonzero(mine)[:PLACES]
+    z, cov = np.zeros((PLACES, 2)), np.tile(np.eye(2), (PLACES, 1, 1))
+    tags, valid = np.full(PLACES, -1), np.arange(PLACES) < len(rows)
+    z[: len(rows)], cov[: len(rows)], tags[: len(rows)] = (
+        found.line[rows],
+        found.cov[rows],
+        tag[rows],
+    )
+    nees = np.einsum("ki,kij,kj->k", gap[rows], np.linalg.inv(found.cov[rows]), gap[rows])
+    return (z, cov, tags, valid), nees, len(tag) - len(rows)
+
+
+def drive(world, count: int, control, scans) -> Any:
+    """The EKF's poses, covariances, and NIS and dof by step; a filter is made for each line."""
+    key = jax.random.key(0)
+
+    def filter_of(cov):
+        return filters.ekf_slam(world.motion, sensors.line(cov), count)
+
+    def step(state, row):
+        control, lines = row
+        state = filter_of(jnp.eye(2)).predict(state, control, key)
+
+        def one(state, line):
+            z, cov, tag, valid = (part[None] for part in line)
+            state, info = filter_of(cov[0]).update(state, Scan(z, tag, valid), key)
+            return state, (info.nis.sum(), info.dof.sum())
+
+        state, (nis, dof) = jax.lax.scan(one, state, lines)
+        return state, (state.pose, state.cov[:3, :3], nis.sum(), dof.sum())
+
+    start = filter_of(jnp.eye(2)).init(jnp.asarray(world.pose, float), jnp.zeros((3, 3)))
+    return jax.lax.scan(step, start, (control, scans))[1]
+
+
+def judge(name: str, runs: int, every: int) -> tuple[float, float, float]:
+    """NEES of lines, NEES of the pose, NIS/dof; prints them with their intervals."""
+    world = scenarios.ROOMS[name]()
+    lines, _ = walls.wall_lines(world.walls)
+    keys = jax.random.split(jax.random.key(0), runs)
+    logs = jax.device_get(jax.jit(jax.vmap(lambda key: laser.scan_world(world, key)))(keys))
+    nothing = (
+        np.zeros((PLACES, 2)),
+        np.tile(np.eye(2), (PLACES, 1, 1)),
+        np.full(PLACES, -1),
+        np.zeros(PLACES, bool),
+    )
+    steps, nees, none = logs.pose.shape[1], [], 0
+    table = []
+    for run in range(runs):
+        rows = []
+        for t in range(steps):
+            if t % every:
+                rows.append(nothing)
+                continue
+            beams = Beams(*(part[run, t] for part in logs.beams))
+            row, each, spurious = lines_of(world, lines, logs.pose[run, t], beams)
+            rows.append(row)
+            nees.append(each)
+            none += spurious
+        table.append([np.stack(part) for part in zip(*rows, strict=True)])
+    scans = tuple(np.stack(part) for part in zip(*table, strict=True))
+    go = jax.jit(jax.vmap(lambda control, scans: drive(world, len(lines), control, scans)))
+    pose, cov, nis, dof = (np.asarray(part) for part in go(logs.control, scans))
+    measured = slice(every, None)  # P0 = 0 at first
+    of_pose, there = mean_pose_nees(logs.pose[:, measured], pose[:, measured], cov[:, measured])
+    of_pose, of_lines = of_pose[there], np.concatenate(nees)
+    ratio = nis.sum(axis=1) / dof.sum(axis=1)
+    error = np.sqrt(((logs.pose - pose)[:, -1, :2] ** 2).sum(axis=1).mean())
+    print(f"{name}: {runs} runs × {steps} steps, a scan every {every}")
+    shown = {"NEES of a line (2)": of_lines, "pose NEES (3)": of_pose, "NIS/dof (1)": ratio}
+    for what, values in shown.items():
+        half = t_quantile(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
+        print(f"  {what:20}{values.mean():8.3f} ± {half:.3f}  median {np.median(values):.3f}")
+    share = none / (none + len(of_lines))
+    print(f"  {len(of_lines):,} lines, {share:.1%} more of no wall or in pieces, left out")
+    print(f"  final position RMSE {error:.3f} m")
+    return float(np.mean(of_lines)), float(np.mean(of_pose)), float(np.mean(ratio))
+
+
+def measure(runs: int = 100, rooms: str = "square,office") -> list[Metric]:
+    metrics = []
+    for name in rooms.split(","):
+        line, pose, ratio = judge(name, runs, every=4 if name == "square" else 8)
+        metrics += [
+            Metric(f"{name}: NEES of a line", line, low=1.6, high=2.8, note="honest: 2"),
+            Metric(f"{name}: pose NEES", pose, high=6.0, note="honest: 3"),
+            Metric(f"{name}: NIS/dof", ratio, low=0.85, high=1.3, note="honest: 1"),
+        ]
+    return metrics
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    raise SystemExit(
+        alone(
+            "lines",
+            measure,
+            runs={"type": int, "default": 100},
+            rooms={"default": "square,office"},
+        )
+    )

@@ -1,0 +1,28 @@
+"""The record of what a job on a laser log found."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+Files = dict[str, str | Callable[[Path], object]]
+"""By name, a text, or a function that writes the file at a path: as `write_files` takes them."""
+
+
+class Job(NamedTuple):
+    """The result of a job, for the screen and the folder of results."""
+
+    summary: dict[str, Any]
+    """entries of the summary"""
+    files: Files
+    figures: Callable[[tuple[str, ...]], Files]
+    """(formats) -> the figures"""
+
+
+def figure_files(name: str, figure: Any, formats: tuple[str, ...]) -> Files:
+    """What writes a figure in some formats."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    def saved(kind: str) -> Callable[[Path], object]:
+        return lambda path: path.write_bytes(plot.encode(figure, kind))
+
+    return {f"{name}.{kind}": saved(kind) for kind in formats}

@@ -1,0 +1,143 @@
+"""`jaxslam run --map known`: a map from the poses that stand beside the scans."""
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam import grids
+from jaxslam.cli.laser.job import Files, Job, figure_files
+from jaxslam.datasets import LaserLog
+from jaxslam.datasets.formats import ros_map
+from jaxslam.grids import Counts, Grid
+from jaxslam.monte_carlo.progress import Progress
+from jaxslam.results import report
+from jaxslam.types import Beams, Estimate
+
+TOGETHER = 64
+"""Scans between two updates of the progress."""
+
+MARGIN = 1.0
+"""Distance from the outermost hit to the border of the map [m]."""
+
+MOST = 10**8
+"""Largest number of cells of a map."""
+
+
+def run(log: LaserLog, options: argparse.Namespace) -> Job:
+    """The map of the scans at the poses in the file: counts of hits and misses, as log-odds.
+
+    A beam without a return says nothing.
+    """
+    shape, origin = frame_of(log, options.resolution)
+    with Progress(f"{log.name}, map", "scans") as progress:
+        counts = counted(log, shape, origin, options.resolution, progress)
+    grid = jax.device_get(grids.occupancy(counts))
+    zero = np.zeros((len(log.time), 3, 3))
+    path: Any = Estimate(log.corrected, zero, (), (), (), ())  # type: ignore[arg-type]
+
+    def figures(formats: tuple[str, ...]) -> Files:
+        from jaxslam.results import plot  # matplotlib is slow to load
+
+        figure = plot.grid_figure(
+            grid,
+            poses=log.corrected,
+            width=plot.PAGE,
+            title=f"{log.name}: {len(log.time):,} scans at known poses",
+        )
+        return figure_files("map", figure, formats)
+
+    files: Files = {
+        **ros_map.files("map", grid),
+        "trajectory.csv": report.trajectory_csv(log.time, path),
+        "trajectory.tum": report.trajectory_tum(log.time, path),
+    }
+    summary = {"job": "map from the poses in the file", "beams": beams_told(log, counts)}
+    return Job(summary | map_told(grid), files, figures)
+
+
+def frame_of(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:
+    """The shape (H, W) and the origin of a map that holds all poses and hits.
+
+    Raises ValueError on more than `MOST` cells.
+    """
+    ranges, angles, valid = (np.asarray(part) for part in log.beams)
+    pose = log.corrected
+    heading = pose[:, 2:] + angles
+    ends = pose[:, None, :2] + ranges[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    places = np.concatenate([pose[:, :2], ends[valid & (ranges < log.max_range)]])
+    low = resolution * np.floor((places.min(axis=0) - MARGIN) / resolution)
+    size = np.ceil((places.max(axis=0) + MARGIN - low) / resolution)
+    if not size.prod() <= MOST:
+        raise ValueError(
+            f"--resolution: cells of {resolution:g} m make a map of {size[0]:,.0f} × {size[1]:,.0f}"
+            f" cells; at most {MOST:,}"
+        )
+    return (int(size[1]), int(size[0])), np.array([*low, 0.0])
+
+
+def counted(
+    log: LaserLog,
+    shape: tuple[int, int],
+    origin: Float[np.ndarray, "3"],
+    resolution: float,
+    progress: Callable[[int, int], object],
+) -> Counts:
+    """The counts of all scans at the poses in the file; scans of which no beam is valid are passed.
+
+    Some at a time, padded by scans without a valid beam.
+    """
+    total, width = np.shape(log.beams.range)
+    hits, misses = np.zeros((2, *shape), np.int32)
+    outside = unusable = 0
+    for begin in range(0, total, TOGETHER):
+        rows = slice(begin, begin + TOGETHER)
+        beams = Beams(*(_padded(part[rows]) for part in log.beams))
+        unusable += int((~np.asarray(beams.valid)).sum()) - width * (TOGETHER - len(log.time[rows]))
+        if beams.valid.any():
+            found = grids.count(
+                shape,
+                origin,
+                resolution,
+                _padded(log.corrected[rows]),
+                beams,
+                max_range=log.max_range,
+                no_return=0.0,
+            )
+            hits += np.asarray(found.hits)
+            misses += np.asarray(found.misses)
+            outside += int(found.outside)
+        progress(min(begin + TOGETHER, total), total)
+    made: Any = hits, misses, origin, np.array(resolution), np.array(outside), np.array(unusable)
+    return Counts(*made)
+
+
+def _padded(rows: Any) -> Any:
+    return np.pad(rows, [(0, TOGETHER - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
+
+
+def beams_told(log: LaserLog, counts: Counts) -> dict[str, int]:
+    """What became of the beams."""
+    far = int((np.asarray(log.beams.valid) & (log.beams.range >= log.max_range)).sum())
+    return {
+        "in the map": int(counts.hits.sum()),
+        "met nothing": far,
+        "without a range, or padding": int(counts.unusable),
+    }
+
+
+def map_told(grid: Grid) -> dict[str, Any]:
+    """Size and certainty of a map: entries of the summary."""
+    height, width = grid.log_odds.shape
+    known = np.asarray(grid.known)
+    bits = np.asarray(grids.entropy(grid))[known]
+    return {
+        "cells": f"{width} × {height} of {float(grid.resolution):g} m",
+        "cells known": int(known.sum()),
+        "cells occupied": int((np.asarray(grid.log_odds) > 0).sum()),
+        "mean entropy of a known cell [bit]": float(bits.mean()),
+        "entropy of the map [bit]": float(bits.sum() + (~known).sum()),
+    }

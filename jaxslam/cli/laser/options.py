@@ -1,0 +1,153 @@
+"""The options of `jaxslam run` for a laser log, and the log that they ask for."""
+
+import argparse
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from jaxslam import datasets
+from jaxslam.datasets import LaserLog
+
+READERS = {"carmen": datasets.carmen}
+"""Readers of laser logs by name; each takes (path, max_range=…)."""
+
+DEFAULTS: dict[str, Any] = {
+    "resolution": 0.05,
+    "max_range": 50.0,
+    "every": 1,
+    "scans": ":",
+    "start": "file",
+    "particles": 2000,
+    "seed": 0,
+}
+"""Of the options that have one; an option that is not given is None in the namespace."""
+
+ALONE = ("map", "localize", *DEFAULTS)
+"""Options that only a laser log has."""
+
+OTHERS = {"filters": "ekf", "gate": None, "associate": None, "check_every": None, "robot": None}
+"""Options, with their defaults, that a laser log does not have."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of laser logs to `jaxslam run`."""
+    group = parser.add_argument_group(
+        "laser logs", "of --dataset carmen; without --map and --localize: laser SLAM"
+    )
+    what = group.add_mutually_exclusive_group()
+    what.add_argument(
+        "--map",
+        choices=["known"],
+        help="known: make a map from the poses that stand in the file beside the scans",
+    )
+    what.add_argument(
+        "--localize",
+        metavar="MAP.yaml",
+        help="localize the robot in a map of ROS, from raw odometry and scans",
+    )
+    for name, kind, metavar, text in (
+        ("resolution", float, "M", "side of a cell of the map that is made [m]"),
+        ("max-range", float, "M", "a range from here on is of a beam that met nothing [m]"),
+        ("every", int, "N", "use each n-th scan"),
+        ("scans", str, "A:B", "use the scans from number A on and before B; :455 is the first 455"),
+        (
+            "start",
+            str,
+            "POSE",
+            "where --localize starts: file (the pose beside the first scan), global (anywhere that "
+            "is free), or X,Y,HEADING [m, m, deg]",
+        ),
+        ("particles", int, "N", "largest number of particles of --localize"),
+        ("seed", int, "N", "seed of the particles' random numbers"),
+    ):
+        default = DEFAULTS[name.replace("-", "_")]
+        group.add_argument(
+            f"--{name}", type=kind, metavar=metavar, help=f"{text} (default: {default})"
+        )
+
+
+def refuse_laser_options(options: argparse.Namespace) -> None:
+    """Raise ValueError if an option of laser logs is given with another data set."""
+    given = [name for name in ALONE if getattr(options, name, None) is not None]
+    if given:
+        name = given[0].replace("_", "-")
+        raise ValueError(f"--{name}: only of a laser log (--dataset {', '.join(READERS)})")
+
+
+def complete(options: argparse.Namespace) -> argparse.Namespace:
+    """The options with their defaults; raises ValueError on what a laser log cannot have."""
+    for name, default in OTHERS.items():
+        if getattr(options, name) != default:
+            raise ValueError(f"--{name.replace('_', '-')}: not of a laser log")
+    if options.animate:
+        raise ValueError("--animate: not of a laser log")
+    for_localization = [
+        n for n in ("start", "particles", "seed") if getattr(options, n) is not None
+    ]
+    if options.localize is None and for_localization:
+        raise ValueError(f"--{for_localization[0]}: only with --localize")
+    if options.localize is not None and options.resolution is not None:
+        raise ValueError("--resolution: only of a map that is made; --localize reads one")
+    given = {n: v for n, v in vars(options).items() if v is not None}
+    made = argparse.Namespace(**(vars(options) | DEFAULTS | given))
+    for name in ("resolution", "max_range", "every", "particles"):
+        value = getattr(made, name)
+        if not 0 < value < math.inf:
+            raise ValueError(f"--{name.replace('_', '-')}: expected a number above 0, got {value}")
+    return made
+
+
+def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
+    """The scans that the options ask for, and how many are left out, by reason.
+
+    Raises ValueError, with the file, where no scan is left or none has a valid beam.
+    """
+    log = READERS[options.dataset](options.path, max_range=options.max_range)
+    total = len(log.time)
+    first, last = _interval(options.scans, total)
+    keep = np.arange(first, last)[:: options.every]
+    if not len(keep):
+        raise ValueError(f"--scans: {options.scans} has none of the {total} scans of {log.source}")
+    log = dataclasses.replace(
+        log,
+        **{name: getattr(log, name)[keep] for name in ("time", "corrected", "raw", "row")},
+        beams=type(log.beams)(*(part[keep] for part in log.beams)),
+    )
+    blind = int((~np.asarray(log.beams.valid).any(axis=1)).sum())
+    if blind == len(keep):
+        raise ValueError(f"{log.source}: none of {blind} scans has a valid beam")
+    left_out = {"not in --scans": total - (last - first), "between each --every": last - first}
+    left_out["between each --every"] -= len(keep)
+    return log, left_out | {"without a valid beam": blind}
+
+
+def _interval(text: str, total: int) -> tuple[int, int]:
+    """The first scan and the one after the last of A:B, as slices of Python have it."""
+    ends = text.split(":")
+    try:
+        if len(ends) != 2:
+            raise ValueError
+        first, last = (int(end) if end.strip() else None for end in ends)
+    except ValueError:
+        raise ValueError(f"--scans: expected A:B, two numbers of scans, got {text!r}") from None
+    start, stop, _ = slice(first, last).indices(total)
+    return start, max(start, stop)
+
+
+def start_pose(text: str, log: LaserLog) -> np.ndarray | None:
+    """The pose (3,) at which localization starts; None for anywhere."""
+    if text == "global":
+        return None
+    if text == "file":
+        return np.asarray(log.corrected[0])
+    fields = text.split(",")
+    try:
+        pose = np.array([float(field) for field in fields])
+    except ValueError:
+        pose = np.zeros(0)
+    if pose.shape != (3,) or not np.all(np.isfinite(pose)):
+        raise ValueError(f"--start: expected file, global or X,Y,HEADING [m, m, deg], got {text!r}")
+    pose[2] = np.angle(np.exp(1j * np.deg2rad(pose[2])))
+    return pose

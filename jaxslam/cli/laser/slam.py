@@ -1,0 +1,60 @@
+"""`jaxslam run` on a laser log without --map or --localize: laser SLAM."""
+
+import argparse
+from typing import Any
+
+import numpy as np
+
+from jaxslam import laser_slam, metrics
+from jaxslam.cli.laser.job import Job
+from jaxslam.datasets import LaserLog
+from jaxslam.monte_carlo.progress import Progress
+from jaxslam.results import laser_slam as results
+
+METRES = (1.0, 2.0, 5.0, 10.0)
+"""Lengths of path of the relations that score the result."""
+
+
+def run(log: LaserLog, options: argparse.Namespace) -> Job:
+    """Path, graph, loops and map from raw odometry and scans; the poses in the file score them."""
+    solved = _solved(log, laser_slam.Settings(resolution=options.resolution))
+    return Job(
+        results.summary(solved) | _scores(log, solved),
+        results.files(solved),
+        lambda formats: results.figures(solved, formats, log.corrected),
+    )
+
+
+def _solved(log: LaserLog, settings: laser_slam.Settings) -> laser_slam.Solved:
+    """The result, with a bar of progress for each stage."""
+    with Progress(f"{log.name}, reading", "scans") as first:
+        bars = {"": first}
+
+        def tell(stage: str, done: int, of: int) -> None:
+            if stage not in bars:
+                unit = "candidates" if stage == "loop closing" else "scans"
+                bars[stage] = Progress(f"{log.name}, {stage}", unit)
+            bars[stage](done, of)
+
+        return laser_slam.solve(log, settings, progress=tell)
+
+
+def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, Any]:
+    """Errors of relations, ATE, and which loops are right, by the poses in the file."""
+    paths = {"raw odometry": solved.raw, "laser odometry": solved.odometry, "": solved.poses}
+    out: dict[str, Any] = {}
+    try:
+        for name, path in paths.items():
+            found = [metrics.rpe(log.corrected, path, metres=m) for m in METRES]
+            every = np.concatenate([each.translation for each in found])
+            what = "mean relation error to 10 m [m]" + (f", {name}" if name else "")
+            out[what] = float(every.mean())
+        ate = metrics.ate(log.corrected, solved.poses).translation
+    except ValueError as problem:
+        return {"score": f"none: {problem}"}
+    score = laser_slam.closure_score(solved, log.corrected)
+    out["ATE, RMSE [m]"] = float(np.sqrt((ate**2).mean()))
+    out["loops that agree with the poses in the file"] = f"{score.correct} of {score.kept}"
+    if score.revisits:
+        out["recall of revisits"] = score.recall
+    return out

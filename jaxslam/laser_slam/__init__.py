@@ -1,0 +1,26 @@
+"""Laser SLAM: from the raw odometry and scans of a log to a path, a pose graph and a map."""
+
+from jaxslam.laser_slam.odometry import Odometry, laser_odometry
+from jaxslam.laser_slam.raw_odometry import Steps, steps_of
+from jaxslam.laser_slam.records import LoopOutcome, Loops, ScanLog, Solved
+from jaxslam.laser_slam.scans import Scans, scans_of
+from jaxslam.laser_slam.score import ClosureScore, closure_score
+from jaxslam.laser_slam.settings import Settings
+from jaxslam.laser_slam.solve import solve
+
+__all__ = [
+    "ClosureScore",
+    "LoopOutcome",
+    "Loops",
+    "Odometry",
+    "ScanLog",
+    "Scans",
+    "Settings",
+    "Solved",
+    "Steps",
+    "closure_score",
+    "laser_odometry",
+    "scans_of",
+    "solve",
+    "steps_of",
+]

@@ -1,0 +1,67 @@
+"""The pose graph of keyframes: odometry and loops as tables, optimum, relative covariances."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxslam import graphs
+from jaxslam.graphs import Graph, Table
+from jaxslam.graphs.loops import LOOPS
+from jaxslam.laser_slam import poses
+
+
+def table_of(
+    first: Int[np.ndarray, "E"],
+    second: Int[np.ndarray, "E"],
+    z: Float[np.ndarray, "E 3"],
+    cov: Float[np.ndarray, "E 3 3"],
+) -> Table:
+    """Relative poses between rows of the graph; cov is of the end of z."""
+    information = np.linalg.inv(cov)
+    rows: Any = (
+        np.stack([first, second], axis=1),
+        z,
+        0.5 * (information + np.swapaxes(information, 1, 2)),
+        np.ones(len(z), bool),
+    )
+    return Table(*rows)
+
+
+def graph_of(
+    path: Float[np.ndarray, "N 3"],
+    keyframe: Int[np.ndarray, "N"],
+    odometry: Table,
+    loops: Table | None = None,
+) -> Graph:
+    """The graph of keyframes, the first of which is fixed."""
+    tables = {"relative_pose": odometry}
+    if loops is not None and len(loops.z):
+        tables[LOOPS] = loops
+    made: Any = {
+        "poses": path,
+        "points": np.zeros((0, 2)),
+        "fixed_pose": np.arange(len(path)) == 0,
+        "fixed_point": np.zeros(0, bool),
+        "pose_id": keyframe,
+        "point_id": np.zeros(0, int),
+    }
+    return Graph(tables=tables, **made)
+
+
+def relative(
+    graph: Graph, pairs: Int[np.ndarray, "Q 2"], plan: graphs.Plan | None = None
+) -> Float[np.ndarray, "Q 3 3"]:
+    """The covariance of the end of the second pose in the frame of the first, of each pair.
+
+    From the joint marginals of both, by the Jacobians of x_i⁻¹ ∘ x_j.
+    """
+    joint = np.asarray(graphs.marginals(graph, pairs=pairs, plan=plan).pairs, np.float64)
+    at = np.asarray(graph.poses, np.float64)
+    i, j = at[pairs[:, 0]], at[pairs[:, 1]]
+    # x_i + δ_i is x_i ∘ R(θ_i)ᵀ δ_i to first order, which moves the end by -Ad(z)⁻¹ of it.
+    by_i = -poses.adjoint(poses.between(j, i)) @ poses.turns(-i[:, 2])
+    by_j = poses.turns(-j[:, 2])
+    both = np.concatenate([by_i, by_j], axis=2)
+    whole = np.swapaxes(joint, 2, 3).reshape(-1, 6, 6)
+    return poses.carried(both, whole)

@@ -1,0 +1,148 @@
+"""Loop closing in rounds: candidates, matches, the loops that agree, the optimum."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import chi2
+
+from jaxslam import graphs
+from jaxslam.graphs import Graph
+from jaxslam.graphs.loops import LOOPS
+from jaxslam.laser_slam import poses
+from jaxslam.laser_slam.assembly import graph_of, relative, table_of
+from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_place, near
+from jaxslam.laser_slam.loops.descriptor import descriptors
+from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
+from jaxslam.laser_slam.loops.pairwise import clique, consistent
+from jaxslam.laser_slam.odometry import Odometry
+from jaxslam.laser_slam.records import LoopOutcome, Loops
+from jaxslam.laser_slam.scans import Scans
+from jaxslam.laser_slam.settings import Settings
+
+
+class Closed(NamedTuple):
+    """The graph of keyframes with its loops."""
+
+    graph: Graph
+    loops: Loops
+
+
+def closed(
+    scans: Scans,
+    odometry: Odometry,
+    settings: Settings,
+    progress: Callable[[int, int], object] | None = None,
+) -> Closed:
+    """The graph after all rounds.
+
+    In each round candidates are found by the marginals of the graph so far, matched, and added to
+    those of the rounds before; of all that match, the largest set that agrees pairwise is kept, and
+    the graph is optimized with Cauchy's kernel on them. In the end loops whose squared residual is
+    above the quantile of `settings.consistency` are left out, and the graph is optimized without a
+    kernel.
+    """
+    keyframe = odometry.keyframe
+    at = odometry.poses[keyframe]
+    steps, covs = odometry.z[keyframe[1:]], odometry.cov[keyframe[1:]]
+    index = np.arange(len(keyframe))
+    chain = table_of(index[:-1], index[1:], steps, covs)
+    total = poses.along(at, covs)
+    middle = index[:: max(settings.submap_every, 1)]
+    usable = scans.usable[keyframe]
+    looks = descriptors(scans.points[keyframe], scans.valid[keyframe])
+    graph = graph_of(at, keyframe, chain)
+    tried: list[Candidates] = []
+    found: list[Matches] = []
+    done: set[tuple[int, int, bool]] = set()
+    ends: set[tuple[int, int]] = set()
+    loops, kept = _agreeing(tried, found, at, total, settings)
+    for turn in range(settings.rounds if len(keyframe) > settings.loop_gap else 0):
+        path = np.asarray(graph.poses, np.float64)
+        pairs = near(path, middle, usable, settings.loop_reach + WIDE.distance, settings.loop_gap)
+        cov = (
+            poses.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
+            if turn == 0 or not len(pairs)
+            else relative(graph, pairs)
+        )
+        windows = [(w.distance, w.turns * w.turn) for w in (NARROW, WIDE)]
+        new = by_place(path, pairs, cov, done, ends, settings, windows[0], windows[1])
+        if turn == 0 and settings.appearance:
+            new = _with(new, by_appearance(looks, middle, usable, settings))
+        done |= set(zip(new.first.tolist(), new.second.tolist(), new.wide.tolist(), strict=True))
+        if not len(new.first):
+            break
+        count = 0
+
+        def tell(size: int = len(new.first)) -> None:
+            nonlocal count
+            count += 1
+            if progress is not None:
+                progress(count, size)
+
+        tried.append(new)
+        found.append(matched(scans, keyframe, path, new, settings, tell))
+        loops, kept = _agreeing(tried, found, at, total, settings)
+        ends |= set(zip(loops.first[kept].tolist(), loops.second[kept].tolist(), strict=True))
+        edges = table_of(loops.first[kept], loops.second[kept], loops.z[kept], loops.cov[kept])
+        graph = graph_of(path, keyframe, chain, edges)
+        if kept.any():
+            graph = _host(graphs.optimize(graph, kernel={LOOPS: graphs.cauchy()}).graph)
+    return _final(graph, loops, kept, keyframe, settings)
+
+
+def _final(
+    graph: Graph, loops: Loops, kept: np.ndarray, keyframe: np.ndarray, settings: Settings
+) -> Closed:
+    """The optimum without a kernel, of the loops that the graph does not contradict."""
+    if kept.any():
+        square = np.asarray(graphs.squared_residuals(graph)[LOOPS])
+        doubted = square > chi2.ppf(settings.consistency, 3)
+        loops.outcome[np.flatnonzero(kept)[doubted]] = LoopOutcome.DOUBTED
+        table = graph.tables[LOOPS]
+        tables = graph.tables | {LOOPS: table._replace(valid=~doubted)}
+        graph = _host(graphs.optimize(graph._replace(tables=tables)).graph)
+    return Closed(graph, loops._replace(first=keyframe[loops.first], second=keyframe[loops.second]))
+
+
+def _with(place: Candidates, pairs: np.ndarray) -> Candidates:
+    """Candidates by looks beside those by place: at the same pose, with the wide window."""
+    known = set(zip(place.first.tolist(), place.second.tolist(), strict=True))
+    new = np.array([tuple(pair) not in known for pair in pairs.tolist()], bool)
+    pairs = pairs[new]
+    count = len(pairs)
+    more = Candidates(
+        pairs[:, 0], pairs[:, 1], np.zeros((count, 3)), np.ones(count, bool), np.ones(count, bool)
+    )
+    return Candidates(*(np.concatenate(both) for both in zip(place, more, strict=True)))
+
+
+def _agreeing(
+    tried: list[Candidates],
+    found: list[Matches],
+    at: Float[np.ndarray, "N 3"],
+    total: Float[np.ndarray, "N 3 3"],
+    settings: Settings,
+) -> tuple[Loops, np.ndarray]:
+    """All candidates with their outcome, first and second being rows of the graph; and the kept."""
+    if not tried:
+        none = np.zeros(0, int)
+        empty = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
+        return Loops(none, none, *empty, none, none), np.zeros(0, bool)
+    of = Candidates(*(np.concatenate(part) for part in zip(*tried, strict=True)))
+    by = Matches(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    outcome = by.outcome.copy()
+    good = np.flatnonzero(outcome == LoopOutcome.KEPT)
+    parts = of.first[good], of.second[good], by.z[good], by.cov[good]
+    agree = consistent(at, total, *parts, settings.consistency)
+    out = ~clique(agree, by.score[good])
+    outcome[good[out]] = LoopOutcome.INCONSISTENT
+    loops = Loops(of.first, of.second, by.z, by.cov, by.score, of.appearance.astype(int), outcome)
+    return loops, outcome == LoopOutcome.KEPT
+
+
+def _host(graph: Graph) -> Graph:
+    found: Graph = jax.tree.map(np.asarray, graph)
+    return found

@@ -1,0 +1,121 @@
+"""Results of laser SLAM as files: path, graph, map, pictures, summary."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam.datasets.formats import g2o
+from jaxslam.grids import write_map
+from jaxslam.laser_slam import LoopOutcome, Solved
+from jaxslam.results import report
+from jaxslam.results.files import csv_text
+from jaxslam.types import Estimate
+
+Files = dict[str, str | Callable[[Path], object]]
+
+
+def files(solved: Solved) -> Files:
+    """What `results.files.write_files` writes of a result, by name; without figures.
+
+    | file | content |
+    |---|---|
+    | `trajectory.csv`, `trajectory.tum` | the pose of every scan, the first with its covariance |
+    | `graph.g2o` | the optimized graph of keyframes |
+    | `loops.csv` | every loop that was tried, with its outcome |
+    | `map.yaml`, `map.pgm` | the map, as ROS has it |
+    """
+    path = _estimate(solved)
+    return {
+        "trajectory.csv": report.trajectory_csv(solved.time, path),
+        "trajectory.tum": report.trajectory_tum(solved.time, path),
+        "graph.g2o": g2o.text_of(solved.graph),
+        "loops.csv": _loops_csv(solved),
+        "map.yaml": lambda target: write_map(target, solved.map),
+        "map.pgm": lambda target: None,  # written with its header
+    }
+
+
+def figures(
+    solved: Solved, formats: tuple[str, ...] = ("png",), corrected: ArrayLike | None = None
+) -> Files:
+    """`map_before`, `map_after` (maps of laser odometry alone, and of the optimum) and `graph`.
+
+    corrected: (K, 3) poses of reference, drawn beside both paths in `graph`.
+    """
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    reference = None if corrected is None else np.asarray(corrected, float)
+    pictures = {
+        "map_before": lambda: plot.grid_figure(
+            solved.map_before, title="Laser odometry, before closing", width=plot.PAGE
+        ),
+        "map_after": lambda: plot.grid_figure(solved.map, title="After closing", width=plot.PAGE),
+        "graph": lambda: plot.loops_figure(solved, reference),
+    }
+
+    def drawn(make: Callable[[], Any], kind: str) -> Callable[[Path], object]:
+        return lambda path: path.write_bytes(plot.encode(make(), kind))
+
+    return {
+        f"{name}.{kind}": drawn(make, kind) for name, make in pictures.items() for kind in formats
+    }
+
+
+def summary(solved: Solved) -> dict[str, object]:
+    """The numbers of a result, for the table that is printed and for `summary.json`."""
+    return {
+        **solved.counts,
+        "chi2": solved.chi2,
+        "degrees of freedom": solved.dof,
+        "chi2 / degrees of freedom": solved.chi2 / solved.dof if solved.dof > 0 else None,
+        "covariances": _verdict(solved),
+        "map [cells]": " x ".join(str(n) for n in solved.map.log_odds.shape[::-1]),
+        "resolution [m]": float(solved.map.resolution),
+        **{f"seconds, {stage}": round(value, 2) for stage, value in solved.seconds.items()},
+    }
+
+
+def _verdict(solved: Solved) -> str:
+    """What χ² says of the covariances of matches."""
+    if solved.dof <= 0:
+        return "no loop tests them"
+    ratio = solved.chi2 / solved.dof
+    if 0.5 <= ratio <= 2:
+        return "consistent with χ² within a factor of 2"
+    if ratio > 2:
+        return f"overconfident: σ too small by a factor of {np.sqrt(ratio):.1f}"
+    return f"underconfident: σ too large by a factor of {1 / np.sqrt(ratio):.1f}"
+
+
+def _estimate(solved: Solved) -> Estimate:
+    """The path as an estimate without landmarks."""
+    count = len(solved.time)
+    made: Any = {
+        "pose": solved.poses,
+        "pose_cov": solved.cov,
+        "points": np.zeros((count, 0, 2)),
+        "point_covs": np.zeros((count, 0, 2, 2)),
+        "alive": np.zeros((count, 0), bool),
+        "tag": np.zeros((count, 0), int),
+    }
+    return Estimate(**made)
+
+
+def _loops_csv(solved: Solved) -> str:
+    loops = solved.loops
+    rows = [
+        [
+            str(int(first)),
+            str(int(second)),
+            *(f"{value:.9g}" for value in z),
+            f"{score:.4f}",
+            "appearance" if looks else "place",
+            LoopOutcome(int(outcome)).name.lower(),
+        ]
+        for first, second, z, _, score, looks, outcome in zip(*loops, strict=True)
+    ]
+    head = ["first", "second", "x [m]", "y [m]", "theta [rad]", "inliers", "found by", "outcome"]
+    return csv_text(head, rows)

@@ -1,0 +1,112 @@
+"""Distance and direction of a straight wall, a landmark that is a line and no point."""
+
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from jaxslam.math import se2
+from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import (
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Pose,
+    Unmeasured,
+)
+from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.protocols import Sensor
+from jaxslam.sensors.mounting import NO_OFFSET, mounting
+
+
+def line(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
+    """The sensor of straight walls: a line by the distance and the direction of its normal.
+
+    z = (distance [m], direction [rad]) of l = (r [m], alpha [rad]), the line n·p = r with the
+    normal n = (cos α, sin α). With S = pose ∘ mount = (t, θ) (Williams: features are points, lines
+    and planes)
+
+        z = (r - n·t, wrap(α - θ))        l = invert(S, z) = (z_1 + n·t, wrap(z_2 + θ))
+
+    The sign: (r, α) and (-r, α + π) are the same set of points. Here a line has a side, as a wall
+    has: n points into the wall, away from the side that it is seen from. So the two are the two
+    faces of a thin wall and different landmarks, z has one value, a distance of the sensor's side
+    is positive, and nothing is singular where r passes zero, in the map or as the robot passes the
+    line. Whoever measures lines says on which side the robot is (`features.segments` does);
+    `facing` gives z of either sign the positive distance.
+
+    A line is no place: `carried` says how it changes with the frame (a turn by φ and a shift by t
+    give α + φ and r + n·t), `position` is the point n r nearest to the map's origin, and `embed`
+    is the line of which that is the point. The covariance of that point is singular where r = 0, so
+    a map frame through which no wall passes shows more.
+
+    Args:
+        noise_cov: (2, 2) covariance of z, or a function of z.
+        mount: (3,) pose of the sensor on the robot, Solà's S.
+    Raises:
+        ValueError: if noise_cov is not a (2, 2) covariance or mount not a finite (3,).
+    """
+    sensor_pose, sensor_pose_jacobian = mounting("line", mount)
+
+    def observe(pose: Pose, landmark: Landmark) -> Measurement:
+        frame = sensor_pose(pose)
+        distance = landmark[0] - _along(landmark[1], frame)
+        return jnp.stack([distance, wrap(landmark[1] - frame[2])])
+
+    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
+        return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1])])
+
+    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return carried(sensor_pose(pose), z)
+
+    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
+        frame = sensor_pose(pose)
+        c, s, across = _normal(landmark[1], frame)
+        by_frame = jnp.stack([-c, -s, 0 * c, 0 * c, 0 * c, -jnp.ones_like(c)]).reshape(2, 3)
+        by_line = jnp.eye(2, dtype=across.dtype).at[0, 1].set(-across)
+        return by_frame @ sensor_pose_jacobian(pose), by_line
+
+    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+        frame = sensor_pose(pose)
+        c, s_, across = _normal(z[1] + frame[2], frame)
+        by_frame = jnp.stack([c, s_, across, 0 * c, 0 * c, jnp.ones_like(c)]).reshape(2, 3)
+        by_z = jnp.eye(2, dtype=across.dtype).at[0, 1].set(across)
+        return by_frame @ sensor_pose_jacobian(pose), by_z, jnp.zeros((2, 0), pose.dtype)
+
+    return Sensor(
+        name="line",
+        measurements=("distance [m]", "direction [rad]"),
+        landmark=("r [m]", "alpha [rad]"),
+        observe=observe,
+        residual=residual,
+        noise_cov=noise_model("line", noise_cov, 2),
+        invert=invert,
+        position=se2.rectangular,
+        embed=lambda pose, point: se2.polar(point),
+        carry=carried,
+        observe_jacobians=observe_jacobians,
+        invert_jacobians=invert_jacobians,
+    )
+
+
+def carried(frame: Pose, landmark: Landmark) -> Landmark:
+    """A line (r, α) of a frame in the coordinates that its pose is in: (r + n·t, α + θ)."""
+    alpha = landmark[1] + frame[2]
+    return jnp.stack([landmark[0] + _along(alpha, frame), wrap(alpha)])
+
+
+def facing(z: Measurement) -> Measurement:
+    """The one of (r, α) and (-r, α + π), the same set of points, with the distance r >= 0."""
+    behind = z[0] < 0
+    return jnp.stack([jnp.abs(z[0]), wrap(z[1] + jnp.where(behind, jnp.pi, 0.0))])
+
+
+def _along(alpha: Array, frame: Pose) -> Array:
+    """n·t, n = (cos α, sin α)."""
+    return jnp.cos(alpha) * frame[0] + jnp.sin(alpha) * frame[1]
+
+
+def _normal(alpha: Array, frame: Pose) -> tuple[Array, Array, Array]:
+    """cos α, sin α, and the derivative of n·t by α."""
+    c, s = jnp.cos(alpha), jnp.sin(alpha)
+    return c, s, c * frame[1] - s * frame[0]

@@ -1,0 +1,87 @@
+"""Rooms whose walls are the landmarks, lines by distance and direction: an office, a square."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.sensors.line import line
+from jaxslam.simulation.laser import LaserWorld
+from jaxslam.simulation.scenarios.rooms import office, square
+from jaxslam.simulation.walls import Walls, exact_ranges, wall_lines
+from jaxslam.simulation.worlds import Scenario
+from jaxslam.validation.numbers import check_count
+
+BEAMS, HITS, SLANT = 120, 5, np.sin(np.deg2rad(10.0))
+"""A wall is measured where at least `HITS` of so many beams all around meet it within the laser's
+range, at 10° or more to its surface."""
+
+NOISE = np.diag([0.02, np.deg2rad(0.5)]) ** 2
+
+
+def office_lines(steps: int | None = None) -> Scenario:
+    """A robot maps the walls of `office` as lines: once along the corridor and into three rooms.
+
+    σ = 0.02 m and 0.5° of a wall; the odometry has σ = 0.05 m/s and 3 °/s, the robot none. P0 = 0;
+    joint correction. The map's frame is that of the start, so no line passes its origin. Parameters
+    ours.
+
+    Args:
+        steps: of the drive, as many as it has; fewer are its beginning.
+    """
+    return _lines("office_lines", office(), steps, places=17)
+
+
+def square_lines(steps: int | None = None) -> Scenario:
+    """A robot on a square path maps the four walls of `square` as lines; see `office_lines`."""
+    return _lines("square_lines", square(), steps, places=4)
+
+
+def _lines(name: str, world: LaserWorld, steps: int | None, places: int) -> Scenario:
+    controls = np.asarray(world.controls)
+    if steps is not None:
+        check_count(f"{name}: steps", steps)
+        if steps > len(controls):
+            raise ValueError(f"{name}: expected at most {len(controls)} steps, got {steps}")
+        controls = controls[:steps]
+    walls = from_start(world)
+    return Scenario(
+        name=name,
+        motion=world.motion,
+        sensor=line(NOISE),
+        landmarks=wall_lines(walls)[0],
+        controls=controls,
+        noise_on="odometry",
+        visible=_met_by_beams(walls, world.laser.max_range),
+        places=places,
+        filter_options={"update": "joint"},
+        source="parameters ours",
+    )
+
+
+def from_start(world: LaserWorld) -> Walls:
+    """The walls of a room without circles, in the frame of the robot's start."""
+    x, y, theta = np.asarray(world.pose, np.float64)
+    c, s = np.cos(theta), np.sin(theta)
+    segments = (np.asarray(world.walls.segments) - [x, y]) @ np.array([[c, -s], [s, c]])
+    made: Any = segments, np.zeros((0, 3))
+    return Walls(*made)
+
+
+def _met_by_beams(walls: Walls, max_range: float) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """The field of view of a laser that needs some beams on a wall to measure it."""
+    around = 2 * np.pi * np.arange(BEAMS) / BEAMS
+
+    def visible(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+        angles = jnp.asarray(around, pose.dtype)
+        ranges = exact_ranges(walls, pose, angles, max_range)
+        heading = pose[2] + angles
+        e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
+        normal = jnp.stack([jnp.cos(landmark[1]), jnp.sin(landmark[1])])
+        off = (pose[None, :2] + ranges[:, None] * e) @ normal - landmark[0]
+        met = (ranges < max_range) & (jnp.abs(off) < 1e-3) & (e @ normal > SLANT)
+        return jnp.asarray(met.sum() >= HITS)
+
+    return visible

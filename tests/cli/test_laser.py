@@ -1,0 +1,188 @@
+"""`jaxslam run` on a laser log: a map that ROS reads, a row for every scan, bad input."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from jaxslam import cli, grids
+from jaxslam.cli.laser.mapping import TOGETHER
+from jaxslam.simulation.laser import scan_world
+from jaxslam.simulation.scenarios import square
+from jaxslam.simulation.walls import is_free, rasterize, walls
+
+BEAMS, STEPS = 24, TOGETHER + 6
+
+
+def line(ranges, pose, raw, t):
+    """ODOM and FLASER lines of a scan; the beams of FLASER look ahead, 180° wide."""
+    numbers = " ".join(f"{r:.4f}" for r in ranges)
+    x, y, h = pose
+    return (
+        f"ODOM {raw[0]} {raw[1]} {raw[2]} 0 0 0 {t} robot {t}\n"
+        f"FLASER {len(ranges)} {numbers} {x} {y} {h} {x} {y} {h} {t} robot {t}\n"
+    )
+
+
+@pytest.fixture(scope="module")
+def log_file(tmp_path_factory):
+    """A robot in a room with a niche: 70 scans of the beams ahead, of which scan 3 has no valid one."""
+    niche = [[0, 0], [6, 0], [6, 4], [7.5, 4], [7.5, 6], [0, 6]]
+    room = walls(niche, [[2.6, 2.6], [3.4, 2.6], [3.4, 2.9]])
+    world = dataclasses.replace(square(beams=2 * BEAMS), walls=room)
+    log = jax.device_get(scan_world(world, jax.random.key(0)))
+    ahead = slice(BEAMS // 2, BEAMS // 2 + BEAMS)  # from -90° on, 7.5° apart
+    assert np.isclose(log.beams.angle[0, ahead][0], -np.pi / 2)
+    ranges = np.where(log.beams.valid, log.beams.range, 0.0)[:STEPS, ahead]
+    ranges[3] = 0.0
+    path = tmp_path_factory.mktemp("log") / "room.log"
+    raw = log.pose + [10.0, -3.0, 0.0]
+    text = "".join(line(ranges[k], log.pose[k], raw[k], 100 + 0.25 * k) for k in range(STEPS))
+    path.write_text("# comment\n" + text)
+    return SimpleNamespace(path=path, pose=log.pose[:STEPS], walls=world.walls)
+
+
+def run(path, out, *options):
+    return cli.main(["run", "--dataset", "carmen", str(path), "--out", str(out), *options])
+
+
+def test_a_map_at_known_poses_is_one_that_ros_reads(log_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert (
+        run(log_file.path, out, "--map", "known", "--resolution", "0.1", "--max-range", "10") == 0
+    )
+    assert "without a valid beam 1" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == {
+        *("map.yaml", "map.pgm", "map.png", "trajectory.csv", "trajectory.tum", "summary.json")
+    }
+    grid = grids.read_map(out / "map.yaml")
+    centres = np.asarray(grids.centers(grid))
+    free = np.asarray(grid.log_odds) < 0
+    assert free.sum() > 1000
+    assert is_free(log_file.walls, centres[free]).mean() > 0.98
+    rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(rows[:, 0], 100 + 0.25 * np.arange(STEPS))
+    np.testing.assert_allclose(rows[:, 1:4], log_file.pose, atol=1e-7)
+    assert len((out / "trajectory.tum").read_text().splitlines()) == STEPS
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["dropped by the reader"]["comments"] == 1
+    beams = summary["beams"]
+    assert sum(beams.values()) == STEPS * BEAMS
+    assert beams["without a range, or padding"] >= BEAMS
+    assert 0 < summary["mean entropy of a known cell [bit]"] < 1
+
+
+def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
+    out = tmp_path / "out"
+    chosen = ["--map", "known", "--resolution", "0.1", "--scans", "10:31", "--every", "2"]
+    assert run(log_file.path, out, *chosen) == 0
+    rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(rows[:, 0], 100 + 0.25 * np.arange(10, 31, 2))
+    left_out = json.loads((out / "summary.json").read_text())["scans left out"]
+    assert left_out == {
+        "not in --scans": STEPS - 21,
+        "between each --every": 10,
+        "without a valid beam": 0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--map", "known", "--filters", "seif"], "--filters: not of a laser log"),
+        (["--map", "known", "--animate"], "--animate: not of a laser log"),
+        (["--map", "known", "--start", "global"], "--start: only with --localize"),
+        (["--localize", "m.yaml", "--resolution", "1"], "--resolution: only of a map"),
+        (["--map", "known", "--resolution", "0"], "--resolution: expected a number above 0"),
+        (["--map", "known", "--resolution", "1e-4"], "--resolution: cells of 0.0001 m make a map"),
+        (["--map", "known", "--max-range", "-1"], "--max-range: expected a number above 0"),
+        (["--map", "known", "--every", "0"], "--every: expected a number above 0"),
+        (["--map", "known", "--scans", "a:b"], "--scans: expected A:B"),
+        (["--map", "known", "--scans", "900:"], "--scans: 900: has none of the 70 scans"),
+        (["--map", "known", "--scans", "3:4"], "room.log: none of 1 scans has a valid beam"),
+        (["--map", "known", "--figures", "gif"], "--figures: expected formats"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(log_file, tmp_path, refused, options, message):
+    out = tmp_path / "out"
+    refused(["run", "--dataset", "carmen", log_file.path, "--out", out, *options], message)
+    assert not out.exists()
+
+
+def test_a_log_that_ends_in_a_line_is_refused_with_the_line(log_file, tmp_path, refused):
+    short, out = tmp_path / "short.log", tmp_path / "out"
+    short.write_text(log_file.path.read_text()[:-40])
+    run = ["run", "--dataset", "carmen", short, "--out", out, "--map", "known"]
+    refused(run, f"short.log:{2 * STEPS + 1}: expected {BEAMS + 11} fields")
+    assert not out.exists()
+
+
+def test_options_of_laser_logs_are_of_no_other_data_set(tmp_path, refused):
+    run = ["run", "--dataset", "bonn", tmp_path, "--map", "known"]
+    refused(run, "--map: only of a laser log (--dataset carmen)")
+    refused(["run", "--dataset", "moon", tmp_path], "unknown dataset 'moon'; known: ", ", carmen")
+
+
+@pytest.fixture(scope="module")
+def room_map(log_file, tmp_path_factory):
+    """A map of the room, as another program would have made it."""
+    path = tmp_path_factory.mktemp("map") / "room.yaml"
+    grids.write_map(path, rasterize(log_file.walls, 0.1))
+    return path
+
+
+def test_a_robot_is_localized_in_a_map_by_odometry_and_scans(log_file, room_map, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ["--max-range", "10", "--particles", "500", "--localize", str(room_map)]
+    assert run(log_file.path, out, *options) == 0
+    capsys.readouterr()
+    assert {path.name for path in out.iterdir()} == {
+        *("localization.png", "trajectory.csv", "trajectory.tum", "summary.json")
+    }
+    rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(rows[:, 0], 100 + 0.25 * np.arange(STEPS))
+    error = np.hypot(*(rows[:, 1:3] - log_file.pose[:, :2]).T)
+    assert np.median(error) < 0.3 and error[-1] < 0.3
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["from the poses in the file, median [m]"] == pytest.approx(np.median(error))
+    assert summary["scans left out"]["without a valid beam"] == 1
+    assert 0 < summary["particles in use, mean"] <= 500
+    assert summary["hypotheses at the end"] >= 1
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        (("", ""), ["--start", "9,9,0"], "--start: the pose (9 m, 9 m, 0°) is off the map"),
+        (("", ""), ["--start", "here"], "--start: expected file, global or X,Y,HEADING"),
+        (("image: room.pgm", "image: no.pgm"), [], "room.yaml:1: no image"),
+        (("resolution: 0.1", "resolution: 0"), [], "room.yaml:3: expected a resolution above 0"),
+        (("origin: [-0.5, ", "origin: ["), [], "room.yaml:4: expected origin: [x, y, yaw]"),
+        (("negate: 0", "negate: 1"), [], "room.yaml: the map has no free cell"),
+    ],
+)
+def test_a_map_or_a_start_that_is_none_is_refused(
+    log_file, room_map, tmp_path, refused, change, options, message
+):
+    here, out = tmp_path / "room.yaml", tmp_path / "out"
+    text = room_map.read_text()
+    assert change[0] in text
+    here.write_text(text.replace(*change))
+    full = "negate: 1" in change  # then white is occupied
+    image = b"P5\n2 1\n255\n\xff\xff" if full else room_map.with_suffix(".pgm").read_bytes()
+    (tmp_path / "room.pgm").write_bytes(image)
+    run = ["run", "--dataset", "carmen", log_file.path, "--out", out, "--localize", here]
+    refused([*run, *options], message)
+    assert not out.exists()
+
+
+def test_an_image_of_another_format_is_refused(log_file, room_map, tmp_path, refused):
+    here, out = tmp_path / "room.yaml", tmp_path / "out"
+    here.write_text(room_map.read_text())
+    (tmp_path / "room.pgm").write_bytes(b"\x89PNG\r\n")
+    run = ["run", "--dataset", "carmen", log_file.path, "--out", out, "--localize", here]
+    refused(run, "room.pgm: expected a PGM image (P5 or P2), got PNG")
+    assert not out.exists()

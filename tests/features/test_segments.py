@@ -1,0 +1,118 @@
+"""Segments of scans: the lines of a room, their covariances held against draws, what is left out."""
+
+import numpy as np
+import pytest
+
+from jaxslam.features import fit_line, segments
+from jaxslam.types import Beams
+
+SIGMA = 0.02
+SQUARE = np.array([[-2.0, -1.0], [4.0, -1.0], [4.0, 3.0], [-2.0, 3.0]])
+"""Corners of a room, the laser at the origin."""
+WALLS = np.array([[1.0, -np.pi / 2], [4.0, 0.0], [3.0, np.pi / 2], [2.0, np.pi]])
+
+
+def scan(angle, seed=None, lines=WALLS, sigma=SIGMA):
+    """The ranges in a convex room of these lines, with noise."""
+    toward = np.cos(angle[:, None] - lines[:, 1])
+    met = np.where(toward > 1e-9, lines[:, 0] / np.maximum(toward, 1e-9), np.inf)
+    noise = 0.0 if seed is None else np.random.default_rng(seed).normal(size=len(angle)) * sigma
+    exact = met.min(axis=1) + noise
+    return Beams(exact, angle, np.ones(len(angle), bool))
+
+
+def off(line, true):
+    gap = line - true
+    gap[..., 1] = np.angle(np.exp(1j * gap[..., 1]))
+    return gap
+
+
+def nearest(found):
+    """The index of the wall of each found line."""
+    gap = np.abs(off(found.line[:, None], WALLS[None])).sum(axis=2)
+    assert (gap.min(axis=1) < 0.2).all()
+    return gap.argmin(axis=1)
+
+
+AROUND = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+
+
+def test_a_room_has_its_four_walls_each_once_and_across_the_seam():
+    found = segments(scan(AROUND), sigma=SIGMA, max_range=10)
+    assert sorted(nearest(found)) == [0, 1, 2, 3]  # the seam is within wall 3
+    np.testing.assert_allclose(off(found.line, WALLS[nearest(found)]), 0, atol=1e-9)
+    assert found.left == 360 - found.size.sum() == 4 * 4
+    for (r, alpha), ends in zip(found.line, found.ends, strict=True):
+        np.testing.assert_allclose(ends @ [np.cos(alpha), np.sin(alpha)], r, atol=1e-9)
+
+
+def test_the_covariance_of_a_fit_is_that_of_the_draws():
+    """A wall seen from -30° to 70°, 600 draws of the ranges and of the directions."""
+    angle, true, noise = np.deg2rad(np.arange(-30, 71.0)), np.array([2.0, 0.0]), (0.03, 0.004)
+    rng = np.random.default_rng(0)
+    errors, white = [], []
+    for _ in range(600):
+        turned = angle + rng.normal(size=len(angle)) * noise[1]
+        distance = 2.0 / np.cos(turned) + rng.normal(size=len(angle)) * noise[0]
+        line, cov, chi2 = fit_line(angle, distance, *noise)
+        errors.append(off(line, true))
+        white.append((errors[-1] @ np.linalg.solve(cov, errors[-1]), chi2))
+    nees, chi2 = np.mean(white, axis=0)
+    # Four standard errors of the means of χ² of 2 and of 99 degrees of freedom.
+    assert abs(nees - 2) < 4 * np.sqrt(4 / 600)
+    assert abs(chi2 - 99) < 4 * np.sqrt(198 / 600) + 1.0  # and the second order of the directions
+    np.testing.assert_allclose(np.cov(np.array(errors).T), cov, rtol=0.25, atol=1e-7)
+    sigma = np.sqrt(np.diag(cov) / 600)
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * sigma + [1e-3, 0])
+
+
+def test_segments_of_noisy_scans_are_honest():
+    white = []
+    for seed in range(60):
+        found = segments(scan(AROUND, seed), sigma=SIGMA, max_range=10)
+        which = nearest(found)
+        assert len(set(which)) == len(which)  # no wall twice
+        gap = off(found.line, WALLS[which])
+        white += list(np.einsum("ki,kij,kj->k", gap, np.linalg.inv(found.cov), gap))
+    assert len(white) >= 0.98 * 240
+    assert abs(np.mean(white) - 2) < 4 * np.sqrt(4 / len(white))
+
+
+def test_the_normal_points_into_the_wall_wherever_the_wall_is():
+    angle = np.deg2rad(np.arange(100.0, 171.0))  # a wall behind, to the left
+    (r, alpha), _, _ = fit_line(angle, 3.0 / np.cos(angle - 2.5), SIGMA)
+    np.testing.assert_allclose([r, alpha], [3.0, 2.5], atol=1e-9)
+
+
+def test_jumps_divide_and_what_is_no_wall_is_left_out():
+    beams = scan(AROUND, seed=1)
+    beams.range[100:110] = 0.5  # somebody stands there
+    beams.range[200] = np.nan
+    beams.valid[201] = False
+    beams.range[300:310] = 12.0
+    found = segments(beams, sigma=SIGMA, max_range=10)
+    assert set(nearest(found)) == {0, 1, 2, 3}
+    assert found.left == 348 - found.size.sum()
+    round_room = Beams(np.full(90, 1.0), np.linspace(-3, 3, 90), np.ones(90, bool))
+    assert len(segments(round_room, sigma=1e-3, max_range=10).line) == 0
+    none = beams._replace(valid=np.zeros(360, bool))
+    assert segments(none, sigma=SIGMA, max_range=10).left == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        ({"range": np.ones(3)}, {}, "segments: expected one scan"),
+        ({"angle": AROUND[::-1]}, {}, "segments: expected angles that increase"),
+        ({}, {"sigma": 0.0}, "segments: expected sigma and max_range above 0"),
+        ({}, {"least": 2}, "segments: .*least of at least 3"),
+    ],
+)
+def test_bad_input_is_refused(change, options, message):
+    with pytest.raises(ValueError, match=message):
+        segments(scan(AROUND)._replace(**change), **({"sigma": 0.1, "max_range": 9} | options))
+
+
+def test_beams_at_one_point_are_no_line():
+    with pytest.raises(ValueError, match="fit_line: expected beams that end at different points"):
+        fit_line(np.zeros(4), np.ones(4), SIGMA)

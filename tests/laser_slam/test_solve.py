@@ -1,0 +1,149 @@
+"""A small log from raw odometry to its map, and logs with something wrong in them."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from ring_of_rooms import FAR, SETTINGS, driven, errors
+
+from jaxslam import laser_slam
+from jaxslam.cli import main
+from jaxslam.laser_slam import LoopOutcome
+from jaxslam.results import laser_slam as results
+from jaxslam.results.files import write_files
+
+ONCE = dataclasses.replace(SETTINGS, rounds=1)  # and so fewer programs
+
+
+@pytest.fixture(scope="module")
+def drive():
+    true, log = driven()
+    return true, log, laser_slam.solve(log, SETTINGS)
+
+
+def test_loops_close(drive):
+    true, log, found = drive
+    position, heading = errors(found.poses, true)
+    before, _ = errors(found.odometry, true)
+    raw, _ = errors(found.raw, true)
+    assert position.max() < 0.1 and heading.max() < np.deg2rad(1.5)
+    assert position.mean() < before.mean() < raw.mean()
+    score = laser_slam.closure_score(found, true)
+    assert score.kept >= 5 and score.precision == 1.0 and score.recall > 0.5
+
+
+def test_the_covariances_are_of_the_right_size(drive):
+    """The mean NEES of a run: its poses are correlated, so the band is wide."""
+    true, _, found = drive
+    error = found.poses[1:] - true[1:]
+    error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
+    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.cov[1:]), error)
+    assert 0.02 < nees.mean() < 9
+    assert 0.02 < found.chi2 / found.dof < 2
+
+
+def test_the_map_is_of_the_walls(drive):
+    true, log, found = drive
+    grid = found.map
+    occupied = np.argwhere(grid.log_odds > 0)[:, ::-1] * 0.1 + 0.05 + grid.origin[:2]
+    ends = log.beams.range < FAR
+    angle = true[:, 2:3] + log.beams.angle
+    walls = true[:, None, :2] + log.beams.range[..., None] * np.stack(
+        [np.cos(angle), np.sin(angle)], axis=-1
+    )
+    walls = walls[ends]
+    gap = np.linalg.norm(occupied[:, None] - walls[None], axis=-1).min(axis=1)
+    assert np.quantile(gap, 0.95) < 0.15
+    assert grid.log_odds.shape == found.map_before.log_odds.shape
+
+
+def test_what_is_wrong_is_counted_and_the_run_goes_on(drive):
+    """A scan without points, one of maximum ranges, a jump of odometry, time that runs backward."""
+    true, log, _ = drive
+    ranges, valid = log.beams.range.copy(), log.beams.valid.copy()
+    valid[5], ranges[9] = False, FAR
+    ranges[12, :3] = np.nan
+    raw, time = log.raw.copy(), log.time.copy()
+    raw[20:] += [40.0, -30.0, 0.0]
+    time[30] -= 3.0
+    bad = log._replace(time=time, raw=raw, beams=log.beams._replace(range=ranges, valid=valid))
+    told = []
+    found = laser_slam.solve(bad, ONCE, progress=lambda *what: told.append(what))
+    counts = found.counts
+    assert counts["scans with too few points"] == 2
+    assert counts["jumps of raw odometry"] == 1
+    assert counts["scans stamped before their predecessor"] == 1
+    assert np.isfinite(found.poses).all() and np.isfinite(found.cov).all()
+    assert errors(found.poses, true)[0].max() < 0.3
+    assert {what[0] for what in told} == {"odometry", "loop closing"}
+    assert sum(counts[f"loops {o.name.lower()}"] for o in LoopOutcome) == counts["loops matched"]
+
+
+def test_a_log_of_maximum_ranges_is_raw_odometry(drive):
+    _, log, _ = drive
+    short = laser_slam.ScanLog(*(part[:3] for part in (log.time, log.time, log.raw)), FAR)
+    beams = log.beams._replace(
+        range=np.full((3, 60), FAR), angle=log.beams.angle[:3], valid=log.beams.valid[:3]
+    )
+    found = laser_slam.solve(short._replace(beams=beams), SETTINGS)
+    np.testing.assert_allclose(found.poses, log.raw[:3], atol=1e-9)
+    assert found.counts["keyframes"] == 1 and not np.any(found.map.log_odds)
+
+
+def test_logs_that_are_none_are_refused(drive):
+    _, log, _ = drive
+    for change, message in (
+        ({"raw": log.raw[:3]}, "raw odometry"),
+        ({"time": log.time[:3]}, "times"),
+        ({"max_range": 0.0}, "max_range"),
+        ({"beams": log.beams._replace(angle=log.beams.angle[:, :3])}, "angles"),
+        ({"beams": log.beams._replace(range=np.zeros((0, 3)))}, "ranges"),
+        ({"raw": log.raw * np.nan}, "scan 0 is not finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            laser_slam.solve(log._replace(**change))
+    for wrong in ({"beams": 0}, {"consistency": 1.5}, {"sigma": -1.0}):
+        with pytest.raises(ValueError, match=f"laser_slam.Settings.*{next(iter(wrong))}"):
+            laser_slam.Settings(**wrong)
+
+
+def test_its_files(drive, tmp_path):
+    _, log, found = drive
+    write_files(tmp_path, results.files(found))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {
+        "trajectory.csv",
+        "trajectory.tum",
+        "graph.g2o",
+        "loops.csv",
+        "map.yaml",
+        "map.pgm",
+    }
+    rows = np.loadtxt(tmp_path / "trajectory.tum")
+    np.testing.assert_array_equal(rows[:, 0], log.time)
+    np.testing.assert_allclose(rows[:, 1:3], found.poses[:, :2], rtol=1e-8)
+    assert len((tmp_path / "loops.csv").read_text().splitlines()) == 1 + len(found.loops.outcome)
+    assert results.summary(found)["keyframes"] == len(found.keyframe)
+
+
+def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_path):
+    """`jaxslam run --dataset carmen FILE`, with the result of above in place of a second one."""
+    true, log, found = drive
+    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+    lines = []
+    for k, (pose, ranges) in enumerate(zip(true, np.asarray(log.beams.range), strict=True)):
+        told = " ".join(f"{value:.6f}" for value in pose)
+        lines.append(f"ODOM {told} 0 0 0 {k} host {k}")
+        ranges = " ".join(f"{value:.3f}" for value in ranges)
+        lines.append(f"FLASER 60 {ranges} {told} {told} {k} host {k}")
+    (tmp_path / "ring.log").write_text("\n".join(lines))
+    out = tmp_path / "out"
+    command = ["run", "--dataset", "carmen", str(tmp_path / "ring.log"), "--out", str(out)]
+    assert main([*command, "--figures", "svg"]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["mean relation error to 10 m [m]"] < 0.1
+    kept = laser_slam.closure_score(found, true).kept
+    assert summary["loops that agree with the poses in the file"] == f"{kept} of {kept}"
+    names = {path.name for path in out.iterdir()}
+    assert {"trajectory.tum", "graph.g2o", "map.pgm", "map_before.svg", "graph.svg"} <= names
