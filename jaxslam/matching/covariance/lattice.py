@@ -25,9 +25,9 @@ def lattice(
     """The covariance of p(x) ∝ exp(-E(x)/σ²) over a lattice of steps³ poses around the match.
 
     K = Σ p x xᵀ, u = Σ p x, and the covariance K - u uᵀ with Σ p = 1. The lattice is x̂ + L z, z in
-    [-4, 4]³, L Lᵀ the inverse of ∂²E/∂x²/σ² and the window's information: as fine as
-    the peak needs, and as wide as the window where nothing else bounds it. Residuals are evaluated
-    at each pose: in a grid all that a shift changes counts, with the pairs of an ICP kept.
+    [-4, 4]³, L Lᵀ the inverse of ∂²E/∂x²/σ² and the window's information: as fine as the peak
+    needs, and as wide as the window where nothing else bounds it. Residuals are evaluated at each
+    pose: in a grid all that a shift changes counts, with the pairs of an ICP kept.
 
     Olson 2009, "Real-time correlative scan matching", ICRA, where the lattice is the search's.
 
