@@ -41,6 +41,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--animate",
         action="store_true",
-        help="also write a film of each filter (consistency: of run 0): film.html to step and "
-        "play, and film.mp4, or film.gif where ffmpeg is missing",
+        help="also write a film of each filter (consistency: of run 0; of a laser log: the map "
+        "growing): film.html to step and play, and film.mp4, or film.gif where ffmpeg is missing",
     )

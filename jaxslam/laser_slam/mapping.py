@@ -1,18 +1,22 @@
 """The map of a log's scans at given poses."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxslam import grids
-from jaxslam.grids import Grid
+from jaxslam.grids import Counts, Grid
 from jaxslam.laser_slam.records import LogOfScans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.types import Beams
 
 LARGEST = 4_000
 """cells along a side of the map; a larger world has larger cells"""
+FILM = 400
+"""cells along a side of a map in a film"""
 
 
 def frame_of(
@@ -52,6 +56,48 @@ def map_of(
     counts = grids.count(shape, origin, resolution, poses, beams, max_range=settings.max_range)
     found = grids.occupancy(counts)
     return Grid(*(np.asarray(part) for part in found))  # type: ignore[arg-type]
+
+
+def growing_maps(
+    log: LogOfScans,
+    path: Float[np.ndarray, "K 3"],
+    settings: Settings,
+    *,
+    frames: int = 60,
+    others: Sequence[Float[np.ndarray, "K 3"]] = (),
+) -> tuple[list[Grid], Int[np.ndarray, "F"]]:
+    """Maps of the first scans, more of them in each, for a film; and how many scans each has.
+
+    Cells are as large as `FILM` of them along a side need.
+
+    Args:
+        frames: number of maps at most.
+        others: paths whose maps have to fit the same frame.
+    """
+    paths = [path, *others]
+    shape, _, resolution = frame_of(log, paths, settings)
+    coarse = max(resolution, max(shape) * resolution / FILM)
+    shape, origin, resolution = frame_of(log, paths, replace(settings, resolution=coarse))
+    beams = _used(log, settings, np.ones(len(path), bool))
+    together = -(-len(path) // min(frames, len(path)))
+    hits, misses = np.zeros((2, *shape), np.int32)
+    maps, until = [], []
+    for begin in range(0, len(path), together):
+        end = min(begin + together, len(path))
+        fill = together - (end - begin)
+        rows: Any = [np.pad(part[begin:end], [(0, fill), (0, 0)]) for part in beams]
+        scans = Beams(*rows)
+        if scans.valid.any():
+            poses: Any = np.pad(path[begin:end], [(0, fill), (0, 0)])
+            found = grids.count(
+                shape, origin, resolution, poses, scans, max_range=settings.max_range
+            )
+            hits += np.asarray(found.hits)
+            misses += np.asarray(found.misses)
+        counts: Any = Counts(hits, misses, origin, np.asarray(resolution), 0, 0)  # type: ignore
+        maps.append(Grid(*(np.asarray(part) for part in grids.occupancy(counts))))  # type: ignore
+        until.append(end)
+    return maps, np.array(until)
 
 
 def _used(log: LogOfScans, settings: Settings, usable: np.ndarray) -> Beams:

@@ -2,19 +2,27 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.datasets.formats import g2o
 from jaxslam.grids import write_map
-from jaxslam.laser_slam import LoopOutcome, Solved
+from jaxslam.laser_slam import LoopOutcome, Settings, Solved
+from jaxslam.laser_slam.mapping import growing_maps
+from jaxslam.laser_slam.records import LogOfScans
 from jaxslam.results import report
 from jaxslam.results.files import csv_text
 from jaxslam.types import Estimate
 
+if TYPE_CHECKING:  # Pillow is slow to load
+    from jaxslam.results.film import Film
+
 Files = dict[str, str | Callable[[Path], object]]
+
+HELD = 12
+"""Frames of a film that show the map after closing."""
 
 
 def files(solved: Solved) -> Files:
@@ -62,6 +70,38 @@ def figures(
     return {
         f"{name}.{kind}": drawn(make, kind) for name, make in pictures.items() for kind in formats
     }
+
+
+def film(
+    log: LogOfScans,
+    solved: Solved,
+    settings: Settings,
+    *,
+    title: str = "",
+    progress: Callable[[int, int], object] | None = None,
+) -> "Film":
+    """The film of a map that grows by laser odometry alone, and of the map after closing.
+
+    Arguments are those of `laser_slam.solve` and its result.
+    """
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    maps, until = growing_maps(log, solved.odometry, settings, others=[solved.poses])
+    closed, _ = growing_maps(log, solved.poses, settings, others=[solved.odometry])
+    kept = int((solved.loops.outcome == LoopOutcome.KEPT).sum())
+    last = [closed[-1]] * HELD
+    paths = [solved.odometry[:end] for end in until] + [solved.poses] * HELD
+    said = [f"laser odometry, scan {end:,} of {until[-1]:,}" for end in until]
+    said += [f"after closing by {kept:,} loops"] * HELD
+    scene = plot.map_scene(
+        [np.asarray(one.log_odds) for one in (*maps, *last)],
+        np.asarray(maps[0].origin),
+        float(maps[0].resolution),
+        paths,
+        said,
+        title=title,
+    )
+    return plot.render(scene, progress=progress)
 
 
 def summary(solved: Solved) -> dict[str, object]:

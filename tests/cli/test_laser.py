@@ -93,7 +93,7 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
     ("options", "message"),
     [
         (["--map", "known", "--filters", "seif"], "--filters: not of a laser log"),
-        (["--map", "known", "--animate"], "--animate: not of a laser log"),
+        (["--map", "known", "--animate"], "--animate: of a laser log only without --map"),
         (["--map", "known", "--start", "global"], "--start: only with --localize"),
         (["--localize", "m.yaml", "--resolution", "1"], "--resolution: only of a map"),
         (["--map", "known", "--resolution", "0"], "--resolution: expected a number above 0"),

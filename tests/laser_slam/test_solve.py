@@ -10,6 +10,7 @@ from ring_of_rooms import FAR, SETTINGS, driven, errors
 from jaxslam import laser_slam
 from jaxslam.cli import main
 from jaxslam.laser_slam import LoopOutcome
+from jaxslam.laser_slam.mapping import growing_maps
 from jaxslam.results import laser_slam as results
 from jaxslam.results.files import write_files
 
@@ -41,6 +42,16 @@ def test_the_covariances_are_of_the_right_size(drive):
     nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.cov[1:]), error)
     assert 0.02 < nees.mean() < 9
     assert 0.02 < found.chi2 / found.dof < 2
+
+
+def test_maps_of_a_film_grow_to_the_whole(drive):
+    _, log, found = drive
+    grown, until = growing_maps(log, found.odometry, SETTINGS, frames=4, others=[found.poses])
+    (whole,), _ = growing_maps(log, found.odometry, SETTINGS, frames=1, others=[found.poses])
+    assert until[-1] == len(log.time) and len(grown) == len(until) <= 4
+    np.testing.assert_array_equal(grown[-1].log_odds, whole.log_odds)
+    known = [(one.log_odds != 0).sum() for one in grown]
+    assert (np.diff(known) > 0).all()
 
 
 def test_the_map_is_of_the_walls(drive):

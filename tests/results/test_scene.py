@@ -343,3 +343,18 @@ def test_a_filter_is_filmed_in_a_world_by_itself():
     film = plot.animate_world(world, catalog.BASELINES["dead_reckoning"](world), jax.random.key(0))
     assert len(set(film.frames)) == 4 and film.title == "ring"
     assert film.said[0] == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
+
+
+def test_a_map_scene_has_as_many_paths_as_maps():
+    origin, path = np.zeros(3), np.zeros((2, 3))
+    maps = [np.zeros((2, 3)), np.ones((2, 3))]
+    scene = plot.map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
+    assert scene.frames == 2 and scene.said(1) == "two"
+    assert scene.main.xlim == (0.0, 1.5) and scene.main.ylim == (0.0, 1.0)
+    for wrong, message in (
+        ((maps, origin, 0.5, [path], ["one", "two"]), "as many paths"),
+        (([], origin, 0.5, [], []), "as many paths"),
+        ((maps, np.ones(3), 0.5, [path, path], ["one", "two"]), "without yaw"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plot.map_scene(*wrong)

@@ -81,8 +81,8 @@ def complete(options: argparse.Namespace) -> argparse.Namespace:
     for name, default in OTHERS.items():
         if getattr(options, name) != default:
             raise ValueError(f"--{name.replace('_', '-')}: not of a laser log")
-    if options.animate:
-        raise ValueError("--animate: not of a laser log")
+    if options.animate and (options.map is not None or options.localize is not None):
+        raise ValueError("--animate: of a laser log only without --map and --localize")
     for_localization = [
         n for n in ("start", "particles", "seed") if getattr(options, n) is not None
     ]

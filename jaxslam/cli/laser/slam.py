@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxslam import laser_slam, metrics
+from jaxslam.cli.films import film_files
 from jaxslam.cli.laser.job import Job
 from jaxslam.datasets import LaserLog
 from jaxslam.monte_carlo.progress import Progress
@@ -17,10 +18,16 @@ METRES = (1.0, 2.0, 5.0, 10.0)
 
 def run(log: LaserLog, options: argparse.Namespace) -> Job:
     """Path, graph, loops and map from raw odometry and scans; the poses in the file score them."""
-    solved = _solved(log, laser_slam.Settings(resolution=options.resolution))
+    settings = laser_slam.Settings(resolution=options.resolution)
+    solved = _solved(log, settings)
+    files = results.files(solved)
+    if options.animate:
+        with Progress(f"{log.name}: film", "frames") as progress:
+            made = results.film(log, solved, settings, title=log.name, progress=progress)
+        files |= film_files({"slam": made}, suffixed=False)
     return Job(
         results.summary(solved) | _scores(log, solved),
-        results.files(solved),
+        files,
         lambda formats: results.figures(solved, formats, log.corrected),
     )
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
@@ -61,10 +61,8 @@ def grid_figure(
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
     axes.grid(visible=False)
     if isinstance(grid, Grid):
-        shades: Any = LinearSegmentedColormap.from_list("occupancy", ["white", "black"])
-        shades = shades.with_extremes(bad=_UNKNOWN)
-        shown = np.ma.masked_array(0.5 * (1 + np.tanh(values / 2)), mask=values == 0)
-        axes.pcolormesh(x, y, shown, cmap=shades, vmin=0, vmax=1, rasterized=True)
+        look: Look = {"cmap": shades_of_occupancy(), "vmin": 0, "vmax": 1, "rasterized": True}
+        axes.pcolormesh(x, y, shown_occupancy(values), **look)
         handles = [
             Patch(fc="black", ec=INK, label="occupied"),
             Patch(fc="white", ec=INK, label="free"),
@@ -102,6 +100,18 @@ def grid_figure(
     drawn = every_handle([axes])
     caption(figure, title, [*handles, *drawn]) if handles or drawn or title else None
     return figure
+
+
+def shades_of_occupancy() -> Colormap:
+    """White for free, black for occupied, and a colour of its own for what is masked: unknown."""
+    shades: Any = LinearSegmentedColormap.from_list("occupancy", ["white", "black"])
+    found: Colormap = shades.with_extremes(bad=_UNKNOWN)
+    return found
+
+
+def shown_occupancy(log_odds: np.ndarray) -> np.ma.MaskedArray:
+    """The probability of each cell, masked where it is unknown."""
+    return np.ma.masked_array(0.5 * (1 + np.tanh(log_odds / 2)), mask=log_odds == 0)
 
 
 def world_of(
