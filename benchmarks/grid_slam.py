@@ -28,6 +28,9 @@ from jaxslam import grids
 from jaxslam.consistency.nees import block_nees
 from jaxslam.grids.slam.particles import copied_rows
 from jaxslam.motion import unicycle
+from jaxslam.results import plot
+from jaxslam.results.plot.grids import shades_of_occupancy, shown_occupancy
+from jaxslam.results.plot.style import INK, PAGE, caption, panels_of, titled
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import rasterize
@@ -188,9 +191,6 @@ def copies(shape):
 
 def draw(world, truth, log, trace, out):
     """The map by odometry alone, and that of the best particle, with the paths."""
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update({"font.size": 9})
     odometry = driven(log)
     counts = grids.count(
         *(truth.log_odds.shape, truth.origin, CELL),
@@ -203,20 +203,22 @@ def draw(world, truth, log, trace, out):
         ("scans at the odometry's poses", grids.occupancy(counts), odometry),
         ("best of 30 particles", grids.best_map(trace.final), np.asarray(trace.estimate.pose)),
     )
-    figure, panels = plt.subplots(1, 2, figsize=(6.6, 3.6), layout="constrained", sharey=True)
+    figure, panels = panels_of(PAGE, 0.56 * PAGE, 1, 2, share=(True, True))
     height, width = truth.log_odds.shape
     x, y = np.asarray(truth.origin)[:2]
     extent = (x, x + CELL * width, y, y + CELL * height)
+    look = {"cmap": shades_of_occupancy(), "vmin": 0, "vmax": 1, "origin": "lower"}
     for axes, (title, grid, path) in zip(panels, pairs, strict=True):
-        shown = np.asarray(1 - grid.probability)
-        axes.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1)
-        axes.plot(*log.pose[:, :2].T, color="#2ca02c", lw=1.6, label="true path")
-        axes.plot(*path[:, :2].T, color="#d62728", lw=1.0, label="estimate")
-        axes.set(title=title, xlabel="x [m]", aspect="equal")
+        axes.grid(visible=False)
+        axes.imshow(shown_occupancy(np.asarray(grid.log_odds)), extent=extent, **look)
+        axes.plot(*log.pose[:, :2].T, color=INK, lw=1.4, ls="--", label="true path")
+        axes.plot(*path[:, :2].T, color=plot.COLORS[0], lw=1.2, label="estimate")
+        axes.set(xlabel="x [m]", aspect="equal")
+        titled(axes, title)
     panels[0].set_ylabel("y [m]")
-    panels[0].legend(loc="center", fontsize=8)
+    caption(figure, "")
     out.parent.mkdir(exist_ok=True)
-    figure.savefig(out, dpi=150, bbox_inches="tight")
+    figure.savefig(out, dpi=150)
 
 
 if __name__ == "__main__":
