@@ -290,7 +290,8 @@ def run_from(pose, pose_cov=WORLD.pose_cov):
         ),
         (
             lambda: jaxslam.verify_jacobians(3),
-            "^verify_jacobians: expected a Motion, a Sensor, a Factor or a function of vectors, got int",
+            "^verify_jacobians: expected a Motion, a Sensor, a Factor, a BeamModel or a function of "
+            "vectors, got int",
         ),
         (
             lambda: jaxslam.verify_jacobians(np.sin, 3),

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
 
 from jaxslam import graphs
 from jaxslam.graphs import Graph
@@ -21,6 +20,7 @@ from jaxslam.laser_slam.odometry import Odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops
 from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
+from jaxslam.math.stats import chi2_quantile
 
 
 class Closed(NamedTuple):
@@ -99,7 +99,7 @@ def _final(
     """The optimum without a kernel, of the loops that the graph does not contradict."""
     if kept.any():
         square = np.asarray(graphs.squared_residuals(graph)[LOOPS])
-        doubted = square > chi2.ppf(settings.consistency, 3)
+        doubted = square > chi2_quantile(settings.consistency, 3)
         loops.outcome[np.flatnonzero(kept)[doubted]] = LoopOutcome.DOUBTED
         table = graph.tables[LOOPS]
         tables = graph.tables | {LOOPS: table._replace(valid=~doubted)}

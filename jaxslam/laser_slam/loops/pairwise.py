@@ -2,9 +2,9 @@
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import chi2
 
 from jaxslam.laser_slam import poses
+from jaxslam.math.stats import chi2_quantile
 
 STARTS = 10
 """Loops from which a clique is grown."""
@@ -31,7 +31,7 @@ def consistent(
         path: by odometry. total: `poses.along` of it.
         first, second, z, cov: of the loops; the covariance of the end of z.
     """
-    limit = chi2.ppf(probability, 3)
+    limit = chi2_quantile(probability, 3)
     out = np.ones((len(z), len(z)), bool)
     for a in range(len(z) - 1):
         b = np.arange(a + 1, len(z))
