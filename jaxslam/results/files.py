@@ -15,6 +15,9 @@ from typing import Any, TypeAlias
 Json: TypeAlias = dict[str, Any]
 """What JSON can hold, by name."""
 
+Files: TypeAlias = dict[str, str | Callable[[Path], object]]
+"""By name, a text, or a function that writes the file at a path: as `write_files` takes them."""
+
 
 def json_text(content: Mapping[str, object]) -> str:
     """Indented JSON; raises ValueError on NaN and infinity, which JSON does not have."""

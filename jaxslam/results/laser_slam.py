@@ -13,13 +13,11 @@ from jaxslam.laser_slam import LoopOutcome, Settings, Solved
 from jaxslam.laser_slam.mapping import growing_maps
 from jaxslam.laser_slam.records import LogOfScans
 from jaxslam.results import report
-from jaxslam.results.files import csv_text
+from jaxslam.results.files import Files, csv_text
 from jaxslam.types import Estimate
 
 if TYPE_CHECKING:  # Pillow is slow to load
     from jaxslam.results.film import Film
-
-Files = dict[str, str | Callable[[Path], object]]
 
 HELD = 12
 """Frames of a film that show the map after closing."""

@@ -4,14 +4,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-Files = dict[str, str | Callable[[Path], object]]
-"""By name, a text, or a function that writes the file at a path: as `write_files` takes them."""
+from jaxslam.results.files import Files, Json
 
 
 class Job(NamedTuple):
     """The result of a job, for the screen and the folder of results."""
 
-    summary: dict[str, Any]
+    summary: Json
     """entries of the summary"""
     files: Files
     figures: Callable[[tuple[str, ...]], Files]

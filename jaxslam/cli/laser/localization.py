@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam import grids, motion
-from jaxslam.cli.laser.job import Files, Job, figure_files
+from jaxslam.cli.laser.job import Job, figure_files
 from jaxslam.cli.laser.options import start_pose
 from jaxslam.cli.run.piecewise import run_in_pieces
 from jaxslam.datasets import LaserLog
 from jaxslam.grids import Grid
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
+from jaxslam.results.files import Files
 from jaxslam.types import Info
 
 START_DEVIATION = np.array([0.2, 0.2, np.deg2rad(10.0)])

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam import grids
-from jaxslam.cli.laser.job import Files, Job, figure_files
+from jaxslam.cli.laser.job import Job, figure_files
 from jaxslam.datasets import LaserLog
 from jaxslam.datasets.formats import ros_map
 from jaxslam.grids import Counts, Grid
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
+from jaxslam.results.files import Files
 from jaxslam.types import Beams, Estimate
 
 TOGETHER = 64
