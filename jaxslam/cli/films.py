@@ -9,6 +9,10 @@ if TYPE_CHECKING:  # Pillow is slow to load
     from jaxslam.results.film import Film
 
 
+NAMES = ("film.gif", "film.mp4", "film.html", "film-*.gif", "film-*.mp4", "film-*.html")
+"""Patterns of the names of films: those of an earlier command do not stay beside its results."""
+
+
 def film_files(
     films: Mapping[str, "Film"], *, suffixed: bool
 ) -> dict[str, Callable[[Path], object]]:

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from jaxslam import graphs
+from jaxslam.cli import films
 from jaxslam.cli.common import add_dtype, add_out, pick
-from jaxslam.cli.films import film_files
 from jaxslam.cli.runtime import cache
 from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.datasets.formats import g2o
@@ -118,7 +118,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         files |= _film(options, begun, factors, doubted, solution)
     if len(found.points):
         files["points.csv"] = _csv(("x", "y"), found.point_id, found.points, found.fixed_point)
-    written = write_files(options.out, files)
+    written = write_files(options.out, files, replaces=films.NAMES)
     print("\nwrote " + ", ".join(str(path) for path in written))
     if converged:
         return 0
@@ -265,7 +265,7 @@ def _film(
         title=Path(options.path).name,
         note=note,
     )
-    return film_files({"optimize": plot.render(scene, fps=2.0)}, suffixed=False)
+    return films.film_files({"optimize": plot.render(scene, fps=2.0)}, suffixed=False)
 
 
 def _table(summary: Mapping[str, Any]) -> str:

@@ -75,7 +75,7 @@ def segments(
             "segments: expected sigma and max_range above 0, sigma_angle and trim of at least 0, "
             f"least of at least 3, got {sigma}, {max_range}, {sigma_angle}, {trim}, {least}"
         )
-    if not (np.diff(angle) > 0).all() or not np.ptp(angle, axis=None) <= 2 * np.pi:
+    if not (np.diff(angle) > 0).all() or (len(angle) and not np.ptp(angle) <= 2 * np.pi):
         raise ValueError("segments: expected angles that increase within one turn")
     with np.errstate(invalid="ignore"):
         used = valid & np.isfinite(distance) & (distance > 0) & (distance < max_range)

@@ -37,6 +37,7 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
     that neither a fixed variable nor a measurement of one pose holds in place: a disconnected
     graph, or no gauge. Within a trace only what shapes tell is checked.
     """
+    _check_shapes(name, graph)
     for key, table in graph.tables.items():
         if key not in factors:
             raise ValueError(
@@ -102,6 +103,20 @@ def _check_sizes(what: str, table: Table, factor: Factor) -> None:
             raise ValueError(f"{what}: expected {field} of shape {shape}, got {got}")
 
 
+def _check_shapes(name: str, graph: Graph) -> None:
+    poses, points = np.shape(graph.poses), np.shape(graph.points)
+    if len(poses) != 2 or poses[1] != 3 or len(points) != 2:
+        raise ValueError(f"{name}: expected poses (N, 3) and points (P, L), got {poses}, {points}")
+    for field, count in (
+        ("pose_id", poses[0]),
+        ("fixed_pose", poses[0]),
+        ("point_id", points[0]),
+        ("fixed_point", points[0]),
+    ):
+        if (got := np.shape(getattr(graph, field))) != (count,):
+            raise ValueError(f"{name}: expected {field} of shape ({count},), got {got}")
+
+
 def _check_variables(name: str, graph: Graph) -> None:
     kinds = (("pose", graph.poses, graph.pose_id), ("point", graph.points, graph.point_id))
     for kind, values, ids in kinds:
@@ -131,8 +146,8 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
     twice[valid] = (np.sort(of, axis=1)[:, 1:] == np.sort(of, axis=1)[:, :-1]).any(axis=1)
     scale = np.abs(information).max(axis=(1, 2), initial=0.0)
     finite = np.isfinite(information).all(axis=(1, 2))
-    skew = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2), initial=0.0)
     clean = np.where(finite[:, None, None], information, 0.0)
+    skew = np.abs(clean - np.swapaxes(clean, 1, 2)).max(axis=(1, 2), initial=0.0)
     for bad, why in (
         (twice, "joins a variable to itself"),
         (~np.isfinite(z).all(axis=1), "z is not finite"),

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -59,7 +59,12 @@ def check_writable(folder: Path) -> None:
         raise type(error)(f"results cannot be written to {folder}: {reason}") from error
 
 
-def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], object]]) -> list[Path]:
+def write_files(
+    folder: Path,
+    files: Mapping[str, str | Callable[[Path], object]],
+    *,
+    replaces: Sequence[str] = (),
+) -> list[Path]:
     """Write all files or, after any error or interrupt, none; returns their paths.
 
     They are written to a hidden folder in the target and moved into place when all are complete. A
@@ -68,6 +73,8 @@ def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], object]
     Args:
         folder: the target, which is created if needed.
         files: by name, the text, or a function that writes the file at a path.
+        replaces: patterns of names of an earlier result; files of such names that are not written
+            now are removed in the end.
     """
     created = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
@@ -86,4 +93,8 @@ def write_files(folder: Path, files: Mapping[str, str | Callable[[Path], object]
             with contextlib.suppress(OSError):  # not empty, or never created
                 each.rmdir()
         raise
+    for pattern in replaces:
+        for old in folder.glob(pattern):
+            if old.name not in files:
+                old.unlink()
     return [folder / name for name in files]

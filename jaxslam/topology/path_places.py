@@ -35,6 +35,8 @@ def path_places(poses: ArrayLike, pairs: ArrayLike, *, radius: float) -> PathPla
         raise ValueError(
             f"path_places: expected poses and a radius above 0, got {points.shape} and {radius}"
         )
+    if not np.isfinite(points).all():
+        raise ValueError("path_places: expected finite poses")
     if len(edges) and not (edges.min() >= 0 and edges.max() < len(points)):
         raise ValueError(f"path_places: expected pairs of {len(points)} poses, got {edges.max()}")
     centers: list[int] = []

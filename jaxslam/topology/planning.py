@@ -27,14 +27,18 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
     """The shortest way from a point to another along the skeleton of a map (Dijkstra).
 
     From the start to the nearest cell of the skeleton of its place, along the skeleton, and from
-    there to the goal. Raises ValueError on a point that is in no place, and where no way leads from
-    one to the other.
+    there to the goal; straight where the line between them stays in one place. Raises ValueError on
+    a point that is not finite or in no place, and where no way leads from one to the other.
     """
     ends = np.stack([np.asarray(start, np.float64)[:2], np.asarray(goal, np.float64)[:2]])
+    if not np.isfinite(ends).all():
+        raise ValueError(f"route: expected finite points, got {ends.tolist()}")
     labels = place_of(places, ends)
     for name, end, label in zip(("start", "goal"), ends, labels, strict=True):
         if label < 0:
             raise ValueError(f"route: the {name} {end} is in no place of the map")
+    if _in_sight(places, ends):
+        return Route((int(labels[0]),), ends, float(np.linalg.norm(ends[1] - ends[0])))
     cells = places.skeleton.cells.reshape(-1)
     where = cell_centers(places.grid)
     at = []
@@ -54,6 +58,15 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
     changes = np.flatnonzero(np.diff(passed)) + 1
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     return Route(tuple(int(p) for p in [passed[0], *passed[changes]]), path, length)
+
+
+def _in_sight(places: TopologicalMap, ends: Float[np.ndarray, "2 2"]) -> bool:
+    """Whether the straight line between two points stays in the place of the first."""
+    gap = float(np.linalg.norm(ends[1] - ends[0]))
+    count = 2 + int(2 * gap / float(places.grid.resolution))
+    share = np.linspace(0.0, 1.0, count)[:, None]
+    seen = place_of(places, (1 - share) * ends[:1] + share * ends[1:])
+    return bool(seen[0] >= 0 and (seen == seen[0]).all())
 
 
 def place_of(places: TopologicalMap, points: ArrayLike) -> Int[np.ndarray, "n"]:
@@ -83,6 +96,8 @@ def place_weights(
             f"place_weights: expected particles (n, 3) and log-weights (n,), got {table.shape} and "
             f"{logs.shape}"
         )
+    if not np.isfinite(table).all() or np.isnan(logs).any():
+        raise ValueError("place_weights: expected finite poses, and log-weights that are no NaN")
     if not len(logs) or not np.isfinite(logs.max()):
         raise ValueError("place_weights: expected a particle of weight above 0")
     weight = np.exp(logs - logs.max())

@@ -82,3 +82,57 @@ def test_derivatives_of_the_optimum_are_differences():
         seen(*(x + h * t for x, t in zip(at, tangent, strict=True))) for h in (1e-5, -1e-5)
     )
     np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
+
+
+def test_priors_alone_and_what_is_not_determined():
+    """A graph without a measurement of two variables; a singular start with a regular end."""
+    prior = graphs.Table(np.zeros((1, 1), int), np.ones((1, 3)), np.eye(3)[None], np.ones(1, bool))
+    alone = graphs.Graph(
+        poses=np.zeros((1, 3)),
+        points=np.zeros((0, 2)),
+        pose_id=np.arange(1),
+        point_id=np.arange(0),
+        fixed_pose=np.zeros(1, bool),
+        fixed_point=np.zeros(0, bool),
+        tables={"prior": prior},
+    )
+    found = graphs.optimize(alone)
+    assert found.status == Ending.CONVERGED
+    np.testing.assert_allclose(found.graph.poses, 1.0, atol=1e-9)
+
+    def at(value, z):
+        return z - value[0][:2]
+
+    place = graphs.Factor("place", ("pose",), ("x [m]", "y [m]"), ("x [m]", "y [m]"), at)
+    factors = {"place": place, "relative_pose": graphs.relative_pose()}
+    steps = graphs.Table(
+        np.array([[0, 1], [1, 2]]),
+        np.tile([1.0, 0, 0], (2, 1)),
+        np.tile(100.0 * np.eye(3), (2, 1, 1)),
+        np.ones(2, bool),
+    )
+    places = graphs.Table(
+        np.array([[0], [2]]),
+        np.array([[0.0, 0.0], [2.0, 1.0]]),
+        np.tile(10.0 * np.eye(2), (2, 1, 1)),
+        np.ones(2, bool),
+    )
+    graph = alone._replace(
+        poses=np.zeros((3, 3)),
+        pose_id=np.arange(3),
+        fixed_pose=np.zeros(3, bool),
+        tables={"place": places, "relative_pose": steps},
+    )
+    found = graphs.optimize(graph, factors)
+    assert found.status == Ending.CONVERGED and found.singular == -1
+    again = graphs.optimize(found.graph, factors)
+    np.testing.assert_allclose(found.chi2, again.chi2, rtol=1e-9)
+
+    nothing = steps._replace(information=np.zeros((2, 3, 3)))
+    loose = graph._replace(tables={"prior": prior, "relative_pose": nothing})
+    with pytest.raises(ValueError, match="marginals: the measurements do not determine pose"):
+        graphs.marginals(loose)
+    with pytest.raises(ValueError, match="expected a Kernel"):
+        graphs.optimize(alone, kernel="huber")
+    with pytest.raises(ValueError, match=r"expected fixed_pose of shape \(1,\)"):
+        graphs.optimize(alone._replace(fixed_pose=np.zeros(2, bool)))

@@ -5,6 +5,7 @@ import time
 from types import ModuleType
 from typing import Any
 
+from jaxslam.cli import films
 from jaxslam.cli.common import summary_table
 from jaxslam.cli.laser import localization, mapping, slam
 from jaxslam.cli.laser.job import Job
@@ -37,7 +38,7 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
     print(summary_table({"": summary}))
     files = job.files | figures
     files["summary.json"] = json_text(summary | {"versions": versions()})
-    written = write_files(options.out, files)
+    written = write_files(options.out, files, replaces=films.NAMES)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
 

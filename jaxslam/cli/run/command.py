@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.cli.common import pick, summary_table
+from jaxslam.cli.films import NAMES as FILMS
 from jaxslam.cli.laser.command import run_laser
 from jaxslam.cli.laser.options import READERS as LASER_LOGS
 from jaxslam.cli.laser.options import refuse_laser_options
@@ -74,7 +75,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     files |= _figure(data, runs, formats)
     if at is not None:
         files |= films(data, {name: run[:2] for name, run in runs.items()}, at)
-    written = write_files(options.out, files)
+    written = write_files(options.out, files, replaces=FILMS)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
 

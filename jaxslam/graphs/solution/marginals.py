@@ -19,7 +19,8 @@ from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.plan import Plan, plan_for
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
 from jaxslam.graphs.sparse.inverse import selected_inverse
-from jaxslam.graphs.validation import check_graph
+from jaxslam.graphs.validation import check_graph, label
+from jaxslam.validation.numbers import is_concrete
 
 
 class Marginals(NamedTuple):
@@ -57,7 +58,8 @@ def marginals(
         plan: of `plan(graph, marginals=True, pairs=pairs)`; needed under `jit` and `vmap`. Its
             pairs stand if none are given here.
     Raises:
-        ValueError: on what `check_graph` refuses, and on a plan without marginals or those pairs.
+        ValueError: on what `check_graph` refuses, on a plan without marginals or those pairs, and
+            outside of a trace on a variable that the measurements do not determine.
     """
     caller = "graphs.marginals"
     model = model_of(caller, graph, factors, kernel)
@@ -65,7 +67,12 @@ def marginals(
     check_graph(caller, graph, known)
     wanted = np.asarray(pairs, int).reshape(-1, 2)
     plan = plan_for(caller, graph, known, plan, marginals=True, pairs=wanted)
-    return programs.call(_marginals, (model,), graph, plan)
+    found = programs.call(_marginals, (model,), graph, plan)
+    if is_concrete(found.singular) and np.ndim(found.singular) == 0 and found.singular >= 0:
+        raise ValueError(
+            f"{caller}: the measurements do not determine {label(graph, int(found.singular))}"
+        )
+    return found
 
 
 def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:

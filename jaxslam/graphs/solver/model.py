@@ -32,6 +32,10 @@ def model_of(
 ) -> Model:
     """The model of a graph's tables. Raises ValueError, which begins with a caller's name."""
     known = factors_of(name, graph, factors)
+    if isinstance(kernel, str):
+        raise ValueError(
+            f"{name}: expected a Kernel, as graphs.huber(), or one for each table, got {kernel!r}"
+        )
     if isinstance(kernel, Kernel):
         kernel = dict.fromkeys(graph.tables, kernel)
     if lost := sorted(set(kernel or ()) - set(graph.tables)):

@@ -36,8 +36,8 @@ class Ending(IntEnum):
     DIVERGED = 2
     """χ² is not finite, or Gauss-Newton ended above its start."""
     SINGULAR = 3
-    """The measurements do not determine the variable `singular`; where the method damps its steps
-    it went on and χ² is a minimum."""
+    """The measurements do not determine the variable `singular`, at the last iterate; where the
+    method damps its steps it went on and χ² is a minimum."""
     EXHAUSTED = 4
     """All iterations were made."""
 
@@ -86,6 +86,8 @@ class Search(NamedTuple):
     """the last step was refused"""
     former: Float[Array, "B"]
     """χ² of the iterate before"""
+    judged: Bool[Array, "B"]
+    """the factor without damping was tried again at this iterate, where it is singular elsewhere"""
 
 
 def minimize(
@@ -115,6 +117,7 @@ def minimize(
         refused=no,
         careful=no,
         former=zero,
+        judged=no,
     )
 
     def iterate(carry: tuple[Search, Array, Array]) -> tuple[Search, Array, Array]:
@@ -162,6 +165,7 @@ def minimize(
             refused=refused,
             careful=jnp.where(asked, ~good, search.careful),
             former=jnp.where(take & ~began, search.system.chi2, search.former),
+            judged=search.judged & ~take,
         )
 
     def damping(search: Search, good: Array, ratio: Array) -> Array:
@@ -190,18 +194,22 @@ def minimize(
         regular = step.regular.all(axis=0)
         culprit = plan.order[jnp.argmin(step.regular, axis=0)].astype(jnp.int32)
         singular = jnp.where(plain & ~regular & ~known, culprit, search.singular)
-        known = singular >= 0
         least = jnp.maximum(tolerance, 32 * eps) * (search.system.chi2 + 1)
         small = step.decrement <= least
-        bound, stepped = search.bound, ~no
+        # What is regular at the end is determined there, whatever it was on the way.
+        singular = jnp.where(plain & regular & small, -1, singular)
+        known = singular >= 0
+        bound, stepped, judged = search.bound, ~no, search.judged
         if method == "gauss_newton":
             done = ~regular | small
             ending = jnp.where(regular, Ending.CONVERGED, Ending.SINGULAR)
         else:
             stuck = (search.refused if method != "dogleg" else no) | (step.predicted <= 0)
-            done = small & (plain | known | stuck)
+            done = small & (plain | (known & judged) | stuck)
             ending = jnp.where(known, Ending.SINGULAR, Ending.CONVERGED)
-            ending = jnp.where(~known & (~plain | stuck), Ending.STALLED, ending)
+            # A gradient of exactly zero is no reason to stall.
+            stalled = ~plain | (stuck & (step.predicted != 0))
+            ending = jnp.where(~known & stalled, Ending.STALLED, ending)
         if method == "dogleg":
             stuck = ~small & (step.predicted <= least * 1e-3)
             done, ending = done | stuck, jnp.where(stuck, Ending.STALLED, ending)
@@ -209,7 +217,8 @@ def minimize(
             # Without a step: an undamped factor that failed, or that has to confirm convergence.
             stepped = regular & ~(small & ~plain)
             bound = jnp.where(regular, bound, jnp.maximum(10 * bound, FIRST_DAMPING))
-            bound = jnp.where(regular & small & ~plain, 0.0, bound)
+            again = regular & small & ~plain & ~done
+            bound, judged = jnp.where(again, 0.0, bound), judged | (again & known)
             stuck = ~done & (bound > 1e10)
             done, ending = done | stuck, jnp.where(stuck, Ending.STALLED, ending)
         ends = search.going & done
@@ -222,6 +231,7 @@ def minimize(
             going=search.going & ~done & (search.taken < iterations),
             ending=jnp.where(ends, ending, search.ending).astype(jnp.int32),
             singular=jnp.where(search.going, singular, search.singular),
+            judged=judged,
         )
 
     end, first_chi2, first_gradient = jax.lax.while_loop(

@@ -141,6 +141,8 @@ def subtract_products(
     product: Product,
 ) -> jax.Array:
     """The targets (M, …) after the rounds of a level; a factor of None is a target itself."""
+    if not len(tables.base):  # no measurement joins two variables
+        return target
 
     def chunk(c: jax.Array, target: jax.Array) -> jax.Array:
         a = (target if left is None else left)[tables.left[c]]
@@ -162,6 +164,8 @@ def finish(
     tables: Sweep, level: jax.Array, target: jax.Array, by: jax.Array, product: Product
 ) -> jax.Array:
     """The targets (M, …) after those of a level are multiplied."""
+    if not len(tables.end_base):
+        return target
 
     def chunk(c: jax.Array, target: jax.Array) -> jax.Array:
         held = jax.lax.dynamic_slice_in_dim(target, tables.end_base[c], TARGETS)
