@@ -29,7 +29,7 @@ from jaxslam.consistency.nees import block_nees
 from jaxslam.grids.slam.particles import copied_rows
 from jaxslam.motion import unicycle
 from jaxslam.results import plot
-from jaxslam.results.plot.grids import shades_of_occupancy, shown_occupancy
+from jaxslam.results.plot.maps.grids import shades_of_occupancy, shown_occupancy
 from jaxslam.results.plot.style import INK, PAGE, caption, panels_of, titled
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square

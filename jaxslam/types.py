@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam import records, streams
+from jaxslam.logs import streams, tables
 
 
 class Status(IntEnum):
@@ -110,14 +110,14 @@ class Log(NamedTuple):
                 times that go back (of odometry: or repeat), or a tag twice at a time.
         """
         name, controls, measured = "Log.from_records", motion.controls, sensor.measurements
-        moved = records.table(
+        moved = tables.table(
             f"{name}: odometry",
             odometry,
-            lambda given: (records.TIME, *records.odometry_columns(controls, given)),
+            lambda given: (tables.TIME, *tables.odometry_columns(controls, given)),
         )
-        columns = records.measurement_columns(measured, sensor.landmark)
-        seen = records.table(f"{name}: measurements", measurements, lambda _: columns)
-        rows, tags, dropped = records.align(moved, seen, controls, measured)
+        columns = tables.measurement_columns(measured, sensor.landmark)
+        seen = tables.table(f"{name}: measurements", measurements, lambda _: columns)
+        rows, tags, dropped = tables.align(moved, seen, controls, measured)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)
 
 

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from benchmarks.gate import Metric
 from jaxslam.datasets import MRCLAM_CALIBRATION, Calibration
 from jaxslam.datasets.mrclam.files import read_landmarks, read_robot, read_truth
-from jaxslam.streams import interpolate_poses
+from jaxslam.logs.streams import interpolate_poses
 
 RATE = 50.0
 """Of the grid on which odometry is compared with the truth [Hz]."""

@@ -10,7 +10,7 @@ from jaxslam.cli.common import add_out
 from jaxslam.cli.runtime import cache
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
 from jaxslam.datasets.table.settings_text import changed, fragment
-from jaxslam.records import POSE
+from jaxslam.logs.tables import POSE
 from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
 
 

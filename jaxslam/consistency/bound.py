@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import derivatives
 from jaxslam.consistency.score import snapshot_steps
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.linearize import derivatives
 from jaxslam.linearize.at_truth import at_truth
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math.linalg import root_psd

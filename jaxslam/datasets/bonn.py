@@ -6,10 +6,10 @@ import numpy as np
 
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.logs.streams import as_recorded
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import range_bearing
-from jaxslam.streams import as_recorded
 from jaxslam.types import Log
 
 SOURCE = (

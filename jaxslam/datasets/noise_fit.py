@@ -10,9 +10,9 @@ import numpy as np
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.logs.tables import POSE, split_unit
 from jaxslam.math.stats import normal_quantile
 from jaxslam.protocols import Filter
-from jaxslam.records import POSE, split_unit
 from jaxslam.run import run
 from jaxslam.types import Info, Log, Status
 from jaxslam.validation.numbers import check_count

@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.formats.mat_file import read_matrices
+from jaxslam.logs.streams import divide, interpolate_poses
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import range_only
-from jaxslam.streams import divide, interpolate_poses
 from jaxslam.types import Log
 
 SOURCE = (

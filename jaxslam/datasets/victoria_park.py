@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.logs.streams import as_recorded
 from jaxslam.motion import pose_increment
 from jaxslam.noise import NoiseCov
 from jaxslam.sensors import relative_position
-from jaxslam.streams import as_recorded
 from jaxslam.types import Log
 from jaxslam.validation.numbers import check_covariance
 

@@ -9,9 +9,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import programs, validation
-from jaxslam.derivatives import motion_jacobians
 from jaxslam.graphs.factor import Factor, from_motion, from_sensor, nominal_motion, of_files
 from jaxslam.graphs.graph import Graph, Table
+from jaxslam.linearize.derivatives import motion_jacobians
 from jaxslam.math import linalg, se2
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxslam import derivatives
+from jaxslam.linearize import derivatives
 from jaxslam.math.arrays import Control, Landmark, Measurement, Pose, PoseMatrix
 from jaxslam.math.linalg import matmul
 from jaxslam.protocols import Here, Motion, Sensor

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.logs.streams import relative
 from jaxslam.metrics.paths import pose_pair, poses_of, wrapped
-from jaxslam.streams import relative
 
 Spacing = float | Sequence[float] | None
 

@@ -1,6 +1,6 @@
 """Monte-Carlo campaigns: many filters on identical draws, over blocks, devices and hosts."""
 
-from jaxslam.monte_carlo.blockwise import Library
+from jaxslam.monte_carlo.blocks.blockwise import Library
 from jaxslam.monte_carlo.campaign import Keep, monte_carlo
 from jaxslam.monte_carlo.pieces import missing
 from jaxslam.monte_carlo.record import Campaign, Interrupted

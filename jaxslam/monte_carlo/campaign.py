@@ -20,8 +20,10 @@ from jax.typing import DTypeLike
 from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Summary, Tally, summarize
-from jaxslam.monte_carlo.block import BOUND, BlockRunner, Glimpse
-from jaxslam.monte_carlo.blockwise import Library
+from jaxslam.monte_carlo.blocks.block import BOUND, BlockRunner, Glimpse
+from jaxslam.monte_carlo.blocks.blockwise import Library
+from jaxslam.monte_carlo.blocks.plan import Plan, Promises
+from jaxslam.monte_carlo.blocks.programs import compile_programs
 from jaxslam.monte_carlo.candidates import (
     check_dtype,
     check_fits,
@@ -31,8 +33,6 @@ from jaxslam.monte_carlo.candidates import (
 )
 from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.pieces import check_part, cores, in_part, missing
-from jaxslam.monte_carlo.plan import Plan, Promises
-from jaxslam.monte_carlo.programs import compile_programs
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.monte_carlo.record import Campaign, Interrupted
 from jaxslam.monte_carlo.together import gathered, share

@@ -1,16 +1,15 @@
-"""Sensors, one a file. The conformance tests run over `REGISTRY`."""
+"""Sensors, one a file: those that determine a landmark here, others in `partial` and `absolute`.
+
+The conformance tests run over `REGISTRY`."""
 
 from collections.abc import Callable
 
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.bearing_inverse_depth import bearing_inverse_depth
-from jaxslam.sensors.bearing_only import bearing_only
-from jaxslam.sensors.compass import compass
+from jaxslam.sensors.absolute import compass, position_fix
 from jaxslam.sensors.line import line
-from jaxslam.sensors.position_fix import position_fix
+from jaxslam.sensors.partial import bearing_inverse_depth, bearing_only, range_only
 from jaxslam.sensors.range_bearing import range_bearing
 from jaxslam.sensors.range_bearing_signature import range_bearing_signature
-from jaxslam.sensors.range_only import range_only
 from jaxslam.sensors.relative_position import relative_position
 from jaxslam.sensors.suite import Part, suite
 

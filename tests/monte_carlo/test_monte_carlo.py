@@ -14,9 +14,9 @@ from jaxslam import catalog, filters, motion, run, sensors, simulate, store
 from jaxslam.filters import reporting
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
-from jaxslam.monte_carlo.block import BlockRunner
+from jaxslam.monte_carlo.blocks.block import BlockRunner
+from jaxslam.monte_carlo.blocks.plan import Plan, Promises
 from jaxslam.monte_carlo.candidates import fitting_block, without_noise
-from jaxslam.monte_carlo.plan import Plan, Promises
 from jaxslam.types import Status
 
 WORLD = worlds.ring()

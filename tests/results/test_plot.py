@@ -10,8 +10,8 @@ import pytest
 from jaxslam import plot
 from jaxslam.catalog import ALL, KINDS
 from jaxslam.consistency import DOF, LAGS, LEVELS
-from jaxslam.results.plot.layout import kinds_of
-from jaxslam.results.plot.scale import BEYOND, set_positive
+from jaxslam.results.plot.campaigns.layout import kinds_of
+from jaxslam.results.plot.campaigns.scale import BEYOND, set_positive
 from jaxslam.results.plot.style import COLORS, TEXT, curves_of, look, panels_of
 
 FIVE = ("dead_reckoning", "ekf", "fej", "right_invariant", "fastslam1")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxslam import plot
-from jaxslam.results.plot.scale import BEYOND
+from jaxslam.results.plot.campaigns.scale import BEYOND
 from jaxslam.results.plot.style import curves_of
 
 

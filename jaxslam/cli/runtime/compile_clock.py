@@ -5,7 +5,7 @@ import time
 
 import jax
 
-from jaxslam.monte_carlo.blockwise import RESTORED
+from jaxslam.monte_carlo.blocks.blockwise import RESTORED
 
 _PARTS = (
     "/jax/core/compile/jaxpr_trace_duration",

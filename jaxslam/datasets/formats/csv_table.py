@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.datasets.formats.lines import read_bytes
-from jaxslam.records import TAG, UNITS, Table, split_unit, unit_divisor
+from jaxslam.logs.tables import TAG, UNITS, Table, split_unit, unit_divisor
 
 
 class CsvTable:

@@ -13,12 +13,12 @@ from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam.calibration import Calibration, per_interval, recorded
 from jaxslam.datasets.mrclam.files import ROBOTS, read_landmarks, read_robot, read_truth
 from jaxslam.datasets.mrclam.truth import START_COV, cut_after, true_poses
+from jaxslam.logs.streams import hold
 from jaxslam.motion import unicycle
 from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors import Part, range_bearing, suite
 from jaxslam.sensors.mounting import NO_OFFSET
-from jaxslam.streams import hold
 from jaxslam.team import Robot, motion_of, sensors_of
 from jaxslam.types import Log, Scan
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.streams import interpolate_poses
+from jaxslam.logs.streams import interpolate_poses
 
 GAP = 0.2
 """Time between lines of the truth beyond which it is unknown between them [s]."""

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam import records
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.datasets.formats.csv_table import CsvTable
 from jaxslam.datasets.formats.lines import stored
 from jaxslam.datasets.table.settings import Parametric, Settings
+from jaxslam.logs import tables
+from jaxslam.logs.streams import interpolate_poses
+from jaxslam.logs.tables import POSE, TAG, TIME
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.records import POSE, TAG, TIME
-from jaxslam.streams import interpolate_poses
 from jaxslam.types import Log
 
 
@@ -62,8 +62,8 @@ def table(folder: str | Path) -> Dataset:
     by_motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
     by_sensor = settings.sensor(seen_file.header)
     motion, sensor = by_motion.made(), by_sensor.made()
-    moved = (TIME, *records.odometry_columns(motion.controls, odometry_file.header))
-    measured = records.measurement_columns(sensor.measurements, sensor.landmark)
+    moved = (TIME, *tables.odometry_columns(motion.controls, odometry_file.header))
+    measured = tables.measurement_columns(sensor.measurements, sensor.landmark)
     odometry = odometry_file.table(moved, f"of the motion model {motion.name}")
     seen = seen_file.table(measured, f"of the sensor {sensor.name}")
     notes = [
@@ -72,7 +72,7 @@ def table(folder: str | Path) -> Dataset:
         for column in file.unused(wanted)
     ]
     survey = _survey(folder / "landmarks.csv")
-    rows, tags, dropped = records.align(
+    rows, tags, dropped = tables.align(
         odometry, seen, motion.controls, sensor.measurements, tuple(survey or ())
     )
     known = tags if survey is None else survey
@@ -144,7 +144,7 @@ def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
     if stored(path) is None:
         return None, None
     found = CsvTable(path).table((TIME, *POSE), "of a true path")
-    records.check_times(found, strict=True)
+    tables.check_times(found, strict=True)
     clock = found.columns[TIME]
     covered = (time >= clock[0]) & (time <= clock[-1])
     if not covered.any():

@@ -13,9 +13,9 @@ import numpy as np
 
 from jaxslam import association, motion, sensors
 from jaxslam.datasets.table.settings_text import line_of
+from jaxslam.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.math import stats
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.records import INTERVAL, POSE, odometry_columns, split_unit
 
 _Model = TypeVar("_Model")
 

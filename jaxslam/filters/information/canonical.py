@@ -21,11 +21,11 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.charts.euclidean import euclidean
-from jaxslam.derivatives import observe_jacobians
 from jaxslam.filters.information.settings import InformationSettings
 from jaxslam.filters.information.tag_association import TagAssociation
 from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.linearize import first_order
+from jaxslam.linearize.derivatives import observe_jacobians
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import gaussian_terms, log_density

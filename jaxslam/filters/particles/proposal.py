@@ -10,13 +10,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxslam import derivatives
 from jaxslam.association.predicted import predicted
 from jaxslam.filters.particles.gating import gate_distance
 from jaxslam.filters.particles.scan_association import ParticleAssociation, particle_association
 from jaxslam.filters.particles.settings import ParticleMapSettings
 from jaxslam.filters.particles.states.slam_state import SlamParticles
-from jaxslam.linearize import first_order
+from jaxslam.linearize import derivatives, first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of

@@ -5,21 +5,23 @@ Only this package draws. Figures are made without pyplot, so there is no global 
 column of a paper, with letters of the same size.
 """
 
-from jaxslam.results.plot.campaign import (
+from jaxslam.results.plot.campaigns.cost import cost_figure
+from jaxslam.results.plot.campaigns.errors import errors_figure, run_errors_figure
+from jaxslam.results.plot.campaigns.measures import (
     bound_figure,
     coverage_figure,
     gained_figure,
     whiteness_figure,
 )
-from jaxslam.results.plot.cost import cost_figure
+from jaxslam.results.plot.campaigns.nees import nees_figure
 from jaxslam.results.plot.formats import encode
-from jaxslam.results.plot.geometry import ellipse
-from jaxslam.results.plot.graph import graph_figure
-from jaxslam.results.plot.grids import grid_figure
-from jaxslam.results.plot.lines import walls_figure
-from jaxslam.results.plot.loops import loops_figure, maps_before_after
-from jaxslam.results.plot.maps import map_figure, run_map_figure
-from jaxslam.results.plot.nees import nees_figure
+from jaxslam.results.plot.maps.geometry import ellipse
+from jaxslam.results.plot.maps.graph import graph_figure
+from jaxslam.results.plot.maps.grids import grid_figure
+from jaxslam.results.plot.maps.landmarks import map_figure, run_map_figure
+from jaxslam.results.plot.maps.lines import walls_figure
+from jaxslam.results.plot.maps.loops import loops_figure, maps_before_after
+from jaxslam.results.plot.maps.topology import topology_figure
 from jaxslam.results.plot.scene import (
     History,
     Layer,
@@ -33,9 +35,7 @@ from jaxslam.results.plot.scene import (
     render,
     run_scene,
 )
-from jaxslam.results.plot.single import errors_figure, run_errors_figure
 from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, png, warm_up
-from jaxslam.results.plot.topology import topology_figure
 
 __all__ = [
     "COLORS",

@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.patches import Polygon
 
-from jaxslam.results.plot.geometry import ellipses
+from jaxslam.results.plot.maps.geometry import ellipses
 from jaxslam.results.plot.scene.render import Draw, Layer
 
 _TRIANGLE = np.array([[1.0, 0.0], [-0.6, 0.55], [-0.6, -0.55]])

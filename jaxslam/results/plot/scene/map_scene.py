@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from jaxslam.results.plot.grids import shades_of_occupancy, shown_occupancy
+from jaxslam.results.plot.maps.grids import shades_of_occupancy, shown_occupancy
 from jaxslam.results.plot.scene.layers import triangle
 from jaxslam.results.plot.scene.render import Draw, Layer, Panel, Scene
 from jaxslam.results.plot.style import COLORS

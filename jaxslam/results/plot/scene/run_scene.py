@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxslam.results.plot.geometry import Limits, ellipses, span, square
+from jaxslam.results.plot.maps.geometry import Limits, ellipses, span, square
 from jaxslam.results.plot.scene.history import History, Measured, measured
 from jaxslam.results.plot.scene.layers import (
     cloud,

@@ -14,7 +14,7 @@ from jaxslam import datasets, se2
 from jaxslam.filters import ekf_slam
 from jaxslam.types import Status
 
-DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 COV = "0.01 0 0 0.04 0.001 0.09"
 VICTORIA = {

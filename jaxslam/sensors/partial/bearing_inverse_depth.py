@@ -19,9 +19,9 @@ from jaxslam.math.arrays import (
 )
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Reduced, Sensor
-from jaxslam.sensors.bearing_only import bearing_only
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
-from jaxslam.sensors.prior import FreeLike, prior
+from jaxslam.sensors.partial.bearing_only import bearing_only
+from jaxslam.sensors.partial.prior import FreeLike, prior
 from jaxslam.validation.numbers import is_concrete
 
 _FAR = 1e-6

@@ -10,7 +10,7 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.geometry import ellipses, span, square
+from jaxslam.results.plot.maps.geometry import ellipses, span, square
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,

@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, LEVELS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.layout import finish, head, runs_of, sheet
-from jaxslam.results.plot.scale import common_top, mark_beyond, scale_setters
+from jaxslam.results.plot.campaigns.layout import finish, head, runs_of, sheet
+from jaxslam.results.plot.campaigns.scale import common_top, mark_beyond, scale_setters
 from jaxslam.results.plot.style import INK, PAGE, RULE, band, curve, plain, span
 
 _NOTHING = 1e-6

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxslam import streams
+from jaxslam.logs import streams
 
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"deg": 180 / math.pi},

@@ -37,10 +37,10 @@ from jaxslam.consistency import (
     statistics,
 )
 from jaxslam.filters.ekf.observability import Monitor
-from jaxslam.monte_carlo.blockwise import Axes, Blockwise, Program
+from jaxslam.monte_carlo.blocks.blockwise import Axes, Blockwise, Program
+from jaxslam.monte_carlo.blocks.limit import divergence_limit
+from jaxslam.monte_carlo.blocks.plan import Plan, Promises, run_numbers
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
-from jaxslam.monte_carlo.limit import divergence_limit
-from jaxslam.monte_carlo.plan import Plan, Promises, run_numbers
 from jaxslam.protocols import Candidate, Sensor
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Info, Log, Trace, Truth

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
-from jaxslam.results.plot.grids import world_of
+from jaxslam.results.plot.maps.grids import world_of
 from jaxslam.results.plot.style import COLORS, INK, PAGE, caption, every_handle, panels_of
 from jaxslam.topology import Route, TopologicalMap
 from jaxslam.topology.places import cell_centers

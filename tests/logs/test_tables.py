@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxslam import streams
+from jaxslam.logs import streams
 from jaxslam.motion import pose_increment, unicycle
 from jaxslam.sensors import compass, range_bearing
 from jaxslam.types import Log

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from jaxslam.monte_carlo.blockwise import Library, Program
+from jaxslam.monte_carlo.blocks.blockwise import Library, Program
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario
 

@@ -16,7 +16,7 @@ from jaxslam.math.arrays import (
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
-from jaxslam.sensors.prior import FreeLike, prior
+from jaxslam.sensors.partial.prior import FreeLike, prior
 
 TEN_METRES = ((10.0,), ((25.0,),))
 """Range 10 m, σ 5 m: a placeholder for the actual prior knowledge."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.consistency import final_covariance
-from jaxslam.monte_carlo.plan import Plan, Promises
+from jaxslam.monte_carlo.blocks.plan import Plan, Promises
 from jaxslam.types import Log, Truth
 
 

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 from jaxslam.math.angles import wrap
 from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.absolute import absolute
+from jaxslam.sensors.absolute.absolute import absolute
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 

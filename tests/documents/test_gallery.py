@@ -18,7 +18,7 @@ from jaxslam import datasets, plot
 from jaxslam.catalog import KINDS
 from jaxslam.simulation.scenarios import SCENARIOS
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SCRIPTS = gallery.scripts()
 
 IN_KINDS = {"ekf", "information", "particles", "known"}

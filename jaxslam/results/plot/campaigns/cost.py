@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, Measure
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.layout import TOGETHER, head, kinds_of, runs_of
-from jaxslam.results.plot.scale import mark_beyond, power, set_positive
+from jaxslam.results.plot.campaigns.layout import TOGETHER, head, kinds_of, runs_of
+from jaxslam.results.plot.campaigns.scale import mark_beyond, power, set_positive
 from jaxslam.results.plot.style import (
     INK,
     PAGE,

@@ -16,7 +16,7 @@ from jaxslam.math.arrays import (
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
-from jaxslam.sensors.prior import FreeLike, prior
+from jaxslam.sensors.partial.prior import FreeLike, prior
 
 ANY_DIRECTION = ((0.0,), ((np.pi**2 / 3,),))
 """The Gaussian with the mean and the variance of a direction uniform on (-π, π]."""

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.layout import finish, head, runs_of, sheet
-from jaxslam.results.plot.scale import mark_beyond, nees_scale
+from jaxslam.results.plot.campaigns.layout import finish, head, runs_of, sheet
+from jaxslam.results.plot.campaigns.scale import mark_beyond, nees_scale
 from jaxslam.results.plot.style import INK, PAGE, band, curve, span
 
 

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.scale import common_top, mark_beyond, scale_setters
+from jaxslam.results.plot.campaigns.scale import common_top, mark_beyond, scale_setters
 from jaxslam.results.plot.style import (
     COLORS,
     CURVE,

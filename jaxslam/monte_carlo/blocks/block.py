@@ -11,9 +11,9 @@ from jaxtyping import PyTree
 from jaxslam.consistency import Measure, Score, condense, mean_pose_nees, positive_interval, score
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.filters.ekf.observability import Monitored
-from jaxslam.monte_carlo.limit import divergence_limit, first_run
-from jaxslam.monte_carlo.plan import Plan, Promises, run_numbers
-from jaxslam.monte_carlo.programs import FilterResults, World
+from jaxslam.monte_carlo.blocks.limit import divergence_limit, first_run
+from jaxslam.monte_carlo.blocks.plan import Plan, Promises, run_numbers
+from jaxslam.monte_carlo.blocks.programs import FilterResults, World
 from jaxslam.types import Estimate, Info, Trace, Truth
 
 BOUND = "bound"

@@ -1,0 +1,1 @@
+"""Figures of maps: landmarks, grids, graphs, walls, places, the loops of laser SLAM."""
