@@ -73,9 +73,9 @@ class Log(NamedTuple):
         rule: streams.Rule,
         rows: ArrayLike | None = None,
     ) -> "Log":
-        """The log of odometry (times, values) and measurements (times, tags, values); see
-        `streams.align`, which says what they, the rule and the rows are. Arrays are NumPy's."""
-        return cls.from_rows(streams.align(odometry, measurements, rule, rows))
+        """The log of odometry (times, values) and measurements (times, tags, values), in NumPy;
+        `logs.streams.align_streams` says what they, the rule and the rows are."""
+        return cls.from_rows(streams.align_streams(odometry, measurements, rule, rows))
 
     @classmethod
     def from_rows(cls, rows: streams.Rows) -> "Log":
@@ -110,14 +110,14 @@ class Log(NamedTuple):
                 times that go back (of odometry: or repeat), or a tag twice at a time.
         """
         name, controls, measured = "Log.from_records", motion.controls, sensor.measurements
-        moved = tables.table(
+        moved = tables.columns_of(
             f"{name}: odometry",
             odometry,
             lambda given: (tables.TIME, *tables.odometry_columns(controls, given)),
         )
         columns = tables.measurement_columns(measured, sensor.landmark)
-        seen = tables.table(f"{name}: measurements", measurements, lambda _: columns)
-        rows, tags, dropped = tables.align(moved, seen, controls, measured)
+        seen = tables.columns_of(f"{name}: measurements", measurements, lambda _: columns)
+        rows, tags, dropped = tables.align_tables(moved, seen, controls, measured)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)
 
 

@@ -16,7 +16,7 @@ from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
 from jaxslam.consistency import own_error_of, score
-from jaxslam.consistency.statistics import statistics
+from jaxslam.consistency.statistics import run_statistics
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.results.plot import COLORS
 from jaxslam.run import run
@@ -138,7 +138,7 @@ def campaign(names, maps: int, runs: int, steps: int, seed: int, noise=1.0, bloc
         own = own_error_of(filter.chart, here.sensor, trace, truth)
         # Of the estimate a score looks at poses alone.
         seen = trace._replace(estimate=trace.estimate[:2])
-        return seen, truth, statistics(trace, truth, here.sensor), own
+        return seen, truth, run_statistics(trace, truth, here.sensor), own
 
     def averages(go, rows):
         """Each run's own averages, and how many measurements found no slot in a scan."""

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from benchmarks.gate import Metric
-from jaxslam.datasets import MRCLAM_CALIBRATION, Calibration
+from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
 from jaxslam.datasets.mrclam.files import read_landmarks, read_robot, read_truth
 from jaxslam.logs.streams import interpolate_poses
 
@@ -101,18 +101,18 @@ def odometry(folder: Path) -> tuple[np.ndarray, float, np.ndarray]:
     return np.array([forward, outer, turn]), float(delay), noise
 
 
-def fit(folder: Path) -> Calibration:
+def fit(folder: Path) -> RobotCalibration:
     """The calibration; the camera's yaw is left at zero, since it differs from robot to robot."""
     (depth, ahead), shift, seen = camera(folder)
     (forward, outer, turn), delay, moved = odometry(folder)
-    return Calibration(delay - shift, forward, outer, turn, depth, ahead, 0.0, *moved, *seen)
+    return RobotCalibration(delay - shift, forward, outer, turn, depth, ahead, 0.0, *moved, *seen)
 
 
 def measure(folder: Path) -> list[Metric]:
     """The fit beside the constants of the package; a gate for the worst difference."""
     found, worst = fit(folder), 0.0
     print("| robot 1 of data set 6 | fitted | package |\n| --- | --- | --- |")
-    for name, new, kept in zip(Calibration._fields, found, MRCLAM_CALIBRATION, strict=True):
+    for name, new, kept in zip(RobotCalibration._fields, found, MRCLAM_CALIBRATION, strict=True):
         print(f"| {name} | {new:.4f} | {kept:.4f} |")
         relative, absolute = TOLERANCE
         worst = max(worst, abs(new - kept) / max(relative * abs(kept), relative * absolute))

@@ -66,13 +66,13 @@ class Known(NamedTuple):
 
 
 def known(pairs: Pairs) -> Known:
-    """The bound by the exact world: J_a C_a J_aᵀ + J_b C_b J_bᵀ, C of `laser.observability`, J of
+    """The bound by the exact world: J_a C_a J_aᵀ + J_b C_b J_bᵀ, C of `scan_information`, J of
     `se2.between`."""
     seen, free, bound = [], [], []
     by_pose = jax.jit(jax.vmap(se2.between_jacobians))(*pairs.poses)
     for run, (by_a, by_b) in enumerate(zip(*map(np.asarray, by_pose), strict=True)):
         told = [
-            laser.observability(pairs.world.laser, pairs.world.walls, np.asarray(pose[run]))
+            laser.scan_information(pairs.world.laser, pairs.world.walls, np.asarray(pose[run]))
             for pose in pairs.poses
         ]
         motions = by_b @ told[1].directions.T

@@ -9,7 +9,7 @@ import numpy as np
 from jaxslam.cli.common import add_out
 from jaxslam.cli.runtime import cache
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
-from jaxslam.datasets.table.settings_text import changed, fragment
+from jaxslam.datasets.table.settings_text import changed, toml_lines
 from jaxslam.logs.tables import POSE
 from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
 
@@ -49,7 +49,7 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
         "fit.json": json_text(
             _summary(data, result) | {"command": command, "versions": versions()}
         ),
-        "fit.toml": fragment(changes, comments),
+        "fit.toml": toml_lines(changes, comments),
     }
     written = write_files(options.out, files)
     if text is not None:

@@ -25,7 +25,7 @@ def verify_models(options: argparse.Namespace, command: str) -> int:
     verify_one = partial(verify.verify_jacobians, count=options.states, seed=options.seed)
     if options.target is None:
         reports = _verify_all(verify_one)
-        print(verify.table(reports))
+        print(verify.report_table(reports))
     else:
         reports = user_files.verify_file(options.target, verify_one)
     details = reports if options.target else [r for r in reports if not r.passed]

@@ -22,7 +22,7 @@ from jaxslam.consistency.localization import (
 )
 from jaxslam.consistency.nees import DOF, mean_pose_nees, own_error_of
 from jaxslam.consistency.score import LANDMARK_DOF, LEVELS, Score, monitor_of, score
-from jaxslam.consistency.statistics import LAGS, Statistics, statistics
+from jaxslam.consistency.statistics import LAGS, RunStatistics, run_statistics
 from jaxslam.consistency.summary import Summary, summarize
 from jaxslam.consistency.tally import Tally, condense
 from jaxslam.consistency.verdict import Verdict, judge, power_of
@@ -37,8 +37,8 @@ __all__ = [
     "LocalizationSummary",
     "Measure",
     "RunJacobians",
+    "RunStatistics",
     "Score",
-    "Statistics",
     "Summary",
     "Tally",
     "Verdict",
@@ -59,10 +59,10 @@ __all__ = [
     "positive_interval",
     "posterior_bound",
     "power_of",
+    "run_statistics",
     "score",
     "score_localization",
     "seed_spread",
-    "statistics",
     "summarize",
     "summarize_localization",
     "van_trees",

@@ -1,7 +1,7 @@
 """`score` returns what each run says of a filter, the numbers that a campaign adds up or keeps.
 
-Called by `monte_carlo.block` on the results of a block of runs; `tally.condense` takes what it
-returns.
+Called by `monte_carlo.blocks.block` on the results of a block of runs; `tally.condense` takes what
+it returns.
 
 A run's error is compared with the covariance the filter claims for it. With e = truth - estimate,
 heading wrapped, NEES = eᵀ P⁻¹ e has mean dof for an honest filter; it is *not* divided by dof
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.consistency.nees import DOF, Nees, block_nees, pose_error
-from jaxslam.consistency.statistics import Statistics
+from jaxslam.consistency.statistics import RunStatistics
 from jaxslam.filters.ekf.observability import Monitor, Monitored
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Info, Status, Trace, Truth
@@ -79,7 +79,7 @@ def snapshot_steps(steps: int) -> np.ndarray:
 def score(
     trace: Trace,
     truth: Truth,
-    found: Statistics,
+    found: RunStatistics,
     own_error: Float[np.ndarray, "R T 3"] | None = None,
 ) -> Score:
     """The scores of R runs, by NumPy in float64; every array is the host's and has leading R.
@@ -88,7 +88,7 @@ def score(
         trace: of the estimate only poses and their covariances are looked at, of the final state
             its observability monitor (`monitor_of`), and where it has one, of `probe` the
             information of that after each step (R, T, 3, 3).
-        found: `statistics` of each run.
+        found: `run_statistics` of each run.
         own_error: the pose errors in the filter's own coordinates (see `own_error_of`), by default
             those in (x, y, θ).
     """

@@ -1,6 +1,6 @@
-"""`statistics` returns what a score needs of one run's maps and innovations: sums over its steps.
+"""What a score needs of one run's maps and innovations: sums over its steps.
 
-Compiled and called by `monte_carlo.programs`; `score` takes what it returns.
+Compiled and called by `monte_carlo.blocks.programs`; `score` takes what it returns.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ _UNROLLED = 4
 """Measurement slots that are looked at in one piece of compiled code."""
 
 
-class Statistics(NamedTuple):
+class RunStatistics(NamedTuple):
     """Of one run; with a leading axis, of many."""
 
     finite: Bool[Array, ""]
@@ -49,7 +49,7 @@ class _Sums(NamedTuple):
     """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
 
 
-def statistics(trace: Trace, truth: Truth, sensor: Sensor) -> Statistics:
+def run_statistics(trace: Trace, truth: Truth, sensor: Sensor) -> RunStatistics:
     """The sums over one run that `score` is made of. For `vmap`, over runs."""
     estimate, info = trace.estimate, trace.info
     held = jnp.where(estimate.alive, estimate.tag, -1)
@@ -98,7 +98,7 @@ def statistics(trace: Trace, truth: Truth, sensor: Sensor) -> Statistics:
     named = held[-1] >= 0
     off = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
     square = jnp.where(named, (off**2).sum(axis=-1), 0.0).sum()
-    return Statistics(
+    return RunStatistics(
         finite=jnp.isfinite(sums.poison).all(),
         landmark_nees=nees,
         regular_landmarks=regular,

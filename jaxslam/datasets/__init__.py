@@ -11,7 +11,7 @@ from pathlib import Path
 from jaxslam.datasets.bonn import bonn
 from jaxslam.datasets.carmen import LaserLog, carmen
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, Calibration
+from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
 from jaxslam.datasets.mrclam.reader import mrclam, mrclam_team
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza import plaza
@@ -46,10 +46,10 @@ READERS: dict[str, Reader] = {
 __all__ = [
     "MRCLAM_CALIBRATION",
     "READERS",
-    "Calibration",
     "Dataset",
     "DatasetFit",
     "LaserLog",
+    "RobotCalibration",
     "bonn",
     "carmen",
     "fit",

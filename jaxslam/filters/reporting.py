@@ -143,7 +143,7 @@ def nothing_of(scan: Scan) -> Info:
     )
 
 
-def joined(infos: list[Info], size_z: int) -> Info:
+def joined_info(infos: list[Info], size_z: int) -> Info:
     """The `Info` of several scans joined; innovations and covariances zero-padded to size_z."""
 
     def together(name: str, padded_axes: int = 0) -> jax.Array:

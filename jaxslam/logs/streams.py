@@ -25,7 +25,7 @@ class Rows(NamedTuple):
     valid: Bool[np.ndarray, "T M"]
 
 
-def align(
+def align_streams(
     odometry: tuple[ArrayLike, ArrayLike],
     measurements: tuple[ArrayLike, ArrayLike, ArrayLike],
     rule: Rule,

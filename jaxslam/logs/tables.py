@@ -22,7 +22,7 @@ POSE = ("x [m]", "y [m]", "theta [rad]")
 _INCREMENT = ("forward [m]", "left [m]", "turn [rad]")
 
 
-class Table(NamedTuple):
+class Columns(NamedTuple):
     """Columns of one length by name, and where a cell is, for messages."""
 
     columns: dict[str, Any]
@@ -70,9 +70,9 @@ def measurement_columns(measured: tuple[str, ...], landmark: tuple[str, ...]) ->
     return (TIME, *((TAG,) if landmark else ()), *measured)
 
 
-def align(
-    odometry: Table,
-    measurements: Table,
+def align_tables(
+    odometry: Columns,
+    measurements: Columns,
     controls: tuple[str, ...],
     measured: tuple[str, ...],
     names: Sequence[Hashable] = (),
@@ -120,7 +120,7 @@ def align(
                 f"{', '.join(columns)} cannot be divided, got {when[lost[0]]:.12g}; poses can: "
                 f"{TIME}, {', '.join(POSE)}"
             )
-    rows = streams.align(
+    rows = streams.align_streams(
         (clock, odometry.values(columns)),
         (when[inside], tag[inside], measurements.values(measured)[inside]),
         rule,
@@ -132,7 +132,7 @@ def align(
     return Aligned(rows, tuple(tag_of), dropped)
 
 
-def check_times(table: Table, *, strict: bool) -> None:
+def check_times(table: Columns, *, strict: bool) -> None:
     """Raise ValueError, with the place, unless times rise; equal ones pass where not strict."""
     time = table.columns[TIME]
     back = np.flatnonzero(np.diff(time) <= 0 if strict else np.diff(time) < 0)
@@ -147,7 +147,7 @@ def ordered(names: set[Any]) -> list[Any]:
     return sorted(names - {None}, key=lambda name: (isinstance(name, str), name))
 
 
-def table(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence[str]]) -> Table:
+def columns_of(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence[str]]) -> Columns:
     """The table of a data frame, a mapping of columns, a structured array, or a sequence of rows.
 
     Columns with names are found by them; a name may have a unit ("bearing [deg]"). Without names
@@ -201,7 +201,7 @@ def table(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence[str]
             columns[name] = _numbers(at, name, column) / divisors[name]
     if not columns[TIME].size:
         raise ValueError(f"{what}: expected at least one row, got none")
-    return Table(columns, at)
+    return Columns(columns, at)
 
 
 def _names(given: Any) -> tuple[str, ...] | None:

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.monte_carlo.blocks.block import BOUND, BlockRunner, Glimpse
 from jaxslam.monte_carlo.blocks.blockwise import Library
-from jaxslam.monte_carlo.blocks.plan import Plan, Promises
+from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
 from jaxslam.monte_carlo.blocks.programs import compile_programs
 from jaxslam.monte_carlo.candidates import (
     check_dtype,
@@ -35,7 +35,7 @@ from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.pieces import check_part, cores, in_part, missing
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.monte_carlo.record import Campaign, Interrupted
-from jaxslam.monte_carlo.together import gathered, share
+from jaxslam.monte_carlo.together import gathered_tallies, share
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario, with_positions
 from jaxslam.types import Estimate, Truth
@@ -131,7 +131,7 @@ def monte_carlo(
     names = (*filters, BOUND)
     tallies = {name: Tally() for name in names}
     size = int(block or fitting_block(scenario, filters, devices[0]))
-    plan = Plan(scenario, filters, key, devices, size, bound, dtype, library)
+    plan = CampaignPlan(scenario, filters, key, devices, size, bound, dtype, library)
     if part is not None and (part[0] - 1) * plan.wide >= runs:
         raise ValueError(
             f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
@@ -151,7 +151,7 @@ def monte_carlo(
         interrupted = False
     except KeyboardInterrupt:
         interrupted = True
-    for name, tally in (work.own if interrupted else gathered(work.own)).items():
+    for name, tally in (work.own if interrupted else gathered_tallies(work.own)).items():
         tallies[name].merge(tally)
     campaign = None
     if tallies[BOUND].pieces():
@@ -208,7 +208,9 @@ def _check(
         )
 
 
-def _summed_up(plan: Plan, tallies: dict[str, Tally], work: "_Work", seconds: float) -> Campaign:
+def _summed_up(
+    plan: CampaignPlan, tallies: dict[str, Tally], work: "_Work", seconds: float
+) -> Campaign:
     """The campaign of the runs in the tallies."""
     scenario = plan.scenario
     done = sum(count for _, count in tallies[BOUND].pieces())
@@ -250,7 +252,7 @@ class _Work:
     run_seconds: dict[str, float] = field(default_factory=dict)
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
 
-    def in_blocks_that_fit(self, plan: Plan, todo: Sequence[tuple[int, int]]) -> None:
+    def in_blocks_that_fit(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
         """Compute the pieces, in blocks of half the size each time that memory does not suffice."""
         while True:
             try:
@@ -271,7 +273,7 @@ class _Work:
                 )
                 plan = replace(plan, block=half)
 
-    def go(self, plan: Plan, todo: Sequence[tuple[int, int]]) -> None:
+    def go(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
         """Add those of the pieces that are not yet there to the tallies."""
         if not todo:
             return
@@ -332,7 +334,7 @@ class _Work:
 
 
 @contextlib.contextmanager
-def _shown(work: _Work, plan: Plan, wanted: bool) -> Iterator[None]:
+def _shown(work: _Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
     """A block in which, if wanted, a bar of progress tells of the work where it can be seen."""
     count = len(plan.filters)
     bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None

@@ -96,7 +96,7 @@ class Campaign:
         """
         from jaxslam.results import campaign_files
 
-        return campaign_files.save(self, folder, figures, overwrite)
+        return campaign_files.save_campaign(self, folder, figures, overwrite)
 
     def to_dataframe(self) -> Any:
         """A pandas DataFrame with a row for each run of each filter.
@@ -131,7 +131,7 @@ class Campaign:
         """
         from jaxslam.results import run_table
 
-        return run_table.save(self, path)
+        return run_table.save_table(self, path)
 
 
 class Interrupted(KeyboardInterrupt):

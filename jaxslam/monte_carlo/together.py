@@ -23,7 +23,7 @@ def share(pieces: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     return list(pieces[jax.process_index() :: count])
 
 
-def gathered(tallies: dict[str, Tally]) -> dict[str, Tally]:
+def gathered_tallies(tallies: dict[str, Tally]) -> dict[str, Tally]:
     """The tallies with what every process has in its own; each gets the same."""
     if jax.process_count() == 1:
         return tallies

@@ -31,7 +31,7 @@ def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list
     return [PAGE, RESULT, CURVES, *(f"{name}.{kind}" for name in figures for kind in kinds)]
 
 
-def check_formats(caller: str, asked: str | Iterable[str]) -> tuple[str, ...]:
+def check_figure_formats(caller: str, asked: str | Iterable[str]) -> tuple[str, ...]:
     """The formats that were asked for, each once; raises ValueError that names another one."""
     try:
         kinds = tuple(dict.fromkeys([asked] if isinstance(asked, str) else asked))
@@ -51,7 +51,7 @@ def filter_of_run_zero(campaign: Campaign) -> str:
     return next(iter(mapping or campaign.filters))
 
 
-def save(
+def save_campaign(
     campaign: Campaign,
     folder: str | Path,
     figures: str | Iterable[str] = ("png",),
@@ -67,7 +67,7 @@ def save(
             none.
         film: of a run, as `Film.player()` gives it, for the page.
     """
-    formats = check_formats("Campaign.save", figures)
+    formats = check_figure_formats("Campaign.save", figures)
     if not isinstance(folder, str | os.PathLike) or not str(folder).strip():
         raise ValueError(f"Campaign.save: expected a folder, got {folder!r}")
     folder = Path(folder)

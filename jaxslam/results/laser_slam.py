@@ -23,7 +23,7 @@ HELD = 12
 """Frames of a film that show the map after closing."""
 
 
-def files(solved: Solved) -> Files:
+def result_files(solved: Solved) -> Files:
     """What `results.files.write_files` writes of a result, by name; without figures.
 
     | file | content |

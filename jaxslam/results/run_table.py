@@ -29,7 +29,7 @@ def columns(campaign: Campaign) -> dict[str, np.ndarray]:
     return found
 
 
-def check_formats(caller: str, asked: Iterable[str]) -> tuple[str, ...]:
+def check_table_formats(caller: str, asked: Iterable[str]) -> tuple[str, ...]:
     """The formats, each once; raises ValueError that names another, or Parquet without pyarrow."""
     kinds = tuple(dict.fromkeys(asked))
     for kind in kinds:
@@ -43,7 +43,7 @@ def check_formats(caller: str, asked: Iterable[str]) -> tuple[str, ...]:
     return kinds
 
 
-def save(campaign: Campaign, path: str | Path) -> Path:
+def save_table(campaign: Campaign, path: str | Path) -> Path:
     """Write the table to a file of the format that its name ends in, whole or not at all.
 
     In CSV what is not finite is an empty cell, in JSON (a list a column) null.
@@ -51,7 +51,7 @@ def save(campaign: Campaign, path: str | Path) -> Path:
     Raises ValueError on another format, and on Parquet where pyarrow is not installed.
     """
     path = Path(path)
-    (kind,) = check_formats("Campaign.save_runs", [path.suffix.removeprefix(".")])
+    (kind,) = check_table_formats("Campaign.save_runs", [path.suffix.removeprefix(".")])
     check_writable(path.parent)
     found = columns(campaign)
     made: str | Callable[[Path], object]

@@ -61,7 +61,7 @@ class LaserWorld:
     """(3,) before the first control"""
 
 
-class LaserLog(NamedTuple):
+class LaserHistory(NamedTuple):
     """A history of a `LaserWorld`. Row t: the control that led *to* pose t, and the scan there."""
 
     pose: Float[Array, "T 3"]
@@ -108,13 +108,13 @@ def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Bea
     return Beams(jnp.where(valid, ranges, 0.0), angles, valid)
 
 
-def scan_world(world: LaserWorld, key: Array) -> LaserLog:
+def scan_world(world: LaserWorld, key: Array) -> LaserHistory:
     """A random history of a world: its path, odometry and scans; traceable, as `simulate` is."""
     check_key("scan_world", key)
     return programs.call(_scan_world, (world,), key)
 
 
-def _scan_world(world: LaserWorld, key: Array) -> LaserLog:
+def _scan_world(world: LaserWorld, key: Array) -> LaserHistory:
     dtype = jnp.result_type(float)
     key_motion, key_scan = jax.random.split(key)
     controls = jnp.asarray(world.controls, dtype)
@@ -122,7 +122,7 @@ def _scan_world(world: LaserWorld, key: Array) -> LaserLog:
     poses, logged = drive(world.motion, start, controls, key_motion, "odometry")
     keys = jax.random.split(key_scan, len(poses))
     beams = jax.vmap(lambda pose, k: scan(world.laser, world.walls, pose, k))(poses, keys)
-    return LaserLog(poses, logged, beams)
+    return LaserHistory(poses, logged, beams)
 
 
 class Observability(NamedTuple):
@@ -139,7 +139,7 @@ class Observability(NamedTuple):
     """of these directions: a translation with its heading, or a rotation with its centre"""
 
 
-def observability(
+def scan_information(
     laser: Laser, walls: Walls, pose: ArrayLike, *, tolerance: float = 1e-9
 ) -> Observability:
     """The Fisher information of a scan about the pose, its bound, and the degenerate directions.

@@ -127,7 +127,7 @@ def _simulate(scenario: Scenario, key: Array) -> tuple[Truth, Log]:
         scan, missed = _suite_scans(scenario, scenario.sensor, poses, landmarks, key_scan)
         return Truth(poses, landmarks, missed, start), Log(logged, scan)
     places = scenario.places or landmarks.shape[0]
-    scan, missed = scans_of(
+    scan, missed = sensor_scans(
         scenario.sensor, scenario.visible, places, poses, landmarks, None, key_scan
     )
     truth = Truth(poses, landmarks, missed, start)
@@ -156,7 +156,7 @@ def _suite_scans(
     return side_by_side(scans, len(sensors.measurements))
 
 
-def scans_of(
+def sensor_scans(
     sensor: Sensor,
     visible: Visible,
     places: int,
@@ -205,7 +205,7 @@ def part_scan(
     tags: Int[Array, "C"],
     key: Array,
 ) -> tuple[Scan, Int[Array, "T"]]:
-    """The `scans_of` one part of a suite, in its measurement slots and at its rate.
+    """The `sensor_scans` one part of a suite, in its measurement slots and at its rate.
 
     tags: of the targets. An absolute sensor has no tag. Without targets nothing is measured.
     """
@@ -217,10 +217,10 @@ def part_scan(
     on = (step >= part.start) & ((step - part.start) % part.every == 0)
     if part.absolute:
         nothing = jnp.zeros((1, 0), poses.dtype)
-        scan, missed = scans_of(part.sensor, everywhere, 1, poses, nothing, on, key)
+        scan, missed = sensor_scans(part.sensor, everywhere, 1, poses, nothing, on, key)
         return scan._replace(tag=jnp.full_like(scan.tag, -1)), missed
     field = visible if part.visible is None else part.visible
-    scan, missed = scans_of(part.sensor, field, part.places, poses, targets, on, key)
+    scan, missed = sensor_scans(part.sensor, field, part.places, poses, targets, on, key)
     tag = jnp.where(scan.valid, tags[jnp.maximum(scan.tag, 0)], -1).astype(jnp.int32)
     spare = part.places - tag.shape[1]
     if spare > 0:  # more slots than there are targets

@@ -18,7 +18,7 @@ from jaxslam.smoothing.forward_pass import (
     in_one_dtype,
     run_forward,
 )
-from jaxslam.smoothing.gauss_newton import Ending, Search, minimize
+from jaxslam.smoothing.gauss_newton import Ending, Iterations, minimize
 from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
 from jaxslam.smoothing.problem import Iterate, Problem
 from jaxslam.smoothing.smooth import solution, with_singular
@@ -26,7 +26,7 @@ from jaxslam.types import Estimate, Info, Log, Trace
 from jaxslam.validation.numbers import check_count, is_concrete
 
 
-class Solved(NamedTuple):
+class BatchSolution(NamedTuple):
     """The `final` of the trace of `batch_map`."""
 
     start: Float[Array, "3"]
@@ -83,9 +83,9 @@ def batch_map(
     What it returns maps (log, key) to a `Trace`: estimates with leading T, the poses at the optimum
     with their covariances there (Laplace's), the map the same at every step; the infos of the
     filter, the last one `exhausted` where the batch did not converge, so that campaigns count it;
-    and a `Solved`. Every measurement is used that the filter fused or initialized a landmark with,
-    except those of a singular R, whose status becomes `Status.SINGULAR`. Where Q depends on the
-    pose, it is evaluated once at the filter's path.
+    and a `BatchSolution`. Every measurement is used that the filter fused or initialized a landmark
+    with, except those of a singular R, whose status becomes `Status.SINGULAR`. Where Q depends on
+    the pose, it is evaluated once at the filter's path.
 
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`. The sensor must determine its
@@ -160,7 +160,9 @@ def _problem_of(
     return problem, Iterate(chain.start.noise, chain.steps.noise, path, landmarks), chain
 
 
-def _solved(sensor: Sensor, search: Search, passed: ForwardPass) -> tuple[Estimate, Solved]:
+def _solved(
+    sensor: Sensor, search: Iterations, passed: ForwardPass
+) -> tuple[Estimate, BatchSolution]:
     """The estimates at the end of a search."""
     at, policy = search.at, search.policy
     joint = jax.lax.stop_gradient(passed.trace.final)._replace(landmarks=at.landmarks)
@@ -173,7 +175,7 @@ def _solved(sensor: Sensor, search: Search, passed: ForwardPass) -> tuple[Estima
     left = policy.decrement > 0
     step = jnp.sqrt(jnp.where(left, policy.decrement, 1.0))
     estimate, smoothed = solution(sensor, search.chain, no_step, at.path, joint, passed)
-    solved = Solved(
+    solved = BatchSolution(
         *smoothed,
         start_noise=at.start,
         noise=at.noise,

@@ -32,7 +32,7 @@ class Start(NamedTuple):
     """ξ̄"""
 
 
-class Step(NamedTuple):
+class LinearizedStep(NamedTuple):
     """A motion and the scan after it, as deviations δ from a reference path x̄ and map m̄.
 
         δx_t = F δx_{t-1} + c + G d_t    ½ |η̄ + d_t|²
@@ -64,7 +64,7 @@ class Chain(NamedTuple):
     """The quadratic cost of a path and a map, the sum of the costs of its parts."""
 
     start: Start
-    steps: Step
+    steps: LinearizedStep
     """with leading T"""
 
 
@@ -128,7 +128,9 @@ def eliminate(chain: Chain, alive: Bool[Array, "N"]) -> Policy:
     return Policy(first, gains, landmarks.reshape(capacity, size), factor, decrement, regular)
 
 
-def eliminate_steps(steps: Step, capacity: int) -> tuple[CostToGo, Gain, Float[Array, ""]]:
+def eliminate_steps(
+    steps: LinearizedStep, capacity: int
+) -> tuple[CostToGo, Gain, Float[Array, ""]]:
     """The cost of all steps as a function of the first pose and of the map, the gains of their
     noises, and their terms of λ².
 
@@ -138,7 +140,9 @@ def eliminate_steps(steps: Step, capacity: int) -> tuple[CostToGo, Gain, Float[A
     """
     wide, kind = capacity * steps.landmark_rows.shape[3], steps.residual.dtype
 
-    def back(carry: tuple[CostToGo, Array], step: Step) -> tuple[tuple[CostToGo, Array], Gain]:
+    def back(
+        carry: tuple[CostToGo, Array], step: LinearizedStep
+    ) -> tuple[tuple[CostToGo, Array], Gain]:
         after, decrement = carry
         after = _add_measurements(after, step, capacity)
         after, gain, gained = _eliminate_noise(after, step.by_noise, step.noise)
@@ -156,7 +160,7 @@ def eliminate_steps(steps: Step, capacity: int) -> tuple[CostToGo, Gain, Float[A
     return to_go, gains, decrement
 
 
-def _by_pose_before(after: CostToGo, step: Step) -> CostToGo:
+def _by_pose_before(after: CostToGo, step: LinearizedStep) -> CostToGo:
     """The cost to go as a function of the pose before a motion, a = F δx + c."""
     return CostToGo(
         pose=linalg.symmetrize(step.by_pose.T @ after.pose @ step.by_pose),
@@ -167,7 +171,7 @@ def _by_pose_before(after: CostToGo, step: Step) -> CostToGo:
     )
 
 
-def _add_measurements(to_go: CostToGo, step: Step, capacity: int) -> CostToGo:
+def _add_measurements(to_go: CostToGo, step: LinearizedStep, capacity: int) -> CostToGo:
     """The cost to go plus a scan: Λ + (A B)ᵀ (A B) and y + (A B)ᵀ b, in the rows it involves."""
     a, b, r = step.pose_rows, step.landmark_rows, step.residual
     size = b.shape[2]

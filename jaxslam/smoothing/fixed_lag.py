@@ -14,14 +14,14 @@ from jaxslam.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.smoothing.window import (
-    Iterate,
     Prior,
-    Steps,
-    linearize,
+    WindowIterate,
+    WindowSteps,
+    linearize_window,
     marginalize_oldest,
     moved_by,
     newest_cov,
-    solve,
+    solve_window,
 )
 from jaxslam.types import Estimate, Info, Scan, Status
 from jaxslam.validation.numbers import check_count
@@ -36,8 +36,8 @@ class WindowState(NamedTuple):
     """the newest pose and the map"""
     prior: Prior
     """of the oldest pose of the window, and of the map before it"""
-    steps: Steps
-    at: Iterate
+    steps: WindowSteps
+    at: WindowIterate
     """the path in the window, and the map"""
 
 
@@ -109,7 +109,9 @@ def fixed_lag(
 
     def predict(state: WindowState, u: Array, key: Array) -> WindowState:
         joint = ekf.predict(state.joint, u, key)
-        system = linearize(motion, sensor, state.prior, state.steps, state.at, first_estimates)
+        system = linearize_window(
+            motion, sensor, state.prior, state.steps, state.at, first_estimates
+        )
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
         root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
         steps, at = shift(state.steps, state.at, u, root, joint.pose)
@@ -132,8 +134,8 @@ def fixed_lag(
         landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
         at = state.at._replace(landmarks=landmarks)
         for _ in range(iterations):
-            system = linearize(motion, sensor, state.prior, steps, at, first_estimates)
-            solved = solve(state.prior, system, at, joint.alive)
+            system = linearize_window(motion, sensor, state.prior, steps, at, first_estimates)
+            solved = solve_window(state.prior, system, at, joint.alive)
             at = moved_by(motion, steps, at, solved)
         joint = with_newest(joint, at, newest_cov(system, solved))
         return WindowState(joint, state.prior, steps, at), info
@@ -149,7 +151,7 @@ def fixed_lag(
 def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -> WindowState:
     """The state before the first step. sizes: of a control and its noise; shape: W and M."""
     (control, noise), (window, places), kind = sizes, shape, joint.pose.dtype
-    steps = Steps(
+    steps = WindowSteps(
         there=jnp.zeros(window, bool),
         control=jnp.zeros((window, control), kind),
         root=jnp.zeros((window, noise, noise), kind),
@@ -158,19 +160,23 @@ def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -
         used=jnp.zeros((window, places), bool),
     )
     path = jnp.tile(joint.pose, (window + 1, 1))
-    at = Iterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
+    at = WindowIterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
     return WindowState(joint, Prior(joint, (joint.pose, joint.landmarks)), steps, at)
 
 
 def shift(
-    steps: Steps, at: Iterate, u: Float[Array, "U"], root: Float[Array, "Q Q"], pose: Array
-) -> tuple[Steps, Iterate]:
+    steps: WindowSteps,
+    at: WindowIterate,
+    u: Float[Array, "U"],
+    root: Float[Array, "Q Q"],
+    pose: Array,
+) -> tuple[WindowSteps, WindowIterate]:
     """The window without its oldest step, and with a new motion to a predicted pose (3,)."""
 
     def append(rows: Array, new: Array | bool | float) -> Array:
         return jnp.roll(rows, -1, axis=0).at[-1].set(new)
 
-    after = Steps(
+    after = WindowSteps(
         there=append(steps.there, True),
         control=append(steps.control, u),
         root=append(steps.root, root),
@@ -181,7 +187,7 @@ def shift(
     return after, at._replace(path=append(at.path, pose), noise=append(at.noise, 0.0))
 
 
-def with_scan(steps: Steps, scan: Scan, info: Info) -> Steps:
+def with_scan(steps: WindowSteps, scan: Scan, info: Info) -> WindowSteps:
     """The window with the measurements of its newest scan that were fused or started landmarks."""
     used = (info.status == Status.FUSED) | (info.status == Status.BORN)
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
@@ -193,7 +199,7 @@ def with_scan(steps: Steps, scan: Scan, info: Info) -> Steps:
     )
 
 
-def with_newest(joint: Joint, at: Iterate, cov: Float[Array, "D D"]) -> Joint:
+def with_newest(joint: Joint, at: WindowIterate, cov: Float[Array, "D D"]) -> Joint:
     """The joint with the newest pose and the map of a window; unit variance at dead slots."""
     there = jnp.repeat(joint.alive, joint.landmarks.shape[1])
     there = jnp.concatenate([jnp.ones(3, bool), there])

@@ -29,7 +29,7 @@ class Ending(IntEnum):
     """No share of the step lowers the cost: rounding, or a model whose derivatives are wrong."""
 
 
-class Search(NamedTuple):
+class Iterations(NamedTuple):
     """The state of the iterations, and their result."""
 
     at: Iterate
@@ -56,14 +56,14 @@ def minimize(
     *,
     iterations: int,
     tolerance: float | None,
-) -> Search:
+) -> Iterations:
     """The result of the iterations from a start; the first step is by the given chain, so the start
     need not satisfy the models.
 
     Without tolerance all iterations are made, in a loop of fixed length.
     """
 
-    def step(search: Search) -> tuple[Search, Bool[Array, ""]]:
+    def step(search: Iterations) -> tuple[Iterations, Bool[Array, ""]]:
         """The search after one iteration: solve the chain, then step or end. Whether it stepped."""
         policy = eliminate(search.chain, alive)
         converged = jnp.asarray(False)
@@ -78,7 +78,7 @@ def minimize(
         ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)
         ending = jnp.where(may & ~lower, Ending.STALLED, ending)
         late = jnp.arange(iterations) >= search.taken
-        found = Search(
+        found = Iterations(
             at=at,
             chain=chain,
             policy=policy,
@@ -92,17 +92,19 @@ def minimize(
     begin = _unstarted(start, chain, alive, iterations)
     # One iteration more than steps: the last solves the chain at the final iterate.
     if tolerance is None:
-        fixed: Search = jax.lax.fori_loop(
+        fixed: Iterations = jax.lax.fori_loop(
             0, iterations + 1, lambda _, search: step(search)[0], begin
         )
         return fixed
-    out: tuple[Search, Array] = jax.lax.while_loop(
+    out: tuple[Iterations, Array] = jax.lax.while_loop(
         lambda carry: carry[1], lambda carry: step(carry[0]), (begin, jnp.asarray(True))
     )
     return out[0]
 
 
-def _unstarted(start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations: int) -> Search:
+def _unstarted(
+    start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations: int
+) -> Iterations:
     """The search before the first step: no chain solved, and infinite cost."""
     kind = chain.steps.residual.dtype
     unsolved = jax.tree.map(
@@ -110,10 +112,10 @@ def _unstarted(start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations
     )
     far, none = jnp.asarray(jnp.inf, kind), jnp.zeros((), jnp.int32)
     costs = jnp.full(iterations, jnp.inf, kind)
-    return Search(start, chain, unsolved, far, costs, none, none + Ending.EXHAUSTED)
+    return Iterations(start, chain, unsolved, far, costs, none, none + Ending.EXHAUSTED)
 
 
-def _converged(search: Search, policy: Policy, tolerance: float) -> Bool[Array, ""]:
+def _converged(search: Iterations, policy: Policy, tolerance: float) -> Bool[Array, ""]:
     """Whether the next step is shorter than the tolerance, in posterior standard deviations.
 
     A step of √eps is rounding of the gradient; so is one whose decrease of the cost is below
@@ -127,7 +129,7 @@ def _converged(search: Search, policy: Policy, tolerance: float) -> Bool[Array, 
 
 
 def _line_search(
-    motion: Motion, sensor: Sensor, problem: Problem, search: Search, policy: Policy
+    motion: Motion, sensor: Sensor, problem: Problem, search: Iterations, policy: Policy
 ) -> tuple[Iterate, Float[Array, ""], Bool[Array, ""]]:
     """The iterate at the first share of the step that lowers the cost enough, its cost, and whether
     there is such a share. The first step may raise the cost, if it stays finite."""

@@ -8,13 +8,13 @@ from jaxslam.linearize import derivatives
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.smoothing.chain import Chain, Start, Step
+from jaxslam.smoothing.chain import Chain, LinearizedStep, Start
 from jaxslam.smoothing.forward_pass import ForwardPass
 from jaxslam.types import Log, Status
 
 Rows = tuple[Array, Array, Array, Array]
-"""A (Z, 3), B (Z, L) and b (Z,) of a measurement, as in `chain.Step`, in units of its noise; and
-() bool, whether the covariance of that noise is positive definite."""
+"""A (Z, 3), B (Z, L) and b (Z,) of a measurement, as in `chain.LinearizedStep`, in units of its
+noise; and () bool, whether the covariance of that noise is positive definite."""
 
 
 def noise_roots(
@@ -49,14 +49,14 @@ def chain_of(
     by_pose, by_noise, drift = _motions(motion, passed, log.control, roots)
     slot, a, b, r, used = _measurements(sensor, passed, log)
     noise = jnp.zeros((len(drift), len(motion.noises)), r.dtype)
-    steps = Step(by_pose, by_noise, drift, noise, slot, a, b, r)
+    steps = LinearizedStep(by_pose, by_noise, drift, noise, slot, a, b, r)
     return Chain(start_of(pose_cov), steps), used
 
 
 def _motions(
     motion: Motion, passed: ForwardPass, control: Float[Array, "T U"], roots: Float[Array, "T W W"]
 ) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3 W"], Float[Array, "T 3"]]:
-    """F, G and c of `chain.Step` for each motion."""
+    """F, G and c of `chain.LinearizedStep` for each motion."""
 
     def one(
         before: Array, predicted: Array, corrected: Array, u: Array, root: Array
@@ -70,7 +70,7 @@ def _motions(
 def _measurements(
     sensor: Sensor, passed: ForwardPass, log: Log
 ) -> tuple[Int[Array, "T M"], Array, Array, Array, Bool[Array, "T M"]]:
-    """The slot of each measurement, A, B and b of `chain.Step`, and whether it is used."""
+    """The slot of each measurement, A, B and b of `LinearizedStep`, and whether it is used."""
     size_l, size_z = len(sensor.landmark), len(sensor.measurements)
     info, final = passed.trace.info, passed.trace.final
 

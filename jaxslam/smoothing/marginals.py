@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.math import linalg
-from jaxslam.smoothing.chain import Chain, Gain, Policy, Step
+from jaxslam.smoothing.chain import Chain, Gain, LinearizedStep, Policy
 
 
 class Marginals(NamedTuple):
@@ -38,7 +38,7 @@ def marginals(chain: Chain, policy: Policy) -> Marginals:
         return linalg.gram(spread, spread)
 
     def forward(
-        before: tuple[Array, Array, Array], row: tuple[Step, Gain]
+        before: tuple[Array, Array, Array], row: tuple[LinearizedStep, Gain]
     ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
         deviation, own, by_map = before
         step, gain = row

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.smoothing.chain import Chain, Policy, Start, Step
+from jaxslam.smoothing.chain import Chain, LinearizedStep, Policy, Start
 from jaxslam.smoothing.linearization import pose_difference, whitened_rows
 
 
@@ -86,7 +86,7 @@ def linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) 
     over_slots = jax.vmap(measured, (0, 0, 0, None))
     a, b, r = jax.vmap(over_slots)(problem.z, problem.slot, problem.used, at.path[1:])
     no_drift = jnp.zeros_like(at.path[1:])
-    steps = Step(by_pose, by_noise, no_drift, at.noise, problem.slot, a, b, r)
+    steps = LinearizedStep(by_pose, by_noise, no_drift, at.noise, problem.slot, a, b, r)
     return Chain(Start(problem.root, at.start), steps)
 
 

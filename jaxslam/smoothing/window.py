@@ -20,7 +20,7 @@ from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.slots import Joint
-from jaxslam.smoothing.chain import CostToGo, Gain, Step, eliminate_steps
+from jaxslam.smoothing.chain import CostToGo, Gain, LinearizedStep, eliminate_steps
 from jaxslam.smoothing.linearization import pose_difference, whitened_rows
 
 
@@ -33,7 +33,7 @@ class Prior(NamedTuple):
     """the oldest pose and these landmarks, where first-estimates Jacobians are taken"""
 
 
-class Steps(NamedTuple):
+class WindowSteps(NamedTuple):
     """The motions and scans of a window, with leading W; the first ones not there at the start."""
 
     there: Bool[Array, "W"]
@@ -45,7 +45,7 @@ class Steps(NamedTuple):
     used: Bool[Array, "W M"]
 
 
-class Iterate(NamedTuple):
+class WindowIterate(NamedTuple):
     """Values of all unknowns, and the resulting path."""
 
     path: Float[Array, "W+1 3"]
@@ -55,7 +55,7 @@ class Iterate(NamedTuple):
     landmarks: Float[Array, "N L"]
 
 
-class Solved(NamedTuple):
+class WindowSolution(NamedTuple):
     """The deviations from an iterate that solve its linearized problem."""
 
     pose: Float[Array, "3"]
@@ -67,10 +67,10 @@ class Solved(NamedTuple):
     """of the oldest pose and the map; zero at dead slots"""
 
 
-def linearize(
-    motion: Motion, sensor: Sensor, prior: Prior, steps: Steps, at: Iterate, first: bool
-) -> Step:
-    """The steps of the window linearized at an iterate, as `chain.Step`.
+def linearize_window(
+    motion: Motion, sensor: Sensor, prior: Prior, steps: WindowSteps, at: WindowIterate, first: bool
+) -> LinearizedStep:
+    """The steps of the window linearized at an iterate, as `chain.LinearizedStep`.
 
     first: Jacobians by a variable that the prior is of are taken at `Prior.points`, everything else
     at the iterate (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag smoothing: algorithm
@@ -103,10 +103,12 @@ def linearize(
     over_slots = jax.vmap(measured, (0, 0, 0, None))
     a, b, r = jax.vmap(over_slots)(steps.z, steps.slot, steps.used, at.path[1:])
     no_drift = jnp.zeros_like(at.path[1:])
-    return Step(by_pose, by_noise, no_drift, at.noise, steps.slot, a, b, r)
+    return LinearizedStep(by_pose, by_noise, no_drift, at.noise, steps.slot, a, b, r)
 
 
-def solve(prior: Prior, system: Step, at: Iterate, alive: Bool[Array, "N"]) -> Solved:
+def solve_window(
+    prior: Prior, system: LinearizedStep, at: WindowIterate, alive: Bool[Array, "N"]
+) -> WindowSolution:
     """The solution of a linearized window. alive: the landmarks of the map.
 
     With Λ and y of all steps (`chain.eliminate_steps`) and e = (x_0, m) - μ at the iterate, the
@@ -129,7 +131,7 @@ def solve(prior: Prior, system: Step, at: Iterate, alive: Bool[Array, "N"]) -> S
     rows = jnp.where(known[:, None], cov, jnp.diag(new.astype(y.dtype)))
     delta, of_delta = jnp.linalg.solve(matrix, right), jnp.linalg.solve(matrix, rows)
     landmarks = delta[3:].reshape(capacity, size)
-    return Solved(delta[:3], landmarks, gains, linalg.symmetrize(of_delta))
+    return WindowSolution(delta[:3], landmarks, gains, linalg.symmetrize(of_delta))
 
 
 def _joined(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
@@ -137,7 +139,9 @@ def _joined(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
     return linalg.symmetrize(information), jnp.concatenate([cost.pose_y, cost.map_y])
 
 
-def moved_by(motion: Motion, steps: Steps, at: Iterate, solved: Solved) -> Iterate:
+def moved_by(
+    motion: Motion, steps: WindowSteps, at: WindowIterate, solved: WindowSolution
+) -> WindowIterate:
     """The iterate after the Gauss-Newton step, by the nonlinear models (see `problem.roll_out`)."""
     delta, gains = solved.landmarks.reshape(-1), solved.gains
     start = at.path[0] + solved.pose
@@ -154,10 +158,12 @@ def moved_by(motion: Motion, steps: Steps, at: Iterate, solved: Solved) -> Itera
     data = steps.there, steps.control, steps.root, at.noise, at.path[1:]
     rows = *data, gains.constant, gains.by_pose, gains.by_map
     _, (path, noise) = jax.lax.scan(forward, start, rows)
-    return Iterate(jnp.concatenate([start[None], path]), noise, at.landmarks + solved.landmarks)
+    return WindowIterate(
+        jnp.concatenate([start[None], path]), noise, at.landmarks + solved.landmarks
+    )
 
 
-def newest_cov(system: Step, solved: Solved) -> Float[Array, "D D"]:
+def newest_cov(system: LinearizedStep, solved: WindowSolution) -> Float[Array, "D D"]:
     """The covariance of the newest pose and the map.
 
     With n standard normal and M = R Rᵀ the matrix of a gain,
@@ -166,7 +172,7 @@ def newest_cov(system: Step, solved: Solved) -> Float[Array, "D D"]:
     wide = solved.cov.shape[0] - 3
 
     def forward(
-        before: tuple[Array, Array, Array], row: tuple[Step, Gain]
+        before: tuple[Array, Array, Array], row: tuple[LinearizedStep, Gain]
     ) -> tuple[tuple[Array, Array, Array], None]:
         by_start, by_map, own = before
         step, gain = row
@@ -186,7 +192,11 @@ def newest_cov(system: Step, solved: Solved) -> Float[Array, "D D"]:
 
 
 def marginalize_oldest(
-    prior: Prior, system: Step, steps: Steps, at: Iterate, tag: Int[Array, "N"]
+    prior: Prior,
+    system: LinearizedStep,
+    steps: WindowSteps,
+    at: WindowIterate,
+    tag: Int[Array, "N"],
 ) -> Prior:
     """The prior of the second pose, with the first motion and the first scan of the window in it.
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.verify.derivatives.jacobians import Evaluated, Evaluation
+from jaxslam.verify.derivatives.jacobians import Evaluated, Jacobians
 from jaxslam.verify.inputs.samples import NOMINAL, Samples
 from jaxslam.verify.record import Finding, WrongEntry
 
@@ -43,7 +43,7 @@ def _at_states(evaluated: Evaluated, rows: Int[np.ndarray, "R"]) -> Evaluated:
     """The evaluation at some of its states."""
     samples = evaluated.samples
     by_argument = tuple(
-        Evaluation(
+        Jacobians(
             {how: jacobian[rows] for how, jacobian in evaluation.methods.items()},
             {how: jacobian[rows] for how, jacobian in evaluation.single.items()},
             evaluation.single_error[rows] if evaluation.single_error.ndim else np.zeros(()),
@@ -77,7 +77,7 @@ class _Compared(NamedTuple):
     """number of states at which the quotients do not converge"""
 
 
-def _compare(evaluation: Evaluation, tolerance: float, float32_tolerance: float) -> _Compared:
+def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) -> _Compared:
     """All differences between the methods, relative to their tolerances."""
     gap, scale = _largest_gap(evaluation.methods)
     gap32, scale32 = _largest_gap(evaluation.single)

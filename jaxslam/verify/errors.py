@@ -10,7 +10,7 @@ _PACKAGE = str(Path(__file__).parents[1])
 _JAX = str(Path(jax.__file__).parent)
 
 
-def line_of(error: BaseException) -> str:
+def place_of_error(error: BaseException) -> str:
     """The place of an error in a user's file, or else in the package, as "file.py:12"; or ""."""
     frames = traceback.extract_tb(error.__traceback__)[::-1]
     users = [f for f in frames if is_user_file(f.filename)]
@@ -28,7 +28,7 @@ def is_user_file(filename: str) -> bool:
 
 def describe_error(error: BaseException) -> str:
     """The error in one line that begins with the user's file and line."""
-    where = line_of(error)
+    where = place_of_error(error)
     if isinstance(error, jax.errors.TracerBoolConversionError):
         why = "a Python `if`, `while` or `and` looks at a traced value; use jnp.where or lax.cond"
     elif isinstance(error, jax.errors.JAXTypeError):

@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.validation.numbers import check_covariance
-from jaxslam.verify.derivatives.differences import on_circle
+from jaxslam.verify.derivatives.differences import modulo_periods
 from jaxslam.verify.derivatives.jacobians import Evaluated
 from jaxslam.verify.derivatives.singular import CURES, singular_operation
-from jaxslam.verify.errors import describe_error, line_of
+from jaxslam.verify.errors import describe_error, place_of_error
 from jaxslam.verify.inputs.functions import Function, at_state, periods, sensor_functions
 from jaxslam.verify.inputs.samples import NOMINAL, Samples
 from jaxslam.verify.record import Check
@@ -177,7 +177,7 @@ def _residual_error(
     plain = np.asarray(residual(z, other))
     circular = np.isfinite(circle)
     period = np.where(circular, circle, 1.0)
-    off = on_circle(plain - on_circle(z - other, circle), circle)
+    off = modulo_periods(plain - modulo_periods(z - other, circle), circle)
     if np.abs(off).max() > _ROUNDING * (1 + np.abs(z).max()):
         return f"residual(z, ẑ) differs from z - ẑ by {np.abs(off).max():.3g}"
     if np.any(np.abs(plain)[:, circular] > period[circular] / 2 + 1e-12):
@@ -204,7 +204,7 @@ def _covariances(noise_cov: Callable[..., jax.Array], arguments: tuple[Values, .
 
 def _deviation(difference: ArrayLike, circle: Float[np.ndarray, "m"]) -> str:
     """How far a difference is from zero modulo the periods, or "" within rounding."""
-    off = on_circle(np.asarray(difference, np.float64), circle)
+    off = modulo_periods(np.asarray(difference, np.float64), circle)
     worst = float(np.max(np.abs(np.where(np.isnan(off), np.inf, off)), initial=0.0))
     return "" if worst <= _ROUNDING else f"off by {worst:.3g} relative to the coordinates"
 
@@ -251,7 +251,7 @@ def _line_of_nan(call: Callable[..., object], state: tuple[Values, ...]) -> str:
         with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
             call(*(jnp.asarray(a) for a in state))
     except (Exception, SystemExit) as error:
-        return line_of(error)
+        return place_of_error(error)
     return ""
 
 

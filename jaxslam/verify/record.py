@@ -178,7 +178,7 @@ class Report:
         return plain
 
 
-def table(reports: Sequence[Report]) -> str:
+def report_table(reports: Sequence[Report]) -> str:
     """The table of reports: a line for each model with its largest differences, and a legend."""
     head = ("", "Jacobians", "float64", "float32", "differences", "checks", "linearity", "")
     lines = [head]

@@ -17,7 +17,7 @@ from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties
 from jaxslam.verify.comparison import compare_methods
-from jaxslam.verify.derivatives.jacobians import Evaluated, evaluate
+from jaxslam.verify.derivatives.jacobians import Evaluated, evaluate_jacobians
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.inputs import samples
 from jaxslam.verify.inputs.beam_models import FAR, beam_function, beam_samples
@@ -215,7 +215,9 @@ def examine(
                 # Where `observe` fails, its own checks say so, and `invert` keeps the drawn states.
                 with contextlib.suppress(Exception, SystemExit):
                     drawn = (given, samples.given_inverse(model, given, drawn[1]))
-        evaluated = tuple(evaluate(f, sampled) for f, sampled in zip(functions, drawn, strict=True))
+        evaluated = tuple(
+            evaluate_jacobians(f, sampled) for f, sampled in zip(functions, drawn, strict=True)
+        )
         checks: list[Check] = []
         for one in evaluated:
             checks += [*one.checks, *properties.function_checks(one)]

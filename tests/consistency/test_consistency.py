@@ -51,7 +51,7 @@ def synthetic(rng, runs, claimed=1.0, singular=0):
 
 @jax.jit
 def _statistics(trace, truth):
-    return jax.vmap(lambda a, b: consistency.statistics(a, b, SENSOR))(trace, truth)
+    return jax.vmap(lambda a, b: consistency.run_statistics(a, b, SENSOR))(trace, truth)
 
 
 def scored(trace, truth, own_error_of=None):

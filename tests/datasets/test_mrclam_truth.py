@@ -9,7 +9,7 @@ import pytest
 from recordings import EPOCH, MRCLAM, TEAM, assert_error, folder, write
 
 from jaxslam import datasets
-from jaxslam.datasets import MRCLAM_CALIBRATION, Calibration
+from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
 from jaxslam.datasets.mrclam.truth import START_COV, cut_after, true_poses
 
 TRUTH = """# Time x y theta
@@ -20,7 +20,7 @@ TRUTH = """# Time x y theta
 1248272273.400 2.0 2.0 0.0
 1248272273.500 2.0 3.0 0.0
 """
-PLAIN = Calibration(0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.01, 0.02, 0.5, 0.1, 0.02)
+PLAIN = RobotCalibration(0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.01, 0.02, 0.5, 0.1, 0.02)
 
 
 def with_truth(path, files=MRCLAM, robot=2, text=TRUTH):

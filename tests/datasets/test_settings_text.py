@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from jaxslam.datasets.table.settings_text import changed, fragment
+from jaxslam.datasets.table.settings_text import changed, toml_lines
 
 CHANGES = {
     "motion": {"noise": [0.012345678, 1e-9]},
@@ -14,7 +14,7 @@ LINES = "noise = [0.01235, 1e-09]"
 
 
 def test_the_fragment_is_toml_with_comments():
-    text = fragment(CHANGES, {"motion.noise": "v [m/s], omega [rad/s]"})
+    text = toml_lines(CHANGES, {"motion.noise": "v [m/s], omega [rad/s]"})
     assert f"[motion]\n{LINES}  # v [m/s], omega [rad/s]\n" in text
     assert tomllib.loads(text)["sensor"] == {"noise": [0.5, 2], "mount": [1, 0, 0]}
 
@@ -31,8 +31,8 @@ def test_the_fragment_is_toml_with_comments():
             "[ sensor ]\nmount=[0,0,0]\n[motion]\n",
             f"[ sensor ]\nnoise = [0.5, 2]\nmount=[1, 0, 0]\n[motion]\n{LINES}\n",
         ),
-        ("name = 'a'", f"name = 'a'\n\n{fragment(CHANGES)}"),
-        (None, fragment(CHANGES)),
+        ("name = 'a'", f"name = 'a'\n\n{toml_lines(CHANGES)}"),
+        (None, toml_lines(CHANGES)),
     ],
 )
 def test_lines_are_replaced_or_inserted(tmp_path, before, after):

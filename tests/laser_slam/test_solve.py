@@ -121,7 +121,7 @@ def test_logs_that_are_none_are_refused(drive):
 
 def test_its_files(drive, tmp_path):
     _, log, found = drive
-    write_files(tmp_path, results.files(found))
+    write_files(tmp_path, results.result_files(found))
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
         "trajectory.csv",

@@ -139,6 +139,6 @@ def test_streams_need_a_row_for_each_measurement():
     with pytest.raises(
         ValueError, match="align: expected measurements at times of rows, got one a"
     ):
-        streams.align(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded, [0, 1])
+        streams.align_streams(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded, [0, 1])
     with pytest.raises(ValueError, match="expected a row at each time of the odometry"):
-        streams.align(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded)
+        streams.align_streams(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded)

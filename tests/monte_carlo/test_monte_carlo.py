@@ -15,7 +15,7 @@ from jaxslam.filters import reporting
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo
 from jaxslam.monte_carlo import campaign as campaign_module
 from jaxslam.monte_carlo.blocks.block import BlockRunner
-from jaxslam.monte_carlo.blocks.plan import Plan, Promises
+from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
 from jaxslam.monte_carlo.candidates import fitting_block, without_noise
 from jaxslam.types import Status
 
@@ -209,7 +209,7 @@ def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it(
 
 
 def test_steps_are_timed_while_nothing_is_compiled():
-    plan = Plan(WORLD, {"a": EKF, "b": EKF}, worlds.key(), jax.devices()[:1], block=2)
+    plan = CampaignPlan(WORLD, {"a": EKF, "b": EKF}, worlds.key(), jax.devices()[:1], block=2)
     runner = BlockRunner(plan, Promises([]))
     runner._spent["a"] += [(False, 8.0), (True, 1.0), (True, 3.0)]
     runner._spent["b"] += [(False, 4.0)]

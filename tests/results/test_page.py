@@ -243,7 +243,7 @@ def test_curves_that_are_long_are_bounded_in_size_and_lose_no_extreme():
         long[name] = dataclasses.replace(flat, curves=of_time | {"nees_pose": values})
         each[name] = values
     world = dataclasses.replace(campaign(**long), steps=steps)
-    data = curves.embedded(world)
+    data = curves.embedded_curves(world)
     found = json.loads(data.text)
     assert len(data.text) < 1_000_000 and found["each"] == data.each > 1
     for (_, values), (low, high) in zip(

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam.simulation.laser import Laser, observability, scan, scan_world, true_ranges
+from jaxslam.simulation.laser import Laser, scan, scan_information, scan_world, true_ranges
 from jaxslam.simulation.scenarios import ROOMS, circular_room, corridor, office, square
 from jaxslam.simulation.walls import exact_ranges, is_free, rasterize, walls
 
@@ -88,25 +88,25 @@ def test_a_grid_of_shares_has_the_area_of_the_room():
 
 def test_the_directions_that_a_scan_does_not_see_are_named():
     room, hall = circular_room(), corridor()
-    found = observability(room.laser, room.walls, [0.7, -1.1, 0.3])
+    found = scan_information(room.laser, room.walls, [0.7, -1.1, 0.3])
     assert found.names == ("rotation about (0.00 m, 0.00 m)",)
     about = np.array([1.1, 0.7, 1.0])
     np.testing.assert_allclose(
         np.abs(found.directions[0]), about / np.linalg.norm(about), atol=1e-6
     )
     np.testing.assert_allclose(found.information @ about, 0, atol=1e-6 * found.information.max())
-    found = observability(hall.laser, hall.walls, [20.0, 0.2, 0.5])
+    found = scan_information(hall.laser, hall.walls, [20.0, 0.2, 0.5])
     assert found.names == ("translation along 0.0°",)
     assert np.sqrt(found.bound[1, 1]) < 0.01
     for world, pose in ((square(), [2, 3, 0.1]), (hall, [3, 0.2, 0.5]), (office(), [1.8, 1.5, 0])):
-        assert observability(world.laser, world.walls, pose).names == ()
+        assert scan_information(world.laser, world.walls, pose).names == ()
 
 
 def test_maximum_likelihood_estimates_reach_the_cramer_rao_bound():
     """400 draws, three steps of Gauss and Newton each: the mean NEES under the bound is 3."""
     world = square(beams=60)
     laser, pose = world.laser, np.array([2.1, 3.4, 0.3])
-    bound = observability(laser, world.walls, pose).bound
+    bound = scan_information(laser, world.walls, pose).bound
 
     def ranges(pose):
         return exact_ranges(world.walls, pose, laser.angles, laser.max_range)
@@ -163,7 +163,7 @@ def test_beams_pass_glass_as_often_as_it_says():
         (lambda: Laser([0.0], mount=(0, 0)), "Laser: expected a mount that is a pose"),
         (lambda: rasterize(square().walls, 0.0), "rasterize: expected a resolution"),
         (
-            lambda: observability(Laser([0.0], max_range=0.1), square().walls, [3, 3, 0]),
+            lambda: scan_information(Laser([0.0], max_range=0.1), square().walls, [3, 3, 0]),
             "no beam from",
         ),
     ],

@@ -52,11 +52,11 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     out = options.resume or options.out or OUT
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
-    devices.join(options)
-    formats = campaign_files.check_formats("--figures", options.figures.split(","))
+    devices.join_processes(options)
+    formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
     there = [kind for kind in run_table.FORMATS if (out / f"runs.{kind}").exists()]  # up to date
     asked_for = filter(None, options.table.split(","))
-    tables = run_table.check_formats("--table", [*asked_for, *there])
+    tables = run_table.check_table_formats("--table", [*asked_for, *there])
     files = UserObjects()
     scenario = files.scenario(asked["scenario"], asked["steps"])
     filters = files.filters(asked["filters"], scenario)
@@ -67,7 +67,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         check_count("block", options.block)
     check_writable(out)
     # What is missing of a campaign of parts is computed as the parts would.
-    here = devices.chosen(options.devices, settings.get("devices"))
+    here = devices.chosen_devices(options.devices, settings.get("devices"))
     key = jax.random.key(asked["seed"])
     identity, programs = _identity(asked, files, scenario, filters, key, here[0].platform)
     if part is not None and options.block is None:
@@ -142,7 +142,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         name = campaign_files.filter_of_run_zero(campaign)
         first = _run_zero(scenario, filters[name], key, campaign.dtype)
         campaign = replace(campaign, first={name: first})
-    paths = campaign_files.save(campaign, out, formats, True, command, asked["seed"], film)
+    paths = campaign_files.save_campaign(campaign, out, formats, True, command, asked["seed"], film)
     paths += [campaign.save_runs(out / f"runs.{kind}") for kind in tables]
     print("\nwrote " + ", ".join(map(str, paths)))
     print(

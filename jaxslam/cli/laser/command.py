@@ -2,15 +2,18 @@
 
 import argparse
 import time
-from types import ModuleType
+from collections.abc import Callable
 from typing import Any
 
 from jaxslam.cli import films
 from jaxslam.cli.common import summary_table
-from jaxslam.cli.laser import localization, mapping, slam
 from jaxslam.cli.laser.job import Job
+from jaxslam.cli.laser.localization import run_localization
+from jaxslam.cli.laser.mapping import run_mapping
 from jaxslam.cli.laser.options import complete, read_log
-from jaxslam.results.campaign_files import check_formats
+from jaxslam.cli.laser.slam import run_slam
+from jaxslam.datasets import LaserLog
+from jaxslam.results.campaign_files import check_figure_formats
 from jaxslam.results.files import check_writable, json_text, versions, write_files
 
 
@@ -18,10 +21,10 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
     """Do what the options ask for, print and write the results; returns the exit status."""
     began = time.perf_counter()
     options = complete(options)
-    formats = check_formats("--figures", options.figures.split(","))
+    formats = check_figure_formats("--figures", options.figures.split(","))
     log, left_out = read_log(options)
     check_writable(options.out)
-    job: Job = _job_of(options).run(log, options)
+    job = _job_of(options)(log, options)
     figures = job.figures(formats)
     summary: dict[str, Any] = {
         "dataset": log.name,
@@ -43,8 +46,8 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _job_of(options: argparse.Namespace) -> ModuleType:
-    """The module whose `run` does what the options ask for."""
+def _job_of(options: argparse.Namespace) -> Callable[[LaserLog, argparse.Namespace], Job]:
+    """The function that does what the options ask for."""
     if options.localize is not None:
-        return localization
-    return slam if options.map is None else mapping
+        return run_localization
+    return run_slam if options.map is None else run_mapping

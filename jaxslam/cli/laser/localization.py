@@ -43,7 +43,7 @@ NEAR = 0.5
 """Distance from the reference within which the robot counts as found [m]."""
 
 
-def run(log: LaserLog, options: argparse.Namespace) -> Job:
+def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
     """Localize the robot in the map, from raw odometry and scans: likelihood field, KLD, and from
     anywhere recovery.
 

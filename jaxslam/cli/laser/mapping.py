@@ -28,7 +28,7 @@ MOST = 10**8
 """Largest number of cells of a map."""
 
 
-def run(log: LaserLog, options: argparse.Namespace) -> Job:
+def run_mapping(log: LaserLog, options: argparse.Namespace) -> Job:
     """The map of the scans at the poses in the file: counts of hits and misses, as log-odds.
 
     A beam without a return says nothing.
@@ -52,7 +52,7 @@ def run(log: LaserLog, options: argparse.Namespace) -> Job:
         return figure_files("map", figure, formats)
 
     files: Files = {
-        **ros_map.files("map", grid),
+        **ros_map.map_files("map", grid),
         "trajectory.csv": report.trajectory_csv(log.time, path),
         "trajectory.tum": report.trajectory_tum(log.time, path),
     }

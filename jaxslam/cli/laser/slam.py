@@ -16,11 +16,11 @@ METRES = (1.0, 2.0, 5.0, 10.0)
 """Lengths of path of the relations that score the result."""
 
 
-def run(log: LaserLog, options: argparse.Namespace) -> Job:
+def run_slam(log: LaserLog, options: argparse.Namespace) -> Job:
     """Path, graph, loops and map from raw odometry and scans; the poses in the file score them."""
     settings = laser_slam.Settings(resolution=options.resolution)
     solved = _solved(log, settings)
-    files = results.files(solved)
+    files = results.result_files(solved)
     if options.animate:
         with Progress(f"{log.name}: film", "frames") as progress:
             made = results.film(log, solved, settings, title=log.name, progress=progress)

@@ -17,7 +17,7 @@ from jaxslam.cli.laser.command import run_laser
 from jaxslam.cli.laser.options import READERS as LASER_LOGS
 from jaxslam.cli.laser.options import refuse_laser_options
 from jaxslam.cli.run.film import film_steps, films, watching
-from jaxslam.cli.run.filters import chosen, with_options
+from jaxslam.cli.run.filters import chosen_filters, with_options
 from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.datasets import READERS, Dataset, Reader
 from jaxslam.datasets.evaluation import Evaluation, evaluate
@@ -25,7 +25,7 @@ from jaxslam.datasets.map_test import joint_map_cov
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.protocols import Filter
 from jaxslam.results import report
-from jaxslam.results.campaign_files import check_formats
+from jaxslam.results.campaign_files import check_figure_formats
 from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Status
@@ -38,10 +38,10 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     refuse_laser_options(options)
     if options.check_every is not None and options.check_every < 0:
         raise ValueError(f"--check-every: expected at least 0, got {options.check_every}")
-    formats = check_formats("--figures", options.figures.split(","))
+    formats = check_figure_formats("--figures", options.figures.split(","))
     data = _reader(options.dataset)(options.path, options.robot)
     data = with_options(data, options)
-    filters = chosen(data, options.filters)
+    filters = chosen_filters(data, options.filters)
     check_writable(options.out)
     at = film_steps(data) if options.animate else None
     runs = {name: _run(name, filter, data, options, at) for name, filter in filters.items()}

@@ -36,7 +36,7 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
     return dataclasses.replace(data, filter_options=mine, assumed=tuple(assumed))
 
 
-def chosen(data: Dataset, asked: str) -> dict[str, Filter]:
+def chosen_filters(data: Dataset, asked: str) -> dict[str, Filter]:
     """The filters of a comma-separated list of names.
 
     Raises ValueError on names that are unknown or occur twice, and on a filter that needs what the

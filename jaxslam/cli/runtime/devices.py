@@ -14,7 +14,8 @@ from jaxslam.monte_carlo.pieces import cores
 def prepare(options: argparse.Namespace) -> None:
     """Set the number of CPU devices, before JAX first uses them; by default one a core.
 
-    Never more than there are cores, since JAX would create them; `chosen` refuses such a request.
+    Never more than there are cores, since JAX would create them; `chosen_devices` refuses
+    such a request.
     """
     asked = options.devices
     count = cores() if asked in ("all", "cpu") else int(asked) if asked.isdecimal() else None
@@ -25,7 +26,7 @@ def prepare(options: argparse.Namespace) -> None:
             jax.config.update("jax_num_cpu_devices", min(count, cores()))
 
 
-def join(options: argparse.Namespace) -> None:
+def join_processes(options: argparse.Namespace) -> None:
     """Connect to the other processes of the campaign, where there are any.
 
     Raises ValueError on inconsistent options, and where the coordinator cannot be reached within
@@ -60,7 +61,7 @@ def join(options: argparse.Namespace) -> None:
         ) from error
 
 
-def chosen(asked: str, most: int | None = None) -> list[jax.Device]:
+def chosen_devices(asked: str, most: int | None = None) -> list[jax.Device]:
     """This process's devices by what was asked for: all, their number, or a platform's name.
 
     most: how many are all.

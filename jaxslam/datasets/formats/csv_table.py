@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.datasets.formats.lines import read_bytes
-from jaxslam.logs.tables import TAG, UNITS, Table, split_unit, unit_divisor
+from jaxslam.logs.tables import TAG, UNITS, Columns, split_unit, unit_divisor
 
 
 class CsvTable:
@@ -53,7 +53,7 @@ class CsvTable:
                     hint = "; a number has a point, no comma: 0.5"
                 raise self._error(number, f"expected {wanted} cells, got {len(cells)}{hint}")
 
-    def table(self, wanted: Sequence[str], why: str) -> Table:
+    def table(self, wanted: Sequence[str], why: str) -> Columns:
         """The wanted columns ("v [m/s]"), in their units.
 
         Raises ValueError on a column that is missing, without unit or in another one, a cell that
@@ -71,7 +71,7 @@ class CsvTable:
             name: self._tags(place) if name == TAG else self._numbers(place, name)
             for name, place in places.items()
         }
-        return Table(columns, at)
+        return Columns(columns, at)
 
     def unused(self, wanted: Sequence[str]) -> list[str]:
         """The columns of the file that are not among those wanted."""

@@ -53,10 +53,10 @@ def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
     path = Path(path)
     if path.suffix != ".yaml" or path.stem == "":
         raise ValueError(f"write_map: expected a path NAME.yaml, got {path}")
-    return write_files(path.parent, files(path.stem, grid, mode))
+    return write_files(path.parent, map_files(path.stem, grid, mode))
 
 
-def files(
+def map_files(
     stem: str, grid: Grid, mode: str = "trinary"
 ) -> dict[str, str | Callable[[Path], object]]:
     """The map file STEM.yaml and its image STEM.pgm, as `write_files` takes them."""

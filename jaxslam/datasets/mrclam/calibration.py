@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxslam.noise import NoiseCov
 
 
-class Calibration(NamedTuple):
+class RobotCalibration(NamedTuple):
     """What the odometry and the camera of a robot get wrong, and the noise that is left.
 
     A recorded velocity (v, ω) at time t moves the robot at time t + delay, by
@@ -93,7 +93,7 @@ class Calibration(NamedTuple):
         return noise_cov
 
 
-MRCLAM_CALIBRATION = Calibration(
+MRCLAM_CALIBRATION = RobotCalibration(
     delay=0.265,
     forward=1.049,
     outer=0.098,
@@ -120,7 +120,7 @@ def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
     return jnp.diag(density) * jnp.where(moving, 1 / jnp.where(moving, dt, 1.0), 0.0)
 
 
-def recorded(odometry: Any, seen: Any, calibration: Calibration | None) -> tuple[Any, Any]:
+def recorded(odometry: Any, seen: Any, calibration: RobotCalibration | None) -> tuple[Any, Any]:
     """The lines of a robot as they are, or corrected."""
     if calibration is None:
         return odometry, seen

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.mrclam.calibration import Calibration, per_interval, recorded
+from jaxslam.datasets.mrclam.calibration import RobotCalibration, per_interval, recorded
 from jaxslam.datasets.mrclam.files import ROBOTS, read_landmarks, read_robot, read_truth
 from jaxslam.datasets.mrclam.truth import START_COV, cut_after, true_poses
 from jaxslam.logs.streams import hold
@@ -36,7 +36,7 @@ def mrclam(
     folder: str | Path,
     robot: int = 1,
     *,
-    calibration: Calibration | None = None,
+    calibration: RobotCalibration | None = None,
     odometry_cov: NoiseCov | None = None,
     measurement_cov: NoiseCov | None = None,
     errata: bool = True,
@@ -108,7 +108,7 @@ def mrclam_team(
     folder: str | Path,
     robots: tuple[int, ...] = (1, 2, 3),
     *,
-    calibration: Calibration | None = None,
+    calibration: RobotCalibration | None = None,
     odometry_cov: NoiseCov | None = None,
     measurement_cov: NoiseCov | None = None,
     sighting_cov: NoiseCov | None = None,
@@ -192,7 +192,7 @@ class _Recorded(NamedTuple):
     corrections: tuple[str, ...]
 
 
-def _read(folder: Path, robot: int, calibration: Calibration | None) -> _Recorded:
+def _read(folder: Path, robot: int, calibration: RobotCalibration | None) -> _Recorded:
     odometry, seen = read_robot(folder, robot)
     truth, corrections = read_truth(folder, robot), []
     if truth is not None:
@@ -206,7 +206,9 @@ def _read(folder: Path, robot: int, calibration: Calibration | None) -> _Recorde
 
 
 def _models(
-    calibration: Calibration | None, odometry_cov: NoiseCov | None, measurement_cov: NoiseCov | None
+    calibration: RobotCalibration | None,
+    odometry_cov: NoiseCov | None,
+    measurement_cov: NoiseCov | None,
 ) -> tuple[Motion, Sensor]:
     """The motion model and the sensor, with the noise that is given or the default."""
     default_moved: NoiseCov = white_noise(*ODOMETRY_DENSITY)

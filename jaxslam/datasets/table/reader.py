@@ -7,7 +7,7 @@ import numpy as np
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.datasets.formats.csv_table import CsvTable
 from jaxslam.datasets.formats.lines import stored
-from jaxslam.datasets.table.settings import Parametric, Settings
+from jaxslam.datasets.table.settings import Parametric, TableSettings
 from jaxslam.logs import tables
 from jaxslam.logs.streams import interpolate_poses
 from jaxslam.logs.tables import POSE, TAG, TIME
@@ -54,7 +54,7 @@ def table(folder: str | Path) -> Dataset:
             [section] key: …` on settings; and on a measured tag that `landmarks.csv` lacks.
     """
     folder = Path(folder)
-    settings = Settings(folder / "dataset.toml")
+    settings = TableSettings(folder / "dataset.toml")
     odometry_file = CsvTable(folder / "odometry.csv")
     seen_file = CsvTable(folder / "measurements.csv")
     clock = odometry_file.table((TIME,), "the time").columns[TIME]
@@ -72,7 +72,7 @@ def table(folder: str | Path) -> Dataset:
         for column in file.unused(wanted)
     ]
     survey = _survey(folder / "landmarks.csv")
-    rows, tags, dropped = tables.align(
+    rows, tags, dropped = tables.align_tables(
         odometry, seen, motion.controls, sensor.measurements, tuple(survey or ())
     )
     known = tags if survey is None else survey

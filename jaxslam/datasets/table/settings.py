@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import association, motion, sensors
-from jaxslam.datasets.table.settings_text import line_of
+from jaxslam.datasets.table.settings_text import line_number
 from jaxslam.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.math import stats
 from jaxslam.protocols import Motion, Sensor
@@ -49,7 +49,7 @@ class Parametric(NamedTuple, Generic[_Model]):
         return self.make(np.array(self.deviations), self.mount)
 
 
-class Settings:
+class TableSettings:
     """The settings of a folder; `assumed` lists the defaults taken so far.
 
     Raises ValueError on a file that is no TOML, and on a section or a key that does not exist.
@@ -264,7 +264,7 @@ class Settings:
 
     def _at(self, section: str, key: str) -> str:
         """The place of a key, with which a message begins."""
-        line = line_of(self._text, section, key)
+        line = line_number(self._text, section, key)
         where = f"{self.path}:" + (f"{line}: " if line else " ")
         return where + (f"[{section}] " if section else "") + key
 

@@ -9,7 +9,7 @@ Changes = Mapping[str, Mapping[str, Sequence[float]]]
 """numbers by section and key"""
 
 
-def fragment(changes: Changes, comments: Mapping[str, str] | None = None) -> str:
+def toml_lines(changes: Changes, comments: Mapping[str, str] | None = None) -> str:
     """The changes as TOML, ready to paste. comments: by "section.key"."""
     told = comments or {}
     parts = []
@@ -34,14 +34,14 @@ def changed(path: Path, changes: Changes) -> str:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        return fragment(changes)
+        return toml_lines(changes)
     before = tomllib.loads(text)
     lines = text.split("\n")
     for section, keys in changes.items():
         head = _head(lines, section)
         if head is None:
             lines = [*"\n".join(lines).rstrip("\n").split("\n"), ""]
-            lines += fragment({section: keys}).split("\n")
+            lines += toml_lines({section: keys}).split("\n")
             continue
         for key, numbers in keys.items():
             at = _find(lines, rf"\s*{key}\s*=", head + 1, _end(lines, head))
@@ -52,7 +52,7 @@ def changed(path: Path, changes: Changes) -> str:
     wanted = {name: dict(part) if isinstance(part, dict) else part for name, part in before.items()}
     for section, keys in changes.items():
         wanted[section] = (
-            wanted.get(section, {}) | tomllib.loads(fragment({section: keys}))[section]
+            wanted.get(section, {}) | tomllib.loads(toml_lines({section: keys}))[section]
         )
     result = "\n".join(lines)
     try:
@@ -64,7 +64,7 @@ def changed(path: Path, changes: Changes) -> str:
     return result
 
 
-def line_of(text: str, section: str, key: str) -> int | None:
+def line_number(text: str, section: str, key: str) -> int | None:
     """The line, from 1, of a key in a section ("": at the top), or of the section, or None."""
     lines = text.split("\n")
     head = _head(lines, section) if section else -1

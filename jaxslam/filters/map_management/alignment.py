@@ -5,7 +5,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.filters.map_management.point_pairs import PointSets, quarter_turned, squared_distances
+from jaxslam.filters.map_management.point_pairs import (
+    PointSets,
+    mahalanobis_of_pairs,
+    quarter_turned,
+)
 from jaxslam.math import linalg, se2
 
 
@@ -63,7 +67,7 @@ def align_points(points: PointSets, slot: Int[Array, "M"]) -> Alignment:
     by_pose = linalg.solve_lower(r.factor, r.jacobian)
     step, solvable = linalg.solve_psd(by_pose.T @ by_pose, by_pose.T @ whitened)
     left = r.error - r.jacobian @ step
-    each, _ = squared_distances(left.reshape(-1, 2), r.covs)
+    each, _ = mahalanobis_of_pairs(left.reshape(-1, 2), r.covs)
     # About the centroids the numbers are small; the pose is that of the frames themselves.
     centred = start - step
     shift = map_centroid + centred[:2] - se2.rotation(centred[2]) @ centroid

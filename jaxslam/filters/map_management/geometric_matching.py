@@ -25,7 +25,7 @@ _BLOCK = 32  # candidates that are scored together; more cost memory
 _FINALISTS = 8  # hypotheses that are tried jointly
 
 
-class Match(NamedTuple):
+class GeometricMatch(NamedTuple):
     """The best match of M cluster points with N map points."""
 
     pose: Float[Array, "3"]
@@ -82,7 +82,7 @@ class _Hypotheses(NamedTuple):
     """more candidates agreed than C"""
 
 
-def match(points: PointSets, limits: SearchLimits) -> Match:
+def match_points(points: PointSets, limits: SearchLimits) -> GeometricMatch:
     """The match with the most cluster points; among equals, that of least D².
 
     Each of a few pairs (a, b) of cluster points, the longest, is compared with all pairs (j, k) of
@@ -96,7 +96,7 @@ def match(points: PointSets, limits: SearchLimits) -> Match:
     found = _hypotheses(points, limits)
     finalists = found.slot.reshape(-1, len(points.cluster))[_finalists(found)]
     fits = jax.vmap(lambda slot: fit_hypothesis(points, slot, limits))(finalists)
-    best: Match = jax.tree.map(
+    best: GeometricMatch = jax.tree.map(
         lambda leaf: leaf[jnp.argmax(_merit(fits.explained, fits.distance))], fits
     )
     same = ((found.slot == best.slot[None, None]) & (found.slot >= 0)).sum(axis=-1)
@@ -140,7 +140,9 @@ def _finalists(found: _Hypotheses) -> Int[Array, "K"]:
     return jnp.concatenate([heads, jax.lax.top_k(every, min(_FINALISTS, len(every)))[1]])
 
 
-def fit_hypothesis(points: PointSets, slot: Int[Array, "M"], limits: SearchLimits) -> Match:
+def fit_hypothesis(
+    points: PointSets, slot: Int[Array, "M"], limits: SearchLimits
+) -> GeometricMatch:
     """The match of one hypothesis: the least-squares frame of the pairs that fit.
 
     r_i = T z_i - m_i over the pairs, Σ their joint covariance: min rᵀ Σ⁻¹ r over T, to first order
@@ -162,7 +164,7 @@ def fit_hypothesis(points: PointSets, slot: Int[Array, "M"], limits: SearchLimit
     count = (slot >= 0).sum()
     ok = (count >= 2) & aligned.regular & (aligned.distance <= levels[count])
     none = jnp.zeros((), jnp.int32)
-    return Match(
+    return GeometricMatch(
         pose=jnp.where(ok, aligned.pose, 0.0),
         slot=jnp.where(ok, slot, -1),
         explained=jnp.where(ok, count, 0).astype(jnp.int32),

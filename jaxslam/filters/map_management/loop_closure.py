@@ -10,10 +10,14 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.alignment import with_unit_blocks
-from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
+from jaxslam.filters.map_management.geometric_matching import (
+    GeometricMatch,
+    match_points,
+    search_limits,
+)
 from jaxslam.filters.map_management.merging import squared_distance
 from jaxslam.filters.map_management.point_pairs import PointSets, difference_covs
-from jaxslam.filters.map_management.relocalization import check_points, check_policy
+from jaxslam.filters.map_management.relocalization import check_point_map, check_policy
 from jaxslam.filters.map_management.successive import merge_histories
 from jaxslam.life.recency import Recency
 from jaxslam.math import linalg
@@ -90,7 +94,7 @@ def loop_settings(caller: str, options: Mapping[str, Any]) -> LoopSettings:
 
 def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
     """Raise ValueError unless landmarks are points and their times are kept (`life.recency`)."""
-    check_points(caller, joint, chart)
+    check_point_map(caller, joint, chart)
     if not isinstance(joint.life, Recency):
         raise ValueError(
             f"{caller}: expected a filter that keeps times of landmarks, as pruning(…, "
@@ -104,8 +108,8 @@ def close_loop(joint: Joint, chart: Chart, **options: Any) -> tuple[Joint, Closi
     A landmark is recent if it was measured within the last `window` scans, and it may be an old one
     only if it was initialized after that was last measured: landmarks observed over overlapping
     periods cannot be duplicates. The pair must agree with the joint covariance of both,
-    δ = l_i - l_k, δᵀ cov(δ)⁻¹ δ <= χ²(2, drift). Of these pairs `geometric_matching.match` finds
-    the largest set of consistent geometry, whatever the drift. They are merged
+    δ = l_i - l_k, δᵀ cov(δ)⁻¹ δ <= χ²(2, drift). Of these pairs `match_points` finds the largest
+    set of consistent geometry, whatever the drift. They are merged
     (`merging.merge_landmarks`) if there are enough of them, clearly more than any other hypothesis
     has, and D² of all δ together is at most χ²(2n, drift).
     The old slot keeps the landmark.
@@ -182,7 +186,7 @@ def search(
     points = PointSets(joint.landmarks[recent], joint.landmarks, own, cov, shared, allowed)
 
     def compare(_: PyTree) -> tuple[Array, Closing]:
-        found = match(points, limits)
+        found = match_points(points, limits)
         likely = _joint_distance(delta, points, found) <= levels[found.explained]
         enough = found.explained >= settings.least
         ok = enough & (found.explained - found.runner_up >= settings.margin) & likely
@@ -212,7 +216,7 @@ def _merge_all(joint: Joint, chart: Chart, old: Int[Array, "M"], recent: Int[Arr
 
 
 def _joint_distance(
-    delta: Float[Array, "M N 2"], points: PointSets, found: Match
+    delta: Float[Array, "M N 2"], points: PointSets, found: GeometricMatch
 ) -> Float[Array, ""]:
     """The joint distance δᵀ cov(δ)⁻¹ δ of all pairs, including the drift."""
     m, there, at = found.slot.shape[0], found.slot >= 0, jnp.maximum(found.slot, 0)

@@ -102,7 +102,7 @@ def extend_pair(
     every, at = jnp.arange(len(points.cluster)), jnp.arange(len(points.map))
     error_covs = difference_covs(covs, points.map_cov[at, :, at], cross_covs)
     error = frame.moved[:, None] - points.map[None, :]
-    distance, regular = squared_distances(error, error_covs)
+    distance, regular = mahalanobis_of_pairs(error, error_covs)
     free = (every != ends[0]) & (every != ends[1])
     left = (at != slots[0]) & (at != slots[1])
     fits = points.allowed & regular & (distance <= gate) & free[:, None] & left[None, :]
@@ -177,7 +177,7 @@ def quarter_turned(points: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]
     return jnp.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
-def squared_distances(
+def mahalanobis_of_pairs(
     error: Float[Array, "*batch 2"], cov: Float[Array, "*batch 2 2"]
 ) -> tuple[Float[Array, "*batch"], Bool[Array, "*batch"]]:
     """eᵀ P⁻¹ e in closed form, 0 where P is not positive definite, and whether it is."""

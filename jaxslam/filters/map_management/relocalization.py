@@ -12,7 +12,11 @@ from jaxslam.filters.ekf.coordinates.map_coordinates import (
     with_cov_of_coordinates,
 )
 from jaxslam.filters.map_management.alignment import align_points
-from jaxslam.filters.map_management.geometric_matching import Match, match, search_limits
+from jaxslam.filters.map_management.geometric_matching import (
+    GeometricMatch,
+    match_points,
+    search_limits,
+)
 from jaxslam.filters.map_management.point_pairs import PointSets
 from jaxslam.math import linalg
 from jaxslam.protocols import Chart, Sensor
@@ -79,8 +83,8 @@ def relocalize(
 ) -> Relocalization:
     """The pose of a scan in a map without a prior, by distances between pairs of points.
 
-    `geometric_matching.match` has the search. Another hypothesis is one that shares fewer than two
-    of the best one's pairs, for two pairs fix a pose; the scan is ambiguous where such a one
+    `match_points` has the search. Another hypothesis is one that shares fewer than two of the
+    best one's pairs, for two pairs fix a pose; the scan is ambiguous where such a one
     explains almost as much, as in a symmetric map. Errors common to the whole map (of its origin)
     do not matter, because the cross-covariances are used.
 
@@ -118,7 +122,7 @@ def relocalize(
     parts = PointSets(
         seen, points, own, cov.reshape(n, 2, n, 2), shared, valid[:, None] & alive[None]
     )
-    return _judged(match(parts, limits), least, margin)
+    return _judged(match_points(parts, limits), least, margin)
 
 
 def check_policy(caller: str, least: int, margin: int) -> None:
@@ -129,7 +133,7 @@ def check_policy(caller: str, least: int, margin: int) -> None:
         raise ValueError(f"{caller}: expected least >= 3, got {least}")
 
 
-def _judged(found: Match, least: int, margin: int) -> Relocalization:
+def _judged(found: GeometricMatch, least: int, margin: int) -> Relocalization:
     ok = (found.explained >= least) & (found.explained - found.runner_up >= margin)
     return Relocalization(
         pose=found.pose,
@@ -142,11 +146,11 @@ def _judged(found: Match, least: int, margin: int) -> Relocalization:
     )
 
 
-def _nothing(size: int, dtype: jnp.dtype) -> Match:
+def _nothing(size: int, dtype: jnp.dtype) -> GeometricMatch:
     none = jnp.zeros((), jnp.int32)
     nobody = jnp.full(size, -1, jnp.int32)
     zero = jnp.zeros((), dtype)
-    return Match(jnp.zeros(3, dtype), nobody, none, zero, none, jnp.asarray(False))
+    return GeometricMatch(jnp.zeros(3, dtype), nobody, none, zero, none, jnp.asarray(False))
 
 
 def map_of(
@@ -156,7 +160,7 @@ def map_of(
 
     Raises ValueError unless the landmarks are points.
     """
-    check_points("map_of", joint, chart)
+    check_point_map("map_of", joint, chart)
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
     return joint.landmarks, cov[3:, 3:], joint.alive
 
@@ -170,7 +174,7 @@ def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool =
     Raises ValueError on landmarks that are no points, a chart that keeps the last motion apart, a
     linearizer with a memory, or a pose_cov that is none.
     """
-    check_points("lost", joint, chart)
+    check_point_map("lost", joint, chart)
     check_covariance("lost: pose_cov", pose_cov, 3)
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
     cov = cov.at[:3].set(0.0).at[:, :3].set(0.0)
@@ -201,7 +205,7 @@ def relocated(
     Raises:
         ValueError: as `lost`, or on shapes that do not fit.
     """
-    check_points("relocated", joint, chart)
+    check_point_map("relocated", joint, chart)
     m, capacity = np.shape(slot)[0], joint.landmarks.shape[0]
     if np.shape(seen) != (m, 2) or np.shape(seen_covs) != (m, 2, 2):
         raise ValueError(
@@ -238,7 +242,7 @@ def relocated(
     return kept
 
 
-def check_points(caller: str, joint: Joint, chart: Chart) -> None:
+def check_point_map(caller: str, joint: Joint, chart: Chart) -> None:
     """Raise ValueError unless landmarks are points and the state keeps no earlier poses."""
     if joint.landmarks.shape[1] != 2:
         raise ValueError(

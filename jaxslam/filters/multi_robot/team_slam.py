@@ -28,7 +28,7 @@ from jaxslam.filters.multi_robot.team_state import (
     seen_from_first,
     with_robot,
 )
-from jaxslam.filters.reporting import joined
+from jaxslam.filters.reporting import joined_info
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.xla import where_any
@@ -116,7 +116,7 @@ def team_slam(
 
     def predict(joint: Joint, u: Float[Array, "U"], key: Array) -> Joint:
         for b, own in enumerate(jnp.split(u, control_ends[:-1])):
-            joint = moved(joint, b, own, settings)
+            joint = predicted_robot(joint, b, own, settings)
         return joint
 
     def update_map(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
@@ -139,7 +139,7 @@ def team_slam(
         for b, masks in used.items():
             for a, mask in enumerate(masks):
                 infos[a] = _reported_initialized(infos[a], mask, settings.slot_of(b))
-        return joint, joined([infos[b] for b in range(len(robots))], size_z)
+        return joint, joined_info([infos[b] for b in range(len(robots))], size_z)
 
     def estimate(joint: Joint) -> Estimate:
         means, covs, _ = poses(joint, len(robots))
@@ -202,7 +202,9 @@ def initial_team_state(
     return joint
 
 
-def moved(joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings) -> Joint:
+def predicted_robot(
+    joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings
+) -> Joint:
     """The state after the prediction of one robot, if it is in the map."""
     after, _ = propagate(
         seen_from(joint, robot, settings), u, settings.robots[robot].motion, settings.ekf

@@ -12,7 +12,7 @@ from jaxslam.consistency import Measure, Score, condense, mean_pose_nees, positi
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.monte_carlo.blocks.limit import divergence_limit, first_run
-from jaxslam.monte_carlo.blocks.plan import Plan, Promises, run_numbers
+from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises, run_numbers
 from jaxslam.monte_carlo.blocks.programs import FilterResults, World
 from jaxslam.types import Estimate, Info, Trace, Truth
 
@@ -27,7 +27,9 @@ Glimpse = Callable[[str, int, Measure | None], PyTree]
 class BlockRunner:
     """Computes blocks; one may be begun before all programs are there, and waits for each."""
 
-    def __init__(self, plan: Plan, promises: Promises, glimpse: Glimpse | None = None) -> None:
+    def __init__(
+        self, plan: CampaignPlan, promises: Promises, glimpse: Glimpse | None = None
+    ) -> None:
         self.plan, self.promises, self.glimpse = plan, promises, glimpse
         self.first: dict[str, tuple[Truth, Estimate]] = {}
         """run 0 of each filter, once its block has run"""

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.consistency import final_covariance
-from jaxslam.monte_carlo.blocks.plan import Plan, Promises
+from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
 from jaxslam.types import Log, Truth
 
 
 def divergence_limit(
-    plan: Plan,
+    plan: CampaignPlan,
     promises: Promises,
     which: Int[np.ndarray, "B"],
     world: tuple[Truth, Log],

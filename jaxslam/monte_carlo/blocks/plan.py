@@ -16,7 +16,7 @@ from jaxslam.simulation.worlds import Scenario
 
 
 @dataclass(frozen=True)
-class Plan:
+class CampaignPlan:
     """The settings of the programs of one campaign."""
 
     scenario: Scenario

@@ -29,17 +29,17 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam.consistency import (
-    Statistics,
+    RunStatistics,
     conditional_bound,
     jacobians_at_truth,
     monitor_of,
     own_error_of,
-    statistics,
+    run_statistics,
 )
 from jaxslam.filters.ekf.observability import Monitor
 from jaxslam.monte_carlo.blocks.blockwise import Axes, Blockwise, Program
 from jaxslam.monte_carlo.blocks.limit import divergence_limit
-from jaxslam.monte_carlo.blocks.plan import Plan, Promises, run_numbers
+from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises, run_numbers
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.protocols import Candidate, Sensor
 from jaxslam.simulation.worlds import Scenario, simulate
@@ -67,7 +67,7 @@ _RUN_AXES = cast(Any, FilterResults)(1, 1, 1, 0, 1)
 """The axis of `FilterResults` that goes over the runs."""
 
 
-def compile_programs(plan: Plan, promises: Promises) -> None:
+def compile_programs(plan: CampaignPlan, promises: Promises) -> None:
     """Fill in all promises, each program compiled while the next one is traced."""
     with contextlib.closing(Blockwise(plan.devices, plan.wide, plan.library)) as blockwise:
         compiling = _Compiling(plan, promises, blockwise)
@@ -87,7 +87,7 @@ def compile_programs(plan: Plan, promises: Promises) -> None:
 class _Compiling(NamedTuple):
     """Starts the compilations; its methods take and return the shapes of what programs pass on."""
 
-    plan: Plan
+    plan: CampaignPlan
     promises: Promises
     blockwise: Blockwise
 
@@ -143,7 +143,7 @@ class _Compiling(NamedTuple):
         return cast(FilterResults, results)
 
     def _statistics(self, name: str, results: FilterResults, world: World) -> None:
-        found = partial(run_statistics, self.plan.scenario.sensor)
+        found = partial(statistics_of_runs, self.plan.scenario.sensor)
         given = world[0], results.estimate, results.info
         self._start(self.promises.statistics[name], "statistics", found, given, (0, 1, 1))
 
@@ -210,13 +210,15 @@ def drive_filter(
     return results
 
 
-def run_statistics(sensor: Sensor, truth: Truth, estimate: Estimate, info: Info) -> Statistics:
+def statistics_of_runs(
+    sensor: Sensor, truth: Truth, estimate: Estimate, info: Info
+) -> RunStatistics:
     """The statistics (B, …) of each run."""
 
-    def one(truth: Truth, estimate: Estimate, info: Info) -> Statistics:
-        return statistics(Trace(estimate, info, None, None), truth, sensor)
+    def one(truth: Truth, estimate: Estimate, info: Info) -> RunStatistics:
+        return run_statistics(Trace(estimate, info, None, None), truth, sensor)
 
-    found: Statistics = jax.vmap(one, in_axes=(0, 1, 1))(truth, estimate, info)
+    found: RunStatistics = jax.vmap(one, in_axes=(0, 1, 1))(truth, estimate, info)
     return found
 
 

@@ -5,7 +5,7 @@ Pillow, which Matplotlib requires, writes GIF; the program ffmpeg, where it is i
 
 from jaxslam.results.film.encoding import NoEncoder, ffmpeg, gif, mp4
 from jaxslam.results.film.film import Film
-from jaxslam.results.film.player import SCRIPT, page, player
+from jaxslam.results.film.player import SCRIPT, player, player_page
 from jaxslam.results.film.timing import MOST, frame_steps
 
 __all__ = [
@@ -17,6 +17,6 @@ __all__ = [
     "frame_steps",
     "gif",
     "mp4",
-    "page",
     "player",
+    "player_page",
 ]

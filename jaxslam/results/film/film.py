@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jaxslam.results.files import write_files
 from jaxslam.results.film.encoding import NoEncoder, gif, mp4, size_of
-from jaxslam.results.film.player import page, player
+from jaxslam.results.film.player import player, player_page
 
 KINDS = ("mp4", "gif", "html")
 """endings of the files that a film can be written to"""
@@ -49,7 +49,7 @@ class Film:
         Raises `NoEncoder` where ffmpeg, which mp4 takes, is not installed or fails.
         """
         if kind == "html":
-            return page(self.player(), self.title).encode()
+            return player_page(self.player(), self.title).encode()
         return mp4(self.frames, self.fps) if kind == "mp4" else gif(self.frames, self.fps)
 
     def moving(self) -> tuple[str, bytes, str]:

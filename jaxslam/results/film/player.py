@@ -201,7 +201,7 @@ def _file(indices: np.ndarray, palette: Sequence[int], **more: int) -> bytes:
     return out.getvalue()
 
 
-def page(fragment: str, title: str = "") -> str:
+def player_page(fragment: str, title: str = "") -> str:
     """A page of HTML with a player alone; the browser may load nothing."""
     policy = (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {SCRIPT_SOURCE}"

@@ -14,7 +14,7 @@ from jaxslam.results.page import curves
 from jaxslam.results.page.parts import (
     VERDICTS,
     badge,
-    embedded,
+    embedded_figure,
     lost_runs,
     measures_table,
     verdict_list,
@@ -55,7 +55,7 @@ def page(
     """
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
     shown = _figures(figures, draw)
-    data = curves.embedded(campaign)
+    data = curves.embedded_curves(campaign)
     scripts = f"""<script type="application/json" id="curves">{data.text}</script>
 <script>{SCRIPT}</script>"""
     return f"""<!DOCTYPE html>
@@ -139,7 +139,7 @@ def _setup(campaign: Campaign) -> str:
 def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure], bytes]) -> str:
     """The figures as HTML, numbered."""
     return "\n".join(
-        embedded(i, name, caption, figure, draw(figure))
+        embedded_figure(i, name, caption, figure, draw(figure))
         for i, (name, (caption, figure)) in enumerate(figures.items(), 1)
     )
 

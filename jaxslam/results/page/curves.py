@@ -37,7 +37,7 @@ class Curves(NamedTuple):
     """number of steps that a point stands for"""
 
 
-def embedded(campaign: Campaign) -> Curves:
+def embedded_curves(campaign: Campaign) -> Curves:
     """The curves of every figure that the page draws by itself."""
     room = int(np.clip(NUMBERS // (_OVER_TIME * len(campaign.filters)), LEAST, MOST))
     each = 1 if campaign.steps <= room else -(-2 * campaign.steps // room)

@@ -156,7 +156,7 @@ def lost_runs(campaign: Campaign) -> str:
     return "\n".join(out)
 
 
-def embedded(number: int, name: str, caption: str, figure: Figure, drawn: bytes) -> str:
+def embedded_figure(number: int, name: str, caption: str, figure: Figure, drawn: bytes) -> str:
     """A figure with its caption as HTML, the PNG file embedded; the script knows it by its name."""
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
     data = base64.b64encode(drawn).decode("ascii")

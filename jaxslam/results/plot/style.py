@@ -180,7 +180,7 @@ def plain(name: str) -> str:
     return f" {name}" if name.startswith("_") else name
 
 
-def wrapped(name: str) -> str:
+def in_lines(name: str) -> str:
     """A long name in several lines, broken at underscores."""
     words = plain(name).replace("_", "_ ")
     return "\n".join(
@@ -227,6 +227,6 @@ def every_handle(panels: Sequence[Axes]) -> list[Artist]:
     return list({handle.get_label(): handle for handle in found}.values())
 
 
-def span(steps: int) -> tuple[float, float]:
+def step_limits(steps: int) -> tuple[float, float]:
     """The limits of the abscissa, with some width if there is a single step."""
     return (1, steps) if steps > 1 else (0.5, 1.5)

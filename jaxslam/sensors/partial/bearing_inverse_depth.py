@@ -21,7 +21,7 @@ from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Reduced, Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
 from jaxslam.sensors.partial.bearing_only import bearing_only
-from jaxslam.sensors.partial.prior import FreeLike, prior
+from jaxslam.sensors.partial.prior import FreeLike, free_parameters
 from jaxslam.validation.numbers import is_concrete
 
 _FAR = 1e-6
@@ -155,7 +155,7 @@ def bearing_inverse_depth(
         invert=invert,
         position=position,
         embed=embed,
-        free=prior("bearing_inverse_depth", by_distance if free is None else free, 1),
+        free=free_parameters("bearing_inverse_depth", by_distance if free is None else free, 1),
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,
         reduced=reduced,

@@ -16,7 +16,7 @@ from jaxslam.math.arrays import (
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
-from jaxslam.sensors.partial.prior import FreeLike, prior
+from jaxslam.sensors.partial.prior import FreeLike, free_parameters
 
 TEN_METRES = ((10.0,), ((25.0,),))
 """Range 10 m, σ 5 m: a placeholder for the actual prior knowledge."""
@@ -76,7 +76,7 @@ def bearing_only(
         residual=residual,
         noise_cov=noise_model("bearing_only", noise_cov, 1),
         invert=invert,
-        free=prior("bearing_only", free, 1),
+        free=free_parameters("bearing_only", free, 1),
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,
     )

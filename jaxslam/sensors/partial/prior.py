@@ -13,7 +13,7 @@ from jaxslam.validation.numbers import check_covariance, is_concrete
 FreeLike = Free | tuple[ArrayLike, ArrayLike]
 
 
-def prior(name: str, free: FreeLike, size: int) -> Free:
+def free_parameters(name: str, free: FreeLike, size: int) -> Free:
     """The `Free` of free = (mean (size,), cov (size, size)), in float64 on the host unless traced.
 
     Raises ValueError unless the mean is finite and the covariance positive definite; a traced part

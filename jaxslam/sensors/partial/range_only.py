@@ -16,7 +16,7 @@ from jaxslam.math.arrays import (
 from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.mounting import NO_OFFSET, mounting
-from jaxslam.sensors.partial.prior import FreeLike, prior
+from jaxslam.sensors.partial.prior import FreeLike, free_parameters
 
 ANY_DIRECTION = ((0.0,), ((np.pi**2 / 3,),))
 """The Gaussian with the mean and the variance of a direction uniform on (-π, π]."""
@@ -75,7 +75,7 @@ def range_only(
         residual=residual,
         noise_cov=noise_model("range_only", noise_cov, 1),
         invert=invert,
-        free=prior("range_only", free, 1),
+        free=free_parameters("range_only", free, 1),
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,
     )

@@ -66,7 +66,7 @@ def quotients(
     flat[which] = ends.reshape(-1, n)
     values = np.asarray(function(*flat), np.float64).reshape(count, 2, halvings, n, -1)
     rise = values[:, 0] - values[:, 1]
-    rise = on_circle(rise, periods)
+    rise = modulo_periods(rise, periods)
     # The step after rounding of x ± h.
     width = (ends[:, 0] - ends[:, 1])[:, :, np.arange(n), np.arange(n)]  # (S, H, n)
     level = np.moveaxis(rise / width[..., None], 1, 0)  # (H, S, n, m)
@@ -74,7 +74,7 @@ def quotients(
     aliased = np.abs(level[fine]) * 2 * steps[:, None, None, None] > periods / 2
     level = np.where(aliased, np.nan, level)
     centre = np.asarray(function(*arguments), np.float64)[:, None, None]  # (S, 1, 1, m)
-    sides = on_circle(values - centre[:, None], periods)[:, :, fine]  # (S, 2, n, m)
+    sides = modulo_periods(values - centre[:, None], periods)[:, :, fine]  # (S, 2, n, m)
     turn = np.abs(sides[:, 0] + sides[:, 1])
     kink = turn > _KINK * np.abs(sides).max(axis=(1, 2, 3), initial=0.0)[:, None, None]
     kink &= turn > 100 * np.finfo(np.float64).eps * (1 + np.abs(values).max(axis=(1, 2)))
@@ -100,7 +100,7 @@ def quotients(
     return Quotient(best.swapaxes(1, 2), least.swapaxes(1, 2), kink.swapaxes(1, 2))
 
 
-def on_circle(
+def modulo_periods(
     difference: Float[np.ndarray, "*batch m"], periods: Float[np.ndarray, "m"]
 ) -> Float[np.ndarray, "*batch m"]:
     """Differences modulo their periods, in [-period/2, period/2]; inf is the period of a line."""

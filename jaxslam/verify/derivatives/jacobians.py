@@ -31,7 +31,7 @@ _FEW = 8
 """number of step sizes for a function that cannot be traced and is called state by state"""
 
 
-class Evaluation(NamedTuple):
+class Jacobians(NamedTuple):
     """The Jacobians of one function by one argument at S states."""
 
     methods: dict[str, Values]
@@ -53,13 +53,13 @@ class Evaluated(NamedTuple):
     samples: Samples
     values: Float[np.ndarray, "S m"] | None
     """in float64; None if the function cannot be called"""
-    by_argument: tuple[Evaluation, ...]
+    by_argument: tuple[Jacobians, ...]
     checks: tuple[Check, ...]
     jumps: tuple[Jump, ...] = ()
     """of outputs that are not named as angles"""
 
 
-def evaluate(function: Function, samples: Samples) -> Evaluated:
+def evaluate_jacobians(function: Function, samples: Samples) -> Evaluated:
     """Compute every Jacobian of a function in float64 and float32; failures become checks."""
     arguments = samples.values
     return _Evaluator(function, samples, arguments).result()
@@ -90,7 +90,7 @@ class _Evaluator:
         for k in self.over:
             quotient, how = self._quotient(k)
             evaluations.append(
-                Evaluation(
+                Jacobians(
                     _of_argument(double, k),
                     _of_argument(single, k),
                     _worst_gap(_of_argument(autodiff32, k), _of_argument(reference, k)),

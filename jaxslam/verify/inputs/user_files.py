@@ -15,7 +15,7 @@ from jaxslam.graphs import Factor
 from jaxslam.grids.beam_models import BeamModel
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import Check, Report, build
-from jaxslam.verify.errors import describe_error, is_user_file, line_of
+from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.functions import makes_a_model
 from jaxslam.verify.verifier import Model
@@ -177,7 +177,7 @@ def import_file(path: Path) -> ModuleType:
     except SyntaxError as error:
         raise UnusableFile(f"{path.name}:{error.lineno}: {error.msg}") from error
     except (Exception, SystemExit) as error:
-        where = line_of(error)
+        where = place_of_error(error)
         why = describe_error(error).removeprefix(f"{where}: ")
         raise UnusableFile(f"{where or path.name}: does not import: {why}") from error
     finally:

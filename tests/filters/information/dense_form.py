@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters.information.sparse.marginals import information_of
+from jaxslam.filters.information.sparse.marginals import local_information
 
 COUNT = 36
 """landmarks of the cloister"""
 
-dense = jax.jit(lambda state: information_of(state, jnp.arange(state.alive.shape[0])))
+dense = jax.jit(lambda state: local_information(state, jnp.arange(state.alive.shape[0])))
 
 
 def canonical(state):

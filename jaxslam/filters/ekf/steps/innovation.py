@@ -16,7 +16,7 @@ from jaxslam.filters.ekf.coordinates.linear_system import Transition, basis_of_e
 from jaxslam.filters.ekf.coordinates.to_points import at_slot
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.predicted_measurements import in_chart, projected_cov
-from jaxslam.filters.ekf.steps.whitening import Factored, factor_of, whiten, whitened_by
+from jaxslam.filters.ekf.steps.whitening import InnovationFactor, factor_of, whiten, whitened_by
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize, no_inline
 from jaxslam.protocols import Here
@@ -253,7 +253,7 @@ def _gate(
 
 def _report(
     gated: _Gated,
-    factored: Factored,
+    factored: InnovationFactor,
     whitened: Float[Array, "K"],
     jacobian: Float[Array, "m Z W"],
     basis: Float[Array, "m W W"] | None,

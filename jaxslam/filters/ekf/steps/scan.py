@@ -27,7 +27,7 @@ from jaxslam.filters.ekf.steps.innovation import Correction
 from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
 from jaxslam.filters.ekf.steps.update import correct
-from jaxslam.filters.reporting import info_of, joined, nothing_of, seen_before, status_of
+from jaxslam.filters.reporting import info_of, joined_info, nothing_of, seen_before, status_of
 from jaxslam.math.xla import change_where, where_any
 from jaxslam.protocols import Association, Sensor
 from jaxslam.sensors.suite import Part, Suite, on_ground, split_scan
@@ -109,7 +109,7 @@ def update_by_scan(joint: Joint, scan: Scan, turns: Sequence[SensorTurn]) -> Sca
         joint, info, gone, more = update_by_sensor(joint, own, turn.settings)
         infos.append(info)
         evicted, system = evicted | gone, (*system, *more)
-    return ScanUpdate(joint, joined(infos, scan.z.shape[1]), evicted, system)
+    return ScanUpdate(joint, joined_info(infos, scan.z.shape[1]), evicted, system)
 
 
 def update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> ScanUpdate:

@@ -9,7 +9,7 @@ from jaxslam.math import linalg
 from jaxslam.math.xla import materialize, no_inline
 
 
-class Factored(NamedTuple):
+class InnovationFactor(NamedTuple):
     """The factor of S = L Lᵀ of the fused measurements."""
 
     s: Float[Array, "m Z m Z"]
@@ -27,7 +27,7 @@ def factor_of(
     inverse: Float[Array, "m Z Z"],
     definite: Bool[Array, "m"],
     fuse: Bool[Array, "m"],
-) -> Factored:
+) -> InnovationFactor:
     """The factor L of the fused measurements; for the others S is the identity and L zero.
 
     same: 1 where both measurements are the same one.
@@ -44,11 +44,11 @@ def factor_of(
     factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
     if m == 1:  # it has been factored already
         pivots = jnp.diagonal(inverse, axis1=1, axis2=2)
-    return Factored(s, factor, inverse, pivots, regular)
+    return InnovationFactor(s, factor, inverse, pivots, regular)
 
 
 def whiten(
-    factored: Factored,
+    factored: InnovationFactor,
     fuse: Bool[Array, "m"],
     hp: Float[Array, "K D"],
     nu: Float[Array, "m Z"],

@@ -20,7 +20,7 @@ from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 
 
-def information_of(state: SparseState, slot: Int[Array, "B"]) -> Float[Array, "D D"]:
+def local_information(state: SparseState, slot: Int[Array, "B"]) -> Float[Array, "D D"]:
     """Ω of the robot and the landmarks of these slots, D = 3 + 2B; N for none, no slot twice."""
     n, count = state.alive.shape[0], slot.shape[0]
     present = slot < n
@@ -54,7 +54,7 @@ def blanket_cov(state: SparseState, slot: Int[Array, ""]) -> Float[Array, "5 5"]
     row = state.neighbours[slot]
     listed = (state.active[:, None] == row[None, :]).any(axis=1) | (state.active == slot)
     members = jnp.concatenate([slot[None], row, jnp.where(listed, n, state.active)])
-    omega = information_of(state, members)
+    omega = local_information(state, members)
     eye = jnp.eye(omega.shape[0], 5, dtype=omega.dtype)
     return linalg.symmetrize(linalg.solve_psd(omega, eye)[0][:5])
 
@@ -71,7 +71,7 @@ def blanket_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Ar
 def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Array, "N 2 2"]]:
     """P of the robot and of each landmark by inverting the whole Ω, O(N³)."""
     count = state.alive.shape[0]
-    omega = information_of(state, jnp.arange(count, dtype=jnp.int32))
+    omega = local_information(state, jnp.arange(count, dtype=jnp.int32))
     cov = linalg.inverse_psd(omega)
     every = jnp.arange(count)
     points = cov[3:, 3:].reshape(count, 2, count, 2)[every, :, every]

@@ -12,11 +12,11 @@ from jaxslam.results.plot.style import (
     INK,
     PAGE,
     caption,
+    in_lines,
     ordinate,
     panels_of,
-    span,
+    step_limits,
     titled,
-    wrapped,
 )
 from jaxslam.types import Estimate, Truth
 
@@ -80,7 +80,7 @@ def run_errors_figure(
         for i, axes in enumerate(panels[3 * j : 3 * j + 3]):
             _draw(axes, error[:, i], bound[:, i], n_sigma)
             mark_beyond(axes)
-        panels[3 * j].set_ylabel(wrapped(name), rotation=0, ha="right", va="center")
+        panels[3 * j].set_ylabel(in_lines(name), rotation=0, ha="right", va="center")
     for axes in panels[-3:]:
         axes.set_xlabel("step")
     caption(figure, title)
@@ -105,4 +105,4 @@ def _draw(axes: Axes, error: np.ndarray, bound: np.ndarray, n_sigma: float) -> N
     label = "truth - estimate"
     axes.plot(step, error, color=COLORS[1], lw=0.9, label=label, gid=CURVE)
     axes.axhline(0.0, color=INK, lw=0.6)
-    axes.set_xlim(span(len(error)))
+    axes.set_xlim(step_limits(len(error)))

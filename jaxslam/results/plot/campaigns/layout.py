@@ -93,7 +93,7 @@ def sheet(
     return figure, rows
 
 
-def finish(figure: Figure, rows: Sequence[Row], title: str, across: str) -> None:
+def add_legends(figure: Figure, rows: Sequence[Row], title: str, across: str) -> None:
     """Add the legends, the title, and the label of the abscissa across the last row."""
     for axes in rows[-1].panels:
         axes.set_xlabel(across)

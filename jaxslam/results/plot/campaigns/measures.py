@@ -6,9 +6,9 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, LEVELS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.campaigns.layout import finish, head, runs_of, sheet
+from jaxslam.results.plot.campaigns.layout import add_legends, head, runs_of, sheet
 from jaxslam.results.plot.campaigns.scale import common_top, mark_beyond, scale_setters
-from jaxslam.results.plot.style import INK, PAGE, RULE, band, curve, plain, span
+from jaxslam.results.plot.style import INK, PAGE, RULE, band, curve, plain, step_limits
 
 _NOTHING = 1e-6
 """Information on a heading that counts as none, σ being 1000 rad [1/rad²]."""
@@ -45,7 +45,7 @@ def bound_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         top = max(top, *(_peak(bound) for bound in bounds[key][:1]), 0.0)
         for row in rows:
             axes = row.panels[j]
-            axes.set(xlim=span(campaign.steps), ylim=(0.0, 1.06 * top or 1.0))
+            axes.set(xlim=step_limits(campaign.steps), ylim=(0.0, 1.06 * top or 1.0))
             for i, name in enumerate(row.names):
                 curve(axes, i, step, curves[name], name)
             for bound in bounds[key][:1]:
@@ -54,7 +54,7 @@ def bound_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
                     step, bound, color=INK, lw=2.0, label=label, zorder=2.5, marker=_lone(bound)
                 )
             mark_beyond(axes)
-    finish(figure, rows, f"{head(campaign)}: error, average over {runs_of(campaign)}", "step")
+    add_legends(figure, rows, f"{head(campaign)}: error, average over {runs_of(campaign)}", "step")
     return figure
 
 
@@ -81,7 +81,7 @@ def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
                 axes.set_box_aspect(1)
     if not rows[0].kind:
         rows[0].panels[0].set_ylabel("share of truth within")
-    finish(
+    add_legends(
         figure,
         rows,
         f"{head(campaign)}: share of the truth within an ellipsoid, {runs_of(campaign)}",
@@ -114,7 +114,7 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             curve(axes, i, lags + aside, values, name, absent="no innovations")
         axes.set(xticks=lags, ylim=(-1.1 * extreme, 1.1 * extreme))
     title = f"{head(campaign)}: whiteness of innovations, {runs_of(campaign)}"
-    finish(figure, rows, title, "lag [steps]")
+    add_legends(figure, rows, title, "lag [steps]")
     return figure
 
 
@@ -142,7 +142,7 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             curve(axes, i, step, np.where(values < _NOTHING, lane, values), name)
         axes.axhspan(_NOTHING * 10**-strip, _NOTHING, color=RULE, alpha=0.5, lw=0, zorder=1)
         axes.axhline(_NOTHING, color=INK, lw=0.5, zorder=1.5)
-        axes.set(yscale="log", xlim=span(campaign.steps), ylim=(_NOTHING * 10**-strip, top))
+        axes.set(yscale="log", xlim=step_limits(campaign.steps), ylim=(_NOTHING * 10**-strip, top))
         _label_powers(axes, strip, decades)
     if not curves:
         said = "no filter has an observability monitor (filters.monitored)"
@@ -151,7 +151,7 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         f"{head(campaign)}: information gained on a turn of the whole frame, {runs_of(campaign)}"
     )
     title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
-    finish(figure, rows, title, "step")
+    add_legends(figure, rows, title, "step")
     return figure
 
 

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.campaigns.layout import finish, head, runs_of, sheet
+from jaxslam.results.plot.campaigns.layout import add_legends, head, runs_of, sheet
 from jaxslam.results.plot.campaigns.scale import mark_beyond, nees_scale
-from jaxslam.results.plot.style import INK, PAGE, band, curve, span
+from jaxslam.results.plot.style import INK, PAGE, band, curve, step_limits
 
 
 def nees_figure(
@@ -35,9 +35,9 @@ def nees_figure(
                 summary = campaign.filters[name]
                 label = f"{name} ({summary.verdict})"
                 curve(axes, i, step, summary.curves[f"nees_{block}"], label, absent="no NEES")
-            axes.set_xlim(span(campaign.steps))
+            axes.set_xlim(step_limits(campaign.steps))
             mark_beyond(axes)
-    finish(figure, rows, f"{head(campaign)}: NEES, average over {runs_of(campaign)}", "step")
+    add_legends(figure, rows, f"{head(campaign)}: NEES, average over {runs_of(campaign)}", "step")
     return figure
 
 

@@ -58,16 +58,16 @@ def ellipse(
     return np.asarray(np.asarray(mean) + contour)
 
 
-def span(clouds: Sequence[np.ndarray]) -> float:
+def extent(clouds: Sequence[np.ndarray]) -> float:
     """The larger side of the bounding box of some points, or 1 if it is 0."""
     return float(np.nanmax(np.ptp(_finite(clouds), axis=0))) or 1.0
 
 
-def square(clouds: Sequence[np.ndarray]) -> Limits:
+def square_limits(clouds: Sequence[np.ndarray]) -> Limits:
     """The limits of a square panel about some points, with a margin."""
     every = _finite(clouds)
     x, y = (every.min(axis=0) + every.max(axis=0)) / 2
-    half = 0.56 * span(clouds)
+    half = 0.56 * extent(clouds)
     return (x - half, x + half), (y - half, y + half)
 
 

@@ -10,7 +10,7 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.maps.geometry import ellipses, span, square
+from jaxslam.results.plot.maps.geometry import ellipses, extent, square_limits
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,
@@ -78,7 +78,7 @@ def map_figure(
     if dead_reckoning is not None:
         path = np.asarray(dead_reckoning)[:, :2]
         axes.plot(*path.T, color=FAINT, lw=1.0, ls=(0, (1, 1.2)), label="dead reckoning", zorder=2)
-        shown += [path] if span([*shown, path]) < _NEAR * span(shown) else []
+        shown += [path] if extent([*shown, path]) < _NEAR * extent(shown) else []
     for i, (name, other) in enumerate((others or {}).items(), start=3):
         line = {key: look(i)[key] for key in ("color", "ls")}
         axes.plot(*np.asarray(other.pose)[:, :2].T, lw=1.0, label=plain(name), zorder=2.5, **line)
@@ -208,5 +208,5 @@ def _draw_residuals(
 
 def _limit(axes: Axes, clouds: Sequence[np.ndarray]) -> None:
     """Set the limits of a square panel about some points."""
-    xlim, ylim = square(clouds)
+    xlim, ylim = square_limits(clouds)
     axes.set(xlim=xlim, ylim=ylim)

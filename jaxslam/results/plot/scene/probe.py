@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.filters.information.eif_slam import CanonicalState
-from jaxslam.filters.information.sparse.marginals import information_of
+from jaxslam.filters.information.sparse.marginals import local_information
 from jaxslam.filters.information.sparse.sparse_state import SparseState
 from jaxslam.filters.particles.states.pose_state import PoseParticles
 from jaxslam.filters.particles.states.slam_state import SlamParticles
@@ -39,7 +39,7 @@ def probe(state: Any) -> Cloud | Links | None:
         return Cloud(state.pose, jnp.exp(state.log_weight))
     if isinstance(state, SparseState):
         every = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
-        return _links(information_of(state, every), 2)
+        return _links(local_information(state, every), 2)
     if isinstance(state, CanonicalState):
         return _links(state.omega, state.landmarks.shape[1])
     return None

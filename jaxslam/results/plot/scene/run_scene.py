@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxslam.results.plot.maps.geometry import Limits, ellipses, span, square
+from jaxslam.results.plot.maps.geometry import Limits, ellipses, extent, square_limits
 from jaxslam.results.plot.scene.history import History, Measured, measured
 from jaxslam.results.plot.scene.layers import (
     cloud,
@@ -100,9 +100,9 @@ def _limits(
     clouds = [np.asarray(each, float)[:, :2] for each in (points, path) if each is not None]
     clouds = clouds or estimated
     for more in (*estimated, np.concatenate([mapped - reach, mapped + reach])):
-        if span([*clouds, more]) <= _NEAR * span(clouds):
+        if extent([*clouds, more]) <= _NEAR * extent(clouds):
             clouds = [*clouds, more]
-    return square(clouds)
+    return square_limits(clouds)
 
 
 def _truth(
