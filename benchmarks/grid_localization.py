@@ -1,4 +1,4 @@
-"""Localization in grids: `python -m benchmarks.grid_localization [--runs 100] [--part logs]`.
+"""Localization in grids: `python -m benchmarks.grid_localization [--runs 30] [--part logs]`.
 
 `office`: the likelihood-field filter on the same draws for each exponent of the likelihood, in a
 map made from another drive: does the 95 % set of its particles cover the truth in 95 % of the
@@ -238,7 +238,7 @@ def found_in(name, seeds=100, particles=5000, steps=100):
     ]
 
 
-def measure(runs=100, part="office,logs"):
+def measure(runs=30, part="office,logs"):
     """The metrics of the parts named."""
     wanted, metrics = part.split(","), []
     if "office" in wanted:
@@ -255,7 +255,7 @@ if __name__ == "__main__":
         alone(
             "grid_localization",
             measure,
-            runs={"type": int, "default": 100},
+            runs={"type": int, "default": 30},
             part={"default": "office,logs"},
         )
     )

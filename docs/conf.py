@@ -1,6 +1,5 @@
 """How the documentation is built: `make docs`, with every warning an error."""
 
-import hashlib
 import importlib.metadata
 import os
 import sys
@@ -23,6 +22,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "myst_nb",
+    "executed",
     "reference",
 ]
 exclude_patterns = ["_build", "_ext"]
@@ -45,13 +45,9 @@ nb_execution_timeout = 300
 nb_execution_show_tb = True
 nb_merge_streams = True
 
-# What a page printed and drew is kept until the page or the package changes.
-sources = hashlib.sha256()
-for path in sorted((ROOT / "jaxslam").rglob("*")):
-    if path.suffix in (".py", ".css", ".js"):
-        sources.update(path.read_bytes())
+# What a page printed and drew is kept until its cells, or code that they reach, change.
 nb_execution_mode = "cache"
-nb_execution_cache_path = str(ROOT / ".cache" / f"docs-{sources.hexdigest()[:16]}")
+nb_execution_cache_path = str(ROOT / ".cache" / "docs")
 get_cache(nb_execution_cache_path).list_cache_records()  # makes it, before several processes do
 
 # The kernels that run the pages keep their compiled programs in the checkout.

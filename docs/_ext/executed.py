@@ -1,0 +1,153 @@
+"""Sphinx extension: a page is run again when its cells, or the code that they reach, have changed.
+
+What a page printed and drew is kept by its cells and its kernel's description (jupyter-cache). This
+extension adds to that description a digest of the files of the package that the cells reach: those
+that define a name in a cell, those that define a name in these, and so on. Docstrings, comments and
+layout do not count. A page with a shell command reaches all files, as they are.
+"""
+
+import ast
+import functools
+import hashlib
+import importlib
+import inspect
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = "jaxslam"
+KERNEL = "  name: python3\n"
+"""The line of a page's head after which the digest is put"""
+
+
+def digest(page: str) -> str | None:
+    """Of what the cells of a page reach; None for a page without cells."""
+    cells = re.findall(r"^```\{code-cell\}[^\n]*\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    if not cells:
+        return None
+    code = "".join(line for cell in cells for line in cell.splitlines(True) if line[:1] != ":")
+    shell = re.search(r"^!", code, re.MULTILINE)
+    everything = {path for path in (ROOT / PACKAGE).rglob("*") if path.suffix in KINDS}
+    if shell:
+        files = everything
+    else:
+        files = reached(named(ast.parse(re.sub(r"^%.*$", "", code, flags=re.MULTILINE))))
+    if "examples" in code:
+        files = files | set((ROOT / "examples").glob("*.py"))
+    hashed = hashlib.sha256()
+    for path in sorted(files):
+        hashed.update(path.read_bytes() if shell else content(path))
+    return hashed.hexdigest()[:16]
+
+
+KINDS = (".py", ".css", ".js")
+
+
+def reached(names: frozenset[str]) -> set[Path]:
+    """The files that define these names, or names in such files; and what lies beside them."""
+    files: set[Path] = set()
+    ahead = {home(name) for name in names}
+    while ahead:
+        path = ahead.pop()
+        files.add(path)
+        ahead |= {home(name) for name in named_in(path)} - files
+    return files | {
+        path for folder in {f.parent for f in files} for path in folder.iterdir()
+        if path.suffix in KINDS[1:]
+    }  # fmt: skip
+
+
+@functools.cache
+def named_in(path: Path) -> frozenset[str]:
+    """The names of the package in a file."""
+    return named(ast.parse(path.read_text(encoding="utf-8")))
+
+
+def named(tree: ast.AST) -> frozenset[str]:
+    """The names of the package that code uses, module and attributes: `jaxslam:filters.ekf_slam`."""
+    alias = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for each in node.names:
+                if each.name.split(".")[0] == PACKAGE:
+                    alias[each.asname or PACKAGE] = f"{each.name if each.asname else PACKAGE}:"
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == PACKAGE:
+            for each in node.names:
+                alias[each.asname or each.name] = f"{node.module}:{each.name}"
+    return frozenset(_used(tree, alias))
+
+
+def _used(node: ast.AST, alias: dict[str, str]) -> Iterator[str]:
+    chain, inner = [], node
+    while isinstance(inner, ast.Attribute):
+        chain.append(inner.attr)
+        inner = inner.value
+    if isinstance(inner, ast.Name) and inner.id in alias:
+        yield ".".join([alias[inner.id], *reversed(chain)])
+    else:
+        for child in ast.iter_child_nodes(node):
+            yield from _used(child, alias)
+
+
+@functools.cache
+def home(name: str) -> Path:
+    """The file that defines a name, or what it is an attribute of."""
+    within, _, attributes = name.partition(":")
+    module = value = importlib.import_module(within)
+    for part in filter(None, attributes.split(".")):
+        if hasattr(value, part):
+            value = getattr(value, part)
+        else:
+            value = importlib.import_module(f"{value.__name__}.{part}")
+        if not inspect.ismodule(value):
+            break
+        module = value
+    owner = getattr(value, "__module__", None) or ""
+    if not inspect.ismodule(value) and owner.split(".")[0] == PACKAGE:
+        module = sys.modules[owner]
+    return Path(module.__file__ or "")
+
+
+@functools.cache
+def content(path: Path) -> bytes:
+    """What of a file decides what it does."""
+    if path.suffix != ".py":
+        return path.read_bytes()
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            node.body = [
+                each
+                for each in node.body
+                if not (isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant))
+            ]
+    return ast.dump(tree).encode()
+
+
+def outdated(app: Any, env: Any, added: Any, changed: Any, removed: Any) -> list[str]:
+    """Pages that are read again since what they reach has changed."""
+    before = getattr(env, "page_digests", {})
+    env.page_digests = {
+        page: digest(Path(env.doc2path(page)).read_text(encoding="utf-8"))
+        for page in env.found_docs
+        if not page.startswith("reference/api")
+    }
+    return [page for page, value in env.page_digests.items() if before.get(page) != value]
+
+
+def marked(app: Any, page: str, source: list[str]) -> None:
+    """Put the digest of a page into its head."""
+    value = app.env.page_digests.get(page)
+    if value is not None:
+        assert KERNEL in source[0], f"{page}: no kernel in its head"
+        source[0] = source[0].replace(KERNEL, f"{KERNEL}  reached: {value}\n", 1)
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Connect to Sphinx."""
+    app.connect("env-get-outdated", outdated)
+    app.connect("source-read", marked)
+    return {"parallel_read_safe": True}
