@@ -67,7 +67,7 @@ def named_in(path: Path) -> frozenset[str]:
 
 
 def named(tree: ast.AST) -> frozenset[str]:
-    """The names of the package that code uses, module and attributes: `jaxslam:filters.ekf_slam`."""
+    """What code uses of the package, module and attributes, as `jaxslam:filters.ekf_slam`."""
     alias = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

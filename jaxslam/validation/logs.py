@@ -1,12 +1,9 @@
 """Checks of a log: shapes, dtypes, finite values, repeated tags."""
 
-from typing import Any
-
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.types import Log, Scan
-from jaxslam.validation.numbers import is_concrete, largest, shape_told
+from jaxslam.validation.numbers import check_array, is_concrete, largest
 
 
 def check_log(
@@ -30,14 +27,14 @@ def check_log(
             f"{name}: log.scan: expected a Scan(z, tag, valid), got {type(scan).__name__}"
         )
     z, tag, valid = scan
-    _expect(f"{name}: log.control", control, ("T", control_size), np.floating)
+    check_array(f"{name}: log.control", control, ("T", control_size), np.floating)
     steps = np.shape(control)[0]
     if np.ndim(tag) != 2:  # it gives the number of measurement slots
-        _expect(f"{name}: log.scan.tag", tag, (steps, "M"), np.integer)
+        check_array(f"{name}: log.scan.tag", tag, (steps, "M"), np.integer)
     places = np.shape(tag)[1]
-    _expect(f"{name}: log.scan.z", z, (steps, places, measurement_size), np.floating)
-    _expect(f"{name}: log.scan.tag", tag, (steps, places), np.integer)
-    _expect(f"{name}: log.scan.valid", valid, (steps, places), np.bool_)
+    check_array(f"{name}: log.scan.z", z, (steps, places, measurement_size), np.floating)
+    check_array(f"{name}: log.scan.tag", tag, (steps, places), np.integer)
+    check_array(f"{name}: log.scan.valid", valid, (steps, places), np.bool_)
     if parts and places != sum(parts):
         raise ValueError(
             f"{name}: log.scan: expected {sum(parts)} measurement slots, "
@@ -62,21 +59,6 @@ def check_log(
         ordered = np.sort(part, axis=1)
         repeats = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
         _refuse(name, repeats, "log.scan.tag: a tag repeats within the scan")
-
-
-def _expect(name: str, value: Any, shape: tuple[int | str, ...], kind: type) -> None:
-    """Raise ValueError unless an array has this shape, in which a letter stands for any number."""
-    got = shape_told(value)
-    there = np.shape(value) if got.startswith("(") else ()
-    if len(there) != len(shape) or any(
-        isinstance(n, int) and n != m for n, m in zip(shape, there, strict=True)
-    ):
-        raise ValueError(f"{name}: expected shape ({', '.join(map(str, shape))}), got {got}")
-    if not hasattr(value, "dtype"):
-        raise ValueError(f"{name}: expected an array, got a {type(value).__name__}")
-    dtype = jnp.result_type(value)
-    if not jnp.issubdtype(dtype, kind):
-        raise ValueError(f"{name}: expected {kind.__name__} values, got {dtype}")
 
 
 def _refuse(name: str, bad: np.ndarray, why: str) -> None:

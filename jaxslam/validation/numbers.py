@@ -36,6 +36,24 @@ def shape_told(value: Any) -> str:
     return str(shape)
 
 
+def check_array(
+    name: str, value: Any, shape: tuple[int | str, ...], kind: type = np.generic
+) -> None:
+    """Raise ValueError unless an array has this shape, in which a letter stands for any number."""
+    got = shape_told(value)
+    there = np.shape(value) if got.startswith("(") else ()
+    if len(there) != len(shape) or any(
+        isinstance(n, int) and n != m for n, m in zip(shape, there, strict=True)
+    ):
+        told = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
+        raise ValueError(f"{name}: expected shape ({told}), got {got}")
+    if not hasattr(value, "dtype"):
+        raise ValueError(f"{name}: expected an array, got a {type(value).__name__}")
+    dtype = jnp.result_type(value)
+    if not jnp.issubdtype(dtype, kind):
+        raise ValueError(f"{name}: expected {kind.__name__} values, got {dtype}")
+
+
 def check_count(name: str, value: Any) -> None:
     """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:

@@ -1,12 +1,15 @@
-"""Checks of the results of user-defined filters, by chex during tracing."""
+"""Checks of the results of user-defined filters, during tracing."""
 
-from collections.abc import Callable
 from typing import Any, TypeVar
 
 import chex
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam.types import Estimate, Info, Scan
+from jaxslam.validation.numbers import check_array, shape_told
 
 _S = TypeVar("_S")
 
@@ -16,10 +19,33 @@ def same_state(name: str, before: _S, after: Any) -> _S:
 
     Tree, shapes and dtypes must be the same, since the state is the carry of a `lax.scan`.
     """
-    _expect(name, chex.assert_trees_all_equal_structs, before, after)
-    _expect(name, chex.assert_trees_all_equal_shapes_and_dtypes, before, after)
+    try:
+        chex.assert_trees_all_equal_structs(before, after)
+    except AssertionError:
+        told = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
+        raise ValueError(f"{name}: {told}") from None
+    try:
+        chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
+    except AssertionError:
+        pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
+        unlike = [
+            f"state{jax.tree_util.keystr(path)}: expected {_array(old)}, got {_array(new)}"
+            for (path, old), new in pairs
+            if _array(old) != _array(new)
+        ]
+        raise ValueError(f"{name}: {'; '.join(unlike)}") from None
     state: _S = after
     return state
+
+
+def _kind(state: PyTree) -> str:
+    """The type of a state, and where its arrays are."""
+    at = [jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(state)]
+    return "an array" if at == [""] else f"{type(state).__name__} of {', '.join(at) or 'nothing'}"
+
+
+def _array(leaf: Any) -> str:
+    return f"{jnp.result_type(leaf)} {shape_told(leaf)}"
 
 
 def state_and_info(name: str, state: _S, scan: Scan, found: Any) -> tuple[_S, Info]:
@@ -31,12 +57,17 @@ def state_and_info(name: str, state: _S, scan: Scan, found: Any) -> tuple[_S, In
         raise ValueError(f"{name}: expected update to return (state, Info), got {got}")
     info: Info = found[1]
     m = scan.tag.shape[0]
-    for field in ("nis", "dof", "slot", "status"):
-        _expect(f"{name}: Info.{field}", chex.assert_shape, getattr(info, field), (m,))
-    _expect(f"{name}: Info.innovation", chex.assert_shape, info.innovation, (m, None))
-    _expect(f"{name}: Info.innovation_cov", chex.assert_shape, info.innovation_cov, (m, None, None))
-    _expect(f"{name}: Info.log_likelihood", chex.assert_shape, info.log_likelihood, ())
-    _expect(f"{name}: Info.status", chex.assert_type, info.status, int)
+    for field, shape in {
+        "nis": (m,),
+        "dof": (m,),
+        "slot": (m,),
+        "status": (m,),
+        "innovation": (m, "Z"),
+        "innovation_cov": (m, "Z", "Z"),
+        "log_likelihood": (),
+    }.items():
+        kind = np.integer if field == "status" else np.generic
+        check_array(f"{name}: update: Info.{field}", getattr(info, field), shape, kind)
     return same_state(f"{name}: update", state, found[0]), info
 
 
@@ -49,14 +80,5 @@ def checked_estimate(name: str, estimate: Any) -> Estimate:
     n = np.shape(estimate.alive)[0] if np.ndim(estimate.alive) == 1 else -1
     shapes = {"pose": (3,), "pose_cov": (3, 3), "points": (n, 2), "point_covs": (n, 2, 2)}
     for field, shape in (shapes | {"alive": (n,), "tag": (n,)}).items():
-        _expect(f"{name}: Estimate.{field}", chex.assert_shape, getattr(estimate, field), shape)
+        check_array(f"{name}: Estimate.{field}", getattr(estimate, field), shape)
     return estimate
-
-
-def _expect(name: str, assertion: Callable[..., None], *arguments: Any) -> None:
-    """Run an assertion of chex; its failure becomes a ValueError that begins with a name."""
-    try:
-        assertion(*arguments)
-    except AssertionError as error:
-        why = str(error).split("failed:", 1)[-1].strip()
-        raise ValueError(f"{name}: {' '.join(why.split())}") from None
