@@ -69,9 +69,3 @@ def inverse(matrix: jax.Array) -> jax.Array:
 def _inverse_slope(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Array]:
     out = inverse(*primals)
     return out, -out @ tangents[0] @ out
-
-
-def eigenvalues(matrix: jax.Array) -> jax.Array:
-    """The eigenvalues of a symmetric (n, n) matrix, ascending (n,). No reverse-mode derivative."""
-    one = jax.custom_batching.sequential_vmap(lambda matrix: jnp.linalg.eigvalsh(matrix))
-    return jnp.asarray(one(matrix))

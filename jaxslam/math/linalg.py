@@ -61,15 +61,15 @@ def _outer_products(a: Float[Array, "k D"], b: Float[Array, "k E"]) -> Float[Arr
 
 
 @jax.custom_jvp
-def square(a: Float[Array, "k D"]) -> Float[Array, "D D"]:
+def self_gram(a: Float[Array, "k D"]) -> Float[Array, "D D"]:
     """Aᵀ A of A (k, D), k of any size; one product in a gradient, where `gram` takes two."""
     return gram(a, a)
 
 
-@square.defjvp
+@self_gram.defjvp
 def _square_slope(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Array]:
     half = gram(tangents[0], primals[0])
-    return square(*primals), half + half.T
+    return self_gram(*primals), half + half.T
 
 
 def gram_both(a: Float[Array, "k D"], b: Float[Array, "k D"]) -> Float[Array, "D D"]:
@@ -336,7 +336,7 @@ def solve_psd(
 
 def inverse_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A⁻¹ of a positive definite A (n, n), exactly symmetric; zero where A is not (n > 8)."""
-    return square(whitener_by_rows(matrix)[0])
+    return self_gram(whitener_by_rows(matrix)[0])
 
 
 def mahalanobis_squared(
@@ -357,8 +357,3 @@ def mahalanobis_squared(
     regular = jnp.all(jnp.diagonal(factor) ** 2 > 100 * n * jnp.finfo(cov.dtype).eps)
     regular = regular & jnp.all(known)
     return jnp.where(regular, jnp.sum(squares), 0.0), regular
-
-
-def is_positive_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
-    """Whether a symmetric (n, n) matrix is positive definite: its Cholesky factor is finite, ()."""
-    return jnp.all(jnp.isfinite(batched_linalg.factor(matrix)))

@@ -102,7 +102,7 @@ def film(
     return plot.render(scene, progress=progress)
 
 
-def summary(solved: Solved) -> dict[str, object]:
+def result_summary(solved: Solved) -> dict[str, object]:
     """The numbers of a result, for the table that is printed and for `summary.json`."""
     return {
         **solved.counts,

@@ -229,7 +229,7 @@ def marginalize_oldest(
     white = linalg.solve_lower(factor, seen)
     innovation = linalg.solve_lower(factor, r.reshape(-1) - jacobian @ deviation)
     deviation = deviation + innovation @ white
-    cov = linalg.symmetrize(cov - linalg.square(white))
+    cov = linalg.symmetrize(cov - linalg.self_gram(white))
     pose = at.path[1] + deviation[:3]
     landmarks = at.landmarks + deviation[3:].reshape(capacity, size)
     after = joint._replace(

@@ -135,7 +135,7 @@ def test_its_files(drive, tmp_path):
     np.testing.assert_array_equal(rows[:, 0], log.time)
     np.testing.assert_allclose(rows[:, 1:3], found.poses[:, :2], rtol=1e-8)
     assert len((tmp_path / "loops.csv").read_text().splitlines()) == 1 + len(found.loops.outcome)
-    assert results.summary(found)["keyframes"] == len(found.keyframe)
+    assert results.result_summary(found)["keyframes"] == len(found.keyframe)
 
 
 def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxslam import validation
-from jaxslam.math import batched_linalg, linalg
+from jaxslam.math import linalg
 
 UNROLLED, LAPACK = [1, 2, 3, 6, 8], [9, 20]  # 8 is the largest that is unrolled
 ROWS = 20
@@ -244,12 +244,6 @@ def test_mahalanobis_masks_directions_that_are_known_exactly():
     assert not by_cov.any()
 
 
-def test_is_positive_definite():
-    cases = np.stack([np.eye(3), np.diag([1.0, -1e-9, 1.0]), np.full((3, 3), np.nan)])
-    flags = jax.vmap(linalg.is_positive_definite)(jnp.asarray(cases))
-    np.testing.assert_array_equal(flags, [True, False, False])
-
-
 # --- checks -------------------------------------------------------------------------------------
 
 BAD = {
@@ -368,9 +362,8 @@ def test_no_batch_reaches_the_librarys_kernels_on_a_cpu():
     # There they wait for threads that they hold themselves: see `batched_linalg`.
     a, b = random_covariances(20, count=4), np.ones((4, 20, 3))
     slope = jax.grad(lambda a, b: everything(a, b)[0].sum(), (0, 1))
-    for f in (everything, slope, batched_linalg.eigenvalues):
-        arguments = (a, b) if f is not batched_linalg.eigenvalues else (a,)
-        program = jax.jit(jax.vmap(f)).lower(*arguments).compile().as_text()
+    for f in (everything, slope):
+        program = jax.jit(jax.vmap(f)).lower(a, b).compile().as_text()
         calls = [
             line for line in program.splitlines() if "lapack" in line and "custom-call(" in line
         ]
@@ -385,10 +378,10 @@ def test_a_square_and_its_slopes_are_those_of_the_product(rows):
     rng = np.random.default_rng(rows)
     a, by_a = rng.normal(size=(2, rows, 5))
     weight = rng.normal(size=(5, 5))
-    np.testing.assert_allclose(linalg.square(a), a.T @ a, atol=1e-12)
-    _, slope = jax.jvp(linalg.square, (a,), (by_a,))
+    np.testing.assert_allclose(linalg.self_gram(a), a.T @ a, atol=1e-12)
+    _, slope = jax.jvp(linalg.self_gram, (a,), (by_a,))
     np.testing.assert_allclose(slope, by_a.T @ a + a.T @ by_a, atol=1e-12)
-    back = jax.grad(lambda a: jnp.sum(weight * linalg.square(a)))(a)
+    back = jax.grad(lambda a: jnp.sum(weight * linalg.self_gram(a)))(a)
     np.testing.assert_allclose(back, a @ (weight + weight.T), atol=1e-12)
 
 

@@ -33,7 +33,7 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> Job:
 
     A beam without a return says nothing.
     """
-    shape, origin = frame_of(log, options.resolution)
+    shape, origin = map_frame(log, options.resolution)
     with Progress(f"{log.name}, map", "scans") as progress:
         counts = counted(log, shape, origin, options.resolution, progress)
     grid = jax.device_get(grids.occupancy(counts))
@@ -60,7 +60,7 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> Job:
     return Job(summary | map_told(grid), files, figures)
 
 
-def frame_of(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:
+def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:
     """The shape (H, W) and the origin of a map that holds all poses and hits.
 
     Raises ValueError on more than `MOST` cells.

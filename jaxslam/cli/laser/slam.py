@@ -26,7 +26,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> Job:
             made = results.film(log, solved, settings, title=log.name, progress=progress)
         files |= film_files({"slam": made}, suffixed=False)
     return Job(
-        results.summary(solved) | _scores(log, solved),
+        results.result_summary(solved) | _scores(log, solved),
         files,
         lambda formats: results.figures(solved, formats, log.corrected),
     )

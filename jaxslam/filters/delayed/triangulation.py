@@ -31,13 +31,11 @@ class Triangulation:
     """The triangulation functions of one type of sensor, for pairs of stored measurements."""
 
     name: str
-    solutions: int
-    """A, in how many points two can intersect"""
     store: Callable[[Float[Array, "3"], Float[Array, "1"]], Stored]
     """(pose, z) -> s, the measurement as a variable of the map"""
     intersect: Callable[[Stored, Stored], Solutions]
-    """(s, s') -> points (A, 2) and whether each is one, (A,) bool: where it is not, or badly
-    conditioned, the point is finite and without meaning"""
+    """(s, s') -> the A points in which two can intersect, and whether each is one: where it is not,
+    or badly conditioned, the point is finite and without meaning"""
     residual: Callable[[Stored, Point], Float[Array, ""]]
     """(s, point) -> g: the measurement minus its prediction from that point, zero for the true
     point without noise [rad or m]"""
@@ -83,7 +81,7 @@ def rays(sensor: Sensor, *, parallax: float = 0.1) -> Triangulation:
     def mirror_solutions(a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
         return jnp.zeros((0, 2), point.dtype)
 
-    return Triangulation("rays", 1, store, intersect, residual, mirror_solutions)
+    return Triangulation("rays", store, intersect, residual, mirror_solutions)
 
 
 def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
@@ -133,7 +131,7 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
         mirrored = a[:2] + 2 * along * axis - offset
         return jnp.where(square > 0, mirrored, point)[None]
 
-    return Triangulation("circles", 2, store, intersect, residual, mirror_solutions)
+    return Triangulation("circles", store, intersect, residual, mirror_solutions)
 
 
 def triangulation_of(sensor: Sensor) -> Triangulation:

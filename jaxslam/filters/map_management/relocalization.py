@@ -153,14 +153,14 @@ def _nothing(size: int, dtype: jnp.dtype) -> GeometricMatch:
     return GeometricMatch(jnp.zeros(3, dtype), nobody, none, zero, none, jnp.asarray(False))
 
 
-def map_of(
+def points_of_map(
     joint: Joint, chart: Chart, *, square_root: bool = False
 ) -> tuple[Float[Array, "N 2"], Float[Array, "2*N 2*N"], Bool[Array, "N"]]:
     """The points of a map, their joint covariance in coordinates, and which are alive.
 
     Raises ValueError unless the landmarks are points.
     """
-    check_point_map("map_of", joint, chart)
+    check_point_map("points_of_map", joint, chart)
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
     return joint.landmarks, cov[3:, 3:], joint.alive
 

@@ -11,14 +11,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.known.localization import checked_map
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
-from jaxslam.filters.particles.pose_steps import predict_particles, weigh_particles
+from jaxslam.filters.particles.pose_steps import pose_filter, weigh_particles
 from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import (
     MonteCarloSettings,
-    check_start,
     checked_box,
     checked_least,
     known_map_sensors,
@@ -27,8 +25,6 @@ from jaxslam.filters.particles.states.moments import weighted_nis
 from jaxslam.filters.particles.states.pose_state import (
     PoseParticles,
     draw_start,
-    initial_pose_particles,
-    pose_particle_moments,
 )
 from jaxslam.filters.particles.states.region import box_region
 from jaxslam.filters.reporting import info_of, status_of, with_extra
@@ -36,7 +32,7 @@ from jaxslam.protocols import Associate, Differentiable, Filter, Motion, Resampl
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import normalized
 from jaxslam.sensors.suite import Suite
-from jaxslam.types import Estimate, Info, Scan
+from jaxslam.types import Info, Scan
 
 
 def particle_localization(
@@ -125,10 +121,9 @@ def particle_localization(
     """
     validation.check_models("particle_localization", motion, sensor)
     points, names = checked_map("particle_localization", sensor, landmarks, tags)
-    check_start("particle_localization", start)
     if start == "uniform" and box is None:
         raise ValueError("particle_localization: expected a box with a uniform start, got none")
-    limits = None if box is None else checked_box("particle_localization", box)
+    limits = checked_box("particle_localization", box)
     settings = MonteCarloSettings(
         name="particle_localization",
         motion=motion,
@@ -146,12 +141,6 @@ def particle_localization(
     )
     sensors = known_map_sensors("particle_localization", sensor, points, names, associate, gate)
 
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PoseParticles:
-        return initial_pose_particles(pose, pose_cov, settings)
-
-    def predict(state: PoseParticles, u: Float[Array, "U"], key: Array) -> PoseParticles:
-        return predict_particles(state, u, key, settings)
-
     def update(state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
         state, scan = draw_start(state, key, settings), zero_padding(scan)
         likelihood = jax.vmap(partial(scan_likelihood, scan=scan, sensors=sensors))(state.pose)
@@ -163,28 +152,11 @@ def particle_localization(
         info = info_of_scan(scan, likelihood, state.log_weight, log_likelihood)
         return state, with_extra(info, "particles", found)
 
-    def estimate(state: PoseParticles) -> Estimate:
-        pose, cov = pose_particle_moments(state)
-        return Estimate(
-            pose=pose,
-            pose_cov=cov,
-            points=jax.vmap(sensor.position)(jnp.asarray(points, pose.dtype)),
-            point_covs=jnp.zeros((len(names), 2, 2), pose.dtype),
-            alive=jnp.ones(len(names), bool),
-            tag=jnp.asarray(names),
-        )
+    def known_points(pose: Float[Array, "3"]) -> Float[Array, "N 2"]:
+        return jax.vmap(sensor.position)(jnp.asarray(points, pose.dtype))
 
-    return Filter(
-        name="particle_localization",
-        control_size=len(motion.controls),
-        measurement_size=len(sensor.measurements),
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        chart=euclidean(),
-        places=sensor.places if isinstance(sensor, Suite) else (),
-    )
+    places = sensor.places if isinstance(sensor, Suite) else ()
+    return pose_filter(settings, update, len(sensor.measurements), known_points, names, places)
 
 
 def info_of_scan(

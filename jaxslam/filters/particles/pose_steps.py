@@ -1,10 +1,14 @@
-"""The steps of Monte-Carlo localization in any known map: motion, number, weights, recovery."""
+"""Monte-Carlo localization in any known map: motion, number, weights, recovery, and the filter."""
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.particles.proposal import sample_motion
 from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
 from jaxslam.filters.particles.settings import MonteCarloSettings
@@ -14,10 +18,62 @@ from jaxslam.filters.particles.states.pose_state import (
     PoseParticles,
     active_mask,
     draw_start,
+    initial_pose_particles,
     no_events,
+    pose_particle_moments,
 )
+from jaxslam.protocols import Filter
 from jaxslam.resampling.kld import bins_of, enough
 from jaxslam.resampling.weights import effective_size, normalized
+from jaxslam.types import Estimate, Info, Scan
+
+Update = Callable[[PoseParticles, Scan, Array], tuple[PoseParticles, Info]]
+
+
+def pose_filter(
+    settings: MonteCarloSettings,
+    update: Update,
+    measurement_size: int,
+    points: Callable[[Float[Array, "3"]], Float[Array, "N 2"]],
+    tags: Int[np.ndarray, "N"],
+    places: tuple[int, ...] = (),
+) -> Filter:
+    """The `Filter` of particles in a known map, with this update.
+
+    Args:
+        points, tags: of the map, which is without error; the points in the dtype of a pose.
+        places: the parts of a suite's scan.
+    """
+
+    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PoseParticles:
+        return initial_pose_particles(pose, pose_cov, settings)
+
+    def predict(state: PoseParticles, u: Float[Array, "U"], key: Array) -> PoseParticles:
+        return predict_particles(state, u, key, settings)
+
+    def estimate(state: PoseParticles) -> Estimate:
+        pose, cov = pose_particle_moments(state)
+        known = points(pose)
+        return Estimate(
+            pose=pose,
+            pose_cov=cov,
+            points=known,
+            point_covs=jnp.zeros((len(known), 2, 2), pose.dtype),
+            alive=jnp.ones(len(known), bool),
+            tag=jnp.asarray(tags),
+        )
+
+    return Filter(
+        name=settings.name,
+        control_size=len(settings.motion.controls),
+        measurement_size=measurement_size,
+        init=init,
+        predict=predict,
+        update=update,
+        estimate=estimate,
+        chart=euclidean(),
+        places=places,
+    )
 
 
 def predict_particles(

@@ -85,6 +85,8 @@ class MonteCarloSettings:
     def __post_init__(self) -> None:
         name, bins, rates = self.name, self.bins, self.rates
         check_resampling(name, self.resample, self.threshold)
+        if self.start not in ("gaussian", "uniform"):
+            raise ValueError(f'{name}: expected start "gaussian" or "uniform", got {self.start!r}')
         if np.shape(bins) != (3,) or not all(np.isfinite(b) and b > 0 for b in bins):
             raise ValueError(f"{name}: expected bins of three sizes above 0, got {bins!r}")
         if not self.error > 0:
@@ -174,17 +176,13 @@ def checked_least(name: str, particles: int, least: int | None) -> int:
     return least
 
 
-def checked_box(name: str, box: ArrayLike) -> np.ndarray:
+def checked_box(name: str, box: ArrayLike | None) -> np.ndarray | None:
     """The box (2, 2), rows its lowest and highest (x, y); ValueError where it has no inside."""
+    if box is None:
+        return None
     limits = np.asarray(box, np.float64)
     if limits.shape != (2, 2) or not np.isfinite(limits).all() or not (limits[1] > limits[0]).all():
         raise ValueError(
             f"{name}: expected a box of shape (2, 2), its lowest and highest (x, y), got {box!r}"
         )
     return limits
-
-
-def check_start(name: str, start: str) -> None:
-    """Raise ValueError unless a start is one of the two."""
-    if start not in ("gaussian", "uniform"):
-        raise ValueError(f'{name}: expected start "gaussian" or "uniform", got {start!r}')

@@ -12,11 +12,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 from jaxslam import validation
-from jaxslam.charts.euclidean import euclidean
-from jaxslam.filters.particles.pose_steps import predict_particles, weigh_particles
+from jaxslam.filters.particles.pose_steps import pose_filter, weigh_particles
 from jaxslam.filters.particles.settings import (
     MonteCarloSettings,
-    check_start,
     checked_box,
     checked_least,
 )
@@ -24,8 +22,6 @@ from jaxslam.filters.particles.states.pose_state import (
     PoseParticles,
     active_mask,
     draw_start,
-    initial_pose_particles,
-    pose_particle_moments,
 )
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
@@ -36,7 +32,7 @@ from jaxslam.math.xla import no_inline
 from jaxslam.protocols import Filter, Motion, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import normalized
-from jaxslam.types import Beams, Estimate, Info, Scan
+from jaxslam.types import Beams, Info, Scan
 from jaxslam.validation.models import check_motion
 from jaxslam.validation.numbers import is_concrete
 
@@ -113,8 +109,7 @@ def localize(
     validation.check_count("localize: every", every)
     if is_concrete(exponent) and not 0 < float(np.asarray(exponent)) < np.inf:
         raise ValueError(f"localize: expected an exponent above 0, got {exponent!r}")
-    check_start("localize", start)
-    limits = None if box is None else checked_box("localize", box)
+    limits = checked_box("localize", box)
     settings = MonteCarloSettings(
         name="localize",
         motion=motion,
@@ -131,12 +126,6 @@ def localize(
         slack=slack,
     )
     prepared = model.prepare(grid)
-
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PoseParticles:
-        return initial_pose_particles(pose, pose_cov, settings)
-
-    def predict(state: PoseParticles, u: Float[Array, "U"], key: Array) -> PoseParticles:
-        return predict_particles(state, u, key, settings)
 
     def update(state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
         state, beams = draw_start(state, key, settings), beams_of(scan, every)
@@ -157,28 +146,10 @@ def localize(
         info = info_of_beams(scan, every, evidence)
         return state, with_extra(info, "particles", found)
 
-    def estimate(state: PoseParticles) -> Estimate:
-        pose, cov = pose_particle_moments(state)
-        none = jnp.zeros((0, 2), pose.dtype)
-        return Estimate(
-            pose=pose,
-            pose_cov=cov,
-            points=none,
-            point_covs=jnp.zeros((0, 2, 2), pose.dtype),
-            alive=jnp.zeros(0, bool),
-            tag=jnp.zeros(0, jnp.int32),
-        )
+    def no_points(pose: Float[Array, "3"]) -> Float[Array, "0 2"]:
+        return jnp.zeros((0, 2), pose.dtype)
 
-    return Filter(
-        name="localize",
-        control_size=len(motion.controls),
-        measurement_size=2,
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        chart=euclidean(),
-    )
+    return pose_filter(settings, update, 2, no_points, np.zeros(0, np.int32))
 
 
 def _in_dtype(prepared: Any, dtype: Any) -> Any:

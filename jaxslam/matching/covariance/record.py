@@ -81,7 +81,7 @@ def inverse_of(
     first, positive = linalg.whitener(linalg.symmetrize(curvature) + floor)
     second, usable = linalg.whitener(linalg.symmetrize(otherwise) + floor)
     last = jnp.eye(3, dtype=curvature.dtype) / (sigma * 1e-3)
-    return linalg.square(jnp.where(positive, first, jnp.where(usable, second, last)))
+    return linalg.self_gram(jnp.where(positive, first, jnp.where(usable, second, last)))
 
 
 def curvature(matcher: Matcher, prepared: Any, points: Points, found: Match) -> Array:

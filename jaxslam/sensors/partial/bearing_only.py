@@ -1,22 +1,12 @@
 """Bearing of a point landmark, without its range: a camera, a radio direction finder."""
 
-import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from jaxslam.math import se2
-from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import (
-    InvertJacobians,
-    Landmark,
-    Measurement,
-    ObserveJacobians,
-    Pose,
-    Unmeasured,
-)
-from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.mounting import NO_OFFSET, mounting
-from jaxslam.sensors.partial.prior import FreeLike, free_parameters
+from jaxslam.sensors.mounting import NO_OFFSET
+from jaxslam.sensors.partial.polar_coordinate import polar_coordinate
+from jaxslam.sensors.partial.prior import FreeLike
 
 TEN_METRES = ((10.0,), ((25.0,),))
 """Range 10 m, σ 5 m: a placeholder for the actual prior knowledge."""
@@ -46,37 +36,4 @@ def bearing_only(
         ValueError: if noise_cov is not a (1, 1) covariance, mount not a finite (3,) or free not a
             Gaussian of positive variance.
     """
-    sensor_pose, sensor_pose_jacobian = mounting("bearing_only", mount)
-
-    def observe(pose: Pose, landmark: Landmark) -> Measurement:
-        return se2.polar_in_frame(sensor_pose(pose), landmark)[1:]
-
-    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
-        return wrap(z - z_hat)
-
-    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        return se2.from_frame(sensor_pose(pose), se2.rectangular(jnp.concatenate([s, z])))
-
-    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
-        frame = sensor_pose(pose)
-        by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
-        outer = se2.polar_jacobians(se2.to_frame(frame, landmark))[0][1:]
-        return outer @ by_frame @ sensor_pose_jacobian(pose), outer @ by_point
-
-    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
-        frame, seen = sensor_pose(pose), jnp.concatenate([s, z])
-        by_frame, by_point = se2.from_frame_jacobians(frame, se2.rectangular(seen))
-        by_polar = by_point @ se2.rectangular_jacobians(seen)[0]
-        return by_frame @ sensor_pose_jacobian(pose), by_polar[:, 1:], by_polar[:, :1]
-
-    return Sensor(
-        name="bearing_only",
-        measurements=("bearing [rad]",),
-        observe=observe,
-        residual=residual,
-        noise_cov=noise_model("bearing_only", noise_cov, 1),
-        invert=invert,
-        free=free_parameters("bearing_only", free, 1),
-        observe_jacobians=observe_jacobians,
-        invert_jacobians=invert_jacobians,
-    )
+    return polar_coordinate("bearing_only", "bearing [rad]", noise_cov, mount, free)

@@ -15,7 +15,7 @@ from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.update import correct
 from jaxslam.filters.map_management.relocalization import (
     lost,
-    map_of,
+    points_of_map,
     relocalize,
     relocated,
     seen_points,
@@ -28,7 +28,7 @@ from jaxslam.types import Scan, Status
 SENSOR = sensors.range_bearing(np.diag([0.05, 0.01]) ** 2, mount=(0.2, 0.1, 0.3))
 FIND, ALIGN = jax.jit(relocalize), jax.jit(se2.align)
 LOST = jax.jit(lost, static_argnums=1, static_argnames="square_root")
-MAP_OF = jax.jit(map_of, static_argnums=1, static_argnames="square_root")
+MAP_OF = jax.jit(points_of_map, static_argnums=1, static_argnames="square_root")
 RELOCATED = jax.jit(relocated, static_argnums=1)
 
 
@@ -447,7 +447,7 @@ def test_refusals():
             np.eye(3),
         )
     with pytest.raises(ValueError, match="landmarks"):
-        map_of(joint._replace(landmarks=jnp.zeros((4, 3))), charts.euclidean())
+        points_of_map(joint._replace(landmarks=jnp.zeros((4, 3))), charts.euclidean())
     with pytest.raises(ValueError, match="scans"):
         relocated(
             joint, charts.euclidean(), jnp.array([0, 1]), jnp.zeros((3, 2)), jnp.zeros((3, 2, 2))

@@ -97,5 +97,5 @@ def moved_cov(
     change = linalg.gram_both(*materialize((jnp.concatenate(left), jnp.concatenate(right))))
     if noise is not None:
         added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
-        change = change + linalg.square(materialize(added))
+        change = change + linalg.self_gram(materialize(added))
     return cov + change

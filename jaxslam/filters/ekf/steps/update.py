@@ -63,7 +63,7 @@ def _corrected_cov(
     v, factor, noise = found.v, found.factor, found.noise
     m, size_z = noise.shape[:2]
     if form == "plain":
-        return cov - linalg.square(v)
+        return cov - linalg.self_gram(v)
     same = jnp.eye(m, dtype=noise.dtype)[:, None, :, None]
     if form == "joseph":
         each = found.fuse[:, None, None, None]

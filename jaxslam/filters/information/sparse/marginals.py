@@ -11,13 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-import scipy.sparse.linalg
 from jax import Array
 from jaxtyping import Float, Int
 
 from jaxslam.filters.information.sparse.sparse_state import SparseState, landmark_blocks
 from jaxslam.math import linalg
-from jaxslam.math.angles import wrap
 
 
 def local_information(state: SparseState, slot: Int[Array, "B"]) -> Float[Array, "D D"]:
@@ -113,15 +111,3 @@ def whole_information(state: SparseState) -> scipy.sparse.csc_array:
     values += [top, top[beside]]
     entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
     return scipy.sparse.coo_array(entries, shape=(3 + 2 * n, 3 + 2 * n)).tocsc()
-
-
-def whole_mean(state: SparseState) -> tuple[np.ndarray, np.ndarray]:
-    """Pose (3,) and landmarks (N, 2) of the mean Ω⁻¹ ξ, by a sparse factorization; not traceable.
-
-    That is the mean to which mean recovery converges; the state is left as it is.
-    """
-    residual = np.concatenate([state.pose_residual, np.ravel(state.landmark_residual)])
-    step = scipy.sparse.linalg.splu(whole_information(state)).solve(residual)
-    pose = np.asarray(state.pose) + step[:3]
-    pose[2] = wrap(pose[2])
-    return pose, np.asarray(state.landmarks) + step[3:].reshape(-1, 2)

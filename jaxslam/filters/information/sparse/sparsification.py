@@ -48,7 +48,7 @@ def sparsify(
     g = by_robot - omega @ linalg.solve_psd(of_leaving, to_leaving)[0]
     g = jnp.where(leaves[:, None], 0.0, g)
     root_x, root_sigma = linalg.whitener(omega[:3, :3])[0], linalg.whitener(g[:3])[0]
-    new = omega + linalg.square(root_sigma @ g.T) - linalg.square(root_x @ by_robot.T)
+    new = omega + linalg.self_gram(root_sigma @ g.T) - linalg.self_gram(root_x @ by_robot.T)
     robot = jnp.arange(len(omega)) < 3
     cut = (leaves[:, None] & robot[None, :]) | (leaves[None, :] & robot[:, None])
     # Of the inverse factors, hence of Σ⁻¹ and Ω_x⁻¹.

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxslam.graphs import Factor, Graph
 from jaxslam.graphs.solver.model import factors_of
-from jaxslam.results.plot.scene.layers import marks, segments, still
+from jaxslam.results.plot.scene.layers import lines_between, marks, still
 from jaxslam.results.plot.scene.render import Layer, Panel, Scene
 from jaxslam.results.plot.style import COLORS, FAINT, INK, SHADE
 
@@ -64,7 +64,7 @@ def graph_scene(
     ):
         if name in edges and edges[name].shape[1]:
             layers.append(
-                segments(list(edges[name]), color=color, lw=width, label=name, zorder=order)
+                lines_between(list(edges[name]), color=color, lw=width, label=name, zorder=order)
             )
     if points.shape[1]:
         shown = np.ones(points.shape[:2], bool)

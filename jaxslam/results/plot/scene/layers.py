@@ -89,7 +89,7 @@ def rings(
     return layer
 
 
-def segments(ends: Sequence[Float[np.ndarray, "E 2 2"]], **look: Any) -> Layer:
+def lines_between(ends: Sequence[Float[np.ndarray, "E 2 2"]], **look: Any) -> Layer:
     """Lines between two points each, other ones in every frame."""
 
     def layer(axes: Axes) -> Draw:

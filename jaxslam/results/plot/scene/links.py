@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxslam.results.plot.scene.history import History
-from jaxslam.results.plot.scene.layers import segments, weighted_segments
+from jaxslam.results.plot.scene.layers import lines_between, weighted_segments
 from jaxslam.results.plot.scene.probe import Links
 from jaxslam.results.plot.scene.render import Layer
 from jaxslam.results.plot.style import COLORS, INK, Look
@@ -53,5 +53,5 @@ def link_layers(history: History) -> list[Layer]:
     return [
         weighted_segments(between, weights["between"], color=_LINK, **landmarks),
         weighted_segments(robot, weights["robot"], color=_ROBOT_LINK, **robots),
-        *([segments(cut, label="link cut", **dots)] if any(map(len, cut)) else []),
+        *([lines_between(cut, label="link cut", **dots)] if any(map(len, cut)) else []),
     ]

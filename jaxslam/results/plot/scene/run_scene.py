@@ -8,9 +8,9 @@ from jaxslam.results.plot.maps.geometry import Limits, ellipses, extent, square_
 from jaxslam.results.plot.scene.history import History, Measured, measured
 from jaxslam.results.plot.scene.layers import (
     cloud,
+    lines_between,
     marks,
     rings,
-    segments,
     still,
     track,
     triangle,
@@ -125,7 +125,7 @@ def _truth(
 def _beams(found: Measured) -> list[Layer]:
     """The beams to measured landmarks, of the kinds that occur."""
     return [
-        segments(found.beams[name], label=f"measured, {name}", zorder=3, **look)
+        lines_between(found.beams[name], label=f"measured, {name}", zorder=3, **look)
         for name, look in _BEAMS.items()
         if any(map(len, found.beams[name]))
     ]
