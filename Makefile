@@ -9,6 +9,8 @@ ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # JAX spreads work over the cores itself; threads of the BLAS under its LAPACK calls only get in the way.
 export OPENBLAS_NUM_THREADS ?= 1
+# Bytecode is kept: without it each process of the suite compiles four hundred modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DELETE_ON_ERROR:
 .PHONY: consistency test check bench docs links clean
