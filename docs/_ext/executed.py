@@ -86,7 +86,7 @@ def _used(node: ast.AST, alias: dict[str, str]) -> Iterator[str]:
         chain.append(inner.attr)
         inner = inner.value
     if isinstance(inner, ast.Name) and inner.id in alias:
-        yield ".".join([alias[inner.id], *reversed(chain)])
+        yield ".".join([alias[inner.id], *reversed(chain)]).replace(":.", ":")
     else:
         for child in ast.iter_child_nodes(node):
             yield from _used(child, alias)

@@ -1,5 +1,6 @@
 """The documentation, as far as it is held without building it: `make docs` runs its code."""
 
+import ast
 import contextlib
 import importlib.util
 import inspect
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jaxslam import cli
@@ -51,6 +53,57 @@ def test_every_block_of_python_is_run():
     """A code cell is run by the build; a plain block would not be."""
     plain = [page for page, text in PAGES.items() if page != "README.md" and "```python" in text]
     assert plain == []
+
+
+NUMBER = r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?"
+GIVEN = {"2.37", "0.5", "99.9"}
+"""numbers beside results that are none: the honest median of a NEES, a radius, a gate"""
+
+
+def quoted():
+    """(page, names, number) of every fraction and every number above 999 quoted from a benchmark.
+
+    They stand in a paragraph with the benchmark's command and in the table that it introduces by a
+    colon, or else follows; of a table with commands, in their rows.
+    """
+    for page, text in PAGES.items():
+        blocks = re.split(r"\n{2,}", re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.M))
+        names = []
+        for before, block, after in zip(["", *blocks], blocks, [*blocks[1:], ""], strict=False):
+            rows = block.split("\n") if block.startswith("|") else [block]
+            for row in rows:
+                cited = re.findall(r"--record --only (\w+)", row)
+                names = cited or names
+                if not cited and not re.search(r"\b[Ss]ame command", row):
+                    continue
+                beside = after if row.endswith(":") else before if len(rows) == 1 else ""
+                told = f"{row}\n{beside}" if beside.startswith("|") else row
+                plain = re.sub(r"`[^`]*`|\$[^$]*\$|\]\([^)]*\)", "", told)
+                for number in re.findall(rf"(?<![\w.,/-]){NUMBER}(?![\w/])", plain):
+                    if re.search(r"[.e]|,\d", number) and number not in GIVEN:
+                        yield page, tuple(names), number
+
+
+def test_numbers_that_a_page_quotes_are_those_of_the_record():
+    """To the digits quoted; as they are, in percent, or in thousandths of the unit."""
+    record = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
+    parts = re.split(r"^## (\w+)$", record, flags=re.MULTILINE)
+    sections = {
+        name: np.array([float(n.replace(",", "")) for n in re.findall(NUMBER, text)])
+        for name, text in zip(parts[1::2], parts[2::2], strict=True)
+    }
+    every, wrong = list(quoted()), []
+    for page, names, number in every:
+        digits, _, power = number.replace(",", "").partition("e")
+        whole, _, fraction = digits.partition(".")
+        zeros = 0 if fraction else len(whole) - len(whole.rstrip("0"))
+        unit = 10.0 ** (zeros - len(fraction) + int(power or 0))
+        recorded = np.concatenate([sections.get(name, np.zeros(0)) for name in names])
+        off = np.outer([1, 100, 1000], np.abs(recorded)) - abs(float(digits + "e" + (power or "0")))
+        if not (np.abs(off) <= 0.5001 * unit).any():
+            wrong.append((page, names, number))
+    assert len(every) > 150
+    assert wrong == []
 
 
 def test_links_between_pages_lead_somewhere():
@@ -117,3 +170,36 @@ def test_a_link_into_the_reference_leads_somewhere():
                 module, _, name = owner.rpartition(".")
                 assert field in dir(getattr(sys.modules[module], name)), (page, target)
     assert lost == []
+
+
+def executed():
+    """The extension that says what code the cells of a page reach."""
+    path = ROOT / "docs" / "_ext" / "executed.py"
+    spec = importlib.util.spec_from_file_location("executed", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_page_is_run_again_when_code_that_it_reaches_has_changed(tmp_path):
+    extension = executed()
+    names = extension.named(ast.parse("import jaxslam\nf = jaxslam.filters.seif"))
+    assert names == {"jaxslam:filters.seif"}
+    files = {p.relative_to(ROOT / "jaxslam").as_posix() for p in extension.reached(names)}
+    assert "filters/information/seif.py" in files
+    assert "filters/information/sparse/mean_recovery.py" in files  # a step of it
+    assert "math/linalg.py" in files
+    assert not any(name.startswith(("filters/particles", "results", "cli")) for name in files)
+    page = PAGES["docs/getting_started.md"]
+    everything = page.replace("print(campaign)", "!jaxslam verify")
+    assert len({extension.digest(text) for text in (page, page + "\n", everything)}) == 2
+    assert extension.digest("prose alone") is None
+    said = {}
+    for name, code in {
+        "first": 'def f(x):\n    """Twice x."""\n    return 2 * x\n',
+        "told otherwise": 'def f(x):\n    """x and x."""\n    # a comment\n    return (2 * x)\n',
+        "another": 'def f(x):\n    """Twice x."""\n    return 3 * x\n',
+    }.items():
+        (tmp_path / f"{name}.py").write_text(code)
+        said[name] = extension.content(tmp_path / f"{name}.py")
+    assert said["first"] == said["told otherwise"] != said["another"]
