@@ -75,7 +75,11 @@ def command_seconds() -> list[Metric]:
 
 
 def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
-    """What is measured, by name, in order."""
+    """What is measured, by name, in order; figures are drawn unless it is quick."""
+
+    def drawn(name: str) -> Path | None:
+        return None if quick else FIGURES / name
+
     return {
         "commands": command_seconds,
         "compile": compile.measure,
@@ -91,7 +95,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "victoria_park": victoria_park.measure,
         "real_data": real_data.measure,
         "mrclam": measure_mrclam,
-        "association": lambda: measure_association(quick),
+        "association": lambda: measure_association(quick, drawn("")),
         "baselines": lambda: baselines.measure(100 if quick else 1000),
         "bearing": lambda: bearing.measure(20 if quick else 100),
         "team": team.measure,
@@ -101,22 +105,26 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "graph_files": graph_files.measure,
         "graph_consistency": lambda: measure_graphs(quick),
         "graph_speed": lambda: graph_speed.measure(3 if quick else 9),
-        "fastslam": lambda: fastslam.measure(4 if quick else 20, (10, 100)),
+        "fastslam": lambda: fastslam.measure(
+            4 if quick else 20, (10, 100), drawn("fastslam_nees.png")
+        ),
         "plain_particles": lambda: plain_particles.measure(8 if quick else 20),
         "grids": measure_grids,
         "grid_localization": lambda: grid_localization.measure(10 if quick else 30),
-        "grid_slam": lambda: grid_slam.measure(2 if quick else 6),
+        "grid_slam": lambda: grid_slam.measure(2 if quick else 6, drawn("grid_slam.png")),
         "laser_slam": lambda: measure_laser_slam(quick),
         "scan_matching": lambda: measure_matching(quick),
         "lines": lambda: lines.measure(10 if quick else 100),
-        "scaling": scaling.measure,
+        "scaling": lambda: scaling.measure(drawn("scaling.png")),
         "seif": lambda: seif.measure(4 if quick else 10) + seif.park(),
-        "comparison": lambda: comparison.measure(8 if quick else 16),
+        "comparison": lambda: comparison.measure(8 if quick else 16, out=drawn("comparison.png")),
         "soak": lambda: soak.measure(6_000 if quick else 20_000),
         "kill": lambda: kill.measure(10 if quick else 100),
         "fuzz": lambda: fuzz.measure(2 if quick else 20),
         "wheel": wheel.measure,
-        "monte_carlo_localization": lambda: monte_carlo_localization.measure(4 if quick else 12),
+        "monte_carlo_localization": lambda: monte_carlo_localization.measure(
+            4 if quick else 12, out=drawn("monte_carlo_localization.png")
+        ),
     }
 
 

@@ -29,7 +29,7 @@ def measure(quick=False, out=None):
     def save(figure, name):
         if out:
             out.mkdir(parents=True, exist_ok=True)
-            figure.savefig(out / name, dpi=160)
+            figure.savefig(out / f"association_{name}", dpi=160)
 
     seconds = cost.measure()
     print("\n20 measurements, 200 landmarks, 16 runs together, time a run:")

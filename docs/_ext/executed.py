@@ -2,8 +2,8 @@
 
 What a page printed and drew is kept by its cells and its kernel's description (jupyter-cache). This
 extension adds to that description a digest of the files of the package that the cells reach: those
-that define a name in a cell, those that define a name in these, and so on. Docstrings, comments and
-layout do not count. A page with a shell command reaches all files, as they are.
+that define a name in a cell, those that define a name in these, and so on; all files, where a cell
+has a shell command. Docstrings, comments and layout do not count.
 """
 
 import ast
@@ -19,6 +19,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "jaxslam"
+KINDS = (".py", ".css", ".js")
 KERNEL = "  name: python3\n"
 """The line of a page's head after which the digest is put"""
 
@@ -29,21 +30,16 @@ def digest(page: str) -> str | None:
     if not cells:
         return None
     code = "".join(line for cell in cells for line in cell.splitlines(True) if line[:1] != ":")
-    shell = re.search(r"^!", code, re.MULTILINE)
-    everything = {path for path in (ROOT / PACKAGE).rglob("*") if path.suffix in KINDS}
-    if shell:
-        files = everything
+    if re.search(r"^!", code, re.MULTILINE):
+        files = {path for path in (ROOT / PACKAGE).rglob("*") if path.suffix in KINDS}
     else:
         files = reached(named(ast.parse(re.sub(r"^%.*$", "", code, flags=re.MULTILINE))))
     if "examples" in code:
-        files = files | set((ROOT / "examples").glob("*.py"))
+        files |= set((ROOT / "examples").glob("*.py"))
     hashed = hashlib.sha256()
     for path in sorted(files):
-        hashed.update(path.read_bytes() if shell else content(path))
+        hashed.update(content(path))
     return hashed.hexdigest()[:16]
-
-
-KINDS = (".py", ".css", ".js")
 
 
 def reached(names: frozenset[str]) -> set[Path]:
@@ -54,10 +50,8 @@ def reached(names: frozenset[str]) -> set[Path]:
         path = ahead.pop()
         files.add(path)
         ahead |= {home(name) for name in named_in(path)} - files
-    return files | {
-        path for folder in {f.parent for f in files} for path in folder.iterdir()
-        if path.suffix in KINDS[1:]
-    }  # fmt: skip
+    folders = {file.parent for file in files}
+    return files | {path for each in folders for path in each.iterdir() if path.suffix in KINDS[1:]}
 
 
 @functools.cache

@@ -38,7 +38,10 @@ def as_folders(options: argparse.Namespace) -> None:
 def add_out(parser: argparse.ArgumentParser) -> None:
     """Add the option of the folder of results."""
     parser.add_argument(
-        "--out", metavar="DIR", default=str(OUT), help=f"folder for results (default: {OUT})"
+        "--out",
+        metavar="DIR",
+        default=str(OUT),
+        help=f"folder for results; earlier ones of the same command are replaced (default: {OUT})",
     )
 
 

@@ -77,7 +77,8 @@ def quoted():
                 if not cited and not re.search(r"\b[Ss]ame command", row):
                     continue
                 beside = after if row.endswith(":") else before if len(rows) == 1 else ""
-                told = f"{row}\n{beside}" if beside.startswith("|") else row
+                table = beside.startswith("|") and "--only" not in beside
+                told = f"{row}\n{beside}" if table else row
                 plain = re.sub(r"`[^`]*`|\$[^$]*\$|\]\([^)]*\)", "", told)
                 for number in re.findall(rf"(?<![\w.,/-]){NUMBER}(?![\w/])", plain):
                     if re.search(r"[.e]|,\d", number) and number not in GIVEN:
