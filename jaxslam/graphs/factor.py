@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 
 from jaxslam import sensors
 from jaxslam.math import se2
+from jaxslam.math.angles import sin_cos, wrap
 from jaxslam.protocols import Motion, Sensor
 
 Array = jax.Array
@@ -41,6 +42,13 @@ class Factor:
 POSE = ("x [m]", "y [m]", "theta [rad]")
 
 
+def _between(a: Array, b: Array) -> Array:
+    """`se2.between`, with the sine and cosine that are fast over many rows."""
+    s, c = sin_cos(a[2])
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    return jnp.stack([c * dx + s * dy, c * dy - s * dx, wrap(b[2] - a[2])])
+
+
 def relative_pose() -> Factor:
     """The factor of a relative pose: e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), no logarithm.
 
@@ -50,7 +58,7 @@ def relative_pose() -> Factor:
 
     def residual(variables: tuple[Array, ...], z: Array) -> Array:
         first, second = variables
-        return se2.between(z, se2.between(first, second))
+        return _between(z, _between(first, second))
 
     def jacobians(variables: tuple[Array, ...], z: Array) -> tuple[Array, ...]:
         first, second = variables
@@ -73,7 +81,7 @@ def relative_pose_log() -> Factor:
 
     def residual(variables: tuple[Array, ...], z: Array) -> Array:
         first, second = variables
-        return se2.log(se2.between(z, se2.between(first, second)))
+        return se2.log(_between(z, _between(first, second)))
 
     poses = ("pose", "pose")
     return Factor("relative_pose_log", poses, POSE, POSE, residual, predict=se2.compose)

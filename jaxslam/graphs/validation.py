@@ -35,7 +35,8 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
     finite, an id twice, a measurement of a variable that is nowhere or of one variable twice, an
     information that is not symmetric or not positive semidefinite, no measurement at all, and parts
     that neither a fixed variable nor a measurement of one pose holds in place: a disconnected
-    graph, or no gauge. Within a trace only what shapes tell is checked.
+    graph, or no gauge. A measurement of zero information joins nothing. Within a trace only what
+    shapes tell is checked.
     """
     _check_shapes(name, graph)
     for key, table in graph.tables.items():
@@ -55,12 +56,16 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
 
 
 def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
-    """The connected parts of a graph, and which have a gauge."""
+    """The connected parts of a graph, and which have a gauge.
+
+    A row whose information is zero neither joins its variables nor holds one.
+    """
     poses, points = len(graph.poses), len(graph.points)
     pairs = [np.zeros((0, 2), int)]
     held = np.asarray(graph.fixed_pose).copy()
     for key, table in graph.tables.items():
-        who = variables_of(graph, table, factors[key])
+        counted = np.asarray(table.valid) & np.asarray(table.information).any(axis=(1, 2))
+        who = variables_of(graph, table._replace(valid=counted), factors[key])
         pairs += [who[:, [0, k]] for k in range(1, who.shape[1])]
         if factors[key].variables == ("pose",):
             held[who[:, 0]] = True
@@ -176,8 +181,8 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
             "give one a prior"
         )
     raise ValueError(
-        f"{name}: the graph is disconnected: no measurement joins {told} to a fixed pose or one "
-        f"with a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
+        f"{name}: the graph is disconnected: no measurement with information joins {told} to a "
+        f"fixed pose or one with a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
     )
 
 

@@ -10,12 +10,18 @@ increment is in the local frame) and `boxminus(a, b) = log(b⁻¹ ∘ a)`, so th
 `boxplus(b, boxminus(a, b)) = a`.
 """
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Num
 
-from jaxslam.math.angles import sinc, sinc_slope, wrap
+from jaxslam.math.angles import horner, sinc, sinc_slope, wrap
 from jaxslam.math.arrays import Point, PointByPose, PointMatrix, Pose, PoseMatrix, Scalar
+
+_ZETA_LESS_1 = [np.pi**2 / 6 - 1, np.pi**4 / 90 - 1]
+_ZETA_LESS_1 += [sum(k ** (-2.0 * n) for k in range(999, 1, -1)) for n in range(3, 14)]
+"""ζ(2n) - 1, n >= 1; of the sum of its terms 1e-16 is left out at most."""
 
 
 def rotation(theta: Scalar) -> PointMatrix:
@@ -93,8 +99,7 @@ def log_jacobians(pose: Pose) -> tuple[PoseMatrix]:
     """Derivative of `log`, (3, 3)."""
     x, y, w = pose[0], pose[1], wrap(pose[2])
     a, h = _half_cot(w), w / 2
-    s, ds = sinc(h), sinc_slope(h)
-    da = -0.5 * jnp.sin(h) / s - 0.5 * jnp.cos(h) * ds / s**2
+    da = _half_cot_slope(w)
     return (_rows([a, h, da * x + 0.5 * y], [-h, a, -0.5 * x + da * y], [0, 0, 1]),)
 
 
@@ -212,9 +217,25 @@ def _cosc_slope(x: Scalar) -> Scalar:
     return 0.5 * (jnp.cos(x / 2) * sinc(x / 2) + jnp.sin(x / 2) * sinc_slope(x / 2))
 
 
+@jax.custom_jvp
 def _half_cot(x: Scalar) -> Scalar:
-    """(x/2) cot(x/2), 1 at 0."""
-    return jnp.cos(x / 2) / sinc(x / 2)
+    """(x/2) cot(x/2), 1 at 0, for |x| <= π: with u = (x/2π)²,
+
+    (1 - 3u)/(1 - u) - 2 Σ (ζ(2n) - 1) uⁿ, n >= 1 (DLMF 4.19.6 and 25.6.2, the term 1 of ζ summed).
+    """
+    u = (x / (2 * np.pi)) ** 2
+    return (1 - 3 * u) / (1 - u) - 2 * u * horner(u, _ZETA_LESS_1)
+
+
+@_half_cot.defjvp
+def _(primals: tuple[Scalar], tangents: tuple[Scalar]) -> tuple[Scalar, Scalar]:
+    return _half_cot(*primals), _half_cot_slope(*primals) * tangents[0]
+
+
+def _half_cot_slope(x: Scalar) -> Scalar:
+    u = (x / (2 * np.pi)) ** 2
+    series = horner(u, [(n + 1) * term for n, term in enumerate(_ZETA_LESS_1)])
+    return -x / np.pi**2 * (1 / (1 - u) ** 2 + series)
 
 
 def _rows(*rows: list[Array | float]) -> Num[Array, "rows columns"]:

@@ -134,7 +134,11 @@ def small_chi2(graph):
     [
         ("# by hand", "VERTEX_SE3 1", "small.g2o:1: unknown kind 'VERTEX_SE3'"),
         ("VERTEX_SE2 17", "VERTEX_SE2 16", "small.g2o:9: vertex 16 occurs twice"),
-        ("# by hand", "VERTEX_SE2 99 0 0 0", "disconnected: no measurement joins pose 99 to"),
+        (
+            "# by hand",
+            "VERTEX_SE2 99 0 0 0",
+            "disconnected: no measurement with information joins pose 99 to",
+        ),
         ("# by hand", "VERTEX_SE2 99 0 0", "small.g2o:1: expected 4 fields (id x y theta), got 3"),
     ],
 )

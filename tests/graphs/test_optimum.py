@@ -1,9 +1,13 @@
 """The optimum of small graphs, against a dense Gauss-Newton in NumPy."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
+import small_graphs
 from pose_rings import SIZE, dense, ring, wrap
+from reference import graph as plain
 
 from jaxslam import graphs
 from jaxslam.graphs import Ending
@@ -21,6 +25,48 @@ def test_the_optimum_is_that_of_dense_gauss_newton(method):
     np.testing.assert_allclose(graphs.chi2(found.graph), chi2, rtol=1e-10)
     assert found.gradient < 1e-6 * found.gradient_start
     assert found.singular == -1
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_poses_and_points_are_those_of_scipy(dtype):
+    """With every kind of measurement."""
+    graph = small_graphs.drawn(noise=0.1)
+    poses, points, chi2 = plain.optimum(graph)
+    numbers = jax.tree.map(lambda x: x.astype(dtype) if x.dtype == np.float64 else x, graph)
+    found = graphs.optimize(numbers)
+    assert found.status == Ending.CONVERGED and found.chi2.dtype == dtype
+    near = 1e-6 if dtype == np.float64 else 1e-3
+    np.testing.assert_allclose(found.chi2, chi2, rtol=near)
+    np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=near)
+    np.testing.assert_allclose(wrap(found.graph.poses[:, 2] - poses[:, 2]), 0, atol=near)
+    np.testing.assert_allclose(found.graph.points, points, atol=near)
+
+
+def test_endings():
+    """Of one program, and of a residual whose derivatives have the wrong sign."""
+    graph = ring()
+    table, factor = graph.tables["relative_pose"], graphs.relative_pose()
+
+    def ended(of, **options):
+        found = graphs.optimize(of, **options)
+        assert np.isfinite(found.graph.poses).all()
+        return Ending(int(found.status)), int(found.singular)
+
+    def changed(field, rows, value):
+        numbers = np.array(getattr(table, field))
+        numbers[rows] = value
+        return graph._replace(tables={"relative_pose": table._replace(**{field: numbers})})
+
+    def uphill(variables, z):
+        e = factor.residual(variables, z)
+        return 2 * jax.lax.stop_gradient(e) - e
+
+    assert ended(graph, iterations=1) == (Ending.EXHAUSTED, -1)
+    assert ended(changed("z", 5, 1e200))[0] == Ending.DIVERGED
+    heading_alone = changed("information", slice(18, 20), np.diag([0.0, 0.0, 40.0]))
+    assert ended(heading_alone) == (Ending.SINGULAR, 19)
+    wrong = dataclasses.replace(factor, residual=uphill, jacobians=None)
+    assert ended(graph, factors={"relative_pose": wrong})[0] == Ending.STALLED
 
 
 def split(graph):
@@ -128,7 +174,7 @@ def test_priors_alone_and_what_is_not_determined():
     again = graphs.optimize(found.graph, factors)
     np.testing.assert_allclose(found.chi2, again.chi2, rtol=1e-9)
 
-    nothing = steps._replace(information=np.zeros((2, 3, 3)))
+    nothing = steps._replace(information=np.tile(np.diag([0.0, 0.0, 1.0]), (2, 1, 1)))
     loose = graph._replace(tables={"prior": prior, "relative_pose": nothing})
     with pytest.raises(ValueError, match="marginals: the measurements do not determine pose"):
         graphs.marginals(loose)

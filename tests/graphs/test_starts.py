@@ -1,5 +1,6 @@
 """Starts of the optimization against the truth, and against dense NumPy."""
 
+import jax
 import numpy as np
 import pytest
 import small_graphs
@@ -34,6 +35,12 @@ def test_without_noise_every_start_is_the_truth(name):
     assert_close(found, truth)
     np.testing.assert_allclose(found.points, truth.points, atol=1e-12)
     np.testing.assert_array_equal(found.poses[0], truth.poses[0])
+    rounded = jax.tree.map(
+        lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, scattered(truth)
+    )
+    found = starts.STARTS[name](rounded)
+    assert found.poses.dtype == found.points.dtype == np.float32
+    assert_close(found, truth, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", PLACING)

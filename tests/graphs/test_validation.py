@@ -22,11 +22,15 @@ def at(graph, field, at, value):
     return graph._replace(**{field: whole})
 
 
-def loose(graph, fixed=False):
-    """Pose 17 in no row, and either it or pose 10 fixed; no prior."""
+def loose(graph, fixed=False, informed=True):
+    """Pose 17 in no row, or in rows without information; either it or pose 10 fixed; no prior."""
     graph = small_graphs.only(graph, "relative_pose")
     table = graph.tables["relative_pose"]
-    table = table._replace(valid=(table.who != 7).all(axis=1))
+    others = (table.who != 7).all(axis=1)
+    if informed:
+        table = table._replace(valid=others)
+    else:
+        table = table._replace(information=table.information * others[:, None, None])
     graph = graph._replace(tables={"relative_pose": table}, points=np.zeros((0, 2)))
     graph = graph._replace(fixed_point=np.zeros(0, bool), point_id=np.zeros(0, np.int32))
     return at(graph, "fixed_pose", 7, fixed)
@@ -82,7 +86,18 @@ SPOILS = {
     ),
     "disconnected": (
         loose,
-        "the graph is disconnected: no measurement joins pose 17 to a fixed pose",
+        "the graph is disconnected: no measurement with information joins pose 17 to a fixed pose",
+    ),
+    "zero information": (
+        lambda g: loose(g, informed=False),
+        "the graph is disconnected: no measurement with information joins pose 17 to a fixed pose",
+    ),
+    "zero prior": (
+        lambda g: spoiled(
+            at(small_graphs.only(g, "relative_pose", "prior"), "fixed_pose", 0, False),
+            *("prior", "information", 0, 0.0),
+        )._replace(points=np.zeros((0, 2)), fixed_point=np.zeros(0, bool), point_id=np.zeros(0)),
+        "the graph has no gauge: fix a pose",
     ),
     "sizes": (
         lambda g: g._replace(tables={"bearing": g.tables["relative_pose"]}),
@@ -128,3 +143,22 @@ def test_the_first_pose_is_fixed_where_nothing_is():
     assert held.fixed_pose.tolist() == [True] + [False] * 7
     for graph in (free, small_graphs.only(small_graphs.drawn(), "relative_pose")):
         assert graphs.with_gauge(graph) is graph  # a prior; a fixed pose
+
+
+@pytest.mark.parametrize(
+    ("residual", "got"),
+    [
+        (lambda v, z: (v[0] - z)[:2], r"\(2,\)"),
+        (lambda v, z: (v[0] - z).sum(), r"\(\)"),
+        (lambda v, z: (v[0][0], z), "tuple"),
+    ],
+)
+def test_a_residual_of_another_shape_is_refused(residual, got):
+    """By all that takes factors: optimization, χ², residuals, and the plan."""
+    names = ("x [m]", "y [m]", "theta [rad]")
+    factors = {"prior": graphs.Factor("mine", ("pose",), names, names, residual)}
+    graph = small_graphs.only(small_graphs.drawn(), "prior")
+    told = r"the factor 'mine' of table 'prior': expected a residual of shape \(3,\), as its errors"
+    for use in (graphs.optimize, graphs.chi2, graphs.squared_residuals, graphs.plan):
+        with pytest.raises(ValueError, match=rf"graphs\.{use.__name__}: {told} .*, got {got}"):
+            use(graph, factors)

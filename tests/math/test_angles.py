@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam.math.angles import sinc, sinc_slope, wrap
+from jaxslam.math.angles import sin_cos, sinc, sinc_slope, wrap
 
 DTYPES = [np.float32, np.float64]
 
@@ -100,3 +100,20 @@ def test_sinc_in_float32_is_finite_and_close(function):
     assert out.dtype == np.float32
     np.testing.assert_allclose(out, [exact_sinc(a, order) for a in x], rtol=0, atol=1e-6)
     np.testing.assert_allclose(slope, [exact_sinc(a, order + 1) for a in x], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sin_cos_are_those_of_numpy(dtype):
+    """Near and far, at the seams of the reduction, and of what is no angle; and their slopes."""
+    random = np.random.default_rng(0)
+    x = [random.uniform(-size, size, 2000) for size in (1.0, 10.0, 1e6)]
+    x += [np.arange(-41, 42) * np.pi / 4, [0.0, -0.0, 1e-300, -1e-9]]
+    x = np.concatenate(x).astype(dtype)
+    (s, c), (ds, dc) = jax.jit(lambda *x: jax.jvp(sin_cos, x[:1], x[1:]))(x, np.ones_like(x))
+    assert s.dtype == c.dtype == dtype
+    atol = 1.2 * np.finfo(dtype).eps
+    for found, exact in ((s, np.sin(x)), (c, np.cos(x)), (ds, np.cos(x)), (dc, -np.sin(x))):
+        np.testing.assert_allclose(found, exact, atol=atol, rtol=0)
+    lost = np.array([1e17, -1e30, np.inf, np.nan], dtype)
+    found = np.asarray(jax.jit(sin_cos)(lost))
+    assert (np.abs(found[:, :2]) <= 1).all() and np.isnan(found[:, 2:]).all()

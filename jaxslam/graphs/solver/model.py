@@ -4,6 +4,10 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from jaxslam.graphs.factor import Factor, of_files
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.kernels import Kernel
@@ -50,7 +54,8 @@ def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) ->
     """The factor of each table: of the same name, or of the part before a slash.
 
     They are in the order of the names, as in a graph that has been through `jax.tree.map`. Without
-    factors they are those of files. Raises ValueError, which begins with a caller's name.
+    factors they are those of files. Raises ValueError, which begins with a caller's name, also on a
+    factor whose residual has another shape than its `errors` tell.
     """
     known = of_files() if factors is None else factors
     out = {}
@@ -60,7 +65,22 @@ def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) ->
             raise ValueError(
                 f"{name}: table {key!r} has no factor; there are: {', '.join(known) or 'none'}"
             )
+        if (got := _residual_shape(found, np.shape(graph.points)[-1])) != (len(found.errors),):
+            raise ValueError(
+                f"{name}: the factor {found.name!r} of table {key!r}: expected a residual of shape "
+                f"({len(found.errors)},), as its errors tell ({', '.join(found.errors)}), got {got}"
+            )
         out[key] = found
     if not out:
         raise ValueError(f"{name}: the graph has no tables")
     return out
+
+
+@functools.lru_cache(maxsize=256)
+def _residual_shape(factor: Factor, point_size: int) -> object:
+    """The shape of what a factor's residual returns; the type's name if that is no array."""
+    sizes, number = {"pose": 3, "point": point_size}, jnp.result_type(float)
+    own = tuple(jax.ShapeDtypeStruct((sizes[kind],), number) for kind in factor.variables)
+    z = jax.ShapeDtypeStruct((len(factor.measurements),), number)
+    found = jax.eval_shape(factor.residual, own, z)
+    return getattr(found, "shape", type(found).__name__)

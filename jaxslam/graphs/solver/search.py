@@ -36,8 +36,9 @@ class Ending(IntEnum):
     DIVERGED = 2
     """χ² is not finite, or Gauss-Newton ended above its start."""
     SINGULAR = 3
-    """The measurements do not determine the variable `singular`, at the last iterate; where the
-    method damps its steps it went on and χ² is a minimum."""
+    """The measurements do not determine the variable `singular`, at the last iterate, beyond the
+    rounding of the numbers: in float32 a chain of some hundred poses from the gauge can be such.
+    Where the method damps its steps it went on, and χ² is a minimum."""
     EXHAUSTED = 4
     """All iterations were made."""
 
@@ -194,7 +195,8 @@ def minimize(
         regular = step.regular.all(axis=0)
         culprit = plan.order[jnp.argmin(step.regular, axis=0)].astype(jnp.int32)
         singular = jnp.where(plain & ~regular & ~known, culprit, search.singular)
-        least = jnp.maximum(tolerance, 32 * eps) * (search.system.chi2 + 1)
+        chi2 = search.system.chi2
+        least = jnp.maximum(tolerance * chi2, 32 * eps * (chi2 + 1))
         small = step.decrement <= least
         # What is regular at the end is determined there, whatever it was on the way.
         singular = jnp.where(plain & regular & small, -1, singular)

@@ -43,7 +43,9 @@ def marquardt(plan: Plan, system: System, damping: Float[Array, "B"]) -> Step:
     """
     width = system.blocks.shape[1]
     unit = jnp.eye(width, dtype=bool)[None, ..., None] & plan.on_diagonal[:, None, None, None]
-    blocks = system.blocks * jnp.where(unit, 1.0 + damping[None, None, None], 1.0)
+    # What no measurement sees has a diagonal of zero, and stays where it is.
+    scale = jnp.where(system.blocks == 0, 1.0, system.blocks)
+    blocks = system.blocks + jnp.where(unit, damping, 0.0) * scale
     factored = factorize(plan.cholesky, blocks)
     step = substitute(plan.cholesky, factored, -system.gradient)
     square = dot(step * _diagonal(plan, system), step)

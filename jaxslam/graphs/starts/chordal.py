@@ -121,9 +121,9 @@ def _relative_rows(relative: Relative, headings: Float[np.ndarray, "N"]) -> tupl
 def _point_rows(table: Table, headings: Float[np.ndarray, "N"], count: int) -> tuple[Any, ...]:
     """The same of relative positions, e = R_iᵀ (l - t_i) - z; points are counted from the poses."""
     valid = np.asarray(table.valid)
-    who, z = np.asarray(table.who)[valid], np.asarray(table.z)[valid]
+    who, z = np.asarray(table.who)[valid], np.asarray(table.z, float)[valid]
     turn = np.swapaxes(_rotations(headings[who[:, 0]]), 1, 2)
-    information = np.asarray(table.information)[valid]
+    information = np.asarray(table.information, float)[valid]
     return who[:, 0], count + who[:, 1], turn, z, information, np.zeros_like(z)
 
 

@@ -44,7 +44,9 @@ def relative_poses(graph: Graph, factors: Factors | None) -> Relative:
         if factor.predict is not se2.compose:
             z, by_error = map(np.asarray, programs.call(_measured, (factor,), z))
             information = np.einsum("eri,ers,esj->eij", by_error, information, by_error)
-        found.append(Relative(who[:, 0], who[:, 1], z, information))
+        found.append(
+            Relative(who[:, 0], who[:, 1], np.asarray(z, float), np.asarray(information, float))
+        )
     nothing = Relative(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     return Relative(*map(np.concatenate, zip(*found, strict=True))) if found else nothing
 
