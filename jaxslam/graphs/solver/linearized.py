@@ -203,7 +203,8 @@ def _jacobians(
 
         def along(unit: Array) -> Array:
             still[k] = jnp.broadcast_to(unit[:, None], own[k].shape)
-            return slope(*still, *common)
+            out: Array = slope(*still, *common)
+            return out
 
         return jax.vmap(along)(jnp.eye(own[k].shape[1], dtype=e.dtype))
 
