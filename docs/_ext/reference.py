@@ -167,7 +167,7 @@ def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: lis
     """Docstrings are plain text with `code` and the sections Args and Raises.
 
     What reStructuredText would take for markup is escaped. A constant without a docstring of its
-    own has its type's, which is left out.
+    own has its type's, which is left out, and so is what Python says of a field.
     """
     from sphinx.ext import napoleon  # the suite imports this file without Sphinx
 
@@ -175,6 +175,7 @@ def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: lis
     of = obj if inspect.isclass(obj) else type(obj)
     first = text.strip().partition("\n")[0]
     borrowed = first.startswith(f"{of.__name__}(") or first in (inspect.getdoc(of) or "")
+    borrowed = borrowed or first.startswith("Alias for field number")  # of a named tuple
     if what in ("data", "attribute") and borrowed:
         lines.clear()
         return

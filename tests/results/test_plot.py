@@ -127,7 +127,8 @@ def test_nees_is_drawn_with_its_band_and_verdicts(five):
     assert [axes.get_ylabel() for axes in figure.axes] == [
         f"{block} NEES (dof {dof})" for block, dof in DOF.items()
     ]
-    assert named(figure)[:3] == ["95 % band", "dead_reckoning (consistent)", "ekf (optimistic)"]
+    expected = ["95 % band", "honest", "dead_reckoning (consistent)", "ekf (optimistic)"]
+    assert named(figure)[:4] == expected
     for axes, block in zip(figure.axes, DOF, strict=True):
         np.testing.assert_array_equal(
             line(axes, "ekf").get_ydata(), five.filters["ekf"].curves[f"nees_{block}"]

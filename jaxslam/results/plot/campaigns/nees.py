@@ -46,4 +46,4 @@ def _draw_band(axes: Axes, campaign: Campaign, block: str) -> None:
     most = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
     step = np.arange(1, campaign.steps + 1)
     band(axes, step, most[f"nees_{block}_low"], most[f"nees_{block}_high"], "95 % band")
-    axes.axhline(DOF[block], color=INK, lw=0.8, zorder=1.5)
+    axes.axhline(DOF[block], color=INK, lw=0.8, zorder=1.5, label="honest")

@@ -94,7 +94,7 @@ def set_positive(
     room = (high / low) ** margin
     set_limits(low / room, high * room)
     axis.set_major_formatter(_short)
-    if high < 100 * low:
+    if high < (100 if which == "y" else 20) * low:  # an abscissa has less room for labels
         axis.set_minor_formatter(few_digits)
     else:
         axis.set_minor_locator(NullLocator())
