@@ -11,6 +11,8 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export OPENBLAS_NUM_THREADS ?= 1
 # Bytecode is kept: without it each process of the suite compiles four hundred modules again.
 unexport PYTHONDONTWRITEBYTECODE
+# Where jemalloc is installed (Debian: libjemalloc2) compiling takes an eighth less of the processor.
+JEMALLOC := $(firstword $(wildcard /usr/lib/*/libjemalloc.so.2 /usr/lib64/libjemalloc.so.2))
 
 .DELETE_ON_ERROR:
 .PHONY: consistency test check bench docs links clean
@@ -21,7 +23,7 @@ consistency: $(VENV)/.run
 
 ## The test suite, on every core: heavy files first, compiled programs kept in .cache/ for the next run.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder $(ARGS)
+	LD_PRELOAD=$(JEMALLOC) $(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder $(ARGS)
 
 ## Format, lint and types.
 check: $(VENV)/.dev
