@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from worlds import narrow
 
 from jaxslam import association
 from jaxslam.math.assignment import assign
@@ -42,24 +43,28 @@ def problem(rng, m, n, near=1.0, size_z=2):
     return z[:, None] - expected[None], cross, noise
 
 
-def pairs_of(innovation, cross, noise, xp=np):
-    n = cross.shape[0]
-    own = cross[xp.arange(n), :, xp.arange(n)]
-    cov = own[None] + noise[:, None]
-    distance = xp.einsum("mni,mnij,mnj->mn", innovation, xp.linalg.inv(cov), innovation)
-    log_det = xp.linalg.slogdet(cov)[1]
-    return Pairs(innovation, cov, distance, log_det, xp.ones(distance.shape, bool))
-
-
-def plainly(method, innovation, cross, noise, valid=None, alive=None):
-    """Of one problem."""
+def posed(innovation, cross, noise, valid=None, alive=None):
+    """A problem as a method sees it, in NumPy: (pairs, C, valid, alive)."""
     m, n = innovation.shape[:2]
-    valid = jnp.ones(m, bool) if valid is None else valid
-    alive = jnp.ones(n, bool) if alive is None else alive
-    pairs = pairs_of(innovation, cross, noise, jnp)
-    pairs = pairs._replace(possible=valid[:, None] & alive[None, :])
+    own = cross[np.arange(n), :, np.arange(n)]
+    cov = own[None] + noise[:, None]
+    distance = np.einsum("mni,mnij,mnj->mn", innovation, np.linalg.inv(cov), innovation)
+    valid = np.ones(m, bool) if valid is None else valid
+    alive = np.ones(n, bool) if alive is None else alive
+    possible = valid[:, None] & alive[None, :]
+    pairs = Pairs(innovation, cov, distance, np.linalg.slogdet(cov)[1], possible)
+    return pairs, cross, valid, alive
+
+
+def stacked(problems):
+    return jax.tree.map(lambda *x: np.stack(x), *problems)
+
+
+def plainly(method, pairs, cross, valid, alive):
+    """Of one problem."""
+    m, n, size_z = pairs.innovation.shape
     prediction = Prediction(jnp.full(n, -1), alive, lambda scan: pairs, lambda: cross)
-    scan = Scan(jnp.zeros((m, innovation.shape[2])), jnp.full(m, -1), valid)
+    scan = Scan(jnp.zeros((m, size_z)), jnp.full(m, -1), valid)
     return Association(*method(prediction, scan))
 
 
@@ -89,7 +94,7 @@ def test_assign_refuses_more_rows_than_columns():
 def exhaustive(innovation, cross, noise, probability):
     """All hypotheses of singly compatible pairs: the most pairs, then the least D²."""
     m, n, size_z = innovation.shape
-    single = pairs_of(innovation, cross, noise).distance
+    single = posed(innovation, cross, noise)[0].distance
     options = [[-1, *np.flatnonzero(row <= chi2_quantile(probability, size_z))] for row in single]
     best = (-1, np.inf, None)
     for slots in itertools.product(*options):
@@ -111,140 +116,173 @@ def exhaustive(innovation, cross, noise, probability):
     return best
 
 
+@pytest.fixture(scope="module")
+def thorough():
+    """Joint compatibility of (many) 8 measurements and 12 landmarks, with all candidates."""
+    method = association.joint(0.95, budget=20_000, candidates=12)
+    return jax.jit(jax.vmap(partial(plainly, method)))
+
+
+def padded(array, *sizes):
+    """With leading axes of these sizes, by repeating the last entry."""
+    widths = [(0, size - had) for size, had in zip(sizes, array.shape, strict=False)]
+    return np.pad(array, widths + [(0, 0)] * (array.ndim - len(sizes)), mode="edge")
+
+
 @pytest.mark.parametrize(
     ("m", "n", "near", "count"), [(1, 3, 0.5, 100), (4, 6, 1.0, 200), (8, 12, 3.0, 100)]
 )
-def test_joint_compatibility_is_exhaustive_searchs_optimum(m, n, near, count):
+def test_joint_compatibility_is_exhaustive_searchs_optimum(thorough, m, n, near, count):
+    """Of fewer measurements and landmarks, too, where the others are not there."""
     rng = np.random.default_rng(n)
     problems = [problem(rng, m, n, near) for _ in range(count)]
-    stacked = [np.stack(parts) for parts in zip(*problems, strict=True)]
-    method = association.joint(0.95, budget=20_000, candidates=n)
-    found = jax.jit(jax.vmap(partial(associated, method)))(*stacked)
+    there = np.arange(8) < m, np.arange(12) < n
+    whole = [
+        posed(
+            padded(innovation, 8, 12),
+            padded(padded(cross, 12).swapaxes(0, 2), 12).swapaxes(0, 2),
+            padded(noise, 8),
+            *there,
+        )
+        for innovation, cross, noise in problems
+    ]
+    found = thorough(*stacked(whole))
     assert not np.asarray(found.exhausted).any()
+    slots_found = np.asarray(found.slot)
+    assert (slots_found[:, m:] == -1).all()
     rivals = 0
-    for parts, slot in zip(problems, np.asarray(found.slot), strict=True):
+    for parts, slot in zip(problems, slots_found[:, :m], strict=True):
         pairs, _, slots = exhaustive(*parts, 0.95)
         assert (slot >= 0).sum() == pairs
         assert tuple(slot) == slots
-        rivals += tuple(slot) != tuple(pairs_of(*parts).distance.argmin(axis=1))
+        rivals += tuple(slot) != tuple(posed(*parts)[0].distance.argmin(axis=1))
     assert m == 1 or rivals > count / 10  # problems that the nearest neighbour gets wrong
 
 
-def test_a_budget_that_does_not_suffice_is_said():
-    rng = np.random.default_rng(0)
-    innovation, cross, noise = problem(rng, 8, 12, 1.5)
+def test_a_budget_that_does_not_suffice_is_said(thorough):
+    parts = posed(*problem(np.random.default_rng(0), 8, 12, 1.5))
 
     @jax.jit
     def search(*parts):
-        budgets = [association.joint(0.95, budget=b, candidates=12) for b in (1, 30, 20_000)]
-        few = association.joint(0.95, budget=20_000, candidates=1)
-        return [plainly(method, *parts) for method in (*budgets, few)]
+        options = ({"budget": 1}, {"budget": 30}, {"budget": 20_000, "candidates": 1})
+        return [
+            plainly(association.joint(0.95, **{"candidates": 12} | each), *parts)
+            for each in options
+        ]
 
-    *found, few = search(innovation, cross, noise)
+    *found, few = search(*parts)
+    found.append(jax.tree.map(lambda leaf: leaf[0], jax.device_get(thorough(*stacked([parts])))))
     assert [bool(one.exhausted) for one in found] == [True, True, False]
     most = [(np.asarray(one.slot) >= 0).sum() for one in found]
     assert most == sorted(most)
     assert few.exhausted
 
 
-def test_the_joint_test_refuses_what_is_compatible_one_by_one():
+@pytest.fixture(scope="module")
+def by_rule():
+    """Association.slot of two measurements and two landmarks by each rule, in one program."""
+    rules = {name: METHODS[name]() for name in METHODS if name != "joint"}
+    rules["careful"] = association.nearest(9.0, ambiguous="leave")
+    rules["joint"] = association.joint(0.98)
+    return jax.jit(lambda *parts: {name: plainly(rule, *parts) for name, rule in rules.items()})
+
+
+def test_the_joint_test_refuses_what_is_compatible_one_by_one(by_rule):
     """Two landmarks whose errors are the same: their innovations may not differ."""
     cross = np.ones((2, 1, 2, 1))
     noise = np.full((2, 1, 1), 0.01)
     innovation = np.array([[[2.0], [9.0]], [[9.0], [-2.0]]])
-    alone = associated(association.nearest(6.0), innovation, cross, noise)
-    together = associated(association.joint(0.98), innovation, cross, noise)
-    assert list(alone.slot) == [0, 1]
-    assert (np.asarray(together.slot) >= 0).sum() == 1
-    assert not together.is_new.any()
+    found = by_rule(*posed(innovation, cross, noise))
+    assert list(found["nearest"].slot) == [0, 1]
+    assert (np.asarray(found["joint"].slot) >= 0).sum() == 1
+    assert not found["joint"].is_new.any()
 
 
-def test_the_sum_of_distances_decides_globally():
+def test_the_sum_of_distances_decides_globally(by_rule):
     """Each landmark's nearest measurement is the first: only one of them can have it."""
     distance = np.array([[1.0, 1.2], [1.5, 4.0]])
     innovation, cross = np.sqrt(distance)[:, :, None], np.zeros((2, 1, 2, 1))
-    noise = np.ones((2, 1, 1))
-    together = associated(association.global_nearest(9.0), innovation, cross, noise)
-    alone = associated(association.nearest(9.0), innovation, cross, noise)
-    assert list(together.slot) == [1, 0]
-    assert list(alone.slot) == [0, -1]
-    assert not alone.is_new.any()
-    careful = association.nearest(9.0, ambiguous="leave")
-    assert list(associated(careful, innovation, cross, noise).slot) == [-1, -1]
+    found = by_rule(*posed(innovation, cross, np.ones((2, 1, 1))))
+    assert list(found["global_nearest"].slot) == [1, 0]
+    assert list(found["nearest"].slot) == [0, -1]
+    assert not found["nearest"].is_new.any()
+    assert list(found["careful"].slot) == [-1, -1]
 
 
-def test_the_determinant_decides_for_likelihood():
+def test_the_determinant_decides_for_likelihood(by_rule):
     """A landmark known badly is near in d², and unlikely."""
     cross = np.zeros((2, 1, 2, 1))
     cross[:, 0, :, 0] = np.diag([0.0, 99.0])
-    innovation, noise = np.array([[[1.5], [3.0]]]), np.ones((1, 1, 1))
-    near = associated(association.nearest(9.0), innovation, cross, noise)
-    likely = associated(association.maximum_likelihood(9.0), innovation, cross, noise)
+    innovation, noise = np.array([[[1.5], [3.0]]] * 2), np.ones((2, 1, 1))
+    found = by_rule(*posed(innovation, cross, noise, valid=np.array([True, False])))
+    near, likely = found["nearest"], found["maximum_likelihood"]
     assert (int(near.slot[0]), int(likely.slot[0])) == (1, 0)
 
 
 # --- properties of all ----------------------------------------------------------------------------
 
 
+COUNT = 20
+"""Random problems of a batch; in two more no landmark is alive, or nothing was measured."""
+
+
 @pytest.fixture(scope="module", params=METHODS)
-def method(request):
-    return METHODS[request.param]()
+def batch(request):
+    """A method, problems of it, and what it finds of them all at once."""
+    method, rng = METHODS[request.param](), np.random.default_rng(5)
+    valid, alive = rng.uniform(size=(COUNT + 2, 5)) < 0.8, rng.uniform(size=(COUNT + 2, 7)) < 0.7
+    valid[COUNT:], alive[COUNT:] = [[True], [False]], [[False], [True]]
+    parts = [posed(*problem(rng, 5, 7), v, a) for v, a in zip(valid, alive, strict=True)]
+    found = jax.jit(jax.vmap(partial(plainly, method)))(*stacked(parts))
+    return method, parts, jax.device_get(found)
 
 
-def test_a_batch_is_its_problems_and_no_landmark_serves_twice(method):
-    rng = np.random.default_rng(5)
-    problems = [problem(rng, 5, 7, 1.0) for _ in range(20)]
-    parts = [np.stack(p) for p in zip(*problems, strict=True)]
-    valid, alive = rng.uniform(size=(20, 5)) < 0.8, rng.uniform(size=(20, 7)) < 0.7
-    many = jax.jit(jax.vmap(partial(plainly, method)))
-    batch = jax.device_get(many(*parts, valid, alive))
-    single = many(*(p.astype("f4") for p in parts), valid, alive)
-    for slot, is_new, there, living in zip(batch.slot, batch.is_new, valid, alive, strict=True):
+def test_a_batch_is_its_problems_and_no_landmark_serves_twice(batch):
+    """The batch in float64, its problems in float32."""
+    method, parts, found = batch
+    for slot, is_new, (_, _, there, living) in zip(found.slot, found.is_new, parts, strict=True):
         used = slot[slot >= 0]
         assert len(set(used)) == len(used)
         assert living[used].all()
         assert not (slot[~there] >= 0).any()
         assert not is_new[~there].any()
         assert not (is_new & (slot >= 0)).any()
-    for found, count in ((batch, 3), (single, 20)):
-        for i in range(count):
-            alone = associated(method, *(p[i] for p in parts), valid[i], alive[i])
-            np.testing.assert_array_equal(found.slot[i], alone.slot)
-            np.testing.assert_array_equal(found.is_new[i], alone.is_new)
+    for i, each in enumerate(narrow(parts)):
+        alone = associated(method, *each)
+        np.testing.assert_array_equal(found.slot[i], alone.slot)
+        np.testing.assert_array_equal(found.is_new[i], alone.is_new)
 
 
-def test_everything_is_new_in_an_empty_map_and_nothing_in_an_empty_scan(method):
-    parts = problem(np.random.default_rng(0), 5, 7)
-    found = associated(method, *parts, np.ones(5, bool), np.zeros(7, bool))
-    assert found.is_new.all()
-    assert (np.asarray(found.slot) == -1).all()
-    found = associated(method, *parts, np.zeros(5, bool), np.ones(7, bool))
-    assert not found.is_new.any()
-    innovation, cross, noise = parts
-    empty = jax.eval_shape(partial(plainly, method), innovation[:0], cross, noise[:0])
-    assert empty.slot.shape == (0,)
+def test_everything_is_new_in_an_empty_map_and_nothing_in_an_empty_scan(batch):
+    method, _, found = batch
+    assert found.is_new[COUNT].all()
+    assert (found.slot[COUNT] == -1).all()
+    assert not found.is_new[COUNT + 1].any()
+    innovation, cross, noise = problem(np.random.default_rng(0), 5, 7)
+    nothing = posed(innovation[:0], cross, noise[:0])
+    assert jax.eval_shape(partial(plainly, method), *nothing).slot.shape == (0,)
 
 
 @pytest.mark.parametrize("name", ["nearest", "maximum_likelihood", "global_nearest"])
 def test_gates_of_nothing_and_of_everything(name):
     factory = getattr(association, name)
-    parts = problem(np.random.default_rng(1), 3, 5)
+    parts = posed(*problem(np.random.default_rng(1), 3, 5))
     gates = np.array([0.0, 0.0, np.inf]), np.array([0.0, np.inf, np.inf])
 
     def of_gates(gate, new_gate, *parts):
         return plainly(factory(gate, new_gate), *parts)
 
-    over = jax.jit(jax.vmap(of_gates, (0, 0, None, None, None)))
+    over = jax.jit(jax.vmap(of_gates, (0, 0, *[None] * len(parts))))
     slot, is_new, _ = jax.device_get(over(*gates, *parts))
     assert (slot[0] == -1).all()
     np.testing.assert_array_equal(is_new, [[True] * 3, [False] * 3, [False] * 3])
     if name == "global_nearest":
-        best = scipy.optimize.linear_sum_assignment(pairs_of(*parts).distance)[1]
+        best = scipy.optimize.linear_sum_assignment(parts[0].distance)[1]
         np.testing.assert_array_equal(slot[2], best)
 
 
 def test_joint_probabilities_of_nothing_and_of_everything():
-    parts = problem(np.random.default_rng(1), 3, 5)
+    parts = posed(*problem(np.random.default_rng(1), 3, 5))
     assert associated(association.joint(0.0), *parts).is_new.all()
     everything = associated(association.joint(1.0, budget=10_000), *parts)
     assert (np.asarray(everything.slot) >= 0).all()
@@ -257,7 +295,7 @@ def test_joint_probabilities_of_nothing_and_of_everything():
         (lambda: association.nearest(np.nan), "at least 0"),
         (lambda: association.nearest("9"), "nearest: expected a number as gate, got str$"),
         (
-            lambda: plainly(association.nearest, *problem(np.random.default_rng(1), 3, 5)),
+            lambda: plainly(association.nearest, *posed(*problem(np.random.default_rng(1), 3, 5))),
             r"expected a number .*: as associate, give nearest\(gate\), not nearest$",
         ),
         (lambda: association.maximum_likelihood(9.0, 4.0), "new_gate >= gate"),
@@ -274,6 +312,6 @@ def test_refusals(make, message):
 
 
 def test_joint_refuses_a_gate_for_new_ones_below_its_own():
-    parts = problem(np.random.default_rng(1), 3, 5)
+    parts = posed(*problem(np.random.default_rng(1), 3, 5))
     with pytest.raises(ValueError, match="new_gate >= gate"):
         associated(association.joint(0.99, new_gate=1.0), *parts)

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import narrow
 
-from jaxslam import association, life, motion, run, sensors, slots
+from jaxslam import life, motion, run, sensors, slots
 from jaxslam.filters import eif_slam, ekf_slam
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life.existence import Existence
@@ -19,6 +20,10 @@ MOTION = motion.increment(np.diag([0.02, 0.01]) ** 2)
 SENSOR = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2)
 POINTS = np.array([[2.0, 1.0], [3.0, -1.0], [1.0, 2.0], [-2.0, 0.5]])
 KEY = jax.random.key(0)
+
+
+UNSEEING = 100.0, 0.0, 0.0
+"""A pose from which no landmark is expected to be measured; from others all are."""
 
 
 def always(pose, landmark):
@@ -43,8 +48,11 @@ def removed_in(trace):
     return trace.info.extra["pruning"].removed
 
 
-def driven(filter, seen, variance=1e-4):
-    return jax.device_get(run(filter, log_of(seen), np.zeros(3), np.eye(3) * variance, KEY))
+def late(rows, steps=12):
+    """The scans of these tags, as the last of so many; before them nothing is seen."""
+    seen = np.full((steps, 2), -1)
+    seen[-len(rows) :] = rows
+    return seen
 
 
 def seen_by_turns(second, steps=12):
@@ -57,19 +65,29 @@ def seen_by_turns(second, steps=12):
 
 
 @cache
-def driver(**options):
-    filter = managed(life.existence(always), 3, **options)
+def driver(replace=False, **options):
+    """Drives a filter that removes landmarks for all reasons there are; with a map of 2 or 3 slots."""
+    if replace:
+        filter = managed(life.existence(always, replace=True), 2)
+    else:
+        visible = lambda pose, landmark: pose[0] < UNSEEING[0] / 2  # noqa: E731
+        filter = managed(life.existence(visible, patience=5, spread=0.5), 3, **options)
 
     @jax.jit
-    def go(log):
-        return run(filter, log, np.zeros(3), np.eye(3) * 1e-4, KEY, probe=lambda joint: joint.life)
+    def go(log, pose, variance):
+        pose_cov = variance * jnp.eye(3, dtype=pose.dtype)
+        return run(filter, log, pose, pose_cov, KEY, probe=lambda joint: joint.life)
 
     return go
 
 
+def driven(seen, pose=(0.0, 0.0, 0.0), variance=1e-4, **options):
+    return jax.device_get(driver(**options)(log_of(seen), np.array(pose), variance))
+
+
 def test_a_landmark_that_is_not_seen_again_is_removed_when_its_odds_say_so():
     seen = seen_by_turns({0: 1})
-    trace = jax.device_get(driver()(log_of(seen)))
+    trace = driven(seen)
     loss = math.log(0.1 / 0.9)
     misses = math.ceil(math.log(0.05 / 0.95) / loss)  # from even odds to a probability of 0.05
     removed = removed_in(trace)
@@ -88,8 +106,9 @@ def test_a_landmark_that_is_not_seen_again_is_removed_when_its_odds_say_so():
 
 def test_what_is_left_is_the_marginal():
     seen = seen_by_turns({0: 1})
-    with_life = jax.device_get(driver()(log_of(seen))).final
-    without = driven(ekf_slam(MOTION, SENSOR, 3), seen).final
+    with_life = driven(seen).final
+    start = np.zeros(3), np.eye(3) * 1e-4, KEY
+    without = run(ekf_slam(MOTION, SENSOR, 3), log_of(seen), *start).final
     marginal = jax.jit(slots.remove)(without, np.array([False, True, False]))
     np.testing.assert_allclose(with_life.cov, marginal.cov, atol=1e-14)
     np.testing.assert_allclose(with_life.landmarks, marginal.landmarks, atol=1e-14)
@@ -97,7 +116,7 @@ def test_what_is_left_is_the_marginal():
 
 def test_a_removed_landmark_can_come_back_and_begins_anew():
     seen = seen_by_turns({0: 1, slice(8, None): 1})
-    trace = jax.device_get(driver()(log_of(seen)))
+    trace = driven(seen)
     assert trace.info.status[8, 1] == Status.BORN
     assert int(trace.probe.seen[-1, 1]) == 4
     assert bool(trace.estimate.alive[-1, 1])
@@ -106,45 +125,37 @@ def test_a_removed_landmark_can_come_back_and_begins_anew():
 def test_patience_is_for_the_provisional_alone():
     seen = np.full((12, 2), -1)
     seen[:3, 0], seen[0, 1] = 0, 1
-    manager = life.existence(lambda pose, landmark: jnp.asarray(False), patience=5)
-    filter = managed(manager, 3)
-    trace = driven(filter, seen)
+    trace = driven(seen, UNSEEING)
     assert list(np.argwhere(removed_in(trace))[0]) == [5, 1]
     assert list(trace.estimate.alive[-1]) == [True, False, False]
 
 
 def test_a_landmark_known_too_badly_is_removed():
-    filter = managed(life.existence(always, spread=0.5), 3)
-    seen = np.array([[0, 1]])
-    exact = driven(filter, seen)
+    seen = late([[0, 1]])
+    exact = driven(seen)
     assert not removed_in(exact).any()
-    lost = driven(filter, seen, variance=1.0)
-    np.testing.assert_array_equal(removed_in(lost)[0], [True, True, False])
+    lost = driven(seen, variance=1.0)
+    np.testing.assert_array_equal(removed_in(lost)[-1], [True, True, False])
     np.testing.assert_array_equal(lost.final.cov[3:, 3:], np.eye(6))
 
 
-@pytest.mark.parametrize("replace", [False, True])
-def test_a_full_map_refuses_or_gives_up_the_least_likely(replace):
+def test_a_full_map_refuses_or_gives_up_the_least_likely():
     # 0 is confirmed, 1 provisional and missed once, 2 comes into a map of two.
-    seen = np.array([[0, 1], [0, -1], [0, 2]])
-    never = life.existence(always, remove=0.01, replace=replace)
-    filter = managed(never, 2)
-    trace = driven(filter, seen)
-    if replace:
-        assert trace.info.status[2, 1] == Status.BORN
-        np.testing.assert_array_equal(removed_in(trace)[2], [False, True])
-        assert list(trace.estimate.tag[-1]) == [0, 2]
-        assert int(trace.final.life.seen[1]) == 1
-    else:
-        assert trace.info.status[2, 1] == Status.OVERFLOW
-        assert list(trace.estimate.tag[-1]) == [0, 1]
+    trace = driven(late([[0, 1], [0, -1], [0, 2]]), replace=True)
+    assert trace.info.status[-1, 1] == Status.BORN
+    np.testing.assert_array_equal(removed_in(trace)[-1], [False, True])
+    assert list(trace.estimate.tag[-1]) == [0, 2]
+    assert int(trace.final.life.seen[1]) == 1
+    # 0 and 1 are provisional and missed, 3 and 2 come into a map of three.
+    trace = driven(late([[0, 1], [3, 2]]))
+    assert list(trace.info.status[-1]) == [Status.BORN, Status.OVERFLOW]
+    assert list(trace.estimate.tag[-1]) == [0, 1, 3]
 
 
 def test_a_full_map_of_confirmed_landmarks_refuses_in_any_case():
-    seen = np.array([[0, 1], [0, 1], [0, 2]])
-    filter = managed(life.existence(always, confirm=0.85, remove=0.01, replace=True), 2)
-    trace = driven(filter, seen)
-    assert trace.info.status[2, 1] == Status.OVERFLOW
+    trace = driven(late([[0, 1], [0, 1], [0, 1], [0, 2]]), replace=True)
+    assert trace.final.life.confirmed.all()
+    assert trace.info.status[-1, 1] == Status.OVERFLOW
     assert not removed_in(trace).any()
 
 
@@ -153,8 +164,7 @@ def test_gradients_pass_through_births_and_deaths():
 
     def loss(sigma):
         sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
-        method = association.nearest(9.0, 25.0)
-        ekf = ekf_slam(MOTION, sensor, 3, associate=method, update="joint")
+        ekf = ekf_slam(MOTION, sensor, 3, update="joint")
         filter = pruning(ekf, life.existence(always))
         trace = run(filter, log, np.zeros(3), np.eye(3) * 1e-4, KEY)
         likely = trace.info.log_likelihood.sum()
@@ -170,26 +180,28 @@ def test_gradients_pass_through_births_and_deaths():
 def test_batches_and_float32():
     each = [log_of(seen_by_turns(second)) for second in ({0: 1}, {slice(3, None): 2})]
     logs = jax.tree.map(lambda *x: np.stack(x), *each)
-    small = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, logs)
-    batch = jax.device_get(jax.vmap(driver())(small))
+    small = (*narrow((logs, np.zeros(3))), 1e-4)
+    batch = jax.device_get(jax.vmap(driver(), (0, None, None))(*small))
     assert batch.probe.log_odds.dtype == np.float32
     for i in range(2):
-        alone = jax.device_get(driver()(each[i]))
+        alone = jax.device_get(driver()(each[i], np.zeros(3), 1e-4))
         np.testing.assert_array_equal(removed_in(batch)[i], removed_in(alone))
         np.testing.assert_array_equal(batch.estimate.tag[i], alone.estimate.tag)
 
 
 def test_a_root_does_not_change_because_another_run_loses_a_landmark():
     one, other = log_of(seen_by_turns({0: 1})), log_of(seen_by_turns({}))
-    go = driver(covariance="square_root")
-    beside = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), one, other))
-    twice = jax.vmap(go)(jax.tree.map(lambda *x: np.stack(x), other, other))
+    go = jax.vmap(driver(covariance="square_root"), (0, None, None))
+    beside, twice = (
+        go(jax.tree.map(lambda *x: np.stack(x), first, other), np.zeros(3), 1e-4)
+        for first in (one, other)
+    )
     assert removed_in(beside)[0].any()
     np.testing.assert_array_equal(beside.final.cov[1], twice.final.cov[1])
 
 
 def test_nothing_ever_seen():
-    trace = jax.device_get(driver()(log_of(np.full((12, 2), -1))))
+    trace = driven(np.full((12, 2), -1))
     assert not removed_in(trace).any()
     assert not trace.estimate.alive.any()
 
@@ -212,11 +224,10 @@ def test_making_room_takes_the_least_likely_provisional_ones():
 
 def test_a_landmark_that_the_scan_measured_stays_in_a_full_map():
     """Though it has been seen no more often than the one that gives way."""
-    seen = np.array([[0, 1], [0, 2], [0, -1]])
-    filter = managed(life.existence(always, remove=0.01, replace=True), 2)
-    trace = driven(filter, seen, variance=0.0)
-    assert (trace.info.status[1:, 0] == Status.FUSED).all()
-    np.testing.assert_array_equal(removed_in(trace), [[False, False], [False, True], [False] * 2])
+    trace = driven(late([[0, 1], [0, 2], [0, -1]]), variance=0.0, replace=True)
+    assert (trace.info.status[-2:, 0] == Status.FUSED).all()
+    removed = [[False, False], [False, True], [False] * 2]
+    np.testing.assert_array_equal(removed_in(trace)[-3:], removed)
     np.testing.assert_array_equal(trace.estimate.tag[-1], [0, 2])
 
 
