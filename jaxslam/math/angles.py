@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxslam.math.xla import traced_once
+
 # Below this the power series is used. There the first term dropped from it and from its first two
 # derivatives is under 1e-16, and above it the closed form loses at most a digit to cancellation.
 _SERIES = 0.5
@@ -19,6 +21,7 @@ _SINE = [(-1) ** k / math.factorial(2 * k + 1) for k in range(1, 9)]
 _COSINE = [(-1) ** k / math.factorial(2 * k) for k in range(1, 9)]
 
 
+@traced_once
 def wrap(angle: ArrayLike) -> jax.Array:
     """Wrap an angle to (-π, π] by whole turns: a - 2π⌈(a - π)/2π⌉.
 
@@ -66,6 +69,7 @@ def _(
     return (s, c), (c * tangents[0], -s * tangents[0])
 
 
+@traced_once
 def sinc(x: ArrayLike) -> jax.Array:
     """sin(x)/x, smooth through 0 with all its derivatives (`jnp.sinc` loses them near 0)."""
     x = jnp.asarray(x)

@@ -17,6 +17,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PyTree
 
 from jaxslam.math import batched_linalg
+from jaxslam.math.xla import traced_once
 
 _T = TypeVar("_T")
 
@@ -102,6 +103,7 @@ def cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
 
 
 @jax.custom_jvp
+@traced_once
 def _cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     n, tolerance = matrix.shape[-1], _tolerance(matrix)
     zero = jnp.zeros((), matrix.dtype)
@@ -166,6 +168,7 @@ def _factor_slope(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Arr
     return factor, jnp.where(regular, slope, 0.0)
 
 
+@traced_once
 def root_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower L (n, n) with L Lᵀ = A for a positive semi-definite A of any size, singular or not.
 
@@ -235,6 +238,7 @@ def solve_lower(
     return solution
 
 
+@traced_once
 def _substituted(
     factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
 ) -> Float[Array, "n *rest"]:
@@ -248,6 +252,7 @@ def _substituted(
 
 
 @jax.custom_jvp
+@traced_once
 def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """The inverse Cholesky factor W = L⁻¹ (n, n) of a small A = L Lᵀ, and `cholesky`'s flag.
 

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Num
 
 from jaxslam.math.angles import horner, sinc, sinc_slope, wrap
 from jaxslam.math.arrays import Point, PointByPose, PointMatrix, Pose, PoseMatrix, Scalar
+from jaxslam.math.xla import traced_once
 
 _ZETA_LESS_1 = [np.pi**2 / 6 - 1, np.pi**4 / 90 - 1]
 _ZETA_LESS_1 += [sum(k ** (-2.0 * n) for k in range(999, 1, -1)) for n in range(3, 14)]
@@ -30,6 +31,7 @@ def rotation(theta: Scalar) -> PointMatrix:
     return _rows([c, -s], [s, c])
 
 
+@traced_once
 def compose(a: Pose, b: Pose) -> Pose:
     """The composition a ∘ b = (t_a + R(θ_a) t_b, θ_a + θ_b): Williams' ⊕, Solà (59), (60)."""
     c, s = jnp.cos(a[2]), jnp.sin(a[2])
@@ -55,6 +57,7 @@ def inverse_jacobians(a: Pose) -> tuple[PoseMatrix]:
     return (_rows([-c, -s, s * a[0] - c * a[1]], [s, -c, c * a[0] + s * a[1]], [0, 0, -1]),)
 
 
+@traced_once
 def between(a: Pose, b: Pose) -> Pose:
     """The relative pose a⁻¹ ∘ b: b in the frame of a."""
     p = to_frame(a, b[:2])
@@ -69,6 +72,7 @@ def between_jacobians(a: Pose, b: Pose) -> tuple[PoseMatrix, PoseMatrix]:
     return by_a, by_b
 
 
+@traced_once
 def exp(tau: Pose) -> Pose:
     """The pose reached by the constant twist τ = (u, v, ω) in unit time: (V(ω)(u, v), ω).
 
@@ -85,6 +89,7 @@ def exp_jacobians(tau: Pose) -> tuple[PoseMatrix]:
     return (_rows([s, -c, ds * u - dc * v], [c, s, dc * u + ds * v], [0, 0, 1]),)
 
 
+@traced_once
 def log(pose: Pose) -> Pose:
     """The twist τ with exp(τ) = pose, |ω| <= π: (V(θ)⁻¹ t, θ).
 
@@ -119,6 +124,7 @@ def adjoint(pose: Pose) -> PoseMatrix:
     return _rows([c, -s, pose[1]], [s, c, -pose[0]], [0, 0, 1])
 
 
+@traced_once
 def to_frame(frame: Pose, point: Point) -> Point:
     """R(θ)ᵀ(p - t): a world point (2,) in the frame's coordinates (Solà (56))."""
     c, s = jnp.cos(frame[2]), jnp.sin(frame[2])
@@ -134,6 +140,7 @@ def to_frame_jacobians(frame: Pose, point: Point) -> tuple[PointByPose, PointMat
     return by_frame, _rows([c, s], [-s, c])
 
 
+@traced_once
 def from_frame(frame: Pose, point: Point) -> Point:
     """R(θ) p + t: a point (2,) of the frame in world coordinates (Solà (55))."""
     c, s = jnp.cos(frame[2]), jnp.sin(frame[2])
@@ -149,12 +156,14 @@ def from_frame_jacobians(frame: Pose, point: Point) -> tuple[PointByPose, PointM
     return by_frame, _rows([c, -s], [s, c])
 
 
+@traced_once
 def polar(point: Point) -> Point:
     """(range, bearing) of a point (2,) (Solà (61)); at the origin (0, 0) with zero gradient."""
     x, y, away = _away_from_origin(point)
     return jnp.stack([jnp.where(away, jnp.sqrt(x * x + y * y), 0.0), jnp.arctan2(y, x)])
 
 
+@traced_once
 def polar_in_frame(frame: Pose, point: Point) -> Point:
     """(range, bearing) of a world point (2,) in the frame: `polar` of `to_frame`, (Solà (63)).
 

@@ -11,6 +11,15 @@ from jaxtyping import PyTree
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def traced_once(function: _F) -> _F:
+    """The function, traced once for the shapes of its arguments and not at each call.
+
+    For functions of arrays alone that a filter calls often. XLA inlines them.
+    """
+    return cast(_F, jax.jit(function))
 
 
 def no_inline(function: Callable[..., _T], *arguments: PyTree) -> _T:
