@@ -2,8 +2,8 @@
 
 What a page printed and drew is kept by its cells and its kernel's description (jupyter-cache). This
 extension adds to that description a digest of the files of the package that the cells reach: those
-that define a name in a cell, those that define a name in these, and so on; all files, where a cell
-has a shell command. Docstrings, comments and layout do not count.
+that define a name in a cell, those that define a name in these, and so on; for `!jaxslam …` those
+of the command. Docstrings, comments and layout do not count.
 """
 
 import ast
@@ -19,7 +19,9 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "jaxslam"
-KINDS = (".py", ".css", ".js")
+COMMAND = {"jaxslam.cli:main"}
+KINDS = (".css", ".js")
+"""files beside those of Python that code reads"""
 KERNEL = "  name: python3\n"
 """The line of a page's head after which the digest is put"""
 
@@ -30,10 +32,8 @@ def digest(page: str) -> str | None:
     if not cells:
         return None
     code = "".join(line for cell in cells for line in cell.splitlines(True) if line[:1] != ":")
-    if re.search(r"^!", code, re.MULTILINE):
-        files = {path for path in (ROOT / PACKAGE).rglob("*") if path.suffix in KINDS}
-    else:
-        files = reached(named(ast.parse(re.sub(r"^%.*$", "", code, flags=re.MULTILINE))))
+    names = named(ast.parse(re.sub(r"^[%!].*$", "", code, flags=re.MULTILINE)))
+    files = reached(names | COMMAND if re.search(r"^!jaxslam", code, re.MULTILINE) else names)
     if "examples" in code:
         files |= set((ROOT / "examples").glob("*.py"))
     hashed = hashlib.sha256()
@@ -51,17 +51,23 @@ def reached(names: frozenset[str]) -> set[Path]:
         files.add(path)
         ahead |= {home(name) for name in named_in(path)} - files
     folders = {file.parent for file in files}
-    return files | {path for each in folders for path in each.iterdir() if path.suffix in KINDS[1:]}
+    return files | {path for each in folders for path in each.iterdir() if path.suffix in KINDS}
 
 
 @functools.cache
 def named_in(path: Path) -> frozenset[str]:
-    """The names of the package in a file."""
-    return named(ast.parse(path.read_text(encoding="utf-8")))
+    """The names of the package in a file; a package is asked for by name what it imports."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return frozenset(aliases(tree).values()) if path.name == "__init__.py" else named(tree)
 
 
 def named(tree: ast.AST) -> frozenset[str]:
     """What code uses of the package, module and attributes, as `jaxslam:filters.ekf_slam`."""
+    return frozenset(_used(tree, aliases(tree)))
+
+
+def aliases(tree: ast.AST) -> dict[str, str]:
+    """What the names that code imports from the package stand for."""
     alias = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -71,7 +77,7 @@ def named(tree: ast.AST) -> frozenset[str]:
         elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == PACKAGE:
             for each in node.names:
                 alias[each.asname or each.name] = f"{node.module}:{each.name}"
-    return frozenset(_used(tree, alias))
+    return alias
 
 
 def _used(node: ast.AST, alias: dict[str, str]) -> Iterator[str]:
