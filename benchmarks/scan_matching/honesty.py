@@ -20,10 +20,12 @@ SAMPLES = 30
 MATCHERS = {
     "point_to_point": matching.point_to_point(),
     "point_to_line": matching.point_to_line(),
-    "point_to_line, Cauchy": matching.point_to_line(kernel=cauchy(), scale=0.05),
+    "point_to_line, Cauchy": matching.point_to_line(
+        matching.IcpSettings(kernel=cauchy(), scale=0.05)
+    ),
     "field": matching.field(),
     "correlative": matching.correlative(
-        cell=CELL, window=0.15, turn_window=0.1, turn=0.01, sigma=0.05, block=5, ambiguous=1.0
+        cell=CELL, window=0.15, turn_window=0.1, turn=0.01, sigma=0.05, block=4, ambiguous=1.0
     ),
 }
 START_COV = np.diag(START**2)

@@ -1,7 +1,7 @@
 """Laser odometry: each scan against the keyframes before it, fused with raw odometry."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -9,14 +9,24 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam import programs
 from jaxslam.laser_slam import poses
 from jaxslam.laser_slam.raw_odometry import Steps
+from jaxslam.laser_slam.reference import (
+    BLUR,
+    gathered,
+    on_walls,
+    search,
+    searched,
+    taken,
+    thinned,
+)
 from jaxslam.laser_slam.scans import Scans
-from jaxslam.laser_slam.search import Window, correlate, fit_lines, gathered, tables
 from jaxslam.laser_slam.settings import Settings
+from jaxslam.matching import Match, Matcher, Points, Prior
+from jaxslam.matching.surface import Surface
 
-NEAR = Window(turns=11, turn=float(np.deg2rad(2.0)), blocks=3, level=1, kept=64)
-"""The search about raw odometry: 0.6 m and 22° to either side."""
-FAR = Window(turns=24, turn=float(np.deg2rad(2.5)), blocks=2, level=3, kept=256)
-"""Where that finds little: 1.6 m and 60°, with raw odometry's covariance times `DOUBT`."""
+NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0))
+"""About raw odometry."""
+FAR = search(1.6, np.deg2rad(60.0), np.deg2rad(2.5))
+"""Where that finds little, with raw odometry's covariance times `DOUBT`."""
 DOUBT = 16.0
 SURE = 0.6
 """Share of the points on walls below which the wider search is made."""
@@ -57,7 +67,7 @@ def laser_odometry(
     covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
     by `settings.correlation`. Where too few points meet a wall the step is raw odometry alone.
     """
-    count, width = len(scans.points), settings.reference
+    count, width = len(scans.usable), settings.reference
     result = Odometry(
         poses=np.zeros((count, 3)),
         base=np.zeros(count, int),
@@ -101,7 +111,7 @@ def laser_odometry(
 
 
 def _tracked(
-    window: Window,
+    matcher: Matcher,
     scans: Scans,
     scan: int,
     of: list[int],
@@ -110,45 +120,43 @@ def _tracked(
     guess: np.ndarray,
     prior: np.ndarray,
     settings: Settings,
-) -> tuple[Any, np.ndarray]:
-    """The fit of a scan to keyframes in the frame of the last, and the covariance of its end."""
+) -> tuple[Match, np.ndarray]:
+    """The match of a scan with keyframes in the frame of the last; its covariance at the end."""
     take = np.array(of + [of[-1]] * (settings.reference - len(of)))
     there = poses.between(path[key], path[take]).astype(np.float32)
+    points = taken(scans.points, take)
     again = np.arange(len(take)) < len(of)  # padding repeats a keyframe without points
     wide = poses.of_coordinates(prior, guess)
-    information = np.linalg.inv(wide)
     fit = programs.call(
         _track,
-        (window,),
-        scans.points[take],
-        scans.normals[take],
-        scans.valid[take] & again[:, None],
+        (matcher,),
+        points._replace(valid=points.valid & again[:, None]),
+        taken(scans.surface, take),
         there,
-        scans.points[scan],
-        scans.valid[scan],
+        taken(scans.points, scan),
         guess.astype(np.float32),
-        information.astype(np.float32),
-        np.float32(settings.sigma**2 * settings.correlation),
+        (settings.correlation * np.linalg.inv(wide)).astype(np.float32),
+        np.float32(settings.sigma),
     )
     sigma = max(settings.sigma, float(fit.residual)) ** 2 * settings.correlation
-    seen = np.asarray(fit.information, np.float64) / sigma + np.linalg.inv(wide)
+    seen = poses.semidefinite(np.asarray(fit.information)) / sigma + np.linalg.inv(wide)
     at_end = poses.at_end(np.linalg.inv(seen), np.asarray(fit.pose, np.float64))
     return fit, at_end + np.diag(np.square(settings.floor))
 
 
 def _track(
-    window: Window,
-    points: Array,
-    normals: Array,
-    valid: Array,
+    matcher: Matcher,
+    points: Points,
+    surface: Surface,
     there: Array,
-    scan: Array,
-    scan_valid: Array,
+    scan: Points,
     guess: Array,
     information: Array,
-    weight: Array,
-) -> Any:
-    reference = gathered(points, normals, valid, there)
-    levels = tables(reference, window.level)
-    found = correlate(levels, scan[::2], scan_valid[::2], guess, information, window)
-    return fit_lines(reference, scan, scan_valid, found.pose, guess, weight * information)
+    sigma: Array,
+) -> Match:
+    """By a search and by walls, with a prior of so much information beside points of variance 1."""
+    reference = gathered(points, surface, there)
+    prepared = searched(matcher, reference)
+    coarse = Prior(guess, BLUR**2 * information)
+    found = matcher.match(prepared, thinned(scan), guess, coarse)
+    return on_walls(reference, scan, found.pose, Prior(guess, sigma**2 * information))

@@ -102,6 +102,15 @@ def relative_cov(total: Covs, poses: Poses, i: np.ndarray, j: np.ndarray) -> Cov
     return carried(ad, difference)
 
 
+def semidefinite(information: Covs) -> Covs:
+    """The symmetric matrix without its negative eigenvalues.
+
+    Of the information of walls what their noise feigns is subtracted, which can be too much.
+    """
+    values, vectors = np.linalg.eigh(np.asarray(information, np.float64))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ np.swapaxes(vectors, -1, -2))
+
+
 def turns(angle: Float[np.ndarray, "..."]) -> Covs:
     """R(angle) for x and y, 1 for θ."""
     c, s = np.cos(angle), np.sin(angle)

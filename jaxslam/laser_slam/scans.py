@@ -2,21 +2,27 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
+from jaxslam import programs
 from jaxslam.laser_slam.records import LogOfScans
 from jaxslam.laser_slam.settings import Settings
+from jaxslam.matching import Points
+from jaxslam.matching.surface import Surface, surface
+
+GAP = 0.5
+"""[m] between points beyond which they are not of one wall"""
 
 
 class Scans(NamedTuple):
     """K scans of B points, each in the frame of its robot; float32, as matching computes."""
 
-    points: Float[np.ndarray, "K B 2"]
-    """[m], (0, 0) where not valid"""
-    normals: Float[np.ndarray, "K B 2"]
-    """unit vector across the wall; (0, 0) where the neighbours are on no line"""
-    valid: Bool[np.ndarray, "K B"]
+    points: Points
+    """(K, B), the robot's place where not valid"""
+    surface: Surface
+    """(K, B) the lines through them and their neighbours"""
     usable: Bool[np.ndarray, "K"]
     """enough points to match"""
 
@@ -43,67 +49,27 @@ def check_log(name: str, log: LogOfScans) -> None:
 
 
 def scans_of(log: LogOfScans, settings: Settings) -> Scans:
-    """The points of a log's scans.
-
-    A normal is the direction of least spread of the points within two degrees (at least two beams)
-    to either side, where these follow each other without a gap, and lie on a line within a tenth of
-    its length.
-    """
+    """The points of a log's scans, and the lines through those within two degrees of each."""
     ranges, angles, there = (np.asarray(part, np.float64) for part in log.beams)
     nearest = min(settings.max_range, log.max_range * (1 - 1e-6))
     with np.errstate(invalid="ignore"):
         valid = (there > 0) & (ranges > 0) & (ranges < nearest)
     ranges = np.where(valid, ranges, 0.0)
-    points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    normals = _normals(points, valid, ranges, _spacing(angles, there > 0))
-    stride = -(-points.shape[1] // settings.beams)
-    kept = slice(None, None, stride)
-    found: Any = (
-        points[:, kept].astype(np.float32),
-        normals[:, kept].astype(np.float32),
-        valid[:, kept],
-        valid[:, kept].sum(axis=1) >= settings.fewest,
-    )
-    return Scans(*found)
+    rays = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
+    points: Any = ranges[..., None].astype(np.float32) * rays, rays, valid
+    span = max(2, round(np.deg2rad(2.0) / max(_spacing(angles, there > 0), 1e-3)))
+    stride = -(-ranges.shape[1] // settings.beams)
+    lines = programs.call(_surfaces, (span,), Points(*points))
+    kept, lines = jax.tree.map(lambda part: np.asarray(part)[:, ::stride], (Points(*points), lines))
+    return Scans(kept, lines, usable=np.asarray(kept.valid).sum(axis=1) >= settings.fewest)
+
+
+def _surfaces(span: int, points: Points) -> Surface:
+    found: Surface = jax.vmap(lambda of: surface(of, span, GAP))(points)
+    return found
 
 
 def _spacing(angles: np.ndarray, there: np.ndarray) -> float:
     """The angle between beams [rad]."""
     steps = np.abs(np.diff(angles, axis=1))[there[:, 1:] & there[:, :-1]]
     return float(np.median(steps)) if steps.size else 0.02
-
-
-def _normals(
-    points: np.ndarray, valid: np.ndarray, ranges: np.ndarray, spacing: float
-) -> np.ndarray:
-    span = max(2, round(np.deg2rad(2.0) / max(spacing, 1e-3)))
-    near = np.maximum(0.15, 4 * spacing * ranges)  # a longer step to the next point is a gap
-    weight = valid.astype(float)
-    total, first = weight.copy(), weight[..., None] * points
-    moments = {"xx": points[..., 0] ** 2, "yy": points[..., 1] ** 2}
-    moments["xy"] = points[..., 0] * points[..., 1]
-    second = {key: weight * value for key, value in moments.items()}
-    for direction in (1, -1):
-        linked = valid.copy()
-        for k in range(1, span + 1):
-            there = np.roll(points, -direction * k, axis=1)
-            before = np.roll(points, -direction * (k - 1), axis=1)
-            linked = linked & np.roll(valid, -direction * k, axis=1)
-            linked = linked & (np.linalg.norm(there - before, axis=-1) < near)
-            edge = np.arange(points.shape[1]) + direction * k
-            linked = linked & (edge >= 0) & (edge < points.shape[1])
-            total += linked
-            first += linked[..., None] * there
-            second["xx"] += linked * there[..., 0] ** 2
-            second["yy"] += linked * there[..., 1] ** 2
-            second["xy"] += linked * there[..., 0] * there[..., 1]
-    count = np.maximum(total, 1.0)
-    mean = first / count[..., None]
-    xx = second["xx"] / count - mean[..., 0] ** 2
-    yy = second["yy"] / count - mean[..., 1] ** 2
-    xy = second["xy"] / count - mean[..., 0] * mean[..., 1]
-    along = 0.5 * np.arctan2(2 * xy, xx - yy)
-    half = np.hypot(0.5 * (xx - yy), xy)
-    least, most = 0.5 * (xx + yy) - half, 0.5 * (xx + yy) + half
-    line = valid & (total >= 3) & (least < 0.01 * most)
-    return np.where(line[..., None], np.stack([-np.sin(along), np.cos(along)], axis=-1), 0.0)

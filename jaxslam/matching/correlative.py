@@ -9,24 +9,24 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam.grids.distance import distance_field
 from jaxslam.grids.grid import Field, Grid, to_cells
-from jaxslam.matching.field import field_cost, field_residuals
+from jaxslam.grids.interpolation import interpolate
+from jaxslam.matching.branch_and_bound import Nodes, search
+from jaxslam.matching.field import field_cost
 from jaxslam.matching.matcher import Match, Matcher
-from jaxslam.matching.outcome import Limits, concluded, information_of, length_of
+from jaxslam.matching.outcome import Limits, concluded, length_of
 from jaxslam.matching.points import Points
+from jaxslam.matching.prior import Prior, prior_cost
+from jaxslam.matching.surface import surface, surface_information
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-
-_CHUNK = 8
-"""Blocks that are looked at in one step."""
 
 
 class Scores(NamedTuple):
     """What a point scores by its cell, with `block` cells of 0 around the map."""
 
-    fine: Float[Array, "H W"]
-    """exp(-d²/2σ²), d the distance to the nearest occupied cell"""
-    coarse: Float[Array, "H W"]
-    """the largest of the block × block cells of which this is the lower left one"""
+    table: Float[Array, "L H W"]
+    """first exp(-d²/2σ²), d the distance to the nearest occupied cell; then, at level l, the
+    largest of the 2^l × 2^l cells of which this is the lower left one"""
     field: Field
     """d [m], of the map alone"""
 
@@ -41,6 +41,8 @@ def correlative(
     block: int = 4,
     ambiguous: float = 0.95,
     apart: float = 0.3,
+    span: int = 5,
+    gap: float = 0.5,
     fewest: int = 10,
     least_score: float = 0.5,
     least_condition: float = 0.01,
@@ -49,10 +51,12 @@ def correlative(
 
     The window holds the headings start ± turn_window in steps of `turn` [rad], and shifts of the
     start by whole cells of the reference's grid up to ± window [m] along its axes. A point scores
-    by the cell that it falls into, 0 off the map. The maximum is exact on this lattice: first all
-    headings and blocks of shifts are scored by the largest score of any cell that a point meets
-    within the block, an upper bound; then blocks are looked at in the order of their bounds, until
-    no bound is above the best score.
+    by the cell that it falls into, 0 off the map. A prior takes eᵀ Λ e/(2 σ² n) from the mean score
+    of n points, as near a wall exp(-d²/2σ²) is 1 - d²/2σ².
+
+    The maximum is exact on this lattice: blocks of shifts are scored by the largest score of any
+    cell that a point meets within the block, less what the prior takes at least there: an upper
+    bound. Those that may hold the best are divided, down to single shifts (`search`).
 
     Olson 2009, "Real-time correlative scan matching", ICRA; bounds over sliding blocks as Hess et
     al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA. The pose is one of the lattice:
@@ -62,11 +66,13 @@ def correlative(
         cell: resolution of the grids [m], which fixes the number of shifts; that of another grid
             counts in place of it, with as many cells.
         sigma: [m] of the score.
-        block: shifts along each axis that are bounded together.
-        ambiguous: the status is AMBIGUOUS where the best pose of another block, more than `apart`
-            [m] away (angles times the RMS range), scores above this share of the maximum.
-        fewest, least_score, least_condition: as in `point_to_line`; a point takes part within 3 σ
-            of an occupied cell.
+        block: shifts along each axis that are bounded together at first: 2, 4, 8, …
+        ambiguous: the status is AMBIGUOUS where a pose more than `apart` [m] away from the best
+            (angles times the RMS range) scores above this share of it; 1 does not look for one.
+        span, gap: of the lines through the points of the scan, which tell what it determines, as
+            in `IcpSettings`.
+        fewest, least_score, least_condition: as in `IcpSettings`; a point takes part within 3 σ of
+            an occupied cell.
     Raises:
         ValueError: a number out of range.
     """
@@ -75,89 +81,93 @@ def correlative(
             "correlative: expected windows not below 0, and turn, cell and sigma above 0, got "
             f"{window}, {turn_window}, {turn}, {cell}, {sigma}"
         )
-    if block < 1 or not 0 < ambiguous <= 1 or not apart > 0:
+    if block < 2 or block & (block - 1) or not 0 < ambiguous <= 1 or not apart > 0:
         raise ValueError(
-            "correlative: expected block >= 1, ambiguous in (0, 1] and apart above 0, got "
+            "correlative: expected block 2, 4, 8, …, ambiguous in (0, 1] and apart above 0, got "
             f"{block}, {ambiguous}, {apart}"
         )
     shifts = int(np.ceil(window / cell - 1e-9))
     steps = int(np.ceil(turn_window / turn - 1e-9))
+    levels = block.bit_length() - 1
     offsets = turn * np.arange(-steps, steps + 1)
     limits = Limits(fewest, least_score, least_condition)
-    # The lower left shifts of the blocks, and the shifts within one.
     corners = _square(np.arange(-shifts, shifts + 1, block))
-    within = _square(np.arange(block))
 
     def prepare(grid: Grid) -> Scores:
         field = distance_field(grid)
-        fine = jnp.pad(jnp.exp(-0.5 * (field.values / sigma) ** 2), block)
-        coarse = jax.lax.reduce_window(
-            fine, -jnp.inf, jax.lax.max, (block, block), (1, 1), 2 * [(0, block - 1)]
-        )
-        return Scores(fine, coarse, field)
+        tables = [jnp.pad(jnp.exp(-0.5 * (field.values / sigma) ** 2), block)]
+        for level in range(levels):
+            right = jnp.maximum(tables[-1], jnp.roll(tables[-1], -(2**level), 1))
+            tables.append(jnp.maximum(right, jnp.roll(right, -(2**level), 0)))
+        return Scores(jnp.stack(tables), field)
 
-    def match(of: Scores, points: Points, start: Array) -> Match:
+    def match(of: Scores, points: Points, start: Array, prior: Prior | None = None) -> Match:
         turns = start[2] + jnp.asarray(offsets, start.dtype)
         count = jnp.maximum(points.valid.sum(), 1)
+        _, height, width = of.table.shape
+        cell_size = of.field.resolution
+        axes = cell_size * se2.rotation(of.field.origin[2])[:, ::-1]  # of a row, of a column
 
         def cells(turn: Array) -> Int[Array, "N 2"]:
             """(row, column) of the points at the start, turned so."""
             moved = points.position @ se2.rotation(turn).T + start[None, :2]
             at = to_cells(of.field.origin, of.field.resolution, moved)[:, ::-1]
-            return jnp.floor(at).astype(jnp.int32)
-
-        def mean(table: Array, at: Int[Array, "N 2"], shift: Int[Array, "S 2"]) -> Array:
-            """The mean score of the points after each of some shifts."""
-            height, width = table.shape
-            row = jnp.clip(at[None, :, 0] + shift[:, None, 0] + block, 0, height - 1)
-            column = jnp.clip(at[None, :, 1] + shift[:, None, 1] + block, 0, width - 1)
-            return jnp.where(points.valid, table[row, column], 0.0).sum(axis=1) / count
+            return jnp.floor(at).astype(jnp.int32) + block
 
         here = jax.vmap(cells)(turns)
-        bound = jax.lax.map(lambda at: mean(of.coarse, at, jnp.asarray(corners)), here)
-        blocks = bound.size
-        chunk = min(_CHUNK, blocks)
-        bound, order = jax.lax.top_k(bound.ravel(), blocks)
-        room = -blocks % chunk
-        bound = jnp.concatenate([bound, jnp.full(room + chunk, -1.0, bound.dtype)])
-        order = jnp.concatenate([order, jnp.zeros(room, order.dtype)])
 
-        def look(block_number: Array) -> tuple[Array, Array]:
-            """The best score of a block, and its shift."""
-            k, corner = jnp.divmod(block_number, len(corners))
-            shift = jnp.asarray(corners)[corner][None] + jnp.asarray(within)
-            score = mean(of.fine, here[k], shift)
-            score = jnp.where(jnp.all(shift <= shifts, axis=1), score, -1.0)
-            best = jnp.argmax(score)
-            return score[best], shift[best]
+        def seen(nodes: Nodes) -> Float[Array, "n"]:
+            """The mean score of the points."""
+            at = here[nodes.turn] + nodes.shift[:, None, :]
+            row, column = jnp.clip(at[..., 0], 0, height - 1), jnp.clip(at[..., 1], 0, width - 1)
+            flat = (nodes.level[:, None] * height + row) * width + column
+            return jnp.where(points.valid, of.table.reshape(-1)[flat], 0.0).sum(axis=1) / count
 
-        def unfinished(state: Any) -> Array:
-            return jnp.asarray(bound[state[0]] > ambiguous * state[1].max())
+        def taken(nodes: Nodes) -> Float[Array, "n"]:
+            """What a prior takes at least within each block: that of the middle is √(eᵀ Λ e), and
+            that of a corner farther in is less by √(uᵀ Λ u) at most."""
+            if prior is None:
+                return jnp.zeros(len(nodes.turn), start.dtype)
+            half = 0.5 * ((1 << nodes.level) - 1).astype(start.dtype)
+            middle = (nodes.shift + half[:, None]) @ axes.T + start[None, :2]
+            pose = jnp.concatenate([middle, turns[nodes.turn][:, None]], axis=1)
+            e = jax.vmap(prior.error)(pose)
+            square = jnp.maximum(((e @ prior.information) * e).sum(axis=1), 0.0)
+            corner = jnp.asarray([[1.0, 1.0], [1.0, -1.0]], start.dtype) @ axes.T
+            far = ((corner @ prior.information[:2, :2]) * corner).sum(axis=1).max()
+            least = jnp.maximum(jnp.sqrt(square) - half * jnp.sqrt(jnp.maximum(far, 0.0)), 0.0)
+            least = jnp.where(nodes.level == 0, square, least**2)
+            return least / (2 * sigma**2 * count)
 
-        def step(state: Any) -> Any:
-            next_, score, shift = state
-            numbers = jax.lax.dynamic_slice(order, (next_,), (chunk,))
-            found, where = jax.vmap(look)(numbers)
-            score = jax.lax.dynamic_update_slice(score, found, (next_,))
-            shift = jax.lax.dynamic_update_slice(shift, where, (next_, jnp.zeros_like(next_)))
-            return next_ + chunk, score, shift
+        def bound_of(nodes: Nodes) -> Float[Array, "n"]:
+            return seen(nodes) - taken(nodes)
 
-        first = (
-            jnp.zeros((), jnp.int32),
-            jnp.full(blocks + room, -1.0, bound.dtype),
-            jnp.zeros((blocks + room, 2), jnp.int32),
-        )
-        looked, score, shift = jax.lax.while_loop(unfinished, step, first)
-        best = jnp.argmax(score)
-        turned = order // len(corners)
-        cell_size = of.field.resolution
-        away = jnp.hypot(*(cell_size * (shift - shift[best][None])).T)
-        away = away + length_of(points) * turn * jnp.abs(turned - turned[best])
-        second = jnp.where(away > apart, score, -1.0).max()
-        moved = se2.rotation(of.field.origin[2]) @ (cell_size * shift[best][::-1])
-        pose = jnp.concatenate([start[:2] + moved, wrap(turns[turned[best]])[None]])
-        residual, jacobian = field_residuals(of.field, points, pose)
+        def roots_of(turn: Array) -> Nodes:
+            full = jnp.full(len(corners), levels, jnp.int32)
+            return Nodes(full, jnp.broadcast_to(turn, full.shape), jnp.asarray(corners))
+
+        numbers = jnp.arange(len(offsets), dtype=jnp.int32)
+        bounds = jax.lax.map(lambda turn: bound_of(roots_of(turn)), numbers).reshape(-1)
+        roots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(roots_of)(numbers))
+        best = search(bound_of, roots, bounds, levels, shifts)
+        elsewhere: Array | bool = False
+        if ambiguous < 1:
+            by_turn = length_of(points) * turn
+
+            def far(nodes: Nodes) -> Array:
+                way = cell_size * (nodes.shift - best.shift[None])
+                return jnp.hypot(*way.T) + by_turn * jnp.abs(nodes.turn - best.turn) > apart
+
+            limit = ambiguous * best.value
+            other = search(
+                bound_of, roots, bounds, levels, shifts, above=limit, counts=far, first=True
+            )
+            elsewhere = other.value > limit
+        pose = jnp.concatenate([start[:2] + axes @ best.shift, wrap(turns[best.turn])[None]])
+        moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
+        residual = interpolate(of.field, moved)
         weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)
+        only = Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
         return concluded(
             start,
             pose,
@@ -165,17 +175,18 @@ def correlative(
             residual=residual,
             weight=weight,
             pair=jnp.zeros(weight.shape, jnp.int32),
-            information=information_of(jacobian, weight),
+            information=surface_information(surface(points, span, gap), pose, weight),
             spread=sigma,
-            iterations=looked,
+            iterations=best.divided,
             converged=jnp.ones((), bool),
             limits=limits,
-            ambiguous=(second > ambiguous * score[best]) & (ambiguous < 1),
-            score=score[best],
+            ambiguous=elsewhere,
+            score=seen(only)[0],
+            prior=prior,
         )
 
     def cost(of: Scores, points: Points, pose: Array, found: Match) -> Array:
-        return field_cost(of.field, points, pose, found.weight)
+        return field_cost(of.field, points, pose, found.weight) + prior_cost(found.prior, pose)
 
     return Matcher("correlative", prepare, match, cost, of_grid=True)
 

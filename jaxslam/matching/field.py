@@ -12,8 +12,10 @@ from jaxslam.grids.grid import Field, Grid
 from jaxslam.grids.interpolation import interpolate
 from jaxslam.matching.correspondences import Rule, weights
 from jaxslam.matching.matcher import Match, Matcher
-from jaxslam.matching.outcome import Limits, concluded, information_of, length_of
+from jaxslam.matching.outcome import Limits, concluded, determined, information_of, length_of
 from jaxslam.matching.points import Points
+from jaxslam.matching.prior import Prior, prior_cost, prior_information
+from jaxslam.matching.surface import surface, surface_information
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
 
@@ -27,8 +29,10 @@ class _At(NamedTuple):
     cost: Float[Array, ""]
     residual: Float[Array, "N"]
     weight: Float[Array, "N"]
-    information: Float[Array, "3 3"]
+    curvature: Float[Array, "3 3"]
+    """A, with Λ"""
     slope: Float[Array, "3"]
+    """half of the cost's"""
 
 
 def field(
@@ -36,6 +40,8 @@ def field(
     reach: float = 0.5,
     kernel: Kernel | None = None,
     scale: float = 0.1,
+    span: int = 5,
+    gap: float = 0.5,
     iterations: int = 50,
     tolerance: float = 1e-6,
     fewest: int = 10,
@@ -50,32 +56,35 @@ def field(
     a step that does not reduce the cost is not taken, and μ grows tenfold, else it falls tenfold.
     The reference is a `Grid`; `raster` makes one of points.
 
-    Arguments are those of `point_to_line`.
+    The slope of a field of cells feigns information along a wall, so the status and
+    `Match.information` are by the lines of the scan (`surface_information`), and a step has no part
+    along what these do not determine.
+
+    Arguments are those of `IcpSettings`.
     Fitzgibbon 2003, "Robust registration of 2D and 3D point sets", Image and Vision Computing 21.
 
     Raises ValueError on a number out of range.
     """
-    if not (reach > 0 and scale > 0 and tolerance > 0) or iterations < 1:
+    if not (reach > 0 and scale > 0 and gap > 0 and tolerance > 0) or min(iterations, span) < 1:
         raise ValueError(
-            "field: expected reach, scale and tolerance above 0 and iterations >= 1, got "
-            f"{reach}, {scale}, {tolerance}, {iterations}"
+            "field: expected reach, scale, gap and tolerance above 0 and span and iterations >= 1, "
+            f"got {reach}, {scale}, {gap}, {tolerance}, {span}, {iterations}"
         )
     rule = Rule(reach, 1.0, kernel, scale)
     limits = Limits(fewest, least_score, least_condition)
 
-    def at_pose(of: Field, points: Points, pose: Array) -> _At:
+    def at_pose(of: Field, points: Points, pose: Array, prior: Prior | None) -> _At:
         residual, jacobian = field_residuals(of, points, pose)
         weight = weights(rule, residual, points.valid & (residual < reach))
-        return _At(
-            cost=_robust_cost(rule, residual, points),
-            residual=residual,
-            weight=weight,
-            information=information_of(jacobian, weight),
-            slope=(weight * residual) @ jacobian,
-        )
+        curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
+        if prior is not None:
+            curvature = curvature + prior.information
+            slope = slope + prior.information @ prior.error(pose)
+        cost = _robust_cost(rule, residual, points) + 2 * prior_cost(prior, pose)
+        return _At(cost, residual, weight, curvature, slope)
 
-    def match(of: Field, points: Points, start: Array) -> Match:
-        length = length_of(points)
+    def match(of: Field, points: Points, start: Array, prior: Prior | None = None) -> Match:
+        length, lines = length_of(points), surface(points, span, gap)
         low, high = _DAMPING[1:]
 
         def unfinished(state: Any) -> Array:
@@ -83,11 +92,14 @@ def field(
 
         def step(state: Any) -> Any:
             k, pose, at, damping, _ = state
-            diagonal = jnp.diagonal(at.information)
+            diagonal = jnp.diagonal(at.curvature)
             diagonal = jnp.maximum(diagonal, 1e-9 * jnp.maximum(diagonal.max(), 1e-9))
-            move, _ = linalg.solve_psd(at.information + damping * jnp.diag(diagonal), -at.slope)
+            move, _ = linalg.solve_psd(at.curvature + damping * jnp.diag(diagonal), -at.slope)
+            known = surface_information(lines, pose, at.weight)
+            known = known + prior_information(prior, known)
+            move = determined(move, known, length, least_condition)
             tried = jnp.concatenate([pose[:2] + move[:2], wrap(pose[2] + move[2])[None]])
-            there = at_pose(of, points, tried)
+            there = at_pose(of, points, tried, prior)
             better = there.cost < at.cost
             small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= tolerance
             pose = jnp.where(better, tried, pose)
@@ -98,7 +110,7 @@ def field(
         first = (
             jnp.zeros((), jnp.int32),
             start,
-            at_pose(of, points, start),
+            at_pose(of, points, start, prior),
             jnp.asarray(_DAMPING[0], start.dtype),
             jnp.zeros((), bool),
         )
@@ -110,15 +122,16 @@ def field(
             residual=at.residual,
             weight=at.weight,
             pair=jnp.zeros(at.weight.shape, jnp.int32),
-            information=at.information,
+            information=surface_information(lines, pose, at.weight),
             spread=scale,
             iterations=k,
             converged=small,
             limits=limits,
+            prior=prior,
         )
 
     def cost(of: Field, points: Points, pose: Array, found: Match) -> Array:
-        return field_cost(of, points, pose, found.weight)
+        return field_cost(of, points, pose, found.weight) + prior_cost(found.prior, pose)
 
     def prepare(grid: Grid) -> Field:
         return distance_field(grid, truncate=reach)

@@ -1,6 +1,7 @@
 """The loop that the iterative closest point methods share: pairs, a closed-form step, again."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -8,13 +9,68 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.solver.kernels import Kernel
+from jaxslam.matching.closed_form import Quadratic, added, least, of_prior
 from jaxslam.matching.correspondences import Rule, nearest, weights
 from jaxslam.matching.matcher import Match, Matcher
-from jaxslam.matching.outcome import Limits, concluded, determined, information_of, length_of
+from jaxslam.matching.outcome import (
+    Limits,
+    concluded,
+    determined,
+    information_along,
+    length_of,
+)
 from jaxslam.matching.points import Points
+from jaxslam.matching.prior import Prior, prior_cost
 from jaxslam.matching.surface import Surface, surface
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+
+
+@dataclass(frozen=True)
+class IcpSettings:
+    """The numbers of `point_to_point` and `point_to_line`; ValueError if out of range."""
+
+    reach: float = 0.5
+    """largest distance of partners [m]"""
+    trim: float = 1.0
+    """share of the pairs that is kept at each step, those of the smallest residuals"""
+    kernel: Kernel | None = None
+    """robust, as `graphs.huber()`, of (residual/scale)²; None for squares"""
+    scale: float = 0.1
+    """[m] of the kernel and of `Match.score`"""
+    span: int = 5
+    """neighbours on each side that a line is fitted to"""
+    gap: float = 0.5
+    """[m] between points beyond which they are not neighbours"""
+    lone: float = 0.0
+    """of `point_to_line`: the factor of the distance from a point that has no line, as in clutter;
+    0 leaves such points out"""
+    iterations: int = 200
+    """at most"""
+    tolerance: float = 1e-6
+    """of convergence: the motion of a step [m], angles times the RMS range"""
+    fewest: int = 10
+    """pairs below which the status is TOO_FEW"""
+    least_score: float = 0.5
+    """`Match.score` below which it is UNLIKE"""
+    least_condition: float = 0.01
+    """`Match.condition` below which it is DEGENERATE"""
+
+    def __post_init__(self) -> None:
+        lengths = (self.reach, self.scale, self.gap, self.tolerance)
+        if not (all(length > 0 for length in lengths) and 0 < self.trim <= 1):
+            raise ValueError(
+                "IcpSettings: expected reach, scale, gap and tolerance above 0 and trim in (0, 1], "
+                f"got {self.reach}, {self.scale}, {self.gap}, {self.tolerance}, {self.trim}"
+            )
+        if self.span < 1 or self.iterations < 1 or not self.lone >= 0:
+            raise ValueError(
+                "IcpSettings: expected span and iterations >= 1 and lone >= 0, got "
+                f"{self.span}, {self.iterations}, {self.lone}"
+            )
+
+
+DEFAULT = IcpSettings()
 
 
 class Pairs(NamedTuple):
@@ -35,35 +91,17 @@ class Metric(NamedTuple):
     """(surface, moved points, partners) -> (N,) [m]"""
     usable: Callable[[Surface], Bool[Array, "M"]]
     """which points of the reference may be partners"""
-    step: Callable[[Surface, Pairs, Array], Array]
-    """(surface, pairs, middle (2,)) -> the motion about the middle that minimizes Σ w e²"""
+    quadratic: Callable[[Surface, Pairs, Array], Quadratic]
+    """(surface, pairs, middle (2,)) -> Σ w e² of a motion about the middle"""
     cost: Callable[[Surface, Array, Array, Array], Array]
     """(surface, moved points, partners, weights) -> ½ Σ w e²"""
 
 
-def icp(
-    name: str,
-    metric: Metric,
-    *,
-    reach: float,
-    trim: float,
-    kernel: Kernel | None,
-    scale: float,
-    span: int,
-    gap: float,
-    iterations: int,
-    tolerance: float,
-    limits: Limits,
-) -> Matcher:
-    """The matcher of a metric; see `point_to_line` for the arguments. Raises ValueError on them."""
-    if not (reach > 0 and 0 < trim <= 1 and scale > 0 and gap > 0 and tolerance > 0):
-        raise ValueError(
-            f"{name}: expected reach, scale, gap and tolerance above 0 and trim in (0, 1], got "
-            f"{reach}, {scale}, {gap}, {tolerance}, {trim}"
-        )
-    if span < 1 or iterations < 1:
-        raise ValueError(f"{name}: expected span and iterations >= 1, got {span}, {iterations}")
-    rule = Rule(reach, trim, kernel, scale)
+def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
+    """The matcher of a metric."""
+    reach, iterations, tolerance = settings.reach, settings.iterations, settings.tolerance
+    rule = Rule(reach, settings.trim, settings.kernel, settings.scale)
+    limits = Limits(settings.fewest, settings.least_score, settings.least_condition)
 
     def pairs_at(of: Surface, points: Points, pose: Array) -> Pairs:
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
@@ -73,7 +111,7 @@ def icp(
         residual = jnp.where(possible, metric.residual(of, moved, partner), 0.0)
         return Pairs(moved, partner, residual, weights(rule, residual, possible))
 
-    def match(of: Surface, points: Points, start: Array) -> Match:
+    def match(of: Surface, points: Points, start: Array, prior: Prior | None = None) -> Match:
         length = length_of(points)
 
         def unfinished(state: Any) -> Array:
@@ -85,8 +123,12 @@ def icp(
             pairs = pairs_at(of, points, pose)
             total = pairs.weight.sum()
             middle = pairs.weight @ pairs.moved / jnp.where(total > 0, total, 1.0)
-            moved = metric.step(of, pairs, middle)
-            moved = determined(moved, _information(of, pairs, middle), length, limits.condition)
+            quadratic = metric.quadratic(of, pairs, middle)
+            information = _information(of, pairs, middle, settings.lone)
+            if prior is not None:
+                quadratic = added(quadratic, of_prior(prior, pose, middle))
+                information = information + about(prior.information, pose[:2] - middle)
+            moved = determined(least(quadratic), information, length, limits.condition)
             pivot = se2.from_frame(moved, pose[:2] - middle) + middle
             after = jnp.concatenate([pivot, wrap(pose[2] + moved[2])[None]])
             # A limit cycle of two steps, where pairs alternate, has ended as well.
@@ -104,18 +146,23 @@ def icp(
             residual=at.residual,
             weight=at.weight,
             pair=at.partner,
-            information=_information(of, at, pose[:2]),
-            spread=scale,
+            information=_information(of, at, pose[:2], settings.lone),
+            spread=settings.scale,
             iterations=k,
             converged=change <= tolerance,
             limits=limits,
+            prior=prior,
         )
 
     def cost(of: Surface, points: Points, pose: Array, found: Match) -> Array:
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
-        return metric.cost(of, moved, jnp.maximum(found.pair, 0), found.weight)
+        of_pairs = metric.cost(of, moved, jnp.maximum(found.pair, 0), found.weight)
+        return of_pairs + prior_cost(found.prior, pose)
 
-    return Matcher(name, lambda reference: surface(reference, span, gap), match, cost)
+    def prepare(reference: Points) -> Surface:
+        return surface(reference, settings.span, settings.gap)
+
+    return Matcher(name, prepare, match, cost)
 
 
 def _size(a: Array, b: Array, length: Array) -> Array:
@@ -123,20 +170,27 @@ def _size(a: Array, b: Array, length: Array) -> Array:
     return jnp.hypot(a[0] - b[0], a[1] - b[1]) + length * jnp.abs(wrap(a[2] - b[2]))
 
 
-def _information(of: Surface, at: Pairs, pivot: Float[Array, "2"]) -> Float[Array, "3 3"]:
-    """Σ w J Jᵀ with J = (n, n·∂(R p)/∂θ), turned about the pivot, over partners that have a line.
+def about(information: Float[Array, "3 3"], arm: Float[Array, "2"]) -> Float[Array, "3 3"]:
+    """The information of a pose by a motion about a point, from which the pose is an arm away."""
+    by_turn = jnp.stack([-arm[1], arm[0], jnp.ones_like(arm[0])])
+    jacobian = jnp.eye(3, dtype=information.dtype).at[:, 2].set(by_turn)
+    return jacobian.T @ information @ jacobian
 
-    A normal that is turned by noise of variance τ² has E n̂n̂ᵀ = (1 - τ²) nnᵀ + τ² ttᵀ, t along the
-    line, which feigns information along a wall; hence the sum of (1 + τ²) n̂n̂ᵀ - τ² ttᵀ.
-    """
-    n, tilt = of.normal[at.partner], of.tilt[at.partner]
-    arm = at.moved - pivot[None]
-    t = jnp.stack([n[:, 1], -n[:, 0]], axis=-1)
-    weight = jnp.where(of.straight[at.partner], at.weight, 0.0)
 
-    def along(v: Array) -> Array:
-        turn = v[:, 1] * arm[:, 0] - v[:, 0] * arm[:, 1]
-        return jnp.concatenate([v, turn[:, None]], axis=1)
-
-    both = information_of(along(n), weight * (1 + tilt))
-    return both - information_of(along(t), weight * tilt)
+def _information(
+    of: Surface, at: Pairs, pivot: Float[Array, "2"], lone: float
+) -> Float[Array, "3 3"]:
+    """Σ w J Jᵀ turned about the pivot: of the lines of partners, and of those that have none."""
+    j, arm = at.partner, at.moved - pivot[None]
+    straight = of.straight[j]
+    by_lines = information_along(of.normal[j], of.tilt[j], arm, jnp.where(straight, at.weight, 0.0))
+    if lone == 0:
+        return by_lines
+    weight = lone**2 * jnp.where(straight, 0.0, at.weight)
+    axis = jnp.zeros_like(arm).at[:, 0].set(1.0)
+    none = jnp.zeros_like(weight)
+    return (
+        by_lines
+        + information_along(axis, none, arm, weight)
+        + information_along(axis[:, ::-1], none, arm, weight)
+    )

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxslam import programs
 from jaxslam.grids.grid import Grid, check_grid
 from jaxslam.matching.points import Points
+from jaxslam.matching.prior import Prior
 from jaxslam.validation.numbers import is_concrete, shape_told
 
 
@@ -22,10 +23,10 @@ class MatchStatus(IntEnum):
     """The pose no longer changes."""
     NOT_CONVERGED = 1
     """It ended at its limit of iterations."""
-    DEGENERATE = 2
-    """The scans do not determine the motion along `Match.weakest`; the pose is usable across it."""
-    AMBIGUOUS = 3
+    AMBIGUOUS = 2
     """Another pose of the window, apart from this one, fits almost as well."""
+    DEGENERATE = 3
+    """The scans do not determine the motion along `Match.weakest`; the pose is usable across it."""
     UNLIKE = 4
     """The score is too low: few points have a partner, or they lie far from it."""
     TOO_FEW = 5
@@ -40,7 +41,7 @@ class Match(NamedTuple):
     status: Int[Array, ""]
     """see `MatchStatus`"""
     iterations: Int[Array, ""]
-    """steps taken; of `correlative` the blocks of the lattice that were looked at"""
+    """steps taken; of `correlative` the blocks of the lattice that were divided"""
     residual: Float[Array, ""]
     """weighted root mean square of the residuals that took part [m]"""
     inliers: Float[Array, ""]
@@ -58,6 +59,8 @@ class Match(NamedTuple):
     """the partner of each point in the reference, -1 without; in a grid 0 where it took part"""
     weight: Float[Array, "N"]
     """of each pair, 0 where it took no part"""
+    prior: Prior | None = None
+    """with which it was found"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,35 +71,47 @@ class Matcher:
     prepare: Callable[[Any], Any]
     """(reference) -> what the matcher needs of it, once for all scans: a pytree of arrays. The
     reference is `Points`, or a `Grid` where `of_grid`."""
-    match: Callable[[Any, Points, Array], Match]
-    """(prepared, points, start (3,)) -> match. By while loops: forward derivatives alone."""
+    match: Callable[[Any, Points, Array, Prior | None], Match]
+    """(prepared, points, start (3,), prior or None) -> match. By while loops: forward derivatives
+    alone."""
     cost: Callable[[Any, Points, Array, Match], Array]
-    """(prepared, points, pose, match) -> () ½ Σ w e² [m²], the match's pairs and weights kept;
-    differentiable by the pose, the points, and by the reference through `prepare`."""
+    """(prepared, points, pose, match) -> () ½ Σ w e² [m²] and the prior's, the match's pairs,
+    weights and prior kept; differentiable by the pose, the points, and by the reference through
+    `prepare`."""
     of_grid: bool = False
 
 
-def match(matcher: Matcher, reference: Any, points: Points, start: Any) -> Match:
+def match(
+    matcher: Matcher, reference: Any, points: Points, start: Any, prior: Prior | None = None
+) -> Match:
     """The match of a scan to a reference, by a program that is compiled once a structure.
 
     Args:
         reference: `Points`, or a `Grid` where `matcher.of_grid`; with a leading axis on all of its
             arrays for many pairs at once, as `points` and `start` then have.
         start: (3,) where the search begins.
+        prior: what is known of the pose; without one only the start is.
     Raises:
         ValueError: a reference of another kind, arrays that do not fit each other, numbers that
             are not finite. A scan without points is a status.
     """
     batch = _checked(matcher, reference, points, start)
-    return programs.call(_many if batch else _one, (matcher,), reference, points, start)
+    if prior is not None:
+        _check_prior(prior, batch)
+    call = _many if batch else _one
+    return programs.call(call, (matcher,), reference, points, start, prior)
 
 
-def _one(matcher: Matcher, reference: Any, points: Points, start: Array) -> Match:
-    return matcher.match(matcher.prepare(reference), points, start)
+def _one(
+    matcher: Matcher, reference: Any, points: Points, start: Array, prior: Prior | None
+) -> Match:
+    return matcher.match(matcher.prepare(reference), points, start, prior)
 
 
-def _many(matcher: Matcher, reference: Any, points: Points, start: Array) -> Match:
-    return jax.vmap(matcher.match)(prepared_all(matcher, reference), points, start)
+def _many(
+    matcher: Matcher, reference: Any, points: Points, start: Array, prior: Prior | None
+) -> Match:
+    return jax.vmap(matcher.match)(prepared_all(matcher, reference), points, start, prior)
 
 
 def prepared_all(matcher: Matcher, references: Any) -> Any:
@@ -107,8 +122,8 @@ def prepared_all(matcher: Matcher, references: Any) -> Any:
     return jax.vmap(matcher.prepare)(references)
 
 
-def _checked(matcher: Any, reference: Any, points: Any, start: Any) -> bool:
-    """Whether there is a leading axis; raises ValueError on what `match` refuses."""
+def _checked(matcher: Any, reference: Any, points: Any, start: Any) -> tuple[int, ...]:
+    """The leading axis, () of one pair; raises ValueError on what `match` refuses."""
     if not isinstance(matcher, Matcher):
         raise ValueError(f"match: expected a Matcher, got {type(matcher).__name__}")
     kind = Grid if matcher.of_grid else Points
@@ -117,7 +132,7 @@ def _checked(matcher: Any, reference: Any, points: Any, start: Any) -> bool:
             f"match: {matcher.name} takes a reference of {kind.__name__}, "
             f"got {type(reference).__name__}"
         )
-    batch = np.shape(start)[:-1]
+    batch: tuple[int, ...] = np.shape(start)[:-1]
     if len(batch) > 1 or np.shape(start)[-1:] != (3,):
         raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_told(start)}")
     check_points("match", points, batch)
@@ -131,7 +146,30 @@ def _checked(matcher: Any, reference: Any, points: Any, start: Any) -> bool:
         )
     if is_concrete(start) and not np.all(np.isfinite(np.asarray(start))):
         raise ValueError(f"match: expected a finite start, got {np.asarray(start)}")
-    return bool(batch)
+    return batch
+
+
+def _check_prior(prior: Any, batch: tuple[int, ...]) -> None:
+    if not isinstance(prior, Prior):
+        raise ValueError(f"match: expected a Prior, got {type(prior).__name__}")
+    if np.shape(prior.pose) != (*batch, 3) or np.shape(prior.information) != (*batch, 3, 3):
+        whole = " x ".join(str(size) for size in (*batch, 3))
+        raise ValueError(
+            f"match: expected a prior of a pose {whole} and an information {whole} x 3, got "
+            f"{shape_told(prior.pose)} and {shape_told(prior.information)}"
+        )
+    if is_concrete(prior):
+        information = np.asarray(prior.information)
+        if not (np.all(np.isfinite(np.asarray(prior.pose))) and np.all(np.isfinite(information))):
+            raise ValueError("match: expected a finite prior")
+        scale = np.abs(information).max(axis=(-1, -2), initial=0.0)
+        crooked = np.abs(information - np.swapaxes(information, -1, -2)).max(axis=(-1, -2))
+        if np.any(crooked > 1e-4 * scale) or np.any(
+            np.linalg.eigvalsh(information).min(axis=-1) < -1e-4 * scale
+        ):
+            raise ValueError(
+                "match: expected a symmetric information of the prior, positive semi-definite"
+            )
 
 
 def check_points(name: str, of: Any, batch: tuple[int, ...] = ()) -> None:

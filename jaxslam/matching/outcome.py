@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxslam.matching.matcher import Match, MatchStatus
 from jaxslam.matching.points import Points
+from jaxslam.matching.prior import Prior
 from jaxslam.math import linalg
 
 
@@ -38,10 +39,12 @@ def concluded(
     limits: Limits,
     ambiguous: Array | bool = False,
     score: Array | None = None,
+    prior: Prior | None = None,
 ) -> Match:
     """The `Match` of a pose that a search ended at, with its status.
 
-    The score is that of the residuals over `spread`, unless given.
+    The score is that of the residuals over `spread`, unless given. Along a degenerate direction
+    other poses fit as well, so that a match is only called ambiguous where it is not degenerate.
     """
     took_part = weight > 0
     total = jnp.maximum(weight.sum(), jnp.finfo(weight.dtype).tiny)
@@ -54,8 +57,8 @@ def concluded(
     status = jnp.asarray(MatchStatus.CONVERGED, jnp.int32)
     for applies, value in (
         (~converged, MatchStatus.NOT_CONVERGED),
-        (condition < limits.condition, MatchStatus.DEGENERATE),
         (ambiguous, MatchStatus.AMBIGUOUS),
+        (condition < limits.condition, MatchStatus.DEGENERATE),
         (score < limits.score, MatchStatus.UNLIKE),
         (few, MatchStatus.TOO_FEW),
     ):
@@ -72,6 +75,7 @@ def concluded(
         condition=condition,
         pair=jnp.where(took_part, pair, -1),
         weight=weight,
+        prior=prior,
     )
 
 
@@ -88,6 +92,27 @@ def length_of(points: Points) -> Float[Array, ""]:
 def information_of(jacobian: Float[Array, "N 3"], weight: Float[Array, "N"]) -> Array:
     """Σ w J Jᵀ (3, 3)."""
     return linalg.gram(weight[:, None] * jacobian, jacobian)
+
+
+def information_along(
+    normal: Float[Array, "N 2"],
+    tilt: Float[Array, "N"],
+    arm: Float[Array, "N 2"],
+    weight: Float[Array, "N"],
+) -> Float[Array, "3 3"]:
+    """Σ w J Jᵀ with J = (n, n·∂(R p)/∂θ), arms [m] from the pivot, over lines of normals n.
+
+    A normal that is turned by noise of variance τ² has E n̂n̂ᵀ = (1 - τ²) nnᵀ + τ² ttᵀ, t along the
+    line, which feigns information along a wall; hence the sum of (1 + τ²) n̂n̂ᵀ - τ² ttᵀ.
+    """
+    along = jnp.stack([normal[:, 1], -normal[:, 0]], axis=-1)
+
+    def by_motion(v: Array) -> Array:
+        turn = v[:, 1] * arm[:, 0] - v[:, 0] * arm[:, 1]
+        return jnp.concatenate([v, turn[:, None]], axis=1)
+
+    both = information_of(by_motion(normal), weight * (1 + tilt))
+    return both - information_of(by_motion(along), weight * tilt)
 
 
 def weakest_direction(

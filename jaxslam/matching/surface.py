@@ -7,7 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.matching.correspondences import FAR
+from jaxslam.matching.outcome import information_along
 from jaxslam.matching.points import Points
+from jaxslam.math import se2
 
 _BENT = 4.0
 """A line whose points scatter by more than this times the median variance goes round a corner."""
@@ -77,6 +79,25 @@ def surface(of: Points, span: int, gap: float) -> Surface:
         tilt=variance / jnp.where(round_, 1.0, largest),
         straight=~round_ & (least < 0.1 * largest) & (variance < _BENT * usual + _FLAT**2),
     )
+
+
+def surface_at(of: Surface, pose: Float[Array, "3"]) -> Surface:
+    """A surface that is given in the frame of a pose, in the coordinates of the pose's frame."""
+    turn = se2.rotation(pose[2]).T
+    return of._replace(
+        position=of.position @ turn + pose[None, :2],
+        middle=of.middle @ turn + pose[None, :2],
+        normal=of.normal @ turn,
+    )
+
+
+def surface_information(
+    of: Surface, pose: Float[Array, "3"], weight: Float[Array, "M"]
+) -> Float[Array, "3 3"]:
+    """Σ w J Jᵀ of a scan at a pose, by the lines through its own points (`information_along`)."""
+    turn = se2.rotation(pose[2]).T
+    arm = jnp.where((weight > 0)[:, None], of.position @ turn, 0.0)
+    return information_along(of.normal @ turn, of.tilt, arm, jnp.where(of.straight, weight, 0.0))
 
 
 def _median(values: Float[Array, "M"], there: Bool[Array, "M"]) -> Float[Array, ""]:

@@ -8,7 +8,7 @@ from scanned_rooms import BEAMS, by_polynomial, moved, pairs, points_at, stacked
 
 from jaxslam import matching
 from jaxslam.graphs import huber
-from jaxslam.matching import MatchStatus, Points
+from jaxslam.matching import IcpSettings, MatchStatus, Points, Prior
 
 COUNT, GOOD = 8, 4
 SPAN, GAP, REACH = 2, 0.8, 0.5
@@ -43,7 +43,7 @@ def found():
     return {
         (name, steps): jax.device_get(
             matching.match(
-                make(**OPTIONS, **({"iterations": 1} if steps == 1 else {})),
+                make(IcpSettings(**OPTIONS, **({"iterations": 1} if steps == 1 else {}))),
                 REFERENCES, SCANS, STARTS,
             )
         )
@@ -119,7 +119,7 @@ def test_bad_scans_have_a_status(found):
         end = found[name, None]
         assert list(end.status[4:6]) == [MatchStatus.TOO_FEW] * 2
         assert end.status[6] == MatchStatus.UNLIKE
-        assert all(np.all(np.isfinite(part)) for part in end)
+        assert all(np.all(np.isfinite(part)) for part in jax.tree.leaves(end))
         np.testing.assert_allclose(end.pose[4:6], STARTS[4:6])
         assert np.all(end.pair[4:6] == -1) and np.all(end.inliers[4:6] == 0)
 
@@ -133,6 +133,29 @@ def test_a_corridor_is_degenerate_along_itself(found):
     assert abs(found["lines", None].pose[7, 1]) < 0.01
 
 
+@pytest.mark.parametrize("make", [matching.point_to_point, matching.point_to_line])
+def test_a_prior_holds_what_the_scans_do_not_determine(make):
+    """At the end the slope of the cost is zero; in the corridor x is that of the prior."""
+    matcher = make(IcpSettings(**OPTIONS, tolerance=1e-9, kernel=huber(), scale=0.05))
+    information = np.diag([0.5, 0.5, 0.5]) + 0.2
+    prior = Prior(STARTS + [0.03, -0.02, 0.01], np.tile(information, (COUNT, 1, 1)))
+    found = jax.device_get(matching.match(matcher, REFERENCES, SCANS, STARTS, prior))
+
+    @jax.jit
+    @jax.vmap
+    def slope(of, scan, end):
+        return jax.grad(lambda pose: matcher.cost(matcher.prepare(of), scan, pose, end))(end.pose)
+
+    good = [*range(GOOD), 7]
+    np.testing.assert_allclose(slope(REFERENCES, SCANS, found)[np.array(good)], 0, atol=1e-5)
+    assert found.status[7] == MatchStatus.DEGENERATE
+    if make is matching.point_to_line:
+        # Of the cost's slope along x only the prior's part is left, up to the tilt of the lines;
+        # at the start it is 0.7 · 0.03 - 0.2 · 0.02 + 0.2 · 0.01 = 0.019.
+        e = found.pose[7] - prior.pose[7]
+        assert abs(information[0] @ e) < 0.003
+
+
 def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite():
     """Every sixth beam is 30 cm short; in float32 the same to 1 mm."""
     position = np.array(SCANS.position[:GOOD])
@@ -144,13 +167,13 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
         "plain": {}, "trimmed": {"trim": 0.75}, "kernel": {"kernel": huber(), "scale": 0.02}
     }.items():  # fmt: skip
         end = matching.match(
-            matching.point_to_line(**OPTIONS, least_score=0.1, **options),
+            matching.point_to_line(IcpSettings(**OPTIONS, least_score=0.1, **options)),
             references, scans, STARTS[:GOOD],
         )  # fmt: skip
         error[name] = np.abs(np.asarray(end.pose) - TRUTH[:GOOD])[:, :2].mean()
     assert error["trimmed"] < 0.5 * error["plain"] and error["kernel"] < 0.7 * error["plain"]
 
-    matcher = matching.point_to_line(**OPTIONS)
+    matcher = matching.point_to_line(IcpSettings(**OPTIONS))
     of, scan = (Points(*(part[0] for part in p)) for p in (REFERENCES, SCANS))
     pose, slope = jax.jit(
         lambda by: jax.jvp(
@@ -180,8 +203,15 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
          "expected N positions, rays and masks"),
         (lambda m, p: matching.match(m, p._replace(position=np.nan * p.position), p, np.zeros(3)),
          "expected finite points"),
-        (lambda m, p: matching.point_to_line(reach=0), "point_to_line: expected reach"),
-        (lambda m, p: matching.point_to_point(span=0), "point_to_point: expected span"),
+        (lambda m, p: matching.match(m, p, p, np.zeros(3), np.eye(3)), "expected a Prior"),
+        (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.zeros(2), np.eye(3))),
+         "expected a prior of a pose 3"),
+        (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.zeros(3), -np.eye(3))),
+         "positive semi-definite"),
+        (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.full(3, np.nan), np.eye(3))),
+         "expected a finite prior"),
+        (lambda m, p: IcpSettings(reach=0), "IcpSettings: expected reach"),
+        (lambda m, p: IcpSettings(span=0), "IcpSettings: expected span"),
         (lambda m, p: matching.field(scale=-1), "field: expected reach"),
         (lambda m, p: matching.correlative(block=0), "correlative: expected block"),
         (lambda m, p: matching.raster(p, 0.0, 1.0), "raster: expected resolution"),

@@ -7,15 +7,15 @@ from scanned_rooms import BEAMS, moved, pairs
 
 from jaxslam import matching, verify_jacobians
 from jaxslam.grids import Field
-from jaxslam.matching import MatchStatus, covariance
+from jaxslam.matching import IcpSettings, MatchStatus, Prior, covariance
 from jaxslam.matching.field import field_residuals
 from jaxslam.matching.points import Points
 from jaxslam.math.stats import chi2_band
 
 SIGMA, RUNS = 0.03, 60
 START_COV = np.diag([0.05, 0.05, 0.03]) ** 2
-LINES = matching.point_to_line(span=2, gap=0.8)
-POINTS = matching.point_to_point(span=2, gap=0.8, least_score=0.2)
+LINES = matching.point_to_line(IcpSettings(span=2, gap=0.8))
+POINTS = matching.point_to_point(IcpSettings(span=2, gap=0.8, least_score=0.2))
 WAYS = {
     "hessian": covariance.hessian(),
     "implicit": covariance.implicit(SIGMA),
@@ -57,6 +57,29 @@ def test_the_noise_through_lines_is_honest_and_others_are_not(by_lines):
     assert nees(found, covs["lattice"]) > high
     for cov in covs.values():
         assert np.all(np.linalg.eigvalsh(cov) > 0)
+
+
+def test_a_prior_tells_what_a_corridor_does_not():
+    """What two walls do not tell is known by the prior, and the covariance says so.
+
+    The prior along them is worth 0.01²/0.01² = 1, beside some hundredths that the noise of 60 normals feigns.
+    """
+    references, scans, truth, _ = pairs(RUNS, seed=5, sigma=0.01, half=(1e3, 1.0))
+    for of in (references, scans):
+        of.valid[:] = np.abs(of.position).max(axis=2) < 4.5
+    cov = np.diag([0.01, 0.01, 0.03]) ** 2
+    expected = truth + np.random.default_rng(6).multivariate_normal(np.zeros(3), cov, RUNS)
+    information = np.tile(0.01**2 * np.linalg.inv(cov), (RUNS, 1, 1))
+    prior = Prior(expected, information)
+    found = matching.match(LINES, references, scans, expected, prior)
+    claimed = covariance.covariance(
+        covariance.implicit(0.01), LINES, references, scans, found, expected, jax.random.key(0)
+    )
+    error, claimed = np.asarray(found.pose) - truth, np.asarray(claimed)
+    low, high = chi2_band(3, RUNS, 0.999)
+    assert low < np.einsum("ri,rij,rj->", error, np.linalg.inv(claimed), error) / RUNS < high
+    along = np.linalg.eigvalsh(claimed[:, :2, :2])[:, 1]
+    assert 0.008 < np.sqrt(np.median(along)) < 0.0101
 
 
 def test_points_with_their_partners_kept_feign_information():

@@ -52,7 +52,9 @@ def closed(
     total = poses.along(at, covs)
     middle = index[:: max(settings.submap_every, 1)]
     usable = scans.usable[keyframe]
-    looks = descriptors(scans.points[keyframe], scans.valid[keyframe])
+    looks = descriptors(
+        *(np.asarray(part)[keyframe] for part in (scans.points.position, scans.points.valid))
+    )
     graph = graph_of(at, keyframe, chain)
     tried: list[Candidates] = []
     found: list[Matches] = []
@@ -61,14 +63,13 @@ def closed(
     loops, kept = _agreeing(tried, found, at, total, settings)
     for turn in range(settings.rounds if len(keyframe) > settings.loop_gap else 0):
         path = np.asarray(graph.poses, np.float64)
-        pairs = near(path, middle, usable, settings.loop_reach + WIDE.distance, settings.loop_gap)
+        pairs = near(path, middle, usable, settings.loop_reach + WIDE[0], settings.loop_gap)
         cov = (
             poses.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
             if turn == 0 or not len(pairs)
             else relative(graph, pairs)
         )
-        windows = [(w.distance, w.turns * w.turn) for w in (NARROW, WIDE)]
-        new = by_place(path, pairs, cov, done, ends, settings, windows[0], windows[1])
+        new = by_place(path, pairs, cov, done, ends, settings, NARROW, WIDE)
         if turn == 0 and settings.appearance:
             new = _with(new, by_appearance(looks, middle, usable, settings))
         done |= set(zip(new.first.tolist(), new.second.tolist(), new.wide.tolist(), strict=True))

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -11,17 +10,24 @@ from jaxslam import programs
 from jaxslam.laser_slam import poses
 from jaxslam.laser_slam.loops.candidates import Candidates
 from jaxslam.laser_slam.records import LoopOutcome
+from jaxslam.laser_slam.reference import (
+    PEAK,
+    Reference,
+    gathered,
+    on_walls,
+    search,
+    searched,
+    taken,
+    thinned,
+)
 from jaxslam.laser_slam.scans import Scans
-from jaxslam.laser_slam.search import Reference, Window, correlate, fit_lines, gathered, tables
 from jaxslam.laser_slam.settings import Settings
+from jaxslam.matching import Match, Matcher, MatchStatus, Points
+from jaxslam.matching.surface import Surface
 
-NARROW = Window(turns=7, turn=float(np.deg2rad(2.0)), blocks=2, level=2, kept=64)
-"""0.8 m and 14° to either side."""
-WIDE = Window(turns=20, turn=float(np.deg2rad(2.0)), blocks=5, level=3, kept=256)
-"""4 m and 40° to either side."""
-LEVELS = 3
-PEAK = 0.9
-"""A pose elsewhere of this share of the best score makes a match ambiguous."""
+NARROW, WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
+"""Windows of the search, [m] and [rad] to either side."""
+SEARCHES = [search(*window, np.deg2rad(2.0), ambiguous=PEAK) for window in (NARROW, WIDE)]
 
 
 class Matches(NamedTuple):
@@ -48,16 +54,15 @@ def matched(
     z, cov = np.zeros((count, 3)), np.zeros((count, 3, 3))
     score, outcome = np.zeros(count), np.zeros(count, int)
     for middle in np.unique(candidates.first):
-        submap, levels = _submap(scans, keyframe, path, int(middle), settings)
+        submap, prepared = _submap(scans, keyframe, path, int(middle), settings)
         for row in np.flatnonzero(candidates.first == middle):
             scan = keyframe[candidates.second[row]]
-            fit, best, other = programs.call(
-                _in_wide if candidates.wide[row] else _in_narrow,
-                (),
+            fit, status = programs.call(
+                _matched,
+                (SEARCHES[int(candidates.wide[row])],),
                 submap,
-                levels,
-                scans.points[scan],
-                scans.valid[scan],
+                prepared,
+                taken(scans.points, scan),
                 candidates.z[row].astype(np.float32),
             )
             z[row] = np.asarray(fit.pose, np.float64)
@@ -65,7 +70,7 @@ def matched(
             score[row] = fit.inliers
             if fit.inliers < settings.loop_inliers:
                 outcome[row] = LoopOutcome.POOR
-            elif float(other) > PEAK * float(best):
+            elif int(status) == MatchStatus.AMBIGUOUS:
                 outcome[row] = LoopOutcome.AMBIGUOUS
             progress()
     return Matches(z, cov, score, outcome)
@@ -83,33 +88,27 @@ def _submap(
     around = np.clip(around, 0, len(keyframe) - 1)
     there = poses.between(path[middle], path[around]).astype(np.float32)
     of = keyframe[around]
-    return programs.call(
-        _prepare, (), scans.points[of], scans.normals[of], scans.valid[of] & inside[:, None], there
-    )
+    points = taken(scans.points, of)
+    points = points._replace(valid=points.valid & inside[:, None])
+    return programs.call(_prepare, (), points, taken(scans.surface, of), there)
 
 
 def _cov(fit: Any, settings: Settings) -> Float[np.ndarray, "3 3"]:
     """Of the coordinates of a match: by its lines, and by the window where these say nothing."""
     sigma = max(settings.sigma, float(fit.residual)) ** 2 * settings.correlation
-    edges = np.diag(1 / np.square([WIDE.distance, WIDE.distance, WIDE.turns * WIDE.turn]))
-    cov = np.linalg.inv(np.asarray(fit.information, np.float64) / sigma + edges)
+    edges = np.diag(1 / np.square([WIDE[0], *WIDE]))
+    cov = np.linalg.inv(poses.semidefinite(np.asarray(fit.information)) / sigma + edges)
     return np.asarray(cov + np.diag(np.square(settings.floor)))
 
 
-def _prepare(points: Array, normals: Array, valid: Array, there: Array) -> tuple[Reference, Any]:
-    reference = gathered(points, normals, valid, there)
-    return reference, tables(reference, LEVELS)
+def _prepare(points: Points, surface: Surface, there: Array) -> tuple[Reference, Any]:
+    reference = gathered(points, surface, there)
+    return reference, searched(SEARCHES[0], reference)
 
 
-def _in(window: Window, submap: Reference, levels: Any, scan: Array, valid: Array, z: Array) -> Any:
-    nothing = jnp.zeros((3, 3), jnp.float32)
-    found = correlate(levels, scan[::2], valid[::2], z, nothing, window)
-    return fit_lines(submap, scan, valid, found.pose, z, nothing), found.score, found.other
-
-
-def _in_narrow(submap: Reference, levels: Any, scan: Array, valid: Array, z: Array) -> Any:
-    return _in(NARROW, submap, levels, scan, valid, z)
-
-
-def _in_wide(submap: Reference, levels: Any, scan: Array, valid: Array, z: Array) -> Any:
-    return _in(WIDE, submap, levels, scan, valid, z)
+def _matched(
+    matcher: Matcher, submap: Reference, prepared: Any, scan: Points, z: Array
+) -> tuple[Match, Array]:
+    """By walls, from where a search ends; and the status of the search."""
+    found = matcher.match(prepared, thinned(scan), z, None)
+    return on_walls(submap, scan, found.pose, None), found.status

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam.matching.covariance.record import MatchCovariance, check_sigma, inverse_of
+from jaxslam.matching.covariance.record import MatchCovariance, check_sigma, inverse_of, of_prior
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import information_of
 from jaxslam.matching.points import Points
@@ -27,7 +27,7 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
 
         B = σ² (Σ_i w_i² (n·R u_i)² J_i J_iᵀ + Σ_j (n_j·u_j)² s_j s_jᵀ),
 
-    s_j the sum of w_i J_i over the partners i of j.
+    s_j the sum of w_i J_i over the partners i of j. A prior adds Λ to A and σ² Λ to B.
 
     References are `Points`.
 
@@ -58,7 +58,8 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
         of_partner = jax.ops.segment_sum(weight[:, None] * jacobian, j, len(reference.valid))
         by_reference = (lines.normal * reference.ray).sum(axis=1)[:, None] * of_partner
         noise = by_scan.T @ by_scan + by_reference.T @ by_reference
+        shape = shape + of_prior(found)
         gain = inverse_of(shape, shape, sigma=sigma)
-        return jnp.asarray(sigma) ** 2 * gain @ noise @ gain
+        return jnp.asarray(sigma) ** 2 * gain @ (noise + of_prior(found)) @ gain
 
     return MatchCovariance("along_normals", of)

@@ -5,13 +5,13 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.matching.covariance.record import MatchCovariance, curvature, inverse_of
+from jaxslam.matching.covariance.record import MatchCovariance, curvature, inverse_of, of_prior
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.points import Points
 
 
 def hessian() -> MatchCovariance:
-    """s² (∂²E/∂x²)⁻¹ with E = ½ Σ w e² and s² = 2E/(n - 3) of n pairs.
+    """s² (∂²E/∂x²)⁻¹ with E = ½ Σ w e² and s² = 2E/(n - 3) of n pairs; 2E/n with a prior.
 
     Right for independent residuals of one variance that the pairs do not follow. Two scans of
     different density, and pairs that change with the pose, break that.
@@ -24,9 +24,9 @@ def hessian() -> MatchCovariance:
     ) -> Float[Array, "3 3"]:
         del start, key
         prepared = matcher.prepare(reference)
-        count = (found.weight > 0).sum()
-        least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(count - 3, 1)
+        free = (found.weight > 0).sum() - (3 if found.prior is None else 0)
+        least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(free, 1)
         shape = curvature(matcher, prepared, points, found)
-        return least * inverse_of(shape, found.information)
+        return least * inverse_of(shape, found.information + of_prior(found))
 
     return MatchCovariance("hessian", of)

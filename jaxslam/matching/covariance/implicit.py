@@ -12,6 +12,7 @@ from jaxslam.matching.covariance.record import (
     check_sigma,
     curvature,
     inverse_of,
+    of_prior,
     range_count,
     with_ranges,
 )
@@ -24,7 +25,8 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
 
     From ∂E/∂x = 0 at the minimum: dx/dz = -(∂²E/∂x²)⁻¹ ∂²E/∂z∂x. The derivatives are those of the
     matcher's cost by automatic differentiation, through the lines that are fitted to the reference;
-    pairs and weights are kept. Of a grid only the noise of the scan counts.
+    pairs and weights are kept. Of a grid only the noise of the scan counts. A prior adds the noise
+    of its pose, σ² Λ in the middle.
     Where pairs follow the scan, as those of point-to-point along a wall, keeping them feigns
     information (Bonnabel et al. 2016; see `along_normals`).
 
@@ -54,7 +56,8 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
         zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)
         by_ranges = jnp.concatenate(jax.jacrev(slope, argnums=(0, 1))(*zeros), axis=1)
         shape = curvature(matcher, prepared, points, found)
-        gain = inverse_of(shape, found.information, sigma=sigma) @ by_ranges
-        return jnp.asarray(sigma) ** 2 * gain @ gain.T
+        gain = inverse_of(shape, found.information + of_prior(found), sigma=sigma)
+        noise = by_ranges @ by_ranges.T + of_prior(found)
+        return jnp.asarray(sigma) ** 2 * gain @ noise @ gain.T
 
     return MatchCovariance("implicit", of)

@@ -13,6 +13,7 @@ from jaxslam.matching.covariance.record import (
     check_sigma,
     curvature,
     inverse_of,
+    of_prior,
 )
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.points import Points
@@ -33,7 +34,7 @@ def lattice(
 
     Args:
         sigma: standard deviation of a residual [m].
-        window, turn_window: standard deviations of a prior [m], [rad].
+        window, turn_window: standard deviations of a prior [m], [rad], beside that of the match.
         steps: along each axis.
     """
     check_sigma("lattice", sigma)
@@ -55,7 +56,7 @@ def lattice(
         bound = jnp.diag(jnp.asarray(prior, dtype))
         variance = jnp.asarray(sigma) ** 2
         shape = curvature(matcher, prepared, points, found) / variance + bound
-        peak = inverse_of(shape, found.information / variance + bound)
+        peak = inverse_of(shape, (found.information + of_prior(found)) / variance + bound)
         root = linalg.cholesky(peak)[0]
         offset = jnp.asarray(grid, dtype) @ root.T
 

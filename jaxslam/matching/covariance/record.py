@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jaxslam import programs
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.points import Points, moved_along_rays
+from jaxslam.matching.prior import prior_information
 from jaxslam.math import linalg
 from jaxslam.validation.numbers import is_concrete
 
@@ -88,6 +89,11 @@ def curvature(matcher: Matcher, prepared: Any, points: Points, found: Match) -> 
     """∂²E/∂x² (3, 3) of the matcher's cost at the pose, pairs and weights kept."""
     by_pose = jax.hessian(lambda pose: matcher.cost(prepared, points, pose, found))
     return jnp.asarray(by_pose(found.pose))
+
+
+def of_prior(found: Match) -> Float[Array, "3 3"]:
+    """Λ of the prior of a match, zeros without one: σ² Λ is the noise of the cost's slope by it."""
+    return prior_information(found.prior, found.information)
 
 
 def with_ranges(reference: Any, by: Float[Array, "M"]) -> Any:

@@ -42,7 +42,9 @@ def unscented(sigma: ArrayLike, start_cov: Any) -> MatchCovariance:
         root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
         sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
         prepared = matcher.prepare(reference)
-        ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off).pose)(sides)
+        ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off, found.prior).pose)(
+            sides
+        )
         apart = _apart(ends, found.pose)
         return apart.T @ apart / 6 + of_noise.of(matcher, reference, points, found, start, key)
 
@@ -52,9 +54,9 @@ def unscented(sigma: ArrayLike, start_cov: Any) -> MatchCovariance:
 def sampling(sigma: ArrayLike, start_cov: Any, samples: int = 30) -> MatchCovariance:
     """The second moment about the match of matches with noise added, from starts that are drawn.
 
-    Noise N(0, σ²) is added to the ranges of both scans (of a grid: to those of the scan), and
-    N(0, start_cov) to the start. The scans have noise already, so partners lie a little farther
-    apart than in the truth.
+    Noise N(0, σ²) is added to the ranges of both scans (of a grid: to those of the scan),
+    N(0, start_cov) to the start, and N(0, σ² Λ⁻¹) to the pose of a prior. The scans have noise
+    already, so partners lie a little farther apart than in the truth.
 
     Args:
         sigma: standard deviation of a range [m].
@@ -71,7 +73,7 @@ def sampling(sigma: ArrayLike, start_cov: Any, samples: int = 30) -> MatchCovari
         root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
 
         def one(key: Array) -> Array:
-            key_reference, key_scan, key_start = jax.random.split(key, 3)
+            key_reference, key_scan, key_start, key_prior = jax.random.split(key, 4)
             dtype = start.dtype
             other = reference
             if isinstance(reference, Points):
@@ -81,13 +83,25 @@ def sampling(sigma: ArrayLike, start_cov: Any, samples: int = 30) -> MatchCovari
                 points, jnp.asarray(sigma) * jax.random.normal(key_scan, points.valid.shape, dtype)
             )
             begin = start + root @ jax.random.normal(key_start, (3,), dtype)
-            return matcher.match(matcher.prepare(other), scan, begin).pose
+            prior = found.prior
+            if prior is not None:
+                spread = jnp.asarray(sigma) * _inverse_root(prior.information)
+                drawn = spread @ jax.random.normal(key_prior, (3,), dtype)
+                prior = prior._replace(pose=prior.pose + drawn)
+            return matcher.match(matcher.prepare(other), scan, begin, prior).pose
 
         ends = jax.vmap(one)(jax.random.split(key, samples))
         apart = _apart(ends, found.pose)
         return apart.T @ apart / samples
 
     return MatchCovariance("sampling", of)
+
+
+def _inverse_root(information: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Wᵀ with WᵀW = Λ⁻¹; of a share 1e-6 of the trace along what Λ does not determine."""
+    floor = 1e-6 * jnp.trace(information)
+    floor = jnp.where(floor > 0, floor, 1.0) * jnp.eye(3, dtype=information.dtype)
+    return linalg.whitener(linalg.symmetrize(information) + floor)[0].T
 
 
 def _apart(poses: Float[Array, "S 3"], middle: Float[Array, "3"]) -> Float[Array, "S 3"]:

@@ -1,0 +1,38 @@
+"""What is known of a pose before its scan is matched: a term of the cost."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.math.angles import wrap
+
+
+class Prior(NamedTuple):
+    """A pose that is expected: ½ eᵀ Λ e is added to ½ Σ w r², e = (x - x₀, y - y₀, θ - θ₀)."""
+
+    pose: Float[Array, "3"]
+    """(x₀, y₀, θ₀) in the frame of the reference"""
+    information: Float[Array, "3 3"]
+    """Λ = σ² P₀⁻¹, P₀ the covariance of (x₀, y₀, θ₀) and σ [m] that of a residual r; may be
+    singular"""
+
+    def error(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        """e, with the angle in (-π, π]."""
+        off = pose - self.pose
+        return jnp.concatenate([off[:2], wrap(off[2:])])
+
+    def cost(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
+        """½ eᵀ Λ e."""
+        e = self.error(pose)
+        return 0.5 * e @ (self.information @ e)
+
+
+def prior_cost(prior: Prior | None, pose: Float[Array, "3"]) -> Float[Array, ""]:
+    """`Prior.cost`; 0 without a prior."""
+    return jnp.zeros((), pose.dtype) if prior is None else prior.cost(pose)
+
+
+def prior_information(prior: Prior | None, like: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Λ; zeros like another matrix without a prior."""
+    return jnp.zeros_like(like) if prior is None else prior.information
