@@ -64,21 +64,45 @@ def go(log):
     return driven(ekf, scenario, log)
 
 
+@cache
+def scans():
+    """(state, scan, what becomes of a landmark) where all three have measured: of new landmarks, and
+    of landmarks that are known."""
+    _, log = drawn()
+    scan = jax.tree.map(lambda leaf: leaf[10], log.scan)
+    assert (scan.valid[:4].any(), scan.valid[4:10].all(), scan.valid[10]) == (True,) * 3
+    known = go(log).final
+    empty = jax.tree.map(np.zeros_like, known)._replace(cov=np.eye(15) / 10)
+    return (empty, scan, Status.BORN), (known, scan, Status.FUSED)
+
+
+def places(scan, first, count, size=2):
+    """Those of a sensor of such measurements."""
+    own = jax.tree.map(lambda leaf: leaf[first : first + count], scan)
+    return own._replace(z=own.z[:, :size])
+
+
 def test_a_suite_of_one_is_the_sensor():
-    alone = ring(40)
-    one = dataclasses.replace(alone, sensor=suite((alone.sensor, 6)))
-    log = draw(alone, 0)[1]
-    a, b = (driven(ekf_slam(w.motion, w.sensor, 6), w, log) for w in (alone, one))
-    chex.assert_trees_all_close(a, b, rtol=0, atol=1e-12)
+    scenario, _ = estimated()
+    pair = [ekf_slam(scenario.motion, s, 6) for s in (EYES, suite((EYES, 4)))]
+
+    @jax.jit
+    def both(state, scan):
+        updates = [(each, *each.update(state, scan, jax.random.key(0))) for each in pair]
+        return [(after, info, each.estimate(after)) for each, after, info in updates]
+
+    for state, scan, status in scans():
+        own = places(scan, 0, 4)
+        a, b = both(state, own)
+        np.testing.assert_array_equal(a[1].status, np.where(own.valid, status, Status.EMPTY))
+        chex.assert_trees_all_close(a, b, rtol=0, atol=1e-12)
 
 
 def test_sensors_in_turn_are_filters_in_turn():
     """Each part by hand: the state of one filter handed to another, of its own sensor. In the chart
     whose basis turns the map; the others have a simpler one."""
     scenario, chart = world(), charts.right_invariant()
-    _, log = drawn()
     whole = ekf_slam(scenario.motion, scenario.sensor, 6, chart=chart)
-    trace = driven(whole, scenario, log)
     eyes, laser = (ekf_slam(scenario.motion, s, 6, chart=chart) for s in (EYES, LASER))
     # A compass among landmarks by hand: a sensor of points that ignores them.
     blind = dataclasses.replace(
@@ -99,22 +123,17 @@ def test_sensors_in_turn_are_filters_in_turn():
         ),
     )
 
-    def by_hand(log):
-        def step(state, row):
-            control, scan = row
-            state = eyes.predict(state, control, jax.random.key(0))
-            at = 0
-            for one, places, size in ((eyes, 4, 2), (laser, 6, 2), (heading, 1, 1)):
-                own = jax.tree.map(lambda leaf, a=at, n=places: leaf[a : a + n], scan)
-                state, _ = one.update(state, own._replace(z=own.z[:, :size]), jax.random.key(0))
-                at += places
-            return state, state
+    @jax.jit
+    def both(state, scan):
+        at_once, _ = whole.update(state, scan, jax.random.key(0))
+        for one, *own in ((eyes, 0, 4), (laser, 4, 6), (heading, 10, 1, 1)):
+            state, _ = one.update(state, places(scan, *own), jax.random.key(0))
+        return at_once, state
 
-        start = whole.init(jnp.asarray(scenario.pose), jnp.asarray(scenario.pose_cov))
-        return jax.lax.scan(step, start, log)[0]
-
-    state = jax.jit(by_hand)(log)
-    chex.assert_trees_all_close(trace.final[:3], state[:3], rtol=0, atol=1e-12)
+    for state, scan, _ in scans():
+        at_once, in_turn = both(state, scan)
+        assert np.abs(at_once.cov - state.cov).max() > 1e-6
+        chex.assert_trees_all_close(at_once, in_turn, rtol=0, atol=1e-12)
 
 
 def test_a_world_has_each_sensor_at_its_rate_and_in_its_places():
@@ -171,10 +190,7 @@ def test_more_sensors_know_more():
 def test_gradients_reach_every_part():
     """Of one scan of a map that is known, by every number of every sensor."""
     scenario, _ = estimated()
-    _, log = drawn()
-    state = go(log).final
-    scan = jax.tree.map(lambda leaf: leaf[10], log.scan)  # row 10: all three have measured
-    assert (scan.valid[:4].any(), scan.valid[4:10].all(), scan.valid[10]) == (True,) * 3
+    _, (state, scan, _) = scans()
 
     def loss(theta, state, scan):
         eyes = sensors.range_bearing(jnp.diag(theta[:2]) ** 2, mount=theta[4:7])
@@ -185,7 +201,7 @@ def test_gradients_reach_every_part():
         return ekf.update(state, scan, jax.random.key(0))[1].log_likelihood
 
     theta = np.array([0.05, 0.02, 0.03, 0.05, 0.1, 0.0, 0.3])
-    slope = jax.jit(jax.grad(loss))(theta, state, scan)
+    slope = jax.jit(jax.jacfwd(loss))(theta, state, scan)
     assert np.isfinite(slope).all()
     assert (np.asarray(slope) != 0).all()
 
