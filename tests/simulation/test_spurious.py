@@ -153,9 +153,8 @@ def ruined():
     parts = world.motion, world.sensor, 20
     manager = life.existence(lambda pose, landmark: jnp.asarray(True))
     filters = {
-        "trusting": ekf_slam(*parts, update="joint"),
-        "careful": ekf_slam(*parts, update="joint", associate=METHODS["nearest"]),
-        "with a life": pruning(ekf_slam(*parts, update="joint"), manager),
+        "trusting": ekf_slam(*parts),
+        "careful": pruning(ekf_slam(*parts, associate=METHODS["nearest"]), manager),
     }
     return monte_carlo(world, filters, 6, jax.random.key(0)).filters
 
@@ -172,7 +171,7 @@ def test_where_landmarks_are_far_apart_every_method_finds_them_without_tags(by_m
 
 def test_filters_with_and_without_a_life_share_a_campaign(ruined):
     """Their results differ in what no score reads: the programs that score them must not mix."""
-    assert [summary.counts["runs"] for summary in ruined.values()] == [6, 6, 6]
+    assert [summary.counts["runs"] for summary in ruined.values()] == [6, 6]
 
 
 def test_wrong_labels_ruin_a_filter_that_believes_them_and_no_other(ruined):
