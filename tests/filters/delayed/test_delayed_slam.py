@@ -462,12 +462,12 @@ def test_spurious_bearings_move_no_robot_and_empty_scans_neither(poor):
     assert (trace.estimate.pose.shape, trace.info.status.shape) == ((60, 3), (60, 0))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_float32_stays_float32(kind):
-    scenario, filter = small(kind)
-    trace = jax.eval_shape(partial(go, filter), narrow(draw(scenario, 1)[1]))
-    floats = [x for x in jax.tree.leaves(trace) if jnp.issubdtype(x.dtype, jnp.floating)]
-    assert all(x.dtype == np.float32 for x in floats)
+def test_float32_stays_float32(poor):
+    """Of bearings by runs of a full map, of ranges by their shapes alone."""
+    scenario, filter = small("circles")
+    ranges = jax.eval_shape(partial(go, filter), narrow(draw(scenario, 1)[1]))
+    for leaf in jax.tree.leaves((ranges, poor[-1])):
+        assert leaf.dtype == np.float32 or not jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
 def test_derivatives_reach_the_noise_and_are_finite():
