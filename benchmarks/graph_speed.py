@@ -12,13 +12,15 @@ out after that one would lower χ² by a few per cent more. Compilation and plan
 building of GTSAM's graph. Both are timed in turns; a time is the median, in seconds of the
 processor.
 
-The exponent is that of one step, linearization, factor and χ², over the first 500 to 10,000 poses
-of `city10000`, which have 1.2 to 2.1 edges a pose. The files are looked for in the folder
+The exponent is that of one step, linearization, factor and χ², from 500 to 10,000 poses: of a world
+of fixed connectivity (`lanes`), and of the first poses of `city10000`, which have 1.2 to 2.1 edges
+a pose, so that its exponent is also that of the fill. The files are looked for in the folder
 JAXSLAM_DATA, by default ../shared/data.
 """
 
 import resource
 import time
+from functools import partial
 
 import gtsam
 import jax
@@ -27,6 +29,7 @@ import numpy as np
 from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import graphs
+from jaxslam.math import se2
 
 FACTORS = {"relative_pose": graphs.relative_pose_log()}
 TOLERANCE = 5e-7
@@ -154,21 +157,45 @@ def first_poses(graph, size: int):
     )
 
 
-def growth(repeats: int) -> list[Metric]:
-    whole = graphs.with_gauge(graphs.read(DATA / "graphs" / "city10000.g2o"))
+def lanes(size: int, length: int = 20):
+    """A Manhattan world of fixed connectivity: two edges a pose, none longer than two lanes.
+
+    A robot drives lanes of so many steps of 1 m to and fro, side by side, and measures from each
+    pose the one beside it in the lane before; it starts along its odometry.
+    """
+    lane, step = np.divmod(np.arange(size), length)
+    up = lane % 2 == 0
+    x, y, theta = lane, np.where(up, step, length - 1 - step), np.where(up, 1, -1) * np.pi / 2
+    truth = np.stack([x, y, theta], axis=1).astype(float)
+    beside = np.arange(size) - 2 * step - 1
+    there = (beside >= 0) & (step > 0)
+    first = np.concatenate([np.arange(size - 1), beside[there]])
+    second = np.concatenate([np.arange(1, size), np.flatnonzero(there)])
+    sigma = np.array([0.02, 0.02, 0.01])
+    noise = sigma * np.random.default_rng(0).normal(size=(len(first), 3))
+    z = np.asarray(jax.jit(jax.vmap(se2.between))(truth[first], truth[second])) + noise
+    information = np.tile(np.diag(sigma**-2), (len(z), 1, 1))
+    table = graphs.Table(np.stack([first, second], axis=1), z, information, np.ones(len(z), bool))
+    no_points = np.zeros((0, 2)), {"relative_pose": table}, np.arange(size) == 0
+    ids = np.zeros(0, bool), np.arange(size), np.arange(0)
+    return graphs.starts.odometry(graphs.Graph(truth, *no_points, *ids))
+
+
+def growth(name: str, of_size, repeats: int, high: float = np.inf) -> Metric:
+    """The exponent of a step's time by the poses of a family of graphs."""
     times = []
     for size in SIZES:
-        graph = first_poses(whole, size)
+        graph = of_size(size)
         plan = graphs.plan(graph, FACTORS)
         go = jax.jit(lambda g: graphs.optimize(g, FACTORS, plan=plan, iterations=3, tolerance=0.0))
         graph = jax.device_put(graph)
         jax.block_until_ready(go(graph))
         seconds = np.median([processor_seconds(lambda: go(graph))[0] for _ in range(repeats)])
         times.append(seconds / 4)
-        edges = len(graph.tables["relative_pose"].z)
-        print(f"  {size:6} poses, {edges:6} edges: {1e3 * times[-1]:8.2f} ms a step")
+        edges, blocks = len(graph.tables["relative_pose"].z), len(plan.block_row)
+        print(f"  {size:6} poses, {edges:6} edges, {blocks:7} blocks: {1e3 * times[-1]:8.2f} ms")
     power = float(np.polyfit(np.log(SIZES), np.log(times), 1)[0])
-    return [Metric("city10000's first poses: step as a power of them", power, high=1.2)]
+    return Metric(f"{name}: a step as a power of the poses", power, high=high)
 
 
 def measure(repeats: int = 5) -> list[Metric]:
@@ -179,7 +206,11 @@ def measure(repeats: int = 5) -> list[Metric]:
     metrics = one_graph("input_M3500_g2o", 1.0, repeats)
     metrics += one_graph("city10000", 1.5, repeats)
     metrics += many_graphs(repeats)
-    metrics += growth(repeats)
+    print("a step in lanes, of fixed connectivity:")
+    metrics.append(growth("lanes", lanes, repeats, high=1.2))
+    print("a step over the first poses of city10000, whose connectivity grows:")
+    whole = graphs.with_gauge(graphs.read(DATA / "graphs" / "city10000.g2o"))
+    metrics.append(growth("city10000", partial(first_poses, whole), repeats))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return [*metrics, Metric("peak memory of the process [GB]", peak)]
 
