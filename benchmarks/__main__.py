@@ -103,7 +103,10 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "plaza": plaza.measure,
         "smoothing": lambda: smoothing.measure(10 if quick else 100),
         "graph_files": graph_files.measure,
-        "graph_consistency": lambda: measure_graphs(quick),
+        "graph_draws": lambda: measure_graphs(quick, ["draws"]),
+        "graph_kernels": lambda: measure_graphs(quick, ["kernels"]),
+        "graph_filters": lambda: measure_graphs(quick, ["filters"]),
+        "graph_bicocca": lambda: measure_graphs(quick, ["bicocca"]),
         "graph_speed": lambda: graph_speed.measure(3 if quick else 9),
         "fastslam": lambda: fastslam.measure(
             4 if quick else 20, (10, 100), drawn("fastslam_nees.png")

@@ -32,9 +32,9 @@ import numpy as np
 from benchmarks.gate import Metric, report
 from jaxslam import datasets, monte_carlo
 from jaxslam.filters import ekf_slam
+from jaxslam.graphs import Ending
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.smoothing import batch_map, smooth
-from jaxslam.smoothing.gauss_newton import Ending
 
 TOL = 1e-6
 ROWS = (

@@ -1,12 +1,13 @@
 """Is a graph honest about its own covariance?
 
-    python -m benchmarks.graph_consistency [--quick] [--part draws,kernels,filters] [--runs 100]
+    python -m benchmarks.graph_consistency [--quick] [--part draws,…] [--runs 40]
 
 - `draws`: many draws of the Manhattan world at its true poses (with --quick, or without the data, a
   square of 100 poses), noise as the file has it, times 1, 3 and 10 (`monte_carlo`);
 - `kernels`: robust kernels at 0 to 50 % false loop closures (`kernels`);
 - `filters`: filters, the fixed-lag smoother and the graph on the same draws of `circle`, `loop` and
-  `webmap` (`filters`).
+  `webmap` (`filters`);
+- `bicocca`: robust kernels and GTSAM's graduated non-convexity on a real path (`bicocca`).
 
 Figures: benchmarks/figures/graph_draws.png, graph_kernels.png, graph_filters_*.png.
 """
@@ -16,15 +17,15 @@ import argparse
 import jax
 
 from benchmarks.gate import Metric, report
-from benchmarks.graph_consistency import figures, kernels
+from benchmarks.graph_consistency import bicocca, figures, kernels
 from benchmarks.graph_consistency.filters import campaigns
 from benchmarks.graph_consistency.monte_carlo import SCALES, draws, summary
 from benchmarks.graph_consistency.worlds import MANHATTAN, manhattan, ring
 
-PARTS = ("draws", "kernels", "filters")
+PARTS = ("draws", "kernels", "filters", "bicocca")
 
 
-def measure(quick=False, parts=PARTS, runs=100):
+def measure(quick=False, parts=PARTS, runs=40):
     """The metrics of the chosen parts, which print their tables and draw their figures; runs: of
     the Manhattan world."""
     there = MANHATTAN.exists() and not quick
@@ -35,6 +36,8 @@ def measure(quick=False, parts=PARTS, runs=100):
         metrics += _kernels(ring() if quick else ring(200, 40), 4 if quick else 20)
     if "filters" in parts:
         metrics += _filters(10 if quick else 50, 100 if quick else None)
+    if "bicocca" in parts and bicocca.GRAPH.exists() and not quick:
+        metrics += _bicocca()
     return metrics
 
 
@@ -98,11 +101,25 @@ def _filters(runs, steps):
     return metrics
 
 
+def _bicocca():
+    metrics = []
+    for share in (0.0, 0.5):
+        found = bicocca.compare(share)
+        _table(found, "")
+        ours, theirs = found["truncated"], found["GTSAM's GNC"]
+        gap = ours["position RMSE [m]"] / theirs["position RMSE [m]"]
+        name = f"Bicocca 25b, {share:.0%} false"
+        metrics.append(Metric(f"{name}: position RMSE, truncated / GTSAM's GNC", gap, high=1.05))
+        if share:
+            metrics.append(Metric(f"{name}: false loops kept", ours["false loops kept"]))
+    return metrics
+
+
 def _table(rows, head):
     """Print figures of merit, a column for each row of {label: {name: value}}."""
     names = list(next(iter(rows.values())))
     width = max(map(len, [*names, head]))
-    print(f"{head:{width}}" + "".join(f"{label:>12g}" for label in rows))
+    print(f"{head:{width}}" + "".join(f"{label!s:>12}" for label in rows))
     for name in names:
         print(f"{name:{width}}" + "".join(f"{row[name]:>12.4g}" for row in rows.values()))
 
@@ -111,7 +128,7 @@ def main():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.graph_consistency")
     parser.add_argument("--quick", action="store_true", help="a small graph and few runs")
     parser.add_argument("--part", default=",".join(PARTS), help="some of " + ", ".join(PARTS))
-    parser.add_argument("--runs", type=int, default=100, help="draws of the Manhattan world")
+    parser.add_argument("--runs", type=int, default=40, help="draws of the Manhattan world")
     options = parser.parse_args()
     asked = options.part.split(",")
     if unknown := set(asked) - set(PARTS):

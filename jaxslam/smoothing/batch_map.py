@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.graphs.solver.search import Ending
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.smoothing.chain import Chain
@@ -18,7 +19,7 @@ from jaxslam.smoothing.forward_pass import (
     in_one_dtype,
     run_forward,
 )
-from jaxslam.smoothing.gauss_newton import Ending, Iterations, minimize
+from jaxslam.smoothing.gauss_newton import Iterations, minimize
 from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
 from jaxslam.smoothing.problem import Iterate, Problem
 from jaxslam.smoothing.smooth import solution, with_singular
@@ -52,7 +53,7 @@ class BatchSolution(NamedTuple):
     step: Float[Array, ""]
     """length of the next step, in posterior standard deviations"""
     ending: Int[Array, ""]
-    """see `gauss_newton.Ending`"""
+    """a `graphs.Ending`: converged, stalled or exhausted"""
 
 
 def batch_map(
@@ -86,6 +87,12 @@ def batch_map(
     and a `BatchSolution`. Every measurement is used that the filter fused or initialized a landmark
     with, except those of a singular R, whose status becomes `Status.SINGULAR`. Where Q depends on
     the pose, it is evaluated once at the filter's path.
+
+    The graph of the log (`graphs.of_log`) has the same optimum where the noises of a motion are
+    three and not singular. It does not stand in for this one: its sparse plan needs to know on the
+    host which landmark each measurement is of, and in a campaign the association of the run says
+    it; its unknowns are poses, between which a motion of two noises, or of singular Q, has no
+    finite information.
 
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`. The sensor must determine its

@@ -1,12 +1,12 @@
 """Gauss-Newton with line search on the problem of a path and a map."""
 
-from enum import IntEnum
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.graphs.solver.search import Ending
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.smoothing.chain import Chain, Policy, eliminate
 from jaxslam.smoothing.problem import Iterate, Problem, cost, linearize_at, roll_out
@@ -16,17 +16,6 @@ _SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
 
 _ARMIJO = 1e-4
 """least share of the decrease predicted by the gradient (Armijo)."""
-
-
-class Ending(IntEnum):
-    """The reason for the end of the iterations."""
-
-    CONVERGED = 0
-    """The next step is shorter than the tolerance, or rounding."""
-    EXHAUSTED = 1
-    """All iterations were made."""
-    STALLED = 2
-    """No share of the step lowers the cost: rounding, or a model whose derivatives are wrong."""
 
 
 class Iterations(NamedTuple):

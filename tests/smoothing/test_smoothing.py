@@ -12,10 +12,10 @@ from reference import ekf_slam as plain
 from worlds import ring
 
 from jaxslam import filters, motion, run, sensors, simulate
+from jaxslam.graphs import Ending
 from jaxslam.math.stats import chi2_band
 from jaxslam.protocols import Free, Motion, Sensor
 from jaxslam.smoothing import batch_map, smooth
-from jaxslam.smoothing.gauss_newton import Ending
 from jaxslam.types import Log, Scan, Status
 
 KEY = jax.random.key(0)
