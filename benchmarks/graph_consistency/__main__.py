@@ -35,7 +35,7 @@ def measure(quick=False, parts=PARTS, runs=40):
     if "kernels" in parts:
         metrics += _kernels(ring() if quick else ring(200, 40), 4 if quick else 20)
     if "filters" in parts:
-        metrics += _filters(10 if quick else 50, 100 if quick else None)
+        metrics += _filters(10 if quick else 20, 100 if quick else None)
     if "bicocca" in parts and bicocca.GRAPH.exists() and not quick:
         metrics += _bicocca()
     return metrics

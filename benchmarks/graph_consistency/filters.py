@@ -11,7 +11,7 @@ WORLDS = {"circle": circle, "loop": loop, "webmap": webmap}
 FILTERS = ("ekf", "fej", "oc", "right_invariant", "fixed_lag", "fixed_lag_fej", "batch_map")
 
 
-def campaigns(runs=50, steps=None, names=tuple(WORLDS)):
+def campaigns(runs=20, steps=None, names=tuple(WORLDS)):
     """{world: campaign} of the filters and `batch_map`, the graph of the log."""
     found = {}
     for name in names:
