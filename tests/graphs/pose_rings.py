@@ -60,20 +60,16 @@ def dense(graph, steps=15):
     table, poses = graph.tables["relative_pose"], np.array(graph.poses)
     i, j = np.asarray(table.who).T
     for step in range(steps + 1):
-        e = between(table.z, between(poses[i], poses[j]))
+        e, row = between(table.z, between(poses[i], poses[j])), np.arange(len(i))
+        c, s = np.cos(poses[i, 2] + table.z[:, 2]), np.sin(poses[i, 2] + table.z[:, 2])
+        dx, dy = (poses[j] - poses[i])[:, :2].T
         jacobian = np.zeros((len(i), 3, len(poses), 3))
-        for k in range(len(i)):
-            h = 1e-6
-            for who in (i[k], j[k]):
-                for c in range(3):
-                    low, high = poses.copy(), poses.copy()
-                    low[who, c] -= h
-                    high[who, c] += h
-                    up = between(table.z[k], between(high[i[k]], high[j[k]]))
-                    down = between(table.z[k], between(low[i[k]], low[j[k]]))
-                    slope = up - down
-                    slope[2] = wrap(slope[2])
-                    jacobian[k, :, who, c] = slope / (2 * h)
+        for r, by_second in enumerate(([c, s, 0 * c], [-s, c, 0 * c], [0 * c, 0 * c, 1 + 0 * c])):
+            for k, slope in enumerate(by_second):
+                jacobian[row, r, j, k] += slope
+                jacobian[row, r, i, k] -= slope
+        jacobian[row, 0, i, 2] += c * dy - s * dx
+        jacobian[row, 1, i, 2] -= c * dx + s * dy
         jacobian = jacobian[:, :, 1:].reshape(len(i), 3, -1)
         hessian = np.einsum("era,ers,esb->ab", jacobian, table.information, jacobian)
         gradient = np.einsum("era,ers,es->a", jacobian, table.information, e)

@@ -15,8 +15,8 @@ def test_marginals_are_the_blocks_of_the_dense_inverse():
     cov[1:, :, 1:] = np.linalg.inv(information).reshape(SIZE - 1, 3, SIZE - 1, 3)
     scale = np.abs(cov).max()
     for k in range(SIZE):
-        np.testing.assert_allclose(found.poses[k], cov[k, :, k], atol=1e-8 * scale)
+        np.testing.assert_allclose(found.poses[k], cov[k, :, k], atol=1e-9 * scale)
     for joint, (a, b) in zip(found.pairs, pairs, strict=True):
         both = [[cov[a, :, a], cov[a, :, b]], [cov[b, :, a], cov[b, :, b]]]
-        np.testing.assert_allclose(joint, np.array(both), atol=1e-8 * scale)
+        np.testing.assert_allclose(joint, np.array(both), atol=1e-9 * scale)
     assert found.singular == -1
