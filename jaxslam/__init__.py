@@ -6,7 +6,7 @@ configuration of JAX; for float64 set `jax_enable_x64` yourself, as the command 
 """
 
 import importlib
-from typing import Any
+from types import ModuleType
 
 from jaxslam import (
     association,
@@ -87,7 +87,7 @@ _ON_DEMAND = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> ModuleType:
     """A lazily imported module: modules that read files or plot load on first access."""
     if name in _ON_DEMAND:
         return importlib.import_module(_ON_DEMAND[name])

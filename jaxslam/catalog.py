@@ -7,7 +7,7 @@ line run them side by side.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jaxslam.charts.right_invariant import right_invariant
 from jaxslam.charts.robocentric import robocentric
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.observability import monitored
+from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.filters.information.eif_slam import eif_slam
 from jaxslam.filters.information.eseif import eseif
 from jaxslam.filters.information.seif import seif
@@ -37,7 +38,7 @@ from jaxslam.smoothing.fixed_lag import fixed_lag
 from jaxslam.types import Info, Scan, Truth
 
 
-def variant(scenario: Scenario, *, watch: bool = False, **options: Any) -> Filter:
+def variant(scenario: Scenario, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:
     """EKF-SLAM with the scenario's options, which these arguments of `filters.ekf_slam` replace.
 
     watch: with an observability monitor (`filters.monitored`).
@@ -49,39 +50,52 @@ def variant(scenario: Scenario, *, watch: bool = False, **options: Any) -> Filte
     return monitored(filter) if watch else filter
 
 
-def ideal(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
+def ideal(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
     """The ideal EKF, with Jacobians at the truth: a function of the truth that returns a filter."""
-    return lambda truth: variant(scenario, linearize=at_truth(truth), **options)
+    return lambda truth: variant(scenario, **(options | {"linearize": at_truth(truth)}))
 
 
-def without_measurements(scenario: Scenario, **options: Any) -> Filter:
+def without_measurements(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
     """Dead reckoning in a scenario; it has none of the options of `ekf_slam`."""
     return dead_reckoning(scenario.motion, scenario.sensor)
 
 
-def in_a_known_map(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
+def in_a_known_map(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
     """Localization in the true map, with those options of `ekf_slam` that it has."""
     asked = scenario.filter_options | options
-    mine = {name: asked[name] for name in ("update", "gate", "iterations") if name in asked}
-    return lambda truth: localization(scenario.motion, scenario.sensor, truth.landmarks, **mine)
-
-
-def by_particles(
-    scenario: Scenario, proposal: Literal["motion", "measurement"], **options: Any
-) -> Filter:
-    """FastSLAM of 50 particles, with those options of `ekf_slam` that it has."""
-    asked = scenario.filter_options | options
-    mine = {name: asked[name] for name in ("gate", "associate", "births") if name in asked}
-    capacity = int(np.shape(scenario.landmarks)[0])
-    return fastslam(
-        scenario.motion, scenario.sensor, capacity, SLAM_PARTICLES, proposal=proposal, **mine
+    return lambda truth: localization(
+        scenario.motion,
+        scenario.sensor,
+        truth.landmarks,
+        update=asked.get("update", "sequential"),
+        gate=asked.get("gate"),
+        iterations=asked.get("iterations", 1),
     )
 
 
-def by_particles_in_a_known_map(scenario: Scenario, **options: Any) -> Callable[[Truth], Filter]:
+def by_particles(
+    scenario: Scenario, proposal: Literal["motion", "measurement"], **options: Unpack[EkfOptions]
+) -> Filter:
+    """FastSLAM of 50 particles, with those options of `ekf_slam` that it has."""
+    asked = scenario.filter_options | options
+    capacity = int(np.shape(scenario.landmarks)[0])
+    return fastslam(
+        scenario.motion,
+        scenario.sensor,
+        capacity,
+        SLAM_PARTICLES,
+        proposal=proposal,
+        gate=asked.get("gate"),
+        associate=asked.get("associate"),
+        births=asked.get("births"),
+    )
+
+
+def by_particles_in_a_known_map(
+    scenario: Scenario, **options: Unpack[EkfOptions]
+) -> Callable[[Truth], Filter]:
     """Monte-Carlo localization in the true map, of 300 particles; options as above."""
     asked = scenario.filter_options | options
-    mine = {name: asked[name] for name in ("gate", "associate") if name in asked}
     count = LOCALIZATION_PARTICLES
     return lambda truth: particle_localization(
         scenario.motion,
@@ -90,14 +104,16 @@ def by_particles_in_a_known_map(scenario: Scenario, **options: Any) -> Callable[
         count,
         least=count,
         threshold=0.5,
-        **mine,
+        gate=asked.get("gate"),
+        associate=asked.get("associate"),
     )
 
 
-def in_a_window(scenario: Scenario, *, first_estimates: bool = False, **options: Any) -> Filter:
+def in_a_window(
+    scenario: Scenario, *, first_estimates: bool = False, **options: Unpack[EkfOptions]
+) -> Filter:
     """The fixed-lag smoother of 5 steps, with those options of `ekf_slam` that it has."""
     asked = scenario.filter_options | options
-    mine = {name: asked[name] for name in ("gate", "associate", "births") if name in asked}
     capacity = int(np.shape(scenario.landmarks)[0])
     false = 0 if scenario.spurious is None else scenario.spurious.places
     return fixed_lag(
@@ -107,18 +123,27 @@ def in_a_window(scenario: Scenario, *, first_estimates: bool = False, **options:
         (scenario.places or capacity) + false,
         window=WINDOW,
         first_estimates=first_estimates,
-        **mine,
+        gate=asked.get("gate"),
+        associate=asked.get("associate"),
+        births=asked.get("births"),
     )
 
 
-def in_one_batch(scenario: Scenario, **options: Any) -> Callable[[Truth], Estimator]:
+def in_one_batch(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Estimator]:
     """The graph of the whole log (`smoothing.batch_map`), with those options of `ekf_slam` that it
     has: a function of the truth, which it does not use, that returns the estimator."""
     asked = scenario.filter_options | options
-    mine = {name: asked[name] for name in ("gate", "associate", "births") if name in asked}
     capacity = int(np.shape(scenario.landmarks)[0])
     start = np.asarray(scenario.pose), np.asarray(scenario.pose_cov)
-    return lambda truth: batch_map(scenario.motion, scenario.sensor, capacity, *start, **mine)
+    return lambda truth: batch_map(
+        scenario.motion,
+        scenario.sensor,
+        capacity,
+        *start,
+        gate=asked.get("gate"),
+        associate=asked.get("associate"),
+        births=asked.get("births"),
+    )
 
 
 WINDOW = 5
@@ -132,7 +157,10 @@ LOCALIZATION_PARTICLES = 300
 
 
 def in_canonical_form(
-    scenario: Scenario, make: Callable[..., Filter], sparse: bool = True, **options: Any
+    scenario: Scenario,
+    make: Callable[..., Filter],
+    sparse: bool = True,
+    **options: Unpack[EkfOptions],
 ) -> Filter:
     """An information filter in a scenario; of the options of `ekf_slam` it takes the gate.
 
@@ -145,12 +173,19 @@ def in_canonical_form(
     """
     count = int(np.shape(scenario.landmarks)[0])
     asked = scenario.filter_options | options
-    mine: dict[str, Any] = {name: asked[name] for name in ("gate",) if name in asked}
+    gate = asked.get("gate")
     if not sparse:
-        return make(scenario.motion, scenario.sensor, count, **mine)
+        return make(scenario.motion, scenario.sensor, count, gate=gate)
     active = min(max(min(LARGEST_AREA, count // 2), LEAST_AREA), count)
-    mine |= {"active": active, "links": max(1, count - 1), "whole": True}
-    filter = make(scenario.motion, scenario.sensor, count, **mine)
+    filter = make(
+        scenario.motion,
+        scenario.sensor,
+        count,
+        gate=gate,
+        active=active,
+        links=max(1, count - 1),
+        whole=True,
+    )
     return filter if active == count else in_pieces(filter, active // 2)
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Log, Scan, Trace, Truth
+from jaxslam.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace, Truth
 
 Array = jax.Array
 
@@ -80,11 +80,11 @@ class Motion:
 class Free(NamedTuple):
     """The Gaussian prior of the unmeasured landmark parameters (Solà 39)."""
 
-    mean: Float[Array, "K"]
-    cov: Float[Array, "K K"]
+    mean: Float[JaxOrNumPy, "K"]
+    cov: Float[JaxOrNumPy, "K K"]
 
 
-NOTHING_FREE = Free(np.zeros(0), np.zeros((0, 0)))  # type: ignore[arg-type]
+NOTHING_FREE = Free(np.zeros(0), np.zeros((0, 0)))
 """of a measurement that determines its landmark"""
 
 

@@ -6,14 +6,19 @@ Masks and status codes, never NaN, mark absent data.
 """
 
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam.logs import streams, tables
+
+JaxOrNumPy: TypeAlias = Array | np.ndarray
+"""The array of a record that is made in either: a compiled function takes both, and an operation
+of NumPy compiles nothing."""
 
 
 class Status(IntEnum):
@@ -85,7 +90,7 @@ class Log(NamedTuple):
 
     @classmethod
     def from_records(
-        cls, odometry: PyTree, measurements: PyTree, motion: PyTree, sensor: PyTree
+        cls, odometry: tables.Tabular, measurements: tables.Tabular, motion: PyTree, sensor: PyTree
     ) -> "Recording":
         """The log of lines of odometry and measurements, each with times of its own.
 
@@ -136,15 +141,15 @@ class Recording(NamedTuple):
 class Truth(NamedTuple):
     """The true states of a simulation."""
 
-    pose: Float[Array, "T 3"]
+    pose: Float[JaxOrNumPy, "T 3"]
     """true pose at each scan [m, m, rad]."""
-    landmarks: Float[Array, "N L"]
+    landmarks: Float[JaxOrNumPy, "N L"]
     """true landmarks, in the order of their tags."""
-    missed: Int[Array, "T"]
+    missed: Int[JaxOrNumPy, "T"]
     """landmarks in view for which the scan had no free slot."""
-    start: Float[Array, "3"]
+    start: Float[JaxOrNumPy, "3"]
     """true pose before the first control."""
-    origin: Int[Array, "T M"] | None = None
+    origin: Int[JaxOrNumPy, "T M"] | None = None
     """the tag of the landmark each measurement is truly of, -1 of none; None but in a world with
     `spurious` data."""
 
@@ -152,14 +157,14 @@ class Truth(NamedTuple):
 class Estimate(NamedTuple):
     """Means and marginal covariances in map coordinates, whatever the filter's chart."""
 
-    pose: Float[Array, "3"]
+    pose: Float[JaxOrNumPy, "3"]
     """x [m], y [m], θ [rad] in (-π, π]."""
-    pose_cov: Float[Array, "3 3"]
-    points: Float[Array, "N 2"]
+    pose_cov: Float[JaxOrNumPy, "3 3"]
+    points: Float[JaxOrNumPy, "N 2"]
     """landmark positions [m]; 0 where not alive."""
-    point_covs: Float[Array, "N 2 2"]
-    alive: Bool[Array, "N"]
-    tag: Int[Array, "N"]
+    point_covs: Float[JaxOrNumPy, "N 2 2"]
+    alive: Bool[JaxOrNumPy, "N"]
+    tag: Int[JaxOrNumPy, "N"]
     """-1 where not alive."""
 
 
@@ -183,7 +188,7 @@ class Info(NamedTuple):
     """Σ log N(innovation; 0, S) over fused measurements."""
     exhausted: Bool[Array, ""] | None = None
     """the search for the best association ended at its budget; None where there is no search"""
-    extra: dict[str, Any] | None = None
+    extra: dict[str, PyTree] | None = None
     """records of one family or wrapper of filters alone, by name, as
     "particles" for a `filters.particles.states.particle_info.ParticleInfo`."""
 
@@ -213,10 +218,10 @@ class Trace(NamedTuple):
 class Beams(NamedTuple):
     """A scan of a laser: B beams, in the frame of its mount."""
 
-    range: Float[Array, "B"]
+    range: Float[JaxOrNumPy, "B"]
     """[m]; any finite number where not valid"""
-    angle: Float[Array, "B"]
+    angle: Float[JaxOrNumPy, "B"]
     """direction of each beam [rad], counter-clockwise from the x axis"""
-    valid: Bool[Array, "B"]
+    valid: Bool[JaxOrNumPy, "B"]
     """false for a beam that says nothing: a dropout, NaN, or padding. A beam that met nothing has
     the laser's maximum range, and is valid."""

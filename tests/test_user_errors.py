@@ -12,7 +12,7 @@ from jaxslam import association, charts, filters, life, linearize, motion, senso
 from jaxslam.filters import reporting
 from jaxslam.filters.map_management import merging
 from jaxslam.filters.map_management.closing import closing
-from jaxslam.filters.map_management.loop_closure import loop_settings
+from jaxslam.filters.map_management.loop_closure import LoopSettings
 from jaxslam.protocols import Free, Sensor
 from jaxslam.types import Log, Scan
 from jaxslam.validation import check_models, checked_estimate, state_and_info
@@ -257,13 +257,13 @@ def test_a_compressed_filter_refuses_to_merge():
 
 def test_closing_checks_its_options_when_it_is_made():
     ekf = filters.ekf_slam(MOVE, SEES, 3)
-    with pytest.raises(ValueError, match=r"^closing: expected options of close_loop, got leest"):
-        closing(ekf, leest=3)
-    with pytest.raises(ValueError, match="least"):
-        closing(ekf, least=2)
-    with pytest.raises(ValueError, match="drift"):
-        closing(ekf, drift=1.0)
-    assert loop_settings("closing", {}).least == 5
+    with pytest.raises(ValueError, match=r"^closing: expected settings to be a LoopSettings"):
+        closing(ekf, settings={"least": 3})
+    with pytest.raises(ValueError, match=r"^LoopSettings: .*least"):
+        LoopSettings(least=2)
+    with pytest.raises(ValueError, match=r"^LoopSettings: .*drift"):
+        LoopSettings(drift=1.0)
+    assert LoopSettings().least == 5
 
 
 def test_calibration_is_reached_from_the_package():

@@ -16,6 +16,7 @@ from jaxslam import association, charts, motion, plot, sensors
 from jaxslam.consistency.associations import identities
 from jaxslam.filters import ekf_slam
 from jaxslam.filters.map_management.closing import closing
+from jaxslam.filters.map_management.loop_closure import LoopSettings
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
 from jaxslam.math.stats import chi2_quantile
@@ -28,15 +29,7 @@ RUNS, BLOCK = 50, 10
 RADIUS, COUNT, CAPACITY = 30.0, 72, 120
 ROUND, MORE, STEP = 240, 80, 2 * np.pi * RADIUS / 240
 GATE = chi2_quantile(0.99, 2)
-OPTIONS = {
-    "window": 30,
-    "cluster": 10,
-    "sightings": 2,
-    "least": 5,
-    "every": 4,
-    "reach": 2.0,
-    "candidates": 32,
-}
+SEARCH = LoopSettings(window=30, cluster=10, sightings=2, least=5, candidates=32)
 COLUMNS = (
     "re-found [%]",
     "wrong [%]",
@@ -92,7 +85,9 @@ def methods(scenario):
         "known": make(),
         "nearest": make(associate=association.nearest(GATE)),
         "joint": make(associate=association.joint(0.99, budget=500)),
-        "cluster": closing(pruning(make(associate=near), recency()), **OPTIONS),
+        "cluster": closing(
+            pruning(make(associate=near), recency()), every=4, reach=2.0, settings=SEARCH
+        ),
     }
 
 

@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 _T = TypeVar("_T")
 
@@ -65,7 +65,7 @@ def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more:
     )
 
 
-def summary_table(columns: dict[str, dict[str, Any]]) -> str:
+def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
     """Summaries side by side, a row an entry; names above them where there are several."""
     rows = list(dict.fromkeys(key for column in columns.values() for key in column))
     head = [["", *columns]] if len(columns) > 1 else []

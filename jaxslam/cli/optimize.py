@@ -1,11 +1,12 @@
 """The command `jaxslam optimize`: the optimum of a graph in a file."""
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import SupportsFloat
 
 import jax
 import numpy as np
@@ -24,6 +25,7 @@ from jaxslam.graphs.starts import STARTS
 from jaxslam.graphs.validation import label, variables_of
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, csv_text, json_text, versions, write_files
+from jaxslam.types import JaxOrNumPy
 
 ERRORS = {
     "pose": (graphs.relative_pose, "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),
@@ -79,6 +81,8 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     found = jax.tree.map(np.asarray, solution.graph)
     squared = {k: np.asarray(s) for k, s in graphs.squared_residuals(found, factors).items()}
     converged = int(solution.status) == Ending.CONVERGED
+    costs = _finite(graphs.chi2(begun, factors)), _finite(sum(s.sum() for s in squared.values()))
+    status = _status(solution, found)
     summary = {
         "file": str(options.path),
         "command": command,
@@ -93,11 +97,11 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "method": options.method,
         "kernel": options.kernel or "none",
         "chi2 of the file": _finite(graphs.chi2(given, factors)),
-        "chi2 at the start": _finite(graphs.chi2(begun, factors)),
-        "chi2": _finite(sum(s.sum() for s in squared.values())),
+        "chi2 at the start": costs[0],
+        "chi2": costs[1],
         "degrees of freedom": graphs.degrees_of_freedom(found, factors),
         **({} if kernel is None else {"robust cost": _finite(solution.chi2)}),
-        "status": _status(solution, found),
+        "status": status,
         "iterations": int(solution.iterations),
         "gradient / at the start": _finite(solution.gradient / solution.gradient_start),
         "seconds to compile": round(compiling, 3),
@@ -112,7 +116,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         ),
         "poses.csv": _csv(("x", "y", "theta"), found.pose_id, found.poses, found.fixed_pose),
         "optimized.g2o": g2o.text_of(found),
-        "graph.png": _figure(options, begun, found, squared, summary),
+        "graph.png": _figure(options, begun, found, squared, costs, status),
     }
     if options.animate:
         files |= _film(options, begun, factors, doubted, solution)
@@ -122,7 +126,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     print("\nwrote " + ", ".join(str(path) for path in written))
     if converged:
         return 0
-    print(f"jaxslam: {summary['status']}", file=sys.stderr)
+    print(f"jaxslam: {status}", file=sys.stderr)
     return NOT_CONVERGED
 
 
@@ -144,7 +148,7 @@ def _status(solution: graphs.Solution, found: Graph) -> str:
     return f"singular: the measurements do not determine {label(found, int(solution.singular))}"
 
 
-def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, Any]:
+def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, object]:
     """What is proved of the optimum: entries of the summary."""
     if not converged or not plain:
         why = "of a robust cost nothing is proved" if converged else "there is no optimum"
@@ -166,9 +170,10 @@ def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, Any]:
     }
 
 
-def _finite(value: Any) -> float | None:
+def _finite(value: SupportsFloat) -> float | None:
     """A number, or None where JSON has none."""
-    return float(value) if np.isfinite(value) else None
+    number = float(value)
+    return number if math.isfinite(number) else None
 
 
 def _worst(
@@ -195,7 +200,7 @@ def _worst(
     return found
 
 
-def _csv(names: tuple[str, ...], ids: Any, values: Any, fixed: Any) -> str:
+def _csv(names: tuple[str, ...], ids: JaxOrNumPy, values: JaxOrNumPy, fixed: JaxOrNumPy) -> str:
     """Poses or points as a table, numbers by repr."""
     rows = [
         [str(int(one)), *map(repr, np.asarray(row, float).tolist()), str(int(held))]
@@ -211,22 +216,24 @@ def _figure(
     before: Graph,
     after: Graph,
     squared: Mapping[str, np.ndarray],
-    summary: Mapping[str, Any],
+    costs: tuple[float | None, float | None],
+    status: str,
 ) -> Callable[[Path], object]:
-    """What draws the graph before and after."""
+    """What draws the graph before and after; costs: χ² of both."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
     title = Path(options.path).name
+    edges = sum(int(table.valid.sum()) for table in after.tables.values())
     figure = plot.graph_figure(
         before,
         after,
         squared,
         worst=WORST,
         subtitles=(
-            f"start ({options.start}): χ² = {_shown(summary['chi2 at the start'])}",
-            f"{summary['status'].split(':')[0]}: χ² = {_shown(summary['chi2'])}",
+            f"start ({options.start}): χ² = {_shown(costs[0])}",
+            f"{status.split(':')[0]}: χ² = {_shown(costs[1])}",
         ),
-        title=f"{title}: {summary['poses']:,} poses, {sum(summary['edges'].values()):,} edges",
+        title=f"{title}: {len(after.poses):,} poses, {edges:,} edges",
     )
     return lambda path: path.write_bytes(plot.png(figure))
 
@@ -268,7 +275,7 @@ def _film(
     return films.film_files({"optimize": plot.render(scene, fps=2.0)}, suffixed=False)
 
 
-def _table(summary: Mapping[str, Any]) -> str:
+def _table(summary: Mapping[str, object]) -> str:
     """The summary, a line an entry."""
     wide = max(map(len, summary))
     return "\n".join(f"{key.ljust(wide)}  {_shown(value)}" for key, value in summary.items())

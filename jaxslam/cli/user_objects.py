@@ -10,7 +10,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from jaxslam.catalog import ALL
 from jaxslam.cli.common import pick
@@ -88,7 +87,7 @@ class UserObjects:
                 raise
             raise ValueError(describe_error(error)) from error
 
-    def _find(self, option: str, asked: str) -> tuple[str, Any]:
+    def _find(self, option: str, asked: str) -> tuple[str, object]:
         """The name and the object of FILE.py:NAME."""
         path, name = split_target(asked)
         path = path.resolve()
@@ -113,7 +112,7 @@ class UserObjects:
         check_fits(name, made, scenario)
         return name, made
 
-    def _call(self, asked: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    def _call(self, asked: str, function: Callable[..., object], *arguments: object) -> object:
         """What a user's function returns."""
         given = "one argument" if arguments else "no argument"
         try:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.consistency.score import snapshot_steps
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.linearize import derivatives
 from jaxslam.linearize.at_truth import at_truth
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math.linalg import root_psd
+from jaxslam.protocols import Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.worlds import Scenario
@@ -37,11 +39,13 @@ def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: Array) ->
     ideal EKF without gate and without a quota of new landmarks. The noise of a measurement is what
     the sensor states for what it measured.
     """
-    options: dict[str, Any] = scenario.filter_options | {"gate": None, "births": None}
+    options: EkfOptions = scenario.filter_options | {
+        "gate": None,
+        "births": None,
+        "linearize": at_truth(truth),
+    }
     capacity = truth.landmarks.shape[0]
-    ideal = ekf_slam(
-        scenario.motion, scenario.sensor, capacity, **options, linearize=at_truth(truth)
-    )
+    ideal = ekf_slam(scenario.motion, scenario.sensor, capacity, **options)
     return run(ideal, log, scenario.pose, scenario.pose_cov, key).estimate
 
 
@@ -86,8 +90,8 @@ def posterior_bound(
         raise ValueError(f"posterior_bound: expected steps from 0 to {total - 1}, got {steps}")
     runs = jax.device_get(jax.jit(jax.vmap(partial(jacobians_at_truth, scenario)))(truth, log))
     start = np.asarray(jax.jit(root_psd)(jnp.asarray(scenario.pose_cov, truth.pose.dtype)))
-    by_p: Any = 0.0
-    information: Any = 0.0
+    by_p: np.ndarray = np.zeros(())
+    information: np.ndarray = np.zeros(())
     for i in range(count):
         rows = list(_by_parameters(jax.tree.map(lambda leaf, i=i: leaf[i], runs), start, at))
         by_p = by_p + np.stack([a for a, _ in rows]) / count
@@ -147,7 +151,8 @@ def jacobians_at_truth(scenario: Scenario, truth: Truth, log: Log) -> RunJacobia
     For the world of one robot, nothing spurious, tags known.
     """
     motion, dtype = scenario.motion, truth.pose.dtype
-    old = jnp.concatenate([truth.start[None], truth.pose[:-1]])
+    path, landmarks = jnp.asarray(truth.pose), jnp.asarray(truth.landmarks)
+    old = jnp.concatenate([truth.start[None], path[:-1]])
     still = jnp.zeros(len(motion.noises), dtype)
 
     def moved(old: Array, new: Array, u: Array) -> tuple[Array, Array]:
@@ -156,7 +161,7 @@ def jacobians_at_truth(scenario: Scenario, truth: Truth, log: Log) -> RunJacobia
         root = root_psd(motion.noise_cov(old, u))
         return with_lever_arm(by_pose, new[:2] - ahead[:2]), by_noise @ root
 
-    by_pose, by_noise = jax.vmap(moved)(old, truth.pose, log.control)
+    by_pose, by_noise = jax.vmap(moved)(old, path, log.control)
     sensor = scenario.sensor
     parts = (
         [(p.sensor, p.places) for p in sensor.parts]
@@ -168,17 +173,19 @@ def jacobians_at_truth(scenario: Scenario, truth: Truth, log: Log) -> RunJacobia
     for model, places in parts:
         size = len(model.measurements)
 
-        def seen(pose: Array, z: Array, tag: Array, model: Any = model) -> Any:
-            landmark = truth.landmarks[tag][: len(model.landmark)]
+        def seen(
+            pose: Array, z: Array, tag: Array, model: Sensor = model
+        ) -> tuple[Array, Array, Array]:
+            landmark = landmarks[tag][: len(model.landmark)]
             return *derivatives.observe_jacobians(model, pose, landmark), model.noise_cov(z)
 
         z, tag, valid = (leaf[:, first : first + places] for leaf in log.scan)
         tag = jnp.maximum(tag, 0)
-        found = jax.vmap(jax.vmap(seen, (None, 0, 0)))(truth.pose, z[:, :, :size], tag)
+        found = jax.vmap(jax.vmap(seen, (None, 0, 0)))(path, z[:, :, :size], tag)
         by_pose_there, by_landmark, noise_cov = found
         sensors.append(SensorJacobians(by_pose_there, by_landmark, noise_cov, tag, valid))
         first += places
-    return RunJacobians(by_pose, by_noise, sensors, truth.landmarks)
+    return RunJacobians(by_pose, by_noise, sensors, landmarks)
 
 
 def final_covariance(

@@ -1,6 +1,6 @@
 """Is a particle filter in a known map honest? Coverage, NEES, energy score, share of runs lost."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxslam.protocols import Filter
 from jaxslam.resampling.weights import at_points, weights_of
 from jaxslam.run import run
 from jaxslam.simulation.laser import LaserWorld, scan_world
-from jaxslam.types import Log
+from jaxslam.types import JaxOrNumPy, Log
 from jaxslam.validation.numbers import check_count, check_covariance, check_key
 
 DRAWS = 199
@@ -35,18 +35,18 @@ KERNEL = 0.5
 class LocalizationScores(NamedTuple):
     """What a filter says in each of R runs at T steps, beside the truth."""
 
-    truth: Float[Array, "R T 3"]
-    pose: Float[Array, "R T 3"]
+    truth: Float[JaxOrNumPy, "R T 3"]
+    pose: Float[JaxOrNumPy, "R T 3"]
     """the estimate"""
-    pose_cov: Float[Array, "R T 3 3"]
-    level: Float[Array, "R T"]
+    pose_cov: Float[JaxOrNumPy, "R T 3 3"]
+    level: Float[JaxOrNumPy, "R T"]
     """of the smallest set of the particles that covers the truth, see `covering_level`"""
-    energy: Float[Array, "R T"]
+    energy: Float[JaxOrNumPy, "R T"]
     """energy score of the position [m], see `energy_score`"""
-    together: Bool[Array, "R T"]
+    together: Bool[JaxOrNumPy, "R T"]
     """95 % of the weight lies near the mean: the particles are one group"""
-    ess: Float[Array, "R T"]
-    active: Int[Array, "R T"]
+    ess: Float[JaxOrNumPy, "R T"]
+    active: Int[JaxOrNumPy, "R T"]
 
 
 class LocalizationSummary(NamedTuple):
@@ -108,9 +108,13 @@ def judge_localization(
 
 
 def _judge(
-    world: LaserWorld, filter: Filter, every: int, keys: Any, start_cov: Array
+    world: LaserWorld,
+    filter: Filter,
+    every: int,
+    keys: tuple[Array, Array, Array],
+    start_cov: Array,
 ) -> LocalizationScores:
-    def one(keys: Any) -> LocalizationScores:
+    def one(keys: tuple[Array, Array, Array]) -> LocalizationScores:
         history = scan_world(world, keys[0])
         dtype = history.pose.dtype
         root = root_psd(start_cov.astype(dtype))
@@ -156,7 +160,7 @@ def score_localization(
     true, mean, cov, (poses, log_weights) = scored
     keys = jax.random.split(key_draw, len(true))
 
-    def each(row: Any) -> tuple[Array, Array, Array]:
+    def each(row: tuple[Array, ...]) -> tuple[Array, Array, Array]:
         true, mean, poses, log_weights, key = row
         weights = weights_of(log_weights)
         draws = poses[at_points(weights, jax.random.uniform(key, (DRAWS,), weights.dtype))]
@@ -221,7 +225,7 @@ def summarize_localization(
     Raises:
         ValueError: no step is left.
     """
-    scores = LocalizationScores(*(np.asarray(part) for part in scores))  # type: ignore[arg-type]
+    scores = LocalizationScores(*(np.asarray(part) for part in scores))
     steps = scores.level.shape[1]
     if not 0 <= skip < steps:
         raise ValueError(f"summarize_localization: expected skip from 0 to {steps - 1}, got {skip}")
@@ -260,5 +264,5 @@ def seed_spread(scores: LocalizationScores) -> Float[np.ndarray, "T"]:
     middle = np.broadcast_to(pose[:1], pose.shape)
     off = pose_error(pose, middle)  # around the first, wrapped
     claimed = np.diagonal(cov, axis1=2, axis2=3).mean(axis=0)
-    ratio: Any = off.var(axis=0, ddof=1) / np.where(claimed > 0, claimed, np.nan)
+    ratio = off.var(axis=0, ddof=1) / np.where(claimed > 0, claimed, np.nan)
     return np.asarray(np.nanmean(ratio, axis=1))

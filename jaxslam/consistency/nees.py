@@ -107,7 +107,7 @@ def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Fl
         dx, _ = chart.local(pose, ground, true_pose, ground)
         return dx if chart.basis is None else chart.basis(pose, ground).pose @ dx
 
-    return jax.vmap(one)(trace.estimate.pose, truth.pose)
+    return jax.vmap(one)(jnp.asarray(trace.estimate.pose), jnp.asarray(truth.pose))
 
 
 def _unit(pose: np.ndarray, cov: np.ndarray, eps: float) -> list[np.ndarray]:

@@ -55,16 +55,17 @@ def run_statistics(trace: Trace, truth: Truth, sensor: Sensor) -> RunStatistics:
     held = jnp.where(estimate.alive, estimate.tag, -1)
     found: dict[str, tuple[Array, Array]] = {}
     if truth.origin is not None:
-        held = identities(trace, truth.origin)
-        found = associations(trace, truth.origin, held)
-    points = jax.vmap(sensor.position)(truth.landmarks)
+        origin = jnp.asarray(truth.origin)
+        held = identities(trace, origin)
+        found = associations(trace, origin, held)
+    points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
     size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
     dtype = estimate.pose.dtype
 
     def step(sums: _Sums, row: tuple[Estimate, Info, Array]) -> tuple[_Sums, PyTree]:
         estimate, info, held = row
         off = points[jnp.maximum(held, 0)] - estimate.points
-        nees, regular = _planar_nees(off, estimate.point_covs)
+        nees, regular = _planar_nees(off, jnp.asarray(estimate.point_covs))
         counts = regular & (held >= 0)
         white = _white(estimate, info)
         *w, energy, there = sums.recent

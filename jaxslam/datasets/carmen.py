@@ -138,7 +138,7 @@ def _log_of(
         name=path.name.split(".")[0],
         source=str(path),
         time=time,
-        beams=Beams(ranges, angles, valid),  # type: ignore[arg-type]
+        beams=Beams(ranges, angles, valid),
         corrected=_wrapped(np.array([scan.corrected for scan in scans])),
         raw=_wrapped(raw),
         row=row,

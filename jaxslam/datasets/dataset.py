@@ -2,15 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
+from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.team import Robot
-from jaxslam.types import Log
+from jaxslam.types import JaxOrNumPy, Log
 from jaxslam.validation.logs import check_log
 
 
@@ -23,7 +25,7 @@ class Adjustable(NamedTuple):
     """those that the data set has"""
     mount: tuple[float, ...] | None
     """(x [m], y [m], θ [rad]) of the sensor on the robot; None where it has none"""
-    models: Callable[[Any, Any], tuple[Motion, Sensor]]
+    models: Callable[[JaxOrNumPy, ArrayLike | None], tuple[Motion, Sensor]]
     """(deviations (P,) an array, mount (3,) or None) -> motion and sensor"""
 
 
@@ -51,7 +53,7 @@ class Dataset:
     """the robot's pose before the first control, which is the map's frame"""
     pose_cov: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     """zero, since the first pose defines the frame"""
-    filter_options: dict[str, Any] = field(default_factory=dict)
+    filter_options: EkfOptions = field(default_factory=EkfOptions)
     """keyword arguments of `filters.ekf_slam` for this data set (update, gate)"""
     landmarks: Float[np.ndarray, "N 2"] | None = None
     """surveyed positions [m] in the order of tags, in a frame of their own; None if unknown"""

@@ -1,10 +1,10 @@
 """The test of a map against a survey: the joint NEES of its landmarks, and a verdict."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from jaxslam import programs
 from jaxslam.consistency import LEVEL
@@ -36,7 +36,7 @@ class MapTest(NamedTuple):
             "optimistic" if self.nees > high else "pessimistic" if self.nees < low else "consistent"
         )
 
-    def rows(self) -> dict[str, Any]:
+    def rows(self) -> dict[str, object]:
         """The test as rows of a summary."""
         what = f"joint, {self.dof} dof" if self.joint else "largest of a landmark"
         return {
@@ -47,7 +47,7 @@ class MapTest(NamedTuple):
         }
 
 
-def joint_map_cov(filter: Filter, state: Any) -> Float[np.ndarray, "N 2 N 2"] | None:
+def joint_map_cov(filter: Filter, state: PyTree) -> Float[np.ndarray, "N 2 N 2"] | None:
     """The covariance of all landmark positions together, by slots, in map coordinates.
 
     None of a filter whose state is no `slots.Joint` of point landmarks.

@@ -1,7 +1,7 @@
 """The noises of a data set by maximum likelihood, from its own log."""
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,12 @@ import numpy as np
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.logs.tables import POSE, split_unit
 from jaxslam.math.stats import normal_quantile
 from jaxslam.protocols import Filter
 from jaxslam.run import run
-from jaxslam.types import Info, Log, Status
+from jaxslam.types import Info, JaxOrNumPy, Log, Status
 from jaxslam.validation.numbers import check_count
 
 
@@ -68,12 +69,11 @@ def fit(
     check_count("fit: rounds", rounds)
     names, values, free = _parameters(models, mount, tuple(fixed))
     count, key = len(models.deviations), jax.random.key(0)
-    decided = {k: v for k, v in data.filter_options.items() if k not in ("gate", "associate")}
+    decided = data.filter_options | {"gate": None, "associate": None}
 
-    def filter(whole: Any, options: dict[str, Any]) -> Filter:
-        place = models.mount
-        if place is not None and mount:
-            place = whole[count:]
+    def filter(whole: JaxOrNumPy, options: EkfOptions) -> Filter:
+        fitted = mount and models.mount is not None
+        place = whole[count:] if fitted else models.mount
         motion, sensor = models.models(whole[:count], place)
         return ekf_slam(motion, sensor, data.capacity, **options)
 

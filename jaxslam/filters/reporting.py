@@ -1,6 +1,6 @@
 """`Status` and `Info` of the measurements of a scan, for all filters."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,8 @@ def info_of(
     innovation: jax.Array,
     innovation_cov: jax.Array,
     log_likelihood: jax.Array,
-    **more: Any,
+    exhausted: jax.Array | None = None,
+    extra: dict[str, PyTree] | None = None,
 ) -> Info:
     """The `Info` of M measurements with these statuses, zeros where a number does not apply.
 
@@ -105,7 +106,7 @@ def info_of(
         nis, innovation, innovation_cov: (M,), (M, Z), (M, Z, Z) of those matched; nis counts
             where `has_distance`.
         log_likelihood: () of the scan.
-        more: fields of `Info` that one filter has.
+        exhausted, extra: as in `Info`.
     """
     fused = status == Status.FUSED
     none = jnp.full_like(status, -1)
@@ -118,7 +119,8 @@ def info_of(
         slot=jnp.where(fused, slot, started).astype(jnp.int32),
         status=status,
         log_likelihood=log_likelihood,
-        **more,
+        exhausted=exhausted,
+        extra=extra,
     )
 
 

@@ -6,19 +6,21 @@ residual of the row (`factor.Factor`) and Ω its information.
 
 from typing import NamedTuple
 
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.types import JaxOrNumPy
 
 
 class Table(NamedTuple):
     """Measurements of one kind, E rows: K variables, Z numbers measured and R residuals each."""
 
-    who: Int[Array, "E K"]
+    who: Int[JaxOrNumPy, "E K"]
     """the variables of a row: indices of poses or points, as the factor's `variables` says"""
-    z: Float[Array, "E Z"]
+    z: Float[JaxOrNumPy, "E Z"]
     """what was measured"""
-    information: Float[Array, "E R R"]
+    information: Float[JaxOrNumPy, "E R R"]
     """Ω, the inverse of the residual's covariance; symmetric, positive semidefinite"""
-    valid: Bool[Array, "E"]
+    valid: Bool[JaxOrNumPy, "E"]
     """false for padding, and for rows that are left out"""
 
 
@@ -29,14 +31,14 @@ class Graph(NamedTuple):
     no functions: `graphs.REGISTRY` has those of files.
     """
 
-    poses: Float[Array, "N 3"]
+    poses: Float[JaxOrNumPy, "N 3"]
     """(x, y, θ); θ is wrapped where it was computed, and as it stands in a file"""
-    points: Float[Array, "P L"]
+    points: Float[JaxOrNumPy, "P L"]
     tables: dict[str, Table]
-    fixed_pose: Bool[Array, "N"]
+    fixed_pose: Bool[JaxOrNumPy, "N"]
     """poses that optimization does not move"""
-    fixed_point: Bool[Array, "P"]
-    pose_id: Int[Array, "N"]
+    fixed_point: Bool[JaxOrNumPy, "P"]
+    pose_id: Int[JaxOrNumPy, "N"]
     """identity in a file, or in a log the number of controls before it"""
-    point_id: Int[Array, "P"]
+    point_id: Int[JaxOrNumPy, "P"]
     """identity in a file, or tag in a log"""

@@ -1,6 +1,6 @@
 """The graph of a log: its motions, measurements and prior as factors."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxslam.linearize.derivatives import motion_jacobians
 from jaxslam.math import linalg, se2
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
-from jaxslam.types import Log
+from jaxslam.types import JaxOrNumPy, Log
 from jaxslam.validation.numbers import is_concrete
 
 _STILL = 1e-9
@@ -120,11 +120,11 @@ def _check_slack(name: str, motion: Motion, slack: float | None) -> None:
 
 def _points_of(
     name: str, log: Log, sensor: Sensor, tags: ArrayLike | None, capacity: int | None
-) -> tuple[Any, Any, Int[np.ndarray, "P"]]:
+) -> tuple[JaxOrNumPy, JaxOrNumPy, Int[np.ndarray, "P"]]:
     """The point of each measurement, whether it is used, and the tags of the points."""
-    asked: Any = log.scan.tag if tags is None else tags
-    asked = asked if hasattr(asked, "dtype") else np.asarray(asked)
-    valid: Any = log.scan.valid
+    given = log.scan.tag if tags is None else tags
+    asked: JaxOrNumPy = given if isinstance(given, Array) else np.asarray(given)
+    valid = log.scan.valid
     if not sensor.landmark:
         return log.scan.tag * 0, valid, np.zeros(0, np.int32)
     if np.shape(asked) != np.shape(valid):
@@ -270,7 +270,7 @@ def _placed(
 
 
 def _check_noise(
-    name: str, noise: _Noise, motion: Motion, sensor: Sensor, valid: Any, known: bool
+    name: str, noise: _Noise, motion: Motion, sensor: Sensor, valid: JaxOrNumPy, known: bool
 ) -> None:
     """Raise ValueError where a covariance has no inverse, if the values are concrete."""
     if not is_concrete((noise, valid)):

@@ -78,7 +78,7 @@ def chi2(
 
 def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
     graph = in_one_dtype(graph)
-    who = {name: table.who for name, table in graph.tables.items()}
+    who = {name: jnp.asarray(table.who) for name, table in graph.tables.items()}
     batch = with_batch(graph)
     none = jnp.arange(len(graph.poses) + len(graph.points))
     return cost(model, who, variables_of(batch), data_of(batch, none))[0]

@@ -1,7 +1,7 @@
 """What a graph must be before it is solved; each error is a line that names row or variable."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -64,7 +64,7 @@ def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
     pairs = [np.zeros((0, 2), int)]
     held = np.asarray(graph.fixed_pose).copy()
     for key, table in graph.tables.items():
-        counted: Any = table.valid & np.asarray(table.information).any(axis=(1, 2))
+        counted = table.valid & np.asarray(table.information).any(axis=(1, 2))
         who = variables_of(graph, table._replace(valid=counted), factors[key])
         pairs += [who[:, [0, k]] for k in range(1, who.shape[1])]
         if factors[key].variables == ("pose",):
@@ -196,7 +196,7 @@ def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Gra
     parts = parts_of(graph, known)
     if not len(graph.poses) or parts.anchored.any():
         return graph
-    fixed: Any = np.asarray(graph.fixed_pose).copy()
+    fixed = np.asarray(graph.fixed_pose).copy()
     of_poses = parts.part[: len(graph.poses)]
     fixed[np.flatnonzero(of_poses == np.bincount(of_poses).argmax())[0]] = True
     return graph._replace(fixed_pose=fixed)

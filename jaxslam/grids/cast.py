@@ -65,7 +65,7 @@ def _ray_map(squares: PyTree, skip: bool, grid: Grid) -> RayMap:
     else:
         ahead = jnp.zeros(stops.shape, solid.dtype)
     ahead = jnp.pad(jnp.where(stops, STOP, ahead), 1, constant_values=OFF)
-    return RayMap(solid, ahead, grid.origin, jnp.asarray(grid.resolution, solid.dtype))
+    return RayMap(solid, ahead, jnp.asarray(grid.origin), jnp.asarray(grid.resolution, solid.dtype))
 
 
 def _cells(solid: Float[Array, "H W"]) -> Array:

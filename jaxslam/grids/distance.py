@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam import programs
 from jaxslam.grids.grid import Field, Grid, check_grid
+from jaxslam.types import JaxOrNumPy
 
 
 def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None = None) -> Field:
@@ -31,7 +32,11 @@ def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None
 def _distance_field(grid: Grid, threshold: Array, largest: Array) -> Field:
     squared = squared_distances(grid.log_odds > threshold)
     cells = jnp.sqrt(squared.astype(jnp.result_type(grid.log_odds, float)))
-    return Field(jnp.minimum(grid.resolution * cells, largest), grid.origin, grid.resolution)
+    return Field(
+        jnp.minimum(grid.resolution * cells, largest),
+        jnp.asarray(grid.origin),
+        jnp.asarray(grid.resolution),
+    )
 
 
 def gradient(field: Field) -> Float[Array, "H W 2"]:
@@ -51,7 +56,7 @@ def gradient(field: Field) -> Float[Array, "H W 2"]:
     return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
-def squared_distances(occupied: Bool[Array, "H W"]) -> Int[Array, "H W"]:
+def squared_distances(occupied: Bool[JaxOrNumPy, "H W"]) -> Int[Array, "H W"]:
     """The squared distance, in cells, of each cell from the nearest occupied one: an integer.
 
     First d(i, j), to the nearest one in the same column. Then min over k of (j - k)² + d(i, k)²,

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.math import se2
+from jaxslam.types import JaxOrNumPy
 from jaxslam.validation.numbers import is_concrete, shape_told
 
 
@@ -25,11 +26,11 @@ class Grid(NamedTuple):
     it says nothing of the cell; who must tell the two apart keeps counts (`grids.Counts`).
     """
 
-    log_odds: Float[Array, "H W"]
+    log_odds: Float[JaxOrNumPy, "H W"]
     """log p/(1 - p), p the probability that a cell is occupied; finite"""
-    origin: Float[Array, "3"]
+    origin: Float[JaxOrNumPy, "3"]
     """pose of the lower left corner of cell (0, 0) in the world"""
-    resolution: Float[Array, ""]
+    resolution: Float[JaxOrNumPy, ""]
     """side of a cell [m]"""
 
     @property
@@ -38,7 +39,7 @@ class Grid(NamedTuple):
         return jax.nn.sigmoid(self.log_odds)
 
     @property
-    def known(self) -> Bool[Array, "H W"]:
+    def known(self) -> Bool[JaxOrNumPy, "H W"]:
         """Whether there is evidence for a cell: its log-odds are not 0."""
         return self.log_odds != 0
 

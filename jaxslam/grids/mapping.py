@@ -13,20 +13,20 @@ from jaxslam import programs
 from jaxslam.grids.beam_models.beam_model import usable_beams
 from jaxslam.grids.grid import Grid, check_frame, to_cells
 from jaxslam.math import se2
-from jaxslam.types import Beams
+from jaxslam.types import Beams, JaxOrNumPy
 from jaxslam.validation.numbers import is_concrete
 
 
 class Counts(NamedTuple):
     """How many beams ended in each cell, and how many passed through it."""
 
-    hits: Int[Array, "H W"]
-    misses: Int[Array, "H W"]
-    origin: Float[Array, "3"]
-    resolution: Float[Array, ""]
-    outside: Int[Array, ""]
+    hits: Int[JaxOrNumPy, "H W"]
+    misses: Int[JaxOrNumPy, "H W"]
+    origin: Float[JaxOrNumPy, "3"]
+    resolution: Float[JaxOrNumPy, ""]
+    outside: Int[JaxOrNumPy, ""]
     """usable beams that say nothing: their origin is off the map"""
-    unusable: Int[Array, ""]
+    unusable: Int[JaxOrNumPy, ""]
     """beams that are not valid, of NaN or below 0"""
 
 
@@ -34,7 +34,7 @@ def count(
     shape: tuple[int, int],
     origin: ArrayLike,
     resolution: ArrayLike,
-    poses: Float[Array, "T 3"],
+    poses: Float[JaxOrNumPy, "T 3"],
     beams: Beams,
     *,
     max_range: float,
@@ -76,7 +76,7 @@ def _shape(height: int, width: int) -> tuple[int, int]:
     return height, width
 
 
-def _check_scans(poses: Array, beams: Beams, max_range: float) -> None:
+def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
     shapes = [np.shape(part) for part in beams]
     if len(set(shapes)) != 1 or len(shapes[0]) != 2:
         raise ValueError(f"count: expected as many ranges, angles and masks (T, B), got {shapes}")
@@ -152,7 +152,7 @@ def add_scan(
     start = to_cells(origin, resolution, eyes[:, :2])
     inside = (start >= 0).all(axis=1) & (start[:, 0] < width) & (start[:, 1] < height)
     said = usable & ~(far & (jnp.asarray(free) <= 0))
-    live = (said[None] & inside[:, None]).reshape(-1)
+    live = (inside[:, None] & said[None]).reshape(-1)
     first = jnp.broadcast_to(start[:, None], ends.shape).reshape(-1, 2)
     ends = ends.reshape(-1, 2)
     map_of = height * width * jnp.arange(len(eyes), dtype=jnp.int32)

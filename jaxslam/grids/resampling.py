@@ -84,8 +84,8 @@ def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
     points = centers(a)
     bordered = Grid(jnp.pad(b.log_odds, 1), b.origin, b.resolution)  # unknown off the map
     corner = jnp.asarray([-1.0, -1.0, 0.0]) * b.resolution
-    frame = se2.compose(jnp.asarray(b.origin), corner), b.resolution
-    weight = a.known * interpolate(Field(bordered.known.astype(points.dtype), *frame), points)
+    frame = se2.compose(jnp.asarray(b.origin), corner), jnp.asarray(b.resolution)
+    weight = a.known * interpolate(Field(jnp.asarray(bordered.known, points.dtype), *frame), points)
     other = interpolate(Field(bordered.probability, *frame), points)
     total = weight.sum()
     total = jnp.where(total > 0, total, 1.0)

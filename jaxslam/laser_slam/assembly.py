@@ -1,7 +1,5 @@
 """The pose graph of keyframes: odometry and loops as tables, optimum, relative covariances."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -19,13 +17,12 @@ def table_of(
 ) -> Table:
     """Relative poses between rows of the graph; cov is of the end of z."""
     information = np.linalg.inv(cov)
-    rows: Any = (
+    return Table(
         np.stack([first, second], axis=1),
         z,
         0.5 * (information + np.swapaxes(information, 1, 2)),
         np.ones(len(z), bool),
     )
-    return Table(*rows)
 
 
 def graph_of(
@@ -38,15 +35,15 @@ def graph_of(
     tables = {"relative_pose": odometry}
     if loops is not None and len(loops.z):
         tables[LOOPS] = loops
-    made: Any = {
-        "poses": path,
-        "points": np.zeros((0, 2)),
-        "fixed_pose": np.arange(len(path)) == 0,
-        "fixed_point": np.zeros(0, bool),
-        "pose_id": keyframe,
-        "point_id": np.zeros(0, int),
-    }
-    return Graph(tables=tables, **made)
+    return Graph(
+        poses=path,
+        points=np.zeros((0, 2)),
+        tables=tables,
+        fixed_pose=np.arange(len(path)) == 0,
+        fixed_point=np.zeros(0, bool),
+        pose_id=keyframe,
+        point_id=np.zeros(0, int),
+    )
 
 
 def relative(

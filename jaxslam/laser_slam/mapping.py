@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -51,11 +50,10 @@ def map_of(
     shape, origin, resolution = frame
     beams = _used(log, settings, usable)
     if not (beams.valid & (beams.range > 0)).any():
-        return Grid(np.zeros(shape), origin, np.asarray(resolution))  # type: ignore[arg-type]
-    poses: Any = path
-    counts = grids.count(shape, origin, resolution, poses, beams, max_range=settings.max_range)
+        return Grid(np.zeros(shape), origin, np.asarray(resolution))
+    counts = grids.count(shape, origin, resolution, path, beams, max_range=settings.max_range)
     found = grids.occupancy(counts)
-    return Grid(*(np.asarray(part) for part in found))  # type: ignore[arg-type]
+    return Grid(*(np.asarray(part) for part in found))
 
 
 def growing_maps(
@@ -81,21 +79,21 @@ def growing_maps(
     beams = _used(log, settings, np.ones(len(path), bool))
     together = -(-len(path) // min(frames, len(path)))
     hits, misses = np.zeros((2, *shape), np.int32)
+    none = np.array(0)
     maps, until = [], []
     for begin in range(0, len(path), together):
         end = min(begin + together, len(path))
         fill = together - (end - begin)
-        rows: Any = [np.pad(part[begin:end], [(0, fill), (0, 0)]) for part in beams]
-        scans = Beams(*rows)
+        scans = Beams(*(np.pad(part[begin:end], [(0, fill), (0, 0)]) for part in beams))
         if scans.valid.any():
-            poses: Any = np.pad(path[begin:end], [(0, fill), (0, 0)])
+            poses = np.pad(path[begin:end], [(0, fill), (0, 0)])
             found = grids.count(
                 shape, origin, resolution, poses, scans, max_range=settings.max_range
             )
             hits += np.asarray(found.hits)
             misses += np.asarray(found.misses)
-        counts: Any = Counts(hits, misses, origin, np.asarray(resolution), 0, 0)  # type: ignore
-        maps.append(Grid(*(np.asarray(part) for part in grids.occupancy(counts))))  # type: ignore
+        counts = Counts(hits, misses, origin, np.asarray(resolution), none, none)
+        maps.append(Grid(*(np.asarray(part) for part in grids.occupancy(counts))))
         until.append(end)
     return maps, np.array(until)
 
@@ -106,4 +104,4 @@ def _used(log: LogOfScans, settings: Settings, usable: np.ndarray) -> Beams:
         seen = (valid > 0) & (ranges > 0) & (ranges < log.max_range * (1 - 1e-6))
     seen &= usable[:, None]
     ranges = np.where(seen, np.minimum(ranges, settings.max_range), 0.0)
-    return Beams(ranges, angles, seen)  # type: ignore[arg-type]
+    return Beams(ranges, angles, seen)

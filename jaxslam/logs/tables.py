@@ -1,10 +1,11 @@
 """Columns of odometry and measurements, from lists, arrays or data frames, as the rows of a log."""
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxslam.logs import streams
 
@@ -22,11 +23,27 @@ POSE = ("x [m]", "y [m]", "theta [rad]")
 _INCREMENT = ("forward [m]", "left [m]", "turn [rad]")
 
 
-class Columns(NamedTuple):
+_Name = TypeVar("_Name", bound=int | str)
+"""of a landmark"""
+
+
+class _ByName(Protocol):
+    """Columns by name: a mapping, a structured array, a data frame."""
+
+    def __getitem__(self, name: str, /) -> Iterable[object]: ...
+
+
+Tabular: TypeAlias = Sequence[Sequence[object]] | np.ndarray | _ByName
+"""Rows, or columns by name."""
+
+
+class Columns(NamedTuple, Generic[_Name]):
     """Columns of one length by name, and where a cell is, for messages."""
 
-    columns: dict[str, Any]
-    """(K,) float64 by name with unit, as "v [m/s]"; `TAG` is a list of names, None where unknown"""
+    columns: dict[str, Float[np.ndarray, "K"]]
+    """float64, by name with unit, as "v [m/s]" """
+    tags: list[_Name | None] | None
+    """the column `TAG`: names, None where unknown; None without such a column"""
     at: Callable[[int, str], str]
     """(row, column) -> the place of a cell, with which a message begins"""
 
@@ -35,11 +52,11 @@ class Columns(NamedTuple):
         return np.column_stack([self.columns[name] for name in names])
 
 
-class Aligned(NamedTuple):
+class Aligned(NamedTuple, Generic[_Name]):
     """The rows of two tables, and what became of their names and measurements."""
 
     rows: streams.Rows
-    tags: tuple[Any, ...]
+    tags: tuple[_Name, ...]
     """the names of the landmarks with tags 0, 1, …"""
     dropped: dict[str, int]
 
@@ -71,12 +88,12 @@ def measurement_columns(measured: tuple[str, ...], landmark: tuple[str, ...]) ->
 
 
 def align_tables(
-    odometry: Columns,
-    measurements: Columns,
+    odometry: Columns[_Name],
+    measurements: Columns[_Name],
     controls: tuple[str, ...],
     measured: tuple[str, ...],
-    names: Sequence[Hashable] = (),
-) -> Aligned:
+    names: Sequence[_Name] = (),
+) -> Aligned[_Name]:
     """The rows of two tables: a row at every time of odometry, and of measurements within it.
 
     Velocities (controls with an interval) hold until the next line; poses are interpolated; other
@@ -94,9 +111,9 @@ def align_tables(
     clock, when = odometry.columns[TIME], measurements.columns[TIME]
     for table, least in ((odometry, True), (measurements, False)):
         check_times(table, strict=least)
-    named = measurements.columns.get(TAG) or [None] * len(when)
+    named = measurements.tags or [None] * len(when)
     tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
-    tag = np.array([tag_of.get(name, -1) for name in named], np.int64)
+    tag = np.array([-1 if name is None else tag_of[name] for name in named], np.int64)
     seen: set[tuple[float, int]] = set()
     for row, pair in enumerate(zip(when.tolist(), tag.tolist(), strict=True)):
         if pair[1] >= 0 and pair in seen:
@@ -132,7 +149,7 @@ def align_tables(
     return Aligned(rows, tuple(tag_of), dropped)
 
 
-def check_times(table: Columns, *, strict: bool) -> None:
+def check_times(table: Columns[_Name], *, strict: bool) -> None:
     """Raise ValueError, with the place, unless times rise; equal ones pass where not strict."""
     time = table.columns[TIME]
     back = np.flatnonzero(np.diff(time) <= 0 if strict else np.diff(time) < 0)
@@ -142,12 +159,15 @@ def check_times(table: Columns, *, strict: bool) -> None:
         raise ValueError(f"{table.at(int(back[0]) + 1, TIME)}: expected a time {wanted}, got {at}")
 
 
-def ordered(names: set[Any]) -> list[Any]:
+def ordered(names: set[_Name | None]) -> list[_Name]:
     """The names of landmarks, whole numbers before text; None, the unknown one, is left out."""
-    return sorted(names - {None}, key=lambda name: (isinstance(name, str), name))
+    known = (name for name in names if name is not None)
+    return sorted(known, key=lambda name: (isinstance(name, str), name))
 
 
-def columns_of(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence[str]]) -> Columns:
+def columns_of(
+    what: str, given: Tabular, wanted: Callable[[Sequence[str]], Sequence[str]]
+) -> Columns[int | str]:
     """The table of a data frame, a mapping of columns, a structured array, or a sequence of rows.
 
     Columns with names are found by them; a name may have a unit ("bearing [deg]"). Without names
@@ -180,6 +200,7 @@ def columns_of(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence
         found = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
         divisors = dict.fromkeys(needed, 1.0)
     else:
+        assert not isinstance(given, Sequence)  # which has no names
         own = {split_unit(name)[0]: name for name in names}
         found, divisors = {}, {}
         for name in needed:
@@ -193,18 +214,16 @@ def columns_of(what: str, given: Any, wanted: Callable[[Sequence[str]], Sequence
         lengths = {name: len(column) for name, column in found.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"{what}: expected columns of one length, got {lengths}")
-    columns: dict[str, Any] = {}
-    for name, column in found.items():
-        if name == TAG:
-            columns[name] = [_landmark(at(k, name), value) for k, value in enumerate(column)]
-        else:
-            columns[name] = _numbers(at, name, column) / divisors[name]
+    tags = None
+    if TAG in found:
+        tags = [_landmark(at(k, TAG), value) for k, value in enumerate(found.pop(TAG))]
+    columns = {n: _numbers(at, n, column) / divisors[n] for n, column in found.items()}
     if not columns[TIME].size:
         raise ValueError(f"{what}: expected at least one row, got none")
-    return Columns(columns, at)
+    return Columns(columns, tags, at)
 
 
-def _names(given: Any) -> tuple[str, ...] | None:
+def _names(given: Tabular) -> tuple[str, ...] | None:
     """The names of the columns, or None where they have none."""
     if isinstance(given, Mapping):
         return tuple(map(str, given))
@@ -214,16 +233,21 @@ def _names(given: Any) -> tuple[str, ...] | None:
     return None if columns is None else tuple(map(str, columns))
 
 
-def _numbers(at: Callable[[int, str], str], name: str, column: list[Any]) -> np.ndarray:
+def _numbers(
+    at: Callable[[int, str], str], name: str, column: Sequence[object]
+) -> Float[np.ndarray, "K"]:
     """(K,) float64; raises ValueError on anything else than finite numbers."""
     for row, value in enumerate(column):
-        good = isinstance(value, int | float | np.integer | np.floating)
-        if not good or isinstance(value, bool) or not math.isfinite(value):
+        if (
+            not isinstance(value, int | float | np.integer | np.floating)
+            or isinstance(value, bool)
+            or not math.isfinite(value)
+        ):
             raise ValueError(f"{at(row, name)}: expected a finite number, got {value!r}")
     return np.array(column, np.float64)
 
 
-def _landmark(place: str, value: Any) -> Hashable:
+def _landmark(place: str, value: object) -> int | str | None:
     """The name of a landmark, an int or a str; None where it is unknown (None, "", -1 or NaN)."""
     if isinstance(value, np.generic):
         value = value.item()

@@ -1,7 +1,7 @@
 """The best pose of a lattice, exactly: blocks of shifts that are bounded, divided and left out."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,13 +68,13 @@ def search(
     )
     corner = jnp.asarray(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.int32))
 
-    def unfinished(state: Any) -> Array:
+    def unfinished(state: tuple[Array, Nodes, Array, Best]) -> Array:
         size, _, value, best = state
         rest_is_worse = (size <= count) & (value[jnp.maximum(size - 1, 0)] <= best.value)
         more = (size > 0) & ~rest_is_worse
         return jnp.asarray(more & (best.value <= above) if first else more)
 
-    def step(state: Any) -> Any:
+    def step(state: tuple[Array, Nodes, Array, Best]) -> tuple[Array, Nodes, Array, Best]:
         size, stack, value, best = state
         at = size - 1 - jnp.arange(_CHUNK)
         live = (at >= 0) & (value[jnp.maximum(at, 0)] > best.value)

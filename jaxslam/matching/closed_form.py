@@ -1,6 +1,6 @@
 """Exact minima of the quadratic costs of a step: over points, over lines, with a prior."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ def of_points(
     """Σ w |R s + t - q|²."""
     weighted = weight[:, None] * source
     x, y = weighted.sum(axis=0)
-    eye: Any = jnp.eye(2, dtype=source.dtype)
+    eye = jnp.eye(2, dtype=source.dtype)
     # R s = (s_x r_x - s_y r_y, s_y r_x + s_x r_y).
     along = (weighted * target).sum()
     across = (weighted[:, 0] * target[:, 1] - weighted[:, 1] * target[:, 0]).sum()
@@ -115,7 +115,7 @@ def least(of: Quadratic) -> Float[Array, "3"]:
     A share ε^¾ of the traces (ε of the dtype) pulls towards the identity, so that what the cost
     does not determine stays as it is. Take points about their mean, for small rounding.
     """
-    eye: Any = jnp.eye(2, dtype=of.shift.dtype)
+    eye = jnp.eye(2, dtype=of.shift.dtype)
     pull = float(jnp.finfo(of.shift.dtype).eps) ** 0.75
 
     def pulled(matrix: Array) -> Array:
@@ -147,7 +147,7 @@ def on_circle(s: Float[Array, "2 2"], h: Float[Array, "2"]) -> Float[Array, "2"]
     h1 = jnp.where(jnp.abs(h1) > tiny, h1, jnp.where(h1 < 0, -tiny, tiny))
     start = jnp.maximum(0.5 * jnp.abs(h1) - low, 0.5 * jnp.abs(h2) - high)
 
-    def newton(_: Any, at: Array) -> Array:
+    def newton(_: Array, at: Array) -> Array:
         u, v = low + at, high + at
         phi = (h1 / u) ** 2 + (h2 / v) ** 2
         slope = h1**2 / u**3 + h2**2 / v**3

@@ -1,6 +1,6 @@
 """The best of all poses of a window: correlative scan matching, exact on its lattice."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -191,6 +191,6 @@ def correlative(
     return Matcher("correlative", prepare, match, cost, of_grid=True)
 
 
-def _square(axis: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _square(axis: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n*n 2"]:
     """All pairs of the entries, (n², 2)."""
     return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.int32)

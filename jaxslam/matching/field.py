@@ -1,6 +1,6 @@
 """Levenberg's method on the distance field of a grid."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,10 @@ class _At(NamedTuple):
     """A, with Λ"""
     slope: Float[Array, "3"]
     """half of the cost's"""
+
+
+_State: TypeAlias = tuple[Array, Array, _At, Array, Array]
+"""iterations, pose, linearization there, damping, whether the last step was small"""
 
 
 def field(
@@ -87,10 +91,10 @@ def field(
         length, lines = length_of(points), surface(points, span, gap)
         low, high = _DAMPING[1:]
 
-        def unfinished(state: Any) -> Array:
+        def unfinished(state: _State) -> Array:
             return jnp.asarray((state[0] < iterations) & ~state[4])
 
-        def step(state: Any) -> Any:
+        def step(state: _State) -> _State:
             k, pose, at, damping, _ = state
             diagonal = jnp.diagonal(at.curvature)
             diagonal = jnp.maximum(diagonal, 1e-9 * jnp.maximum(diagonal.max(), 1e-9))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -97,6 +97,10 @@ class Metric(NamedTuple):
     """(surface, moved points, partners, weights) -> ½ Σ w e²"""
 
 
+_State: TypeAlias = tuple[Array, Array, Array, Array]
+"""iterations, pose, the pose before, how far the last step went"""
+
+
 def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
     """The matcher of a metric."""
     reach, iterations, tolerance = settings.reach, settings.iterations, settings.tolerance
@@ -114,11 +118,11 @@ def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
     def match(of: Surface, points: Points, start: Array, prior: Prior | None = None) -> Match:
         length = length_of(points)
 
-        def unfinished(state: Any) -> Array:
+        def unfinished(state: _State) -> Array:
             k, _, _, change = state
             return jnp.asarray((k < iterations) & (change > tolerance))
 
-        def step(state: Any) -> Any:
+        def step(state: _State) -> _State:
             k, pose, before, _ = state
             pairs = pairs_at(of, points, pose)
             total = pairs.weight.sum()

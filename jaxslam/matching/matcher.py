@@ -3,17 +3,20 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam import programs
 from jaxslam.grids.grid import Grid, check_grid
 from jaxslam.matching.points import Points
 from jaxslam.matching.prior import Prior
 from jaxslam.validation.numbers import is_concrete, shape_told
+
+Reference: TypeAlias = Points | Grid
 
 
 class MatchStatus(IntEnum):
@@ -68,13 +71,13 @@ class Matcher:
     """A way to match a scan to a reference. The functions are pure and of one pair: vmap them."""
 
     name: str
-    prepare: Callable[[Any], Any]
+    prepare: Callable[[PyTree], PyTree]
     """(reference) -> what the matcher needs of it, once for all scans: a pytree of arrays. The
     reference is `Points`, or a `Grid` where `of_grid`."""
-    match: Callable[[Any, Points, Array, Prior | None], Match]
+    match: Callable[[PyTree, Points, Array, Prior | None], Match]
     """(prepared, points, start (3,), prior or None) -> match. By while loops: forward derivatives
     alone."""
-    cost: Callable[[Any, Points, Array, Match], Array]
+    cost: Callable[[PyTree, Points, Array, Match], Array]
     """(prepared, points, pose, match) -> () ½ Σ w e² [m²] and the prior's, the match's pairs,
     weights and prior kept; differentiable by the pose, the points, and by the reference through
     `prepare`."""
@@ -82,7 +85,11 @@ class Matcher:
 
 
 def match(
-    matcher: Matcher, reference: Any, points: Points, start: Any, prior: Prior | None = None
+    matcher: Matcher,
+    reference: Reference,
+    points: Points,
+    start: ArrayLike,
+    prior: Prior | None = None,
 ) -> Match:
     """The match of a scan to a reference, by a program that is compiled once a structure.
 
@@ -103,18 +110,18 @@ def match(
 
 
 def _one(
-    matcher: Matcher, reference: Any, points: Points, start: Array, prior: Prior | None
+    matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
 ) -> Match:
     return matcher.match(matcher.prepare(reference), points, start, prior)
 
 
 def _many(
-    matcher: Matcher, reference: Any, points: Points, start: Array, prior: Prior | None
+    matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
 ) -> Match:
     return jax.vmap(matcher.match)(prepared_all(matcher, reference), points, start, prior)
 
 
-def prepared_all(matcher: Matcher, references: Any) -> Any:
+def prepared_all(matcher: Matcher, references: Reference) -> PyTree:
     """What the matcher needs of each reference; grids one after another, as loops over cells go
     slowly side by side."""
     if matcher.of_grid:
@@ -122,7 +129,9 @@ def prepared_all(matcher: Matcher, references: Any) -> Any:
     return jax.vmap(matcher.prepare)(references)
 
 
-def _checked(matcher: Any, reference: Any, points: Any, start: Any) -> tuple[int, ...]:
+def _checked(
+    matcher: object, reference: object, points: object, start: ArrayLike
+) -> tuple[int, ...]:
     """The leading axis, () of one pair; raises ValueError on what `match` refuses."""
     if not isinstance(matcher, Matcher):
         raise ValueError(f"match: expected a Matcher, got {type(matcher).__name__}")
@@ -149,7 +158,7 @@ def _checked(matcher: Any, reference: Any, points: Any, start: Any) -> tuple[int
     return batch
 
 
-def _check_prior(prior: Any, batch: tuple[int, ...]) -> None:
+def _check_prior(prior: object, batch: tuple[int, ...]) -> None:
     if not isinstance(prior, Prior):
         raise ValueError(f"match: expected a Prior, got {type(prior).__name__}")
     if np.shape(prior.pose) != (*batch, 3) or np.shape(prior.information) != (*batch, 3, 3):
@@ -172,7 +181,7 @@ def _check_prior(prior: Any, batch: tuple[int, ...]) -> None:
             )
 
 
-def check_points(name: str, of: Any, batch: tuple[int, ...] = ()) -> None:
+def check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:
     """Raise ValueError, which begins with a caller's name, unless they are finite `Points`."""
     if not isinstance(of, Points):
         raise ValueError(f"{name}: expected Points, got {type(of).__name__}")

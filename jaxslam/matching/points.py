@@ -1,6 +1,6 @@
 """The points of a scan, with the directions of their beams; and a grid of them."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,7 +39,7 @@ def points(
         mount: (3,) pose of the laser on the robot.
     """
     r = jnp.asarray(beams.range)
-    valid = beams.valid & (r > min_range) & (r < jnp.asarray(max_range) * (1 - 1e-6))
+    valid = (r > min_range) & (r < jnp.asarray(max_range) * (1 - 1e-6)) & beams.valid
     r = jnp.where(valid, r, 1.0)
     eye = jnp.asarray(mount, r.dtype)
     heading = eye[2] + beams.angle
@@ -84,5 +84,4 @@ def raster(
     free = jnp.full((size, size), -1.0, of.position.dtype)
     log_odds = free.at[row, column].set(1.0, mode="drop")
     origin = jnp.concatenate([corner, jnp.zeros(1, corner.dtype)])
-    made: Any = log_odds, origin, jnp.asarray(resolution, corner.dtype)
-    return Grid(*made)
+    return Grid(log_odds, origin, jnp.asarray(resolution, corner.dtype))

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
-_F = TypeVar("_F", bound=Callable[..., Any])
+_F = TypeVar("_F", bound=Callable[..., PyTree])
 
 
 def traced_once(function: _F) -> _F:
@@ -40,7 +40,7 @@ def no_inline(function: Callable[..., _T], *arguments: PyTree) -> _T:
         return cast(_T, jax.jit(whole)(*arguments))
 
 
-def quick_options(platform: str) -> dict[str, Any] | None:
+def quick_options(platform: str) -> dict[str, int] | None:
     """Compiler options that shorten the compilation of loop-free programs; None if there are none.
 
     For programs that run only once, or spend their time in long passes over arrays and not in loops
@@ -49,7 +49,7 @@ def quick_options(platform: str) -> dict[str, Any] | None:
     return {"xla_backend_optimization_level": 1} if platform == "cpu" else None
 
 
-def hot_options(platform: str) -> dict[str, Any] | None:
+def hot_options(platform: str) -> dict[str, int] | None:
     """Compiler options that speed up long-running programs; None if there are none.
 
     By default XLA vectorizes CPU code for 256 bits. Where the processor has AVX-512, 512 bits made
@@ -59,7 +59,7 @@ def hot_options(platform: str) -> dict[str, Any] | None:
 
 
 @functools.cache
-def _wide_vectors() -> dict[str, Any] | None:
+def _wide_vectors() -> dict[str, int] | None:
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
             flags = next((line for line in file if line.startswith("flags")), "")
@@ -67,7 +67,7 @@ def _wide_vectors() -> dict[str, Any] | None:
         return None
     if "avx512f" not in flags.split():
         return None
-    options: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512}
+    options: dict[str, int] = {"xla_cpu_prefer_vector_width": 512}
     try:
         jax.jit(lambda: 0).lower().compile(options)
     except jax.errors.JaxRuntimeError as error:

@@ -1,6 +1,6 @@
 """The error of a path, pose by pose, against a reference."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -68,7 +68,7 @@ def carried(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
     return np.stack(out, axis=1)
 
 
-def wrapped(angle: Any) -> Any:
+def wrapped(angle: np.ndarray) -> np.ndarray:
     """Angles [rad] in [-π, π]; those that are there already stay as they are."""
     return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 

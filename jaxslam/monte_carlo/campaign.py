@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import jax
 import numpy as np
@@ -49,10 +49,10 @@ class Keep(Protocol):
     def claim(self, fingerprint: Mapping[str, str]) -> None:
         """Note what campaign this is, once; ValueError where it is another that was noted."""
 
-    def save(self, first: int, arrays: Mapping[str, np.ndarray], runs: int) -> Any:
+    def save(self, first: int, arrays: Mapping[str, np.ndarray], runs: int) -> object:
         """Keep runs first … first + runs - 1."""
 
-    def blocks(self) -> Iterable[Any]:
+    def blocks(self) -> Iterable[tuple[int, int, Mapping[str, np.ndarray]]]:
         """(first, runs, arrays) of each block kept."""
 
 
@@ -289,7 +289,7 @@ class _Work:
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
         early = len(queue) > self.workers
-        flight: dict[Future[Any], tuple[int, int]] = {}
+        flight: dict[Future[dict[str, dict[str, np.ndarray]]], tuple[int, int]] = {}
         stop: BaseException | None = None
         # XLA uses the cores; threads of the BLAS below its LAPACK would only spin beside it.
         with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:

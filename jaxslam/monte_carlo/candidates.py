@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -171,7 +171,7 @@ def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
             )
 
 
-def check_called(name: str, candidate: Callable[..., Any]) -> None:
+def check_called(name: str, candidate: Callable[..., object]) -> None:
     """Raise ValueError if a candidate is a factory of filters instead of what one returns."""
     first = next(iter(inspect.signature(candidate).parameters.values()), None)
     if first is None:

@@ -18,16 +18,17 @@ import dataclasses
 import enum
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Jaxpr, Literal
+from jax.extend.core import Jaxpr, Literal, Var
 from jax.typing import DTypeLike
+from jaxtyping import PyTree
 
 from jaxslam import consistency
 from jaxslam.consistency import own_error_of
@@ -72,9 +73,9 @@ def fingerprint(
 
     def world(key: jax.Array) -> tuple[Truth, Log, jax.Array]:
         truth, log = rounded(simulate(scenario, key), dtype)
-        return truth, log, jax.vmap(sensor.position)(truth.landmarks)
+        return truth, log, jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
 
-    def results(candidate: Candidate) -> Callable[..., Any]:
+    def results(candidate: Candidate) -> Callable[[Truth, Log, jax.Array], tuple[Trace, jax.Array]]:
         def of(truth: Truth, log: Log, key: jax.Array) -> tuple[Trace, jax.Array]:
             method, chart = estimator_of(candidate, truth, scenario)
             trace = method(log, key)
@@ -90,7 +91,7 @@ def fingerprint(
     return found
 
 
-def digest(function: Callable[..., Any], *arguments: Any) -> str:
+def digest(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """Of what a function computes of arguments of these shapes; see the module."""
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     return _short(f"{jax.tree.structure(shapes)} {_Reader().value(closed)}")
@@ -112,14 +113,14 @@ class _Reader:
         """A digest: variables go by the order in which they appear."""
         if id(jaxpr) in self._known:
             return self._known[id(jaxpr)][1]
-        numbers: dict[Any, int] = {}
+        numbers: dict[Var, int] = {}
 
-        def bound(variables: Any) -> str:
+        def bound(variables: Sequence[Var]) -> str:
             for variable in variables:
                 numbers[variable] = len(numbers)
             return f"({', '.join(str(variable.aval) for variable in variables)})"
 
-        def read(atoms: Any) -> str:
+        def read(atoms: Sequence[Var | Literal]) -> str:
             return ", ".join(
                 f"{atom.aval} {self.value(atom.val)}"
                 if isinstance(atom, Literal)
@@ -138,7 +139,7 @@ class _Reader:
         self._known[id(jaxpr)] = jaxpr, short  # held, so that no other gets its id
         return short
 
-    def value(self, value: Any) -> str:
+    def value(self, value: object) -> str:
         """A constant, or a parameter of a primitive."""
         if hasattr(value, "jaxpr") and hasattr(value, "consts"):
             return f"{self.jaxpr(value.jaxpr)} of {self.value(list(value.consts))}"
@@ -166,7 +167,7 @@ def _short(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _array(value: Any) -> str:
+def _array(value: object) -> str:
     """Shape, dtype and a digest of the bits of an array, or of a key."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         return _key(value)
@@ -190,7 +191,7 @@ def _version(name: str) -> str:
         return "not installed"
 
 
-def _source(package: Any) -> str:
+def _source(package: ModuleType) -> str:
     """A digest of the source files of a package."""
     total = hashlib.sha256()
     for folder in package.__path__:

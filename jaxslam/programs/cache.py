@@ -24,7 +24,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -175,7 +175,7 @@ def _shape_of(leaf: jax.Array) -> Shape:
 
 
 def _program(
-    function: Callable[..., Any], tree: PyTree, shapes: Sequence[Shape]
+    function: Callable[..., PyTree], tree: PyTree, shapes: Sequence[Shape]
 ) -> tuple[PyTree, list[PyTree] | None, PyTree]:
     structs = [
         jax.ShapeDtypeStruct(s.shape, s.dtype, weak_type=s.weak_type, sharding=s.sharding)
@@ -203,7 +203,7 @@ class Traced(NamedTuple):
     """the result as `jax.ShapeDtypeStruct`s"""
 
 
-def trace(function: Callable[..., Any], *arguments: PyTree) -> Traced | None:
+def trace(function: Callable[..., PyTree], *arguments: PyTree) -> Traced | None:
     """The function with every number it closes over as an argument; None if one is a tracer."""
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     flat, numbers = hoisted(closed)
@@ -217,11 +217,11 @@ def trace(function: Callable[..., Any], *arguments: PyTree) -> Traced | None:
 
 
 def compiled(
-    lowered: jax.stages.Lowered, where: Hashable, options: dict[str, Any] | None = None
-) -> Callable[..., Any]:
+    lowered: jax.stages.Lowered, where: Hashable, options: dict[str, int] | None = None
+) -> Callable[..., PyTree]:
     """The compiled program of a lowered text, from the cache if compiled for the same devices."""
     text = hashlib.sha256(lowered.as_text().encode()).digest()
     # Unused arguments are not in the text.
     told = tuple(sorted(options.items())) if options else ()
     key = (text, where, lowered.in_tree, str(lowered.in_avals), told)
-    return _BY_TEXT.get(key, lambda: cast(Callable[..., Any], lowered.compile(options)))
+    return _BY_TEXT.get(key, lambda: cast(Callable[..., PyTree], lowered.compile(options)))

@@ -10,23 +10,29 @@ constants.
 import functools
 import math
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.core import AbstractValue, ShapedArray
 from jax.extend import core as _core
+from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import PyTree
 
 core: Any = _core
+"""Its names and their types differ from one JAX to another."""
 
 
-def hoisted(closed: Any) -> tuple[Callable[..., Any], list[Any]]:
+def hoisted(closed: Jaxpr) -> tuple[Callable[..., list[Array]], list[ArrayLike]]:
     """A function (*numbers, *inputs) -> outputs that computes what a closed jaxpr does, and the
     numbers of that jaxpr.
     """
     jaxpr, numbers = _Hoisting().of(closed.jaxpr, closed.consts)
-    return cast(Callable[..., Any], core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, []))), numbers
+    return core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, [])), numbers
 
 
 _PLAIN = frozenset(
@@ -35,16 +41,21 @@ _PLAIN = frozenset(
 )
 
 
-def _is_number(atom: Any) -> bool:
-    """Whether an operand is a literal number that may come from a parameter."""
-    if not isinstance(atom, core.Literal) or not jnp.issubdtype(atom.aval.dtype, jnp.floating):
-        return False
+def _number_of(atom: Literal | Var) -> np.ndarray | None:
+    """The number of a literal that may come from a parameter; None of any other operand."""
+    kind = atom.aval
+    if not isinstance(atom, Literal) or not isinstance(kind, ShapedArray):
+        return None
+    if not jnp.issubdtype(kind.dtype, jnp.floating):
+        return None
     value = float(atom.val)
-    return not (math.isnan(value) or value in _kept(atom.aval.dtype))
+    if math.isnan(value) or value in _kept(kind.dtype):
+        return None
+    return np.asarray(value, kind.dtype)
 
 
 @functools.cache
-def _kept(dtype: Any) -> frozenset[float]:
+def _kept(dtype: DTypeLike) -> frozenset[float]:
     """The numbers of a dtype that remain literals."""
     limits = jnp.finfo(dtype)
     ends = {sign * float(end) for sign in (1, -1) for end in (limits.eps, limits.tiny, limits.max)}
@@ -55,9 +66,9 @@ class _Hoisting:
     """One pass over a jaxpr, which rewrites each inner jaxpr once."""
 
     def __init__(self) -> None:
-        self._done: dict[tuple[int, ...], tuple[Any, Any, Any]] = {}
+        self._done: dict[tuple[int, ...], tuple[PyTree, Jaxpr, list[ArrayLike]]] = {}
 
-    def of(self, jaxpr: Any, consts: Sequence[Any]) -> tuple[Any, list[Any]]:
+    def of(self, jaxpr: Jaxpr, consts: Sequence[ArrayLike]) -> tuple[Jaxpr, list[ArrayLike]]:
         """The result of `hoisted` for a jaxpr and its constants."""
         which = id(jaxpr), *map(id, consts)
         known = self._done.get(which)
@@ -65,20 +76,20 @@ class _Hoisting:
             return known[1:]
         inputs, numbers = list(jaxpr.constvars), list(consts)
 
-        def given(values: Sequence[Any], avals: Sequence[Any]) -> list[Any]:
-            new = [core.Var(aval) for aval in avals]
+        def given(values: Sequence[ArrayLike], avals: Sequence[AbstractValue]) -> list[Var]:
+            new = [Var(aval) for aval in avals]
             inputs.extend(new)
             numbers.extend(values)
             return new
 
         eqns = []
         for eqn in jaxpr.eqns:
-            atoms = [
-                given([np.asarray(a.val, a.aval.dtype)], [a.aval])[0] if _is_number(a) else a
-                for a in eqn.invars
-            ]
+            atoms: list[Literal | Var] = []
+            for atom in eqn.invars:
+                number = _number_of(atom)
+                atoms.append(atom if number is None else given([number], [atom.aval])[0])
             rewrite = _CALLS.get(eqn.primitive.name)
-            eqn = eqn.replace(invars=atoms)
+            eqn = _changed(eqn, atoms, eqn.params)
             eqns.append(eqn if rewrite is None else rewrite(self, eqn, given))
         new = jaxpr.replace(
             constvars=(),
@@ -89,37 +100,45 @@ class _Hoisting:
         self._done[which] = (jaxpr, consts), new, numbers
         return new, numbers
 
-    def inner(self, closed: Any, given: "_Given") -> tuple[Any, list[Any]]:
+    def inner(self, closed: Jaxpr, given: "_Given") -> tuple[Jaxpr, list[Var]]:
         """The jaxpr of a call without its numbers, and the outer variables that replace them."""
         jaxpr, numbers = self.of(closed.jaxpr, closed.consts)
         return jaxpr, given(numbers, [var.aval for var in jaxpr.invars[: len(numbers)]])
 
 
-_Given = Callable[[Sequence[Any], Sequence[Any]], list[Any]]
-_Rewrite = Callable[[_Hoisting, Any, _Given], Any]
+_Given = Callable[[Sequence[ArrayLike], Sequence[AbstractValue]], list[Var]]
+_Rewrite = Callable[[_Hoisting, JaxprEqn, _Given], JaxprEqn]
+
+
+def _changed(
+    eqn: JaxprEqn, invars: Sequence[Literal | Var], params: Mapping[str, object]
+) -> JaxprEqn:
+    """The equation with other operands and parameters."""
+    changed: JaxprEqn = eqn.replace(invars=list(invars), params=dict(params))
+    return changed
 
 
 @functools.cache
-def _plain_call() -> Any:
+def _plain_call() -> JaxprEqn:
     """The handler of an equation that calls one function."""
     (eqn,) = jax.make_jaxpr(jax.jit(lambda x: x + 1.0))(0.0).eqns
     return eqn
 
 
-def _call(work: _Hoisting, eqn: Any, given: _Given) -> Any:
+def _call(work: _Hoisting, eqn: JaxprEqn, given: _Given) -> JaxprEqn:
     """The handler of jit."""
     jaxpr, new = work.inner(eqn.params["jaxpr"], given)
     params, plain = dict(eqn.params), _plain_call().params
     params["jaxpr"] = core.ClosedJaxpr(jaxpr, [])
     for name in ("donated_invars", "in_shardings", "in_layouts"):
         params[name] = (*(plain[name] * len(new)), *params[name])
-    return eqn.replace(invars=[*new, *eqn.invars], params=params)
+    return _changed(eqn, [*new, *eqn.invars], params)
 
 
 def _as_call(name: str) -> _Rewrite:
     """A call with custom differentiation rules, rewritten as a plain call."""
 
-    def rewrite(work: _Hoisting, eqn: Any, given: _Given) -> Any:
+    def rewrite(work: _Hoisting, eqn: JaxprEqn, given: _Given) -> JaxprEqn:
         plain = _plain_call()
         params = dict(plain.params)
         params["jaxpr"] = eqn.params[name]
@@ -127,12 +146,13 @@ def _as_call(name: str) -> _Rewrite:
             params[key] = plain.params[key] * len(eqn.invars)
         for key in ("out_shardings", "out_layouts"):
             params[key] = plain.params[key] * len(eqn.outvars)
-        return _call(work, eqn.replace(primitive=plain.primitive, params=params), given)
+        called: JaxprEqn = eqn.replace(primitive=plain.primitive, params=params)
+        return _call(work, called, given)
 
     return rewrite
 
 
-def _scan(work: _Hoisting, eqn: Any, given: _Given) -> Any:
+def _scan(work: _Hoisting, eqn: JaxprEqn, given: _Given) -> JaxprEqn:
     """The handler of scan, whose constants come first."""
     jaxpr, new = work.inner(eqn.params["jaxpr"], given)
     params = dict(eqn.params)
@@ -140,16 +160,16 @@ def _scan(work: _Hoisting, eqn: Any, given: _Given) -> Any:
     if "ft_in" in params:  # from jax 0.11 on, the inputs by kind
         of_inputs = params["ft_in"]
         consts, *others = of_inputs.unpack()
-        pack: Any = sys.modules[type(of_inputs).__module__]
+        pack = sys.modules[type(of_inputs).__module__]
         params["ft_in"] = pack.pack((pack.pack((pack.nones(len(new)), consts)), *others))
     else:
         params["num_consts"] += len(new)
         if "linear" in params:
             params["linear"] = (*(False,) * len(new), *params["linear"])
-    return eqn.replace(invars=[*new, *eqn.invars], params=params)
+    return _changed(eqn, [*new, *eqn.invars], params)
 
 
-def _while(work: _Hoisting, eqn: Any, given: _Given) -> Any:
+def _while(work: _Hoisting, eqn: JaxprEqn, given: _Given) -> JaxprEqn:
     """The handler of while: constants of the condition, then of the body, come first."""
     params, invars = dict(eqn.params), list(eqn.invars)
     at = 0
@@ -159,17 +179,17 @@ def _while(work: _Hoisting, eqn: Any, given: _Given) -> Any:
         invars[at:at] = new
         params[f"{kind}_nconsts"] += len(new)
         at += params[f"{kind}_nconsts"]
-    return eqn.replace(invars=invars, params=params)
+    return _changed(eqn, invars, params)
 
 
-def _cond(work: _Hoisting, eqn: Any, given: _Given) -> Any:
+def _cond(work: _Hoisting, eqn: JaxprEqn, given: _Given) -> JaxprEqn:
     """The handler of cond: every branch takes the numbers of all branches."""
     found = [work.inner(branch, given) for branch in eqn.params["branches"]]
     new = [var for _, mine in found for var in mine]
     branches = []
     for i, (jaxpr, mine) in enumerate(found):
         before, after = (
-            [core.Var(var.aval) for _, others in part for var in others]
+            [Var(var.aval) for _, others in part for var in others]
             for part in (found[:i], found[i + 1 :])
         )
         own, rest = jaxpr.invars[: len(mine)], jaxpr.invars[len(mine) :]
@@ -178,13 +198,13 @@ def _cond(work: _Hoisting, eqn: Any, given: _Given) -> Any:
         )
         branches.append(core.ClosedJaxpr(whole, []))
     params = eqn.params | {"branches": tuple(branches)}
-    return eqn.replace(invars=[eqn.invars[0], *new, *eqn.invars[1:]], params=params)
+    return _changed(eqn, [eqn.invars[0], *new, *eqn.invars[1:]], params)
 
 
-def _checkpoint(work: _Hoisting, eqn: Any, given: _Given) -> Any:
+def _checkpoint(work: _Hoisting, eqn: JaxprEqn, given: _Given) -> JaxprEqn:
     """The handler of checkpoint, whose jaxpr is open."""
     jaxpr, new = work.inner(core.ClosedJaxpr(eqn.params["jaxpr"], []), given)
-    return eqn.replace(invars=[*new, *eqn.invars], params=eqn.params | {"jaxpr": jaxpr})
+    return _changed(eqn, [*new, *eqn.invars], eqn.params | {"jaxpr": jaxpr})
 
 
 _CALLS: dict[str, _Rewrite] = {

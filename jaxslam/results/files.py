@@ -10,9 +10,9 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
-Json: TypeAlias = dict[str, Any]
+Json: TypeAlias = dict[str, object]
 """What JSON can hold, by name."""
 
 Files: TypeAlias = dict[str, str | Callable[[Path], object]]

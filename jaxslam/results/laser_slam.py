@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,8 +16,9 @@ from jaxslam.results import report
 from jaxslam.results.files import Files, csv_text
 from jaxslam.types import Estimate
 
-if TYPE_CHECKING:  # Pillow is slow to load
+if TYPE_CHECKING:  # Pillow and Matplotlib are slow to load
     from jaxslam.results.film import Film
+    from jaxslam.results.plot.style import Figure
 
 HELD = 12
 """Frames of a film that show the map after closing."""
@@ -62,7 +63,7 @@ def figures(
         "graph": lambda: plot.loops_figure(solved, reference),
     }
 
-    def drawn(make: Callable[[], Any], kind: str) -> Callable[[Path], object]:
+    def drawn(make: Callable[[], "Figure"], kind: str) -> Callable[[Path], object]:
         return lambda path: path.write_bytes(plot.encode(make(), kind))
 
     return {
@@ -131,15 +132,14 @@ def _verdict(solved: Solved) -> str:
 def _estimate(solved: Solved) -> Estimate:
     """The path as an estimate without landmarks."""
     count = len(solved.time)
-    made: Any = {
-        "pose": solved.poses,
-        "pose_cov": solved.cov,
-        "points": np.zeros((count, 0, 2)),
-        "point_covs": np.zeros((count, 0, 2, 2)),
-        "alive": np.zeros((count, 0), bool),
-        "tag": np.zeros((count, 0), int),
-    }
-    return Estimate(**made)
+    return Estimate(
+        pose=solved.poses,
+        pose_cov=solved.cov,
+        points=np.zeros((count, 0, 2)),
+        point_covs=np.zeros((count, 0, 2, 2)),
+        alive=np.zeros((count, 0), bool),
+        tag=np.zeros((count, 0), int),
+    )
 
 
 def _loops_csv(solved: Solved) -> str:

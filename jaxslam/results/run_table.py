@@ -4,7 +4,6 @@ import importlib.util
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -68,7 +67,7 @@ def save_table(campaign: Campaign, path: str | Path) -> Path:
     return write_files(path.parent, {path.name: made})[0]
 
 
-def _plain(column: np.ndarray) -> list[Any]:
+def _plain(column: np.ndarray) -> list[object]:
     """The values as Python's own, None where not finite."""
     if column.dtype.kind != "f":
         return list(column.tolist())

@@ -61,7 +61,7 @@ class Store:
     """
 
     folder: Path
-    settings: Json
+    settings: Mapping[str, object]
     runs: int | None = None
     """number of runs that the campaign is to have, if known; it may be extended"""
     campaign: dict[str, str] = field(default_factory=dict)
@@ -230,15 +230,17 @@ def resume(
             f"{path}: expected format {FORMAT}, got {manifest['format']}: begin a new campaign"
         )
     own, campaign = manifest.get("settings"), manifest.get("campaign")
+    total = manifest.get("runs")
     if (
         not isinstance(own, dict)
         or not isinstance(campaign, dict)
+        or not isinstance(total, int | None)
         or manifest.get("digest") != _digest({"settings": own, "campaign": campaign})
     ):
         raise ValueError(f"{path}: it was changed since the campaign began")
     if settings is not None and (differences := _differences(own, _as_stored(settings))):
         raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
-    kept = Store(folder, own, manifest.get("runs"), campaign)
+    kept = Store(folder, own, total, campaign)
     if runs is None:
         return kept
     if (end := max((first + count for first, count in kept.spans()), default=0)) > runs:
@@ -300,13 +302,16 @@ def _digest(settings: Mapping[str, object]) -> str:
     return hashlib.sha256(canonical_json(settings).encode()).hexdigest()
 
 
-def _differences(there: Json, here: Json, above: str = "") -> list[str]:
+def _differences(
+    there: Mapping[str, object], here: Mapping[str, object], above: str = ""
+) -> list[str]:
     """A sentence for each setting that differs, in nested settings, too."""
     found = []
     for key in {**there, **here}:
         values = [side[key] for side in (there, here) if key in side]
-        if len(values) == 2 and all(isinstance(value, dict) for value in values):
-            found += _differences(values[0], values[1], f"{above}{key}.")
+        inner = [value for value in values if isinstance(value, dict)]
+        if len(inner) == 2:
+            found += _differences(inner[0], inner[1], f"{above}{key}.")
         elif len(values) < 2 or canonical_json(values[0]) != canonical_json(values[1]):
             plain = all(isinstance(value, str) for value in values)
             old, new = (
@@ -315,7 +320,11 @@ def _differences(there: Json, here: Json, above: str = "") -> list[str]:
                 else "absent"
                 for side in (there, here)
             )
-            if len(values) == 2 and plain and all(map(_DIGEST.fullmatch, values)):
+            if (
+                len(values) == 2
+                and plain
+                and all(_DIGEST.fullmatch(str(value)) for value in values)
+            ):
                 how = "computes something else than in the stored runs (was its file edited?)"
             else:
                 how = f"{old} there, {new} here"

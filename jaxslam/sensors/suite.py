@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NoReturn
+from typing import Literal, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +99,7 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
             )
     size = max(len(part.sensor.measurements) for part in made)
 
-    def not_one(*_: Any) -> NoReturn:
+    def not_one(*_: object) -> NoReturn:
         raise ValueError("suite: a suite has no model of its own: call those of suite.parts")
 
     return Suite(
@@ -118,7 +118,7 @@ def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
     )
 
 
-def _part(given: Any) -> Part:
+def _part(given: object) -> Part:
     if not isinstance(given, tuple) or len(given) != 2:
         raise ValueError(f"suite: expected a Part or (sensor, places), got {given!r}")
     return Part(*given)

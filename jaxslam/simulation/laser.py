@@ -1,7 +1,7 @@
 """A laser scanner in a world of exact walls, and what its scan can say of the pose."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -179,7 +179,9 @@ def _ranges_and_slopes(laser: Laser, walls: Walls, pose: Array) -> tuple[Array, 
     return ranges(pose), jax.jacfwd(ranges)(pose)
 
 
-def _named(direction: Any, pose: Any, per_length: float) -> str:
+def _named(
+    direction: Float[np.ndarray, "3"], pose: Float[np.ndarray, "3"], per_length: float
+) -> str:
     """A motion in words: with turn ω it is a rotation about t + (-dy, dx)/ω."""
     dx, dy, turn = direction
     if abs(turn) < 1e-3 * per_length * np.hypot(dx, dy):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,17 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
-from jaxslam.simulation.worlds import Scenario, drawn_near, drive, part_scan, side_by_side
+from jaxslam.simulation.worlds import Scenario, Visible, drawn_near, drive, part_scan, side_by_side
 from jaxslam.team import Robot, check_team, motion_of, sensors_of, sizes
 from jaxslam.types import Log, Scan, Truth
+
+
+class TeamOptions(TypedDict, total=False):
+    """Fields of `Scenario` that a world of a team may have, too."""
+
+    visible: Visible
+    published: dict[str, dict[str, float]]
+    source: str
 
 
 def team_world(
@@ -26,7 +34,7 @@ def team_world(
     name: str = "team",
     pose: ArrayLike = (0.0, 0.0, 0.0),
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-    **options: Any,
+    **options: Unpack[TeamOptions],
 ) -> Scenario:
     """A `Scenario` of several robots among landmarks (x, y), for `simulate` and `monte_carlo`.
 
@@ -45,7 +53,7 @@ def team_world(
         tags: (R,) of the robots; default N, N + 1, …
         report: which robot the truth is of.
         pose, pose_cov: what is known of robot 0 before the first control.
-        options: other fields of `Scenario`: visible, published, source.
+        options: other fields of `Scenario`, see `TeamOptions`.
     Raises:
         ValueError: on no robots, tags that clash, a robot without start, one that is not there to
             report, and as `Scenario` does.

@@ -1,7 +1,7 @@
 """Rooms whose walls a laser sees exactly: segments and circles, without a grid."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.grids.grid import Grid
+from jaxslam.types import JaxOrNumPy
 
 
 class Walls(NamedTuple):
@@ -18,11 +19,11 @@ class Walls(NamedTuple):
     pillar.
     """
 
-    segments: Float[Array, "K 2 2"]
+    segments: Float[JaxOrNumPy, "K 2 2"]
     """both ends (x, y) of each [m]"""
-    circles: Float[Array, "C 3"]
+    circles: Float[JaxOrNumPy, "C 3"]
     """centre (x, y) and radius of each [m]"""
-    glass: Float[Array, "K"] | None = None
+    glass: Float[JaxOrNumPy, "K"] | None = None
     """the share of beams that pass each segment, in [0, 1]; None where none is of glass"""
 
 
@@ -52,12 +53,12 @@ def walls(
     rounds = (
         np.asarray(circles, np.float64).reshape(-1, 3) if np.size(circles) else np.zeros((0, 3))
     )
-    made: Any = Walls(np.concatenate(segments), rounds)  # type: ignore[arg-type]
+    made = Walls(np.concatenate(segments), rounds)
     if not all(np.all(np.isfinite(part)) for part in made[:2]) or np.any(rounds[:, 2] <= 0):
         raise ValueError("walls: expected finite numbers and radii above 0")
     if len(made.segments) + len(rounds) == 0:
         raise ValueError("walls: expected at least one wall")
-    shares: Any = _shares(segments[1:], glass) if glass else None
+    shares = _shares(segments[1:], glass) if glass else None
     return Walls(made.segments, made.circles, shares)
 
 
@@ -118,7 +119,7 @@ def _cross(a: Array, b: Array) -> Array:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def is_free(world: Walls, points: ArrayLike) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def is_free(world: Walls, points: ArrayLike) -> Bool[np.ndarray, "..."]:
     """Whether points (…, 2) lie in free space: inside an odd number of walls; on the host."""
     p = np.asarray(points, np.float64)
     inside = np.zeros(p.shape[:-1], bool)
@@ -209,5 +210,4 @@ def rasterize(
     solid = np.clip(solid, edge, 1 - edge)
     solid = np.where(solid == 0.5, 0.5 + 1e-9, solid)
     origin = np.array([*(turn_back @ low), yaw])
-    made: Any = np.log(solid) - np.log1p(-solid), origin, np.array(resolution)
-    return Grid(*made)
+    return Grid(np.log(solid) - np.log1p(-solid), origin, np.array(resolution))

@@ -4,7 +4,7 @@ key."""
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
+from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Motion, Sensor
@@ -61,7 +62,7 @@ class Scenario:
     spurious: Spurious | None = None
     """clutter, misses, outliers and wrong labels; where given, if only as `Spurious()`, the truth
     says which landmark each measurement is of, and associations are scored."""
-    filter_options: dict[str, Any] = field(default_factory=dict)
+    filter_options: EkfOptions = field(default_factory=EkfOptions)
     """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
     draw: Callable[["Scenario", Array], tuple[Truth, Log]] | None = None
     """(scenario, key) -> truth, log: a world of another kind (`team_world`); None for `simulate`'s

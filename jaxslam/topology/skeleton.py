@@ -41,7 +41,7 @@ def skeleton(grid: Grid, *, clearance: float = 0.2) -> Skeleton:
     if not clearance > 0:
         raise ValueError(f"skeleton: expected a clearance above 0, got {clearance}")
     free = np.pad(np.asarray(grid.log_odds) < 0, 1)
-    walls = Grid(np.where(free, -1.0, 1.0), grid.origin, grid.resolution)  # type: ignore[arg-type]
+    walls = Grid(np.where(free, -1.0, 1.0), grid.origin, grid.resolution)
     field = distance_field(walls)
     # From the centre of a cell to the border of the wall's: half a cell less than to its centre.
     half = 0.5 * float(np.asarray(grid.resolution))

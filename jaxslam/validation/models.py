@@ -4,7 +4,7 @@ Each error is one line that states what was expected."""
 import inspect
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +13,13 @@ import numpy as np
 from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
 
 _Shape = tuple[int, ...]
+_Record = TypeVar("_Record")
 
-_SOUND: weakref.WeakSet[Any] = weakref.WeakSet()
+_SOUND: weakref.WeakSet[Motion | Sensor] = weakref.WeakSet()
 """Models whose sizes have been checked."""
 
 
-def check_models(name: str, motion: Any, sensor: Any) -> None:
+def check_models(name: str, motion: object, sensor: object) -> None:
     """Raise ValueError, which begins with a factory's name, unless these are a Motion and a Sensor.
 
     Their functions are evaluated on shapes alone (`jax.eval_shape`): they must take the arguments
@@ -33,9 +34,9 @@ def check_models(name: str, motion: Any, sensor: Any) -> None:
     check_sensor(name, sensor)
 
 
-def check_motion(name: str, motion: Any) -> None:
+def check_motion(name: str, motion: object) -> None:
     """Raise ValueError unless this is a Motion; see `check_models`."""
-    check_record(name, "motion", motion, Motion)
+    motion = check_record(name, "motion", motion, Motion)
     if motion in _SOUND:
         return
     pose, u, w = _numbers(3), _numbers(len(motion.controls)), _numbers(len(motion.noises))
@@ -44,9 +45,9 @@ def check_motion(name: str, motion: Any) -> None:
     _SOUND.add(motion)
 
 
-def check_sensor(name: str, sensor: Any) -> None:
+def check_sensor(name: str, sensor: object) -> None:
     """Raise ValueError unless this is a Sensor, or a suite of them; see `check_models`."""
-    check_record(name, "sensor", sensor, Sensor)
+    sensor = check_record(name, "sensor", sensor, Sensor)
     if parts := getattr(sensor, "parts", ()):  # of a suite
         for part in parts:
             check_sensor(name, part.sensor)
@@ -72,9 +73,9 @@ def check_sensor(name: str, sensor: Any) -> None:
 def check_parts(
     name: str,
     *,
-    chart: Any = None,
-    linearize: Any = None,
-    associate: Any = None,
+    chart: object = None,
+    linearize: object = None,
+    associate: object = None,
 ) -> None:
     """Raise ValueError unless each part has its type; None stands for the default."""
     if chart is not None:
@@ -85,10 +86,10 @@ def check_parts(
         check_associate(name, associate)
 
 
-def check_record(name: str, what: str, value: Any, kind: type) -> None:
-    """Raise ValueError unless the value is such a record, not a factory that was not called."""
+def check_record(name: str, what: str, value: object, kind: type[_Record]) -> _Record:
+    """The value, if it is such a record; ValueError if not, as on a factory that was not called."""
     if isinstance(value, kind):
-        return
+        return value
     if callable(value):
         factory = getattr(value, "__name__", repr(value))
         raise ValueError(
@@ -98,7 +99,7 @@ def check_record(name: str, what: str, value: Any, kind: type) -> None:
     raise ValueError(f"{name}: expected {what} to be a {kind.__name__}, got {type(value).__name__}")
 
 
-def check_associate(name: str, associate: Any) -> None:
+def check_associate(name: str, associate: object) -> None:
     """Raise ValueError unless this is a function of (prediction, scan)."""
     if not callable(associate):
         raise ValueError(
@@ -127,10 +128,14 @@ def _numbers(*shape: int) -> jax.ShapeDtypeStruct:
 
 
 def _check_size(
-    name: str, model: Any, field: str, arguments: dict[str, Any], shape: _Shape
+    name: str,
+    model: Motion | Sensor,
+    field: str,
+    arguments: dict[str, jax.ShapeDtypeStruct],
+    shape: _Shape,
 ) -> None:
     """Raise ValueError unless the model's function returns this shape for these arguments."""
-    function: Callable[..., Any] = getattr(model, field)
+    function: Callable[..., object] = getattr(model, field)
     told = ", ".join(f"{key} {_told(value.shape)}" for key, value in arguments.items())
     call = f"{model.name}.{field}({told})"
     try:

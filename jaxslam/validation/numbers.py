@@ -1,7 +1,6 @@
 """Checks of numbers: counts, keys, gates, covariances."""
 
 from numbers import Integral
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
-def is_concrete(*values: Any) -> bool:
+def is_concrete(*values: object) -> bool:
     """Whether the values are concrete, i.e. no leaf is a tracer."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def largest(*values: Any) -> float:
+def largest(*values: ArrayLike) -> float:
     """The largest size of a number of a log, by the dtype that these values are computed in.
 
     The fifth root of the largest number of the dtype, 4e61 (float64) or 5e7 (float32): so a filter
@@ -24,7 +23,7 @@ def largest(*values: Any) -> float:
     return float(float(jnp.finfo(dtype).max) ** 0.2)
 
 
-def shape_told(value: Any) -> str:
+def shape_told(value: ArrayLike) -> str:
     """The shape of an array, or the type of anything else, for an error message."""
     try:
         shape = np.shape(value)
@@ -37,7 +36,7 @@ def shape_told(value: Any) -> str:
 
 
 def check_array(
-    name: str, value: Any, shape: tuple[int | str, ...], kind: type = np.generic
+    name: str, value: ArrayLike, shape: tuple[int | str, ...], kind: type = np.generic
 ) -> None:
     """Raise ValueError unless an array has this shape, in which a letter stands for any number."""
     got = shape_told(value)
@@ -54,13 +53,13 @@ def check_array(
         raise ValueError(f"{name}: expected {kind.__name__} values, got {dtype}")
 
 
-def check_count(name: str, value: Any) -> None:
+def check_count(name: str, value: object) -> None:
     """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
         raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
 
 
-def check_key(name: str, key: Any) -> None:
+def check_key(name: str, key: object) -> None:
     """Raise ValueError unless key is one PRNG key: of `jax.random.key`, or the raw numbers of one.
 
     A tracer of one is accepted.
@@ -74,9 +73,9 @@ def check_key(name: str, key: Any) -> None:
         raise ValueError(f"{name}: expected a PRNG key, as jax.random.key(0), got {shown}")
 
 
-def check_gate(name: str, gate: Any) -> None:
+def check_gate(name: str, gate: ArrayLike | None) -> None:
     """Raise ValueError unless the gate is None, a tracer, or above 0."""
-    if gate is not None and is_concrete(gate) and not gate > 0:
+    if gate is not None and is_concrete(gate) and not np.asarray(gate) > 0:
         raise ValueError(f"{name}: expected a gate above 0, got {gate}")
 
 

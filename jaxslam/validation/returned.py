@@ -1,12 +1,13 @@
 """Checks of the results of user-defined filters, during tracing."""
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from jaxslam.types import Estimate, Info, Scan
 from jaxslam.validation.numbers import check_array, shape_told
@@ -14,7 +15,7 @@ from jaxslam.validation.numbers import check_array, shape_told
 _S = TypeVar("_S")
 
 
-def same_state(name: str, before: _S, after: Any) -> _S:
+def same_state(name: str, before: _S, after: PyTree) -> _S:
     """The state that a filter's function returned; ValueError unless its structure is that before.
 
     Tree, shapes and dtypes must be the same, since the state is the carry of a `lax.scan`.
@@ -44,11 +45,11 @@ def _kind(state: PyTree) -> str:
     return "an array" if at == [""] else f"{type(state).__name__} of {', '.join(at) or 'nothing'}"
 
 
-def _array(leaf: Any) -> str:
+def _array(leaf: ArrayLike) -> str:
     return f"{jnp.result_type(leaf)} {shape_told(leaf)}"
 
 
-def state_and_info(name: str, state: _S, scan: Scan, found: Any) -> tuple[_S, Info]:
+def state_and_info(name: str, state: _S, scan: Scan, found: object) -> tuple[_S, Info]:
     """The result of a filter's update; ValueError unless it is a state as before, and an `Info`."""
     if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Info)):
         got = type(found).__name__
@@ -71,7 +72,7 @@ def state_and_info(name: str, state: _S, scan: Scan, found: Any) -> tuple[_S, In
     return same_state(f"{name}: update", state, found[0]), info
 
 
-def checked_estimate(name: str, estimate: Any) -> Estimate:
+def checked_estimate(name: str, estimate: object) -> Estimate:
     """The result of a filter's estimate; ValueError unless it is an `Estimate` of N landmarks."""
     if not isinstance(estimate, Estimate):
         raise ValueError(

@@ -1,6 +1,6 @@
 """Comparison of Jacobians computed in several ways: which entries are wrong, by which method."""
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.verify.derivatives.jacobians import Evaluated, Jacobians
 from jaxslam.verify.inputs.samples import NOMINAL, Samples
-from jaxslam.verify.record import Finding, WrongEntry
+from jaxslam.verify.record import Finding, WorstState, WrongEntry
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 """Jacobians (S, m, n)."""
@@ -177,7 +177,7 @@ def _finding(
     )
 
 
-def _worst_state(compared: _Compared, evaluated: Evaluated, which: int) -> dict[str, Any]:
+def _worst_state(compared: _Compared, evaluated: Evaluated, which: int) -> WorstState:
     """The state and entry with the largest excess over a tolerance, wrong or not."""
     if not compared.excess.size:
         return {}

@@ -4,7 +4,7 @@ import math
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TypedDict
 
 _SHOWN = 3
 """number of wrong entries of a Jacobian that are printed with their values; others by name only"""
@@ -46,6 +46,16 @@ class WrongEntry:
         yield f"  {self.precision}, {self.label}: {at}"
 
 
+class WorstState(TypedDict, total=False):
+    """The state with the largest difference over its tolerance; empty where there is no state."""
+
+    label: str
+    """name of the kind of state"""
+    entry: tuple[str, str]
+    """the output and the entry of the argument, with their units"""
+    state: dict[str, list[float]]
+
+
 @dataclass(frozen=True)
 class Finding:
     """The comparison of one Jacobian: how far its methods differ, and its wrong entries."""
@@ -71,8 +81,7 @@ class Finding:
     samples: int
     no_derivative: int
     """number of samples at which the quotients do not converge and are ignored"""
-    worst_state: dict[str, Any]
-    """label, entry and state with the largest difference over its tolerance"""
+    worst_state: WorstState
     wrong_entries: tuple[WrongEntry, ...]
     """every entry outside its tolerance at some state, in falling order of the number of states"""
 
@@ -162,20 +171,18 @@ class Report:
             lines.append(f"  linearity index {self.linearity:.3g}, median (3 σ of 0.1 m, 0.05 rad)")
         return "\n".join(lines)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """The report as a dictionary for JSON; numbers that are not finite are None."""
-        plain: dict[str, Any] = _json_value(
-            {
-                "model": self.model,
-                "kind": self.kind,
-                "passed": self.passed,
-                "jacobians": [asdict(finding) for finding in self.findings],
-                "checks": [asdict(check) for check in self.checks],
-                "linearity_index": self.linearity,
-                "notes": self.notes,
-            }
-        )
-        return plain
+        told = {
+            "model": self.model,
+            "kind": self.kind,
+            "passed": self.passed,
+            "jacobians": [asdict(finding) for finding in self.findings],
+            "checks": [asdict(check) for check in self.checks],
+            "linearity_index": self.linearity,
+            "notes": self.notes,
+        }
+        return {key: _json_value(part) for key, part in told.items()}
 
 
 def report_table(reports: Sequence[Report]) -> str:
@@ -222,7 +229,7 @@ def _two_digits(value: float) -> str:
     return f"{value:.1e}" if value else "0"
 
 
-def _json_value(value: Any) -> Any:
+def _json_value(value: object) -> object:
     """A value with lists for tuples, and None for numbers that are not finite."""
     if isinstance(value, dict):
         return {key: _json_value(part) for key, part in value.items()}

@@ -4,7 +4,8 @@ import contextlib
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, NamedTuple, TypeAlias
+from types import ModuleType
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.experimental
@@ -319,8 +320,10 @@ def _given_samples(function: Function, states: Sequence[ArrayLike]) -> Samples:
     return Samples(tuple(tables), ("given",) * len(tables[0]))
 
 
-def _float64() -> AbstractContextManager[Any]:
+def _float64() -> AbstractContextManager[object]:
     """A block in which JAX has 64-bit types, in this thread."""
-    home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental  # from jax 0.8 on, before
-    context: AbstractContextManager[Any] = home.enable_x64(True)
+    home: ModuleType = (
+        jax if hasattr(jax, "enable_x64") else jax.experimental
+    )  # from jax 0.8 on, before
+    context: AbstractContextManager[object] = home.enable_x64(True)
     return context

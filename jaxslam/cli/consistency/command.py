@@ -8,7 +8,6 @@ import threading
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any
 
 import jax
 
@@ -16,10 +15,10 @@ from jaxslam.cli.common import INTERRUPTED, OUT
 from jaxslam.cli.consistency.film import write_films
 from jaxslam.cli.consistency.folder import (
     BLOCKS,
-    TIMES,
-    check_same_campaign,
+    CampaignOptions,
     earlier_results,
     open_store,
+    resumed,
 )
 from jaxslam.cli.runtime import devices, library
 from jaxslam.cli.user_objects import UserObjects
@@ -32,17 +31,6 @@ from jaxslam.results.files import check_writable
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Truth
 from jaxslam.validation.numbers import check_count
-
-DEFAULTS: dict[str, Any] = {
-    "scenario": "circle",
-    "filters": "dead_reckoning,ekf",
-    "runs": 100,
-    "steps": None,
-    "seed": 0,
-    "bound": False,
-    "dtype": "float64",
-}
-"""Default values of the options that define a campaign."""
 
 
 def consistency(options: argparse.Namespace, command: str) -> int:
@@ -58,22 +46,24 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     asked_for = filter(None, options.table.split(","))
     tables = run_table.check_table_formats("--table", [*asked_for, *there])
     files = UserObjects()
-    scenario = files.scenario(asked["scenario"], asked["steps"])
-    filters = files.filters(asked["filters"], scenario)
-    if not 0 <= asked["seed"] < 2**32:
-        raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {asked['seed']}")
-    check_count("runs", asked["runs"])
+    scenario = files.scenario(asked.scenario, asked.steps)
+    filters = files.filters(asked.filters, scenario)
+    if not 0 <= asked.seed < 2**32:
+        raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {asked.seed}")
+    check_count("runs", asked.runs)
     if options.block is not None:
         check_count("block", options.block)
     check_writable(out)
     # What is missing of a campaign of parts is computed as the parts would.
-    here = devices.chosen_devices(options.devices, settings.get("devices"))
-    key = jax.random.key(asked["seed"])
+    most = settings.get("devices")
+    assert isinstance(most, int | None)
+    here = devices.chosen_devices(options.devices, most)
+    key = jax.random.key(asked.seed)
     identity, programs = _identity(asked, files, scenario, filters, key, here[0].platform)
     if part is not None and options.block is None:
         options.block = fitting_block(scenario, filters, here[0])
-    if part is not None and (part[0] - 1) * options.block * len(here) >= asked["runs"]:
-        print(f"part {part[0]} of {part[1]} has no block of the {asked['runs']:,} runs")
+    if part is not None and (part[0] - 1) * options.block * len(here) >= asked.runs:
+        print(f"part {part[0]} of {part[1]} has no block of the {asked.runs:,} runs")
         return 0
     keep = open_store(options, out, asked, settings, part and len(here))
     earlier = None if part else earlier_results(out, keep)
@@ -88,12 +78,12 @@ def consistency(options: argparse.Namespace, command: str) -> int:
             campaign = monte_carlo(
                 scenario,
                 filters,
-                asked["runs"],
+                asked.runs,
                 key,
                 block=options.block,
                 devices=here,
-                bound=asked["bound"],
-                dtype=asked["dtype"],
+                bound=asked.bound,
+                dtype=asked.dtype,
                 keep=keep,
                 part=part,
                 identity=identity,
@@ -115,21 +105,26 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     if part is not None:
         print(
             f"part {part[0]} of {part[1]} is done, {campaign.runs:,} runs; {keep.folder} holds "
-            f"{keep.done():,} of {asked['runs']:,}; jaxslam consistency --resume {out} computes "
+            f"{keep.done():,} of {asked.runs:,}; jaxslam consistency --resume {out} computes "
             "what is missing, and sums up"
         )
         return 0
     took = campaign.seconds
     ran = took - campaign.compile_seconds if campaign.compile_seconds else 0.0
     if earlier is not None and not keep.set_aside:  # else some runs were computed again
-        times = {name: earlier[name] for name in TIMES}
-        campaign, command = replace(campaign, **times), earlier["command"]
+        campaign = replace(
+            campaign,
+            seconds=earlier.seconds,
+            compile_seconds=earlier.compile_seconds,
+            step_seconds=earlier.step_seconds,
+        )
+        command = earlier.command
     else:
         written = False
     print(campaign)
     film = ""
     if options.animate:
-        films = write_films(out, scenario, filters, asked["seed"], campaign.dtype)
+        films = write_films(out, scenario, filters, asked.seed, campaign.dtype)
         film = "" if written else next(iter(films.values())).player()
     if written:
         more = "but films" if options.animate else "and nothing written"
@@ -142,7 +137,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         name = campaign_files.filter_of_run_zero(campaign)
         first = _run_zero(scenario, filters[name], key, campaign.dtype)
         campaign = replace(campaign, first={name: first})
-    paths = campaign_files.save_campaign(campaign, out, formats, True, command, asked["seed"], film)
+    paths = campaign_files.save_campaign(campaign, out, formats, True, command, asked.seed, film)
     paths += [campaign.save_runs(out / f"runs.{kind}") for kind in tables]
     print("\nwrote " + ", ".join(map(str, paths)))
     print(
@@ -152,22 +147,20 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _asked(options: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+def _asked(options: argparse.Namespace) -> tuple[CampaignOptions, Mapping[str, object]]:
     """The options that define the campaign, and the settings that a resumed one began with.
 
     They come from the command, the resumed campaign and the defaults, in this order. The options of
     a resumed campaign get its size of blocks unless another is given.
     """
-    asked = {name: value for name, value in vars(options).items() if name in DEFAULTS}
-    settings: dict[str, Any] = {}
-    if options.resume is not None:
-        there = store.resume(options.resume / BLOCKS)
-        check_same_campaign(options, there, asked)
-        settings = there.settings
-        asked = settings["asked"] | {"runs": there.runs} | asked
-        if options.block is None:  # blocks of another size would round differently
-            options.block = settings.get("block")
-    return DEFAULTS | asked, settings
+    asked = {n: value for n, value in vars(options).items() if n in CampaignOptions._fields}
+    if options.resume is None:
+        return CampaignOptions(**asked), {}
+    there = store.resume(options.resume / BLOCKS)
+    whole = resumed(options, there, asked)
+    if options.block is None:  # blocks of another size would round differently
+        options.block = there.settings.get("block")
+    return whole, there.settings
 
 
 def _part(options: argparse.Namespace) -> tuple[int, int] | None:
@@ -189,7 +182,7 @@ def _part(options: argparse.Namespace) -> tuple[int, int] | None:
 
 
 def _identity(
-    asked: Mapping[str, Any],
+    asked: CampaignOptions,
     files: UserObjects,
     scenario: Scenario,
     filters: Mapping[str, Candidate],
@@ -203,10 +196,10 @@ def _identity(
     a trace, and its programs are found in JAX's own cache, by their text.
     """
     if not files.used:
-        identity = library.identity(asked, platform)
+        identity = library.identity(asked._asdict(), platform)
         return identity, library.program_folder(identity)
     with files.located_errors():
-        found = fingerprint(scenario, filters, key, platform, asked["bound"], asked["dtype"])
+        found = fingerprint(scenario, filters, key, platform, asked.bound, asked.dtype)
     return found, nullcontext()
 
 

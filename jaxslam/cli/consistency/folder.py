@@ -5,7 +5,7 @@ import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import jax
 
@@ -17,12 +17,30 @@ from jaxslam.results.campaign_files import RESULT
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
 
-TIMES = ("seconds", "compile_seconds", "step_seconds")
-"""Entries of the results that are measured while the campaign runs."""
+
+class CampaignOptions(NamedTuple):
+    """The options that define a campaign, with their defaults."""
+
+    scenario: str = "circle"
+    filters: str = "dead_reckoning,ekf"
+    runs: int = 100
+    steps: int | None = None
+    seed: int = 0
+    bound: bool = False
+    dtype: str = "float64"
 
 
-def earlier_results(out: Path, keep: store.Store) -> dict[str, Any] | None:
-    """The results of a finished campaign in a folder; None without them or where runs miss."""
+class Earlier(NamedTuple):
+    """Entries of the results that are not the same when a finished campaign is run again."""
+
+    seconds: float
+    compile_seconds: float
+    step_seconds: dict[str, float]
+    command: str
+
+
+def earlier_results(out: Path, keep: store.Store) -> Earlier | None:
+    """Those of a finished campaign in a folder; None without them or where runs miss."""
     assert keep.runs is not None
     if missing(keep.spans(), keep.runs, keep.runs):
         return None
@@ -31,7 +49,9 @@ def earlier_results(out: Path, keep: store.Store) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     whole = isinstance(found, dict) and found.get("runs") == keep.runs
-    return found if whole and {*TIMES, "command"} <= found.keys() else None
+    if not whole or not set(Earlier._fields) <= found.keys():
+        return None
+    return Earlier(*(found[name] for name in Earlier._fields))
 
 
 def _as_option(value: object) -> str:
@@ -41,33 +61,36 @@ def _as_option(value: object) -> str:
     return "not given" if value is None else str(value)
 
 
-def check_same_campaign(
-    options: argparse.Namespace, there: store.Store, asked: Mapping[str, Any]
-) -> None:
-    """Raise ValueError unless the options agree with the campaign that is to be resumed."""
+def resumed(
+    options: argparse.Namespace, there: store.Store, asked: Mapping[str, object]
+) -> CampaignOptions:
+    """The options of the campaign to be resumed; ValueError unless those given agree with them."""
     folder = options.resume
     if options.out is not None and options.out.resolve() != folder.resolve():
         raise ValueError(
             f"--resume: its results go to {folder}: expected no --out, got {options.out}"
         )
-    if "asked" not in there.settings:
+    told = there.settings.get("asked")
+    if not isinstance(told, dict):
         raise ValueError(
             f"--resume: {folder} holds a campaign that was begun from Python; continue it there, "
             "with monte_carlo(keep=jaxslam.store.resume(folder))"
         )
-    if differences := _differences(there.settings["asked"], asked):
+    if differences := _differences(told, asked):
         raise ValueError(
             f"--resume: {folder} holds another campaign: {differences}: leave these "
             "options out to continue it, or begin another with --out in another folder"
         )
-    if (done := there.done()) > (runs := asked.get("runs", done)):
+    done = there.done()
+    if done > (runs := getattr(options, "runs", done)):
         raise ValueError(
             f"--runs: {folder} holds {done} runs: expected at least as many, got {runs}; leave "
             "--runs out to use all of them, or begin another campaign with --out in another folder"
         )
+    return CampaignOptions(**(told | {"runs": there.runs} | dict(asked)))
 
 
-def _differences(told: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
+def _differences(told: Mapping[str, object], asked: Mapping[str, object]) -> str:
     """Every option that is another in the campaign that was told."""
     return "; ".join(
         f"--{name} is {_as_option(told[name])} there, {_as_option(value)} here"
@@ -79,8 +102,8 @@ def _differences(told: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
 def open_store(
     options: argparse.Namespace,
     out: Path,
-    asked: dict[str, Any],
-    settings: dict[str, Any],
+    asked: CampaignOptions,
+    settings: Mapping[str, object],
     devices_of_part: int | None,
 ) -> store.Store:
     """The store of this campaign's blocks, in a new folder or in that of the resumed campaign.
@@ -89,11 +112,11 @@ def open_store(
         settings: those that a resumed campaign began with; empty for another.
         devices_of_part: with how many devices a part of it is computed, where it is a part.
     """
-    folder, runs = out / BLOCKS, asked["runs"]
-    told = {name: value for name, value in asked.items() if name != "runs"}
+    folder, runs = out / BLOCKS, asked.runs
+    told = {name: value for name, value in asked._asdict().items() if name != "runs"}
     settings = settings or {"asked": told, "block": options.block}
     if devices_of_part is not None:
-        return _joined(folder, {"devices": devices_of_part} | settings, runs, options)
+        return _joined(folder, {"devices": devices_of_part, **settings}, runs, options)
     if options.resume is None and jax.process_index() == 0:
         _remove_old_blocks(options, out, settings, runs)
         store.create(folder, settings, runs)
@@ -102,13 +125,13 @@ def open_store(
 
 
 def _joined(
-    folder: Path, settings: dict[str, Any], runs: int, options: argparse.Namespace
+    folder: Path, settings: Mapping[str, object], runs: int, options: argparse.Namespace
 ) -> store.Store:
     """The store of a campaign whose parts independent processes compute."""
     if (folder / store.MANIFEST).exists():
         there = store.resume(folder).settings
-        own = {**settings["asked"], "block": options.block, "devices": settings["devices"]}
-        if "asked" in there and (found := _differences({**there["asked"], **there}, own)):
+        own = _flat(settings) | {"block": options.block}
+        if "asked" in there and (found := _differences(_flat(there), own)):
             raise ValueError(
                 f"--part: {folder.parent} holds another campaign: {found}: give all parts the same "
                 "options, or begin another campaign with --out in another folder"
@@ -121,8 +144,15 @@ def _joined(
     return store.join(folder, settings, runs)
 
 
+def _flat(settings: Mapping[str, object]) -> dict[str, object]:
+    """Settings with the options of the command beside the others."""
+    asked = settings.get("asked")
+    others = {name: value for name, value in settings.items() if name != "asked"}
+    return (asked if isinstance(asked, dict) else {}) | others
+
+
 def _remove_old_blocks(
-    options: argparse.Namespace, out: Path, settings: dict[str, Any], runs: int
+    options: argparse.Namespace, out: Path, settings: Mapping[str, object], runs: int
 ) -> None:
     """Delete the blocks of an earlier campaign; raises ValueError unless the options allow it."""
     folder = out / BLOCKS

@@ -5,7 +5,8 @@ import argparse
 from jaxslam.catalog import ALL
 from jaxslam.cli import films
 from jaxslam.cli.common import OUT, add_figures
-from jaxslam.cli.consistency.command import DEFAULTS, consistency
+from jaxslam.cli.consistency.command import consistency
+from jaxslam.cli.consistency.folder import CampaignOptions
 from jaxslam.cli.runtime import cache
 from jaxslam.results.campaign_files import FORMATS
 from jaxslam.results.run_table import FORMATS as RUN_FORMATS
@@ -26,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "steps": "number of steps of each trajectory; default: the scenario's own",
         "seed": "seed of the random numbers",
     }.items():
-        default = DEFAULTS[name]
+        default = getattr(CampaignOptions(), name)
         kind = str if isinstance(default, str) else int
         text += "" if default is None else f" (default: {default})"
         campaign.add_argument(f"--{name}", type=kind, default=argparse.SUPPRESS, help=text)

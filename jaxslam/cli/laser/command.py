@@ -3,7 +3,6 @@
 import argparse
 import time
 from collections.abc import Callable
-from typing import Any
 
 from jaxslam.cli import films
 from jaxslam.cli.common import summary_table
@@ -26,7 +25,7 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
     check_writable(options.out)
     job = _job_of(options)(log, options)
     figures = job.figures(formats)
-    summary: dict[str, Any] = {
+    summary: dict[str, object] = {
         "dataset": log.name,
         "source": log.source,
         "command": command,

@@ -2,9 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxslam.results.files import Files, Json
+
+if TYPE_CHECKING:  # Matplotlib is slow to load
+    from jaxslam.results.plot.style import Figure
 
 
 class Job(NamedTuple):
@@ -17,7 +20,7 @@ class Job(NamedTuple):
     """(formats) -> the figures"""
 
 
-def figure_files(name: str, figure: Any, formats: tuple[str, ...]) -> Files:
+def figure_files(name: str, figure: "Figure", formats: tuple[str, ...]) -> Files:
     """What writes a figure in some formats."""
     from jaxslam.results import plot  # matplotlib is slow to load
 

@@ -1,12 +1,12 @@
 """`jaxslam run --localize MAP.yaml`: Monte-Carlo localization from raw odometry and scans."""
 
 import argparse
-from typing import Any
+from typing import TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from jaxslam import grids, motion
 from jaxslam.cli.laser.job import Job, figure_files
@@ -26,11 +26,21 @@ ODOMETRY_NOISE = (0.05, 0.03, 0.02, 0.01)
 """α of `motion.odometry_noise`: of the raw odometry of the public logs against their corrected
 poses, 6 cm, 7 cm and 4° a step of 0.7 m, and some."""
 
-TRACKING: dict[str, Any] = {"exponent": 0.2, "forget": None}
+
+class _Weighing(TypedDict):
+    """Options of `grids.localize`."""
+
+    exponent: float
+    """of the likelihood"""
+    forget: tuple[float, float] | None
+    """recovery"""
+
+
+TRACKING: _Weighing = {"exponent": 0.2, "forget": None}
 """Exponent of the likelihood and recovery, of a robot that starts at a pose: none, since it takes
 scans that the map does not explain for a robot that is lost."""
 
-ANYWHERE: dict[str, Any] = {"exponent": 0.1, "forget": (0.05, 0.5)}
+ANYWHERE: _Weighing = {"exponent": 0.1, "forget": (0.05, 0.5)}
 """The same of a robot that may be anywhere, few particles being near the truth."""
 
 SIGMA = {"pose": 0.1, "anywhere": 0.2}
@@ -124,7 +134,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
     return Job(summary, files, figures)
 
 
-def _particle_info(info: Info) -> Any:
+def _particle_info(info: Info) -> PyTree:
     assert info.extra is not None
     return info.extra["particles"]
 

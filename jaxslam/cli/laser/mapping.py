@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
@@ -16,7 +15,7 @@ from jaxslam.grids import Counts, Grid
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
 from jaxslam.results.files import Files
-from jaxslam.types import Beams, Estimate
+from jaxslam.types import Beams, Estimate, JaxOrNumPy
 
 TOGETHER = 64
 """Scans between two updates of the progress."""
@@ -38,7 +37,7 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> Job:
         counts = counted(log, shape, origin, options.resolution, progress)
     grid = jax.device_get(grids.occupancy(counts))
     zero = np.zeros((len(log.time), 3, 3))
-    path: Any = Estimate(log.corrected, zero, (), (), (), ())  # type: ignore[arg-type]
+    path = Estimate(log.corrected, zero, *[np.zeros(0)] * 4)
 
     def figures(formats: tuple[str, ...]) -> Files:
         from jaxslam.results import plot  # matplotlib is slow to load
@@ -112,11 +111,11 @@ def counted(
             misses += np.asarray(found.misses)
             outside += int(found.outside)
         progress(min(begin + TOGETHER, total), total)
-    made: Any = hits, misses, origin, np.array(resolution), np.array(outside), np.array(unusable)
-    return Counts(*made)
+    sums = np.array(outside), np.array(unusable)
+    return Counts(hits, misses, origin, np.array(resolution), *sums)
 
 
-def _padded(rows: Any) -> Any:
+def _padded(rows: JaxOrNumPy) -> np.ndarray:
     return np.pad(rows, [(0, TOGETHER - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
 
 
@@ -130,7 +129,7 @@ def beams_told(log: LaserLog, counts: Counts) -> dict[str, int]:
     }
 
 
-def map_told(grid: Grid) -> dict[str, Any]:
+def map_told(grid: Grid) -> dict[str, object]:
     """Size and certainty of a map: entries of the summary."""
     height, width = grid.log_odds.shape
     known = np.asarray(grid.known)

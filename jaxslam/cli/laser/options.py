@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from jaxslam.datasets import LaserLog
 READERS = {"carmen": datasets.carmen}
 """Readers of laser logs by name; each takes (path, max_range=…)."""
 
-DEFAULTS: dict[str, Any] = {
+DEFAULTS: dict[str, object] = {
     "resolution": 0.05,
     "max_range": 50.0,
     "every": 1,

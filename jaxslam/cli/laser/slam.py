@@ -1,7 +1,6 @@
 """`jaxslam run` on a laser log without --map or --localize: laser SLAM."""
 
 import argparse
-from typing import Any
 
 import numpy as np
 
@@ -46,10 +45,10 @@ def _solved(log: LaserLog, settings: laser_slam.Settings) -> laser_slam.Solved:
         return laser_slam.solve(log, settings, progress=tell)
 
 
-def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, Any]:
+def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
     """Errors of relations, ATE, and which loops are right, by the poses in the file."""
     paths = {"raw odometry": solved.raw, "laser odometry": solved.odometry, "": solved.poses}
-    out: dict[str, Any] = {}
+    out: dict[str, object] = {}
     try:
         for name, path in paths.items():
             found = [metrics.rpe(log.corrected, path, metres=m) for m in METRES]

@@ -4,7 +4,7 @@ import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxslam.cli.films import NAMES as FILMS
 from jaxslam.cli.laser.command import run_laser
 from jaxslam.cli.laser.options import READERS as LASER_LOGS
 from jaxslam.cli.laser.options import refuse_laser_options
-from jaxslam.cli.run.film import film_steps, films, watching
+from jaxslam.cli.run.film import film_steps, films, shown
 from jaxslam.cli.run.filters import chosen_filters, with_options
 from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.datasets import READERS, Dataset, Reader
@@ -104,7 +104,7 @@ def _run(
     at: the steps that a film shows, None without one.
     """
 
-    def check(state: Any) -> bool:
+    def check(state: Joint) -> bool:
         return positive_definite(np.asarray(state.cov))
 
     pose, pose_cov = (np.asarray(part, np.float64) for part in (data.pose, data.pose_cov))
@@ -121,7 +121,8 @@ def _run(
             every=options.check_every if has_covariance else 0,
             check=check,
             progress=progress,
-            **({} if at is None else watching(at)),
+            at=at,
+            watch=shown,
         )
     seconds = time.perf_counter() - began
     last = result.last
@@ -207,8 +208,11 @@ def _definiteness(result: PiecewiseRun) -> str:
 
 def _flat(summary: Json) -> Json:
     """The summary as rows of one value: a row a status that occurs, a row a coordinate."""
-    counts = {f"status: {name}": count for name, count in summary["status"].items() if count}
+    status, final = summary["status"], summary["final pose"]
+    assert isinstance(status, dict)
+    assert isinstance(final, list)
+    counts = {f"status: {name}": count for name, count in status.items() if count}
     names = ("x [m]", "y [m]", "theta [rad]")
-    pose = {f"final {n}": value for n, value in zip(names, summary["final pose"], strict=True)}
+    pose = {f"final {n}": value for n, value in zip(names, final, strict=True)}
     rows = {key: summary[key] for key in summary if key not in ("status", "final pose")}
     return counts | rows | pose

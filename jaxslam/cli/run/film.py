@@ -4,14 +4,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PyTree
 
 from jaxslam.cli.films import film_files
 from jaxslam.cli.run.piecewise import PiecewiseRun
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.evaluation import Evaluation
 from jaxslam.monte_carlo.progress import Progress
-from jaxslam.results.files import Json
 
 
 def film_steps(data: Dataset) -> Int[np.ndarray, "F"]:
@@ -21,11 +20,11 @@ def film_steps(data: Dataset) -> Int[np.ndarray, "F"]:
     return frame_steps(data.steps, time=data.time)
 
 
-def watching(at: Int[np.ndarray, "F"]) -> Json:
-    """The arguments of `run_in_pieces` that keep what films of these steps show."""
+def shown(state: PyTree) -> PyTree:
+    """What a film shows of a filter's own state."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
-    return {"at": at, "watch": plot.probe}
+    return plot.probe(state)
 
 
 def films(
@@ -36,6 +35,7 @@ def films(
 
     made = {}
     for name, (run, found) in runs.items():
+        assert run.estimates is not None
         scene = plot.run_scene(
             plot.History(
                 path=np.asarray(run.path.pose),

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -10,7 +9,7 @@ from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS
 from jaxslam.cli.common import pick
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.table.settings import association_options
-from jaxslam.protocols import Filter
+from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Truth
 
@@ -19,20 +18,18 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
     """The data set with the gate and the association that the command asks for."""
     if options.gate is None and options.associate is None:
         return data
-    mine = dict(data.filter_options)
-    held = mine.pop("associate", None)
-    mine.pop("gate", None)
-    if options.associate is None and held is not None:
+    if options.associate is None and data.filter_options.get("associate") is not None:
         raise ValueError("--gate: expected --associate beside it, since the tags are not used")
     try:
         size = len(data.sensor.measurements)
-        mine |= association_options(options.associate or "known", options.gate, size)
+        own = association_options(options.associate or "known", options.gate, size)
     except ValueError as problem:
         raise ValueError(f"--{problem}") from problem
     asked = [name for name in ("gate", "associate") if getattr(options, name) is not None]
     assumed = (
         line for line in data.assumed if not line.startswith(tuple(f"[filter] {n}" for n in asked))
     )
+    mine = data.filter_options | {"gate": None, "associate": None} | own
     return dataclasses.replace(data, filter_options=mine, assumed=tuple(assumed))
 
 
@@ -58,8 +55,10 @@ def chosen_filters(data: Dataset, asked: str) -> dict[str, Filter]:
     return {name: _filter(name, pick("filter", name, ALL)(world), data) for name in names}
 
 
-def _filter(name: str, candidate: Any, data: Dataset) -> Filter:
-    if "associate" in data.filter_options and (name in CANONICAL or name == "localization"):
+def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:
+    if data.filter_options.get("associate") is not None and (
+        name in CANONICAL or name == "localization"
+    ):
         raise ValueError(f"--filters: {name} needs the tag of every measurement")
     if isinstance(candidate, Filter):
         return candidate
@@ -75,8 +74,7 @@ def _filter(name: str, candidate: Any, data: Dataset) -> Filter:
             else ("a map, landmarks.csv, in the frame of the start")
         )
         raise ValueError(f"--filters: {name} needs {needs}")
-    landmarks: Any = data.landmarks
-    nothing: Any = np.zeros(0)
-    made = candidate(Truth(nothing, landmarks, nothing, nothing))
+    nothing = np.zeros(0)
+    made = candidate(Truth(nothing, data.landmarks, nothing, nothing))
     assert isinstance(made, Filter)
     return made

@@ -1,20 +1,20 @@
 """A filter run over a long log piece by piece, with checks of its state in between."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PyTree
 
 from jaxslam.protocols import Filter
 from jaxslam.types import Estimate, Info, Log
 
-State: TypeAlias = Any
+State: TypeAlias = PyTree
 """A filter's own state, a pytree."""
 
-Rows: TypeAlias = tuple[tuple[Any, ...], Any]
+Rows: TypeAlias = tuple[tuple[PyTree, ...], PyTree]
 """What is kept of each step, and of the steps to watch: arrays with leading T."""
 
 CHECKS = 20
@@ -44,9 +44,9 @@ class PiecewiseRun(NamedTuple):
     """the results of these checks"""
     estimates: Estimate | None = None
     """the whole estimates (F, …) after the steps to watch, where there are such, and"""
-    watched: Any = None
+    watched: PyTree = None
     """what `watch` returned of the states there"""
-    kept: Any = None
+    kept: PyTree = None
     """what `keep` returned of the info of each step, leading T"""
 
 
@@ -61,8 +61,8 @@ def run_in_pieces(
     progress: Callable[[int, int], object],
     seed: int = 0,
     at: Int[np.ndarray, "F"] | None = None,
-    watch: Callable[[State], Any] = lambda state: None,
-    keep: Callable[[Info], Any] = lambda info: None,
+    watch: Callable[[State], PyTree] = lambda state: None,
+    keep: Callable[[Info], PyTree] = lambda info: None,
 ) -> PiecewiseRun:
     """Predict and update row by row, as `run` does, for a log whose values have been checked.
 

@@ -53,7 +53,7 @@ class CsvTable:
                     hint = "; a number has a point, no comma: 0.5"
                 raise self._error(number, f"expected {wanted} cells, got {len(cells)}{hint}")
 
-    def table(self, wanted: Sequence[str], why: str) -> Columns:
+    def table(self, wanted: Sequence[str], why: str) -> Columns[int]:
         """The wanted columns ("v [m/s]"), in their units.
 
         Raises ValueError on a column that is missing, without unit or in another one, a cell that
@@ -67,11 +67,8 @@ class CsvTable:
         def at(row: int, column: str) -> str:
             return f"{self.path}:{self.lines[row]}: {self._column(places[column])}"
 
-        columns = {
-            name: self._tags(place) if name == TAG else self._numbers(place, name)
-            for name, place in places.items()
-        }
-        return Columns(columns, at)
+        columns = {n: self._numbers(place, n) for n, place in places.items() if n != TAG}
+        return Columns(columns, self._tags(places[TAG]) if TAG in places else None, at)
 
     def unused(self, wanted: Sequence[str]) -> list[str]:
         """The columns of the file that are not among those wanted."""

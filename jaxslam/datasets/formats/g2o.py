@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -227,16 +227,15 @@ def _assembled(
         for kind, named in vertices.items()
     }
     ids = {kind: np.array(list(named), np.int32) for kind, named in vertices.items()}
-    fields: Any = {  # the records are declared as JAX arrays
-        "poses": values["pose"],
-        "points": values["point"],
-        "tables": {key: _table(file, table, index) for key, table in rows.items()},
-        "fixed_pose": held["pose"],
-        "fixed_point": held["point"],
-        "pose_id": ids["pose"],
-        "point_id": ids["point"],
-    }
-    graph = Graph(**fields)
+    graph = Graph(
+        poses=values["pose"],
+        points=values["point"],
+        tables={key: _table(file, table, index) for key, table in rows.items()},
+        fixed_pose=held["pose"],
+        fixed_point=held["point"],
+        pose_id=ids["pose"],
+        point_id=ids["point"],
+    )
     placed = len(ids["pose"]) + len(ids["point"]) if unplaced else 0
     return Loaded(odometry(graph) if unplaced else graph, skipped, placed)
 
@@ -264,5 +263,4 @@ def _table(file: TextFile, rows: _Rows, index: dict[str, dict[int, int]]) -> Tab
         if rows.kinds[row].entries == _TORO:
             why += "; EDGE2 has the order I11 I12 I22 I33 I13 I23, EDGE_SE2 that of the rows"
         raise file.error(rows.lines[row], why)
-    fields: Any = (np.array(who, np.int32), numbers[:, :size], information, np.ones(len(who), bool))
-    return Table(*fields)
+    return Table(np.array(who, np.int32), numbers[:, :size], information, np.ones(len(who), bool))

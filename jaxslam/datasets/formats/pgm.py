@@ -1,7 +1,6 @@
 """Grey images in files of the format PGM: P5 (binary) and P2 (text)."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,11 +38,11 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
         )
     count = width * height
     if kind == b"P2":
-        found: Any = np.array(_fields(path, data, at, count)[0])
+        found = np.array(_fields(path, data, at, count)[0])
     else:
-        shades: Any = np.uint8 if top < 256 else ">u2"
+        shades = np.dtype(np.uint8 if top < 256 else ">u2")
         body = data[at + 1 :]
-        size = count * np.dtype(shades).itemsize
+        size = count * shades.itemsize
         if len(body) < size:
             raise ValueError(f"{path}: the image ends after {len(body)} of {size} bytes")
         found = np.frombuffer(body[:size], shades)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ CERTAIN = math.log(509.0)
 
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 _MODES = ("trinary", "scale")
+_Value = TypeVar("_Value")
 _UNKNOWN = 205
 """The shade of unknown cells: p = 50/255 is between the usual thresholds."""
 
@@ -44,8 +45,7 @@ def load(path: str | Path) -> Grid:
     p = shade if negate else 1.0 - shade
     between = np.full(p.shape, 0.5) if mode == "trinary" else (p - free) / (occupied - free)
     p = np.where(p > occupied, 1.0, np.where(p < free, 0.0, between))
-    grid: Any = _log_odds(p)[::-1].copy(), np.array(origin), np.array(resolution)
-    return Grid(*grid)
+    return Grid(_log_odds(p)[::-1].copy(), np.array(origin), np.array(resolution))
 
 
 def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
@@ -156,7 +156,7 @@ class Header:
             wanted = f"expected {key}: [{', '.join(names)}]"
             raise self.file.error(line, f"{wanted}, got {value}: {reason}") from problem
 
-    def choice(self, key: str, choices: dict[str, Any], default: str | None = None) -> Any:
+    def choice(self, key: str, choices: dict[str, _Value], default: str | None = None) -> _Value:
         """What the value of a key stands for."""
         if key not in self.found and default is not None:
             return choices[default]

@@ -1,6 +1,6 @@
 """Systematic errors and noise of MRCLAM's robots, as a record that the readers apply."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -120,7 +120,11 @@ def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
     return jnp.diag(density) * jnp.where(moving, 1 / jnp.where(moving, dt, 1.0), 0.0)
 
 
-def recorded(odometry: Any, seen: Any, calibration: RobotCalibration | None) -> tuple[Any, Any]:
+def recorded(
+    odometry: Float[np.ndarray, "K 3"],
+    seen: Float[np.ndarray, "J 4"],
+    calibration: RobotCalibration | None,
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "J 4"]]:
     """The lines of a robot as they are, or corrected."""
     if calibration is None:
         return odometry, seen

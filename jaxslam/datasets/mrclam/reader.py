@@ -2,25 +2,26 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam.calibration import RobotCalibration, per_interval, recorded
 from jaxslam.datasets.mrclam.files import ROBOTS, read_landmarks, read_robot, read_truth
 from jaxslam.datasets.mrclam.truth import START_COV, cut_after, true_poses
-from jaxslam.logs.streams import hold
+from jaxslam.logs.streams import Rows, hold
 from jaxslam.motion import unicycle
 from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors import Part, range_bearing, suite
 from jaxslam.sensors.mounting import NO_OFFSET
 from jaxslam.team import Robot, motion_of, sensors_of
-from jaxslam.types import Log, Scan
+from jaxslam.types import Log
 
 SOURCE = (
     "K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, The UTIAS multi-robot cooperative "
@@ -164,11 +165,15 @@ def mrclam_team(
                 parts.append(Part(sensor, scan.tag.shape[1], sees=sees))
                 scans.append(scan)
         team.append(Robot(model, suite(*parts)))
-    control: Any = np.concatenate(controls, axis=1)
-    together: list[Any] = [np.concatenate(leaves, axis=1) for leaves in zip(*scans, strict=True)]
     return Dataset(
         name=f"mrclam robots {', '.join(map(str, asked))}",
-        log=Log(control, Scan(*together)),
+        log=Log.from_rows(
+            Rows(
+                time,
+                np.concatenate(controls, axis=1),
+                *(np.concatenate(parts, axis=1) for parts in zip(*scans, strict=True)),
+            )
+        ),
         time=time,
         motion=motion_of(team, 0),
         sensor=sensors_of(team, 0),
@@ -192,6 +197,18 @@ class _Recorded(NamedTuple):
     corrections: tuple[str, ...]
 
 
+class _TrueFields(TypedDict, total=False):
+    """The fields of a data set about true paths, and the start."""
+
+    true_path: Float[np.ndarray, "T 3"]
+    true_at: Bool[np.ndarray, "T"]
+    true_paths: Float[np.ndarray, "R T 3"]
+    true_paths_at: Bool[np.ndarray, "R T"]
+    pose: Float[np.ndarray, "3"]
+    pose_cov: Float[np.ndarray, "3 3"]
+    one_frame: bool
+
+
 def _read(folder: Path, robot: int, calibration: RobotCalibration | None) -> _Recorded:
     odometry, seen = read_robot(folder, robot)
     truth, corrections = read_truth(folder, robot), []
@@ -213,7 +230,7 @@ def _models(
     """The motion model and the sensor, with the noise that is given or the default."""
     default_moved: NoiseCov = white_noise(*ODOMETRY_DENSITY)
     default_seen: NoiseCov = MEASUREMENT_COV
-    mount: Any = NO_OFFSET
+    mount: ArrayLike = NO_OFFSET
     if calibration is not None:
         default_moved, default_seen = calibration.odometry_cov(), calibration.measurement_cov()
         mount = calibration.mount
@@ -222,12 +239,12 @@ def _models(
     return unicycle(moved), range_bearing(seen, mount=mount)
 
 
-def _truth(files: Sequence[_Recorded], time: Float[np.ndarray, "T"]) -> dict[str, Any]:
-    """The fields of a data set about true paths, and the start; none where no path is known."""
+def _truth(files: Sequence[_Recorded], time: Float[np.ndarray, "T"]) -> _TrueFields:
+    """The true paths, and the start; nothing where no path is known."""
     if files[0].truth is None:
         return {}
     paths, known = true_poses(files[0].truth, time)
-    found: dict[str, Any] = {"true_path": paths, "true_at": known}
+    found: _TrueFields = {"true_path": paths, "true_at": known}
     if len(files) > 1 and all(own.truth is not None for own in files):
         each = [true_poses(own.truth, time) for own in files if own.truth is not None]
         found["true_paths"] = np.stack([path for path, _ in each])
@@ -253,8 +270,8 @@ def white_noise(v: float, omega: float) -> NoiseCov:
 def _log(
     odometry: Float[np.ndarray, "K 3"],
     time: Float[np.ndarray, "T"],
-    row: Any,
-    tag: Any,
+    row: Int[np.ndarray, "J"] | list[int],
+    tag: Int[np.ndarray, "J"] | list[int],
     z: Float[np.ndarray, "J Z"],
 ) -> Log:
     """The log of odometry (t, v, ω) and of measurements in some rows."""

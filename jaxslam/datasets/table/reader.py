@@ -76,7 +76,7 @@ def table(folder: str | Path) -> Dataset:
         odometry, seen, motion.controls, sensor.measurements, tuple(survey or ())
     )
     known = tags if survey is None else survey
-    for row, tag in enumerate(seen.columns.get(TAG, ())):
+    for row, tag in enumerate(seen.tags or ()):
         if tag is not None and tag not in known:
             raise ValueError(f"{seen.at(row, TAG)}: expected a tag of landmarks.csv, got {tag}")
     truth, covered = _truth(folder / "truth.csv", rows.time)
@@ -86,7 +86,7 @@ def table(folder: str | Path) -> Dataset:
         start = truth[0] if truth is not None and one_frame else np.zeros(3)
         shown = [float(f"{value:.6g}") for value in start]
         notes.append(f"[filter] start = {shown}" + ", the truth at the first row" * one_frame)
-    unknown = bool(sensor.landmark) and None in seen.columns[TAG]
+    unknown = None in (seen.tags or ())
     capacity = settings.capacity(len(tags), unknown)
     return Dataset(
         name=settings.text("name", folder.resolve().name),
@@ -131,7 +131,7 @@ def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
         return None
     found = CsvTable(path).table((TAG, *POSE[:2]), "of landmarks")
     survey: dict[int, tuple[float, float]] = {}
-    for row, tag in enumerate(found.columns[TAG]):
+    for row, tag in enumerate(found.tags or ()):
         if tag is None or tag in survey:
             got = "nothing" if tag is None else f"{tag} again"
             raise ValueError(f"{found.at(row, TAG)}: expected a tag of its own, got {got}")

@@ -5,19 +5,23 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxslam import association, motion, sensors
 from jaxslam.datasets.table.settings_text import line_number
+from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.math import stats
 from jaxslam.protocols import Motion, Sensor
+from jaxslam.types import JaxOrNumPy
 
-_Model = TypeVar("_Model")
+_Model = TypeVar("_Model", bound=Motion | Sensor)
+_Value = TypeVar("_Value")
 
 MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
 MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
@@ -41,7 +45,7 @@ class Parametric(NamedTuple, Generic[_Model]):
     deviations: tuple[float, ...]
     mount: tuple[float, ...] | None
     """None where the model has none"""
-    make: Callable[[Any, Any], _Model]
+    make: Callable[[JaxOrNumPy, ArrayLike | None], _Model]
     """(deviations (W,) an array, mount (3,) or None) -> model"""
 
     def made(self) -> _Model:
@@ -93,7 +97,7 @@ class TableSettings:
         from_poses = odometry_columns(shell.controls, given) == POSE
         with_interval = INTERVAL in shell.controls
 
-        def model(deviations: Any, mount: Any = None) -> Motion:
+        def model(deviations: JaxOrNumPy, mount: ArrayLike | None = None) -> Motion:
             def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
                 cov = jnp.diag(jnp.asarray(deviations, u.dtype) ** 2)
                 if from_poses:
@@ -103,7 +107,7 @@ class TableSettings:
                     return cov * jnp.where(moving, interval / jnp.where(moving, u[-1], 1.0), 0.0)
                 return cov
 
-            plain: Motion = self._built("motion", factory, options, noise_cov)
+            plain = self._built("motion", factory, options, noise_cov)
             if not from_poses:
                 return plain
             return replace(
@@ -131,26 +135,25 @@ class TableSettings:
         if has_mount and mount is None:
             mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
 
-        def model(deviations: Any, mount: Any) -> Sensor:
+        def model(deviations: JaxOrNumPy, mount: ArrayLike | None) -> Sensor:
             # In NumPy where they are numbers, so that nothing is compiled.
             cov = deviations[:, None] ** 2 * np.eye(len(names))
             more = options if mount is None else options | {"mount": mount}
-            built: Sensor = self._built("sensor", factory, more, cov)
-            return built
+            return self._built("sensor", factory, more, cov)
 
         return Parametric(names, tuple(deviations), None if mount is None else tuple(mount), model)
 
-    def filter_options(self, size: int, unknown: bool) -> dict[str, Any]:
+    def filter_options(self, size: int, unknown: bool) -> EkfOptions:
         """The options of `ekf_slam`. size: of a measurement; unknown: whether tags are unknown."""
         section = self._filter()
-        options: dict[str, Any] = {"update": section.get("update")}
-        if options["update"] is None:
-            options["update"] = self._default("filter", "update", "sequential")
-        if options["update"] not in ("sequential", "joint"):
+        update = section.get("update")
+        if update is None:
+            update = self._default("filter", "update", "sequential")
+        if update != "sequential" and update != "joint":
             raise ValueError(
-                f'{self._at("filter", "update")}: expected "sequential" or "joint", '
-                f"got {options['update']!r}"
+                f'{self._at("filter", "update")}: expected "sequential" or "joint", got {update!r}'
             )
+        options: EkfOptions = {"update": update}
         method, gate = section.get("associate"), section.get("gate")
         if method is None:
             method = self._default("filter", "associate", METHODS[0] if unknown else "known")
@@ -188,8 +191,8 @@ class TableSettings:
             raise ValueError(f"{self._at('filter', 'start_noise')}: expected numbers of at least 0")
         return asked
 
-    def _filter(self) -> dict[str, Any]:
-        section: dict[str, Any] = self.content.get("filter", {})
+    def _filter(self) -> dict[str, object]:
+        section: dict[str, object] = self.content.get("filter", {})
         self._check_keys("filter", section, _FILTER)
         return section
 
@@ -200,14 +203,14 @@ class TableSettings:
         return np.array(self._numbers("filter", key, asked, POSE))
 
     def _model(
-        self, section: str, registry: Mapping[str, Callable[..., Any]], given: Sequence[str]
-    ) -> tuple[Callable[..., Any], dict[str, Any]]:
+        self, section: str, registry: Mapping[str, Callable[..., _Model]], given: Sequence[str]
+    ) -> tuple[Callable[..., _Model], dict[str, object]]:
         """The factory that a section names, or the columns fit, and its options."""
-        options = dict(self.content.get(section, {}))
+        options: dict[str, object] = dict(self.content.get(section, {}))
         name = options.pop("model", None)
         if name is None:
             name = self._default(section, "model", _fitting(section, registry, given, self.path))
-        if name not in registry:
+        if not isinstance(name, str) or name not in registry:
             raise ValueError(
                 f"{self._at(section, 'model')}: expected one of {', '.join(registry)}, got {name!r}"
             )
@@ -232,7 +235,7 @@ class TableSettings:
             )
         return found
 
-    def _numbers(self, section: str, key: str, asked: Any, names: Sequence[str]) -> list[float]:
+    def _numbers(self, section: str, key: str, asked: object, names: Sequence[str]) -> list[float]:
         if (
             not isinstance(asked, list)
             or len(asked) != len(names)
@@ -245,19 +248,25 @@ class TableSettings:
         return [float(value) for value in asked]
 
     def _built(
-        self, section: str, factory: Callable[..., Any], options: dict[str, Any], noise: Any
-    ) -> Any:
+        self,
+        section: str,
+        factory: Callable[..., _Model],
+        options: dict[str, object],
+        noise: object,
+    ) -> _Model:
         try:
             return factory(noise, **options)
         except (ValueError, TypeError) as problem:
             raise ValueError(f"{self.path}: [{section}] {problem}") from problem
 
-    def _default(self, section: str, key: str, value: Any) -> Any:
+    def _default(self, section: str, key: str, value: _Value) -> _Value:
         shown = f'"{value}"' if isinstance(value, str) else value
         self.assumed.append(f"[{section}] {key} = {shown}")
         return value
 
-    def _check_keys(self, section: str, content: Mapping[str, Any], known: Sequence[str]) -> None:
+    def _check_keys(
+        self, section: str, content: Mapping[str, object], known: Sequence[str]
+    ) -> None:
         for key in content:
             if key not in known:
                 raise ValueError(f"{self._at(section, key)}: expected one of {', '.join(known)}")
@@ -269,7 +278,7 @@ class TableSettings:
         return where + (f"[{section}] " if section else "") + key
 
 
-def association_options(method: str, gate: float | None, size: int) -> dict[str, Any]:
+def association_options(method: object, gate: object, size: int) -> EkfOptions:
     """Options of `ekf_slam` for a method by name and a gate by probability.
 
     Raises ValueError, "associate: …" or "gate: …", on a name that is none and a gate that is no
@@ -280,20 +289,29 @@ def association_options(method: str, gate: float | None, size: int) -> dict[str,
         gate: the probability that a correct measurement passes.
         size: numbers of a measurement.
     """
-    if gate is not None and not (_is_number(gate) and 0 < gate < 1):
-        raise ValueError(f"gate: expected a probability between 0 and 1, got {gate!r}")
-    if method not in METHODS:
+    probability = None if gate is None else _probability(gate)
+    if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"associate: expected one of {', '.join(METHODS)}, got {method!r}")
     if method == "known":
-        return {} if gate is None else {"gate": stats.chi2_quantile(gate, size)}
-    inner = GATE if gate is None else gate
+        return {} if probability is None else {"gate": stats.chi2_quantile(probability, size)}
+    inner = GATE if probability is None else probability
     beyond = stats.chi2_quantile(max(inner, NEW_GATE), size)
     limit = inner if method == "joint" else stats.chi2_quantile(inner, size)
     return {"associate": getattr(association, method)(limit, beyond)}
 
 
+def _probability(gate: object) -> float:
+    """The probability that a gate is given by; ValueError where it is none."""
+    if not isinstance(gate, int | float) or isinstance(gate, bool) or not 0 < gate < 1:
+        raise ValueError(f"gate: expected a probability between 0 and 1, got {gate!r}")
+    return gate
+
+
 def _fitting(
-    section: str, registry: Mapping[str, Callable[..., Any]], given: Sequence[str], path: Path
+    section: str,
+    registry: Mapping[str, Callable[..., Motion | Sensor]],
+    given: Sequence[str],
+    path: Path,
 ) -> str:
     """The model whose columns are given; of several the one with most, then of `_FIRST`."""
     bare = {split_unit(name)[0] for name in given}
@@ -301,7 +319,9 @@ def _fitting(
     for name, factory in registry.items():
         model = factory(_of_no_noise)
         names = (
-            odometry_columns(model.controls, given) if section == "motion" else model.measurements
+            odometry_columns(model.controls, given)
+            if isinstance(model, Motion)
+            else model.measurements
         )
         known.append(f"{name} ({', '.join(names)})")
         if {split_unit(one)[0] for one in names} <= bare:
@@ -315,12 +335,12 @@ def _fitting(
     return next(name for *rank, name in fitting if tuple(rank) == most)
 
 
-def _of_no_noise(*_: Any) -> Any:
+def _of_no_noise(*_: object) -> NoReturn:
     """The noise of a model that is made for its names alone, and is never evaluated."""
     raise AssertionError("a model that was made for its names was evaluated")
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return (
         isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
     )

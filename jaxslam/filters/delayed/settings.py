@@ -1,7 +1,7 @@
 """The settings of `delayed_slam`: three records with defaults, validated when they are created."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from jaxslam import validation
 from jaxslam.association.known import known
@@ -166,7 +166,7 @@ def delayed_settings(
     )
 
 
-def _check_positive(record: Any, *fields: str) -> None:
+def _check_positive(record: object, *fields: str) -> None:
     for field in fields:
         value = getattr(record, field)
         if value is not None and is_concrete(value) and not value > 0:
@@ -174,7 +174,7 @@ def _check_positive(record: Any, *fields: str) -> None:
             raise ValueError(f"{name}: expected {field} above 0, got {value}")
 
 
-def _check_not_negative(record: Any, *fields: str) -> None:
+def _check_not_negative(record: object, *fields: str) -> None:
     for field in fields:
         value = getattr(record, field)
         if is_concrete(value) and not value >= 0:

@@ -1,13 +1,13 @@
 """Compressed EKF-SLAM: updates of a local area, with those of the rest of the map postponed."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
 
 from jaxslam import slots, validation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.filters.ekf.settings import check_covariance_form
+from jaxslam.filters.ekf.settings import EkfOptions, check_covariance_form
 from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Filter, Motion, Sensor
@@ -42,7 +42,7 @@ class Compressed(NamedTuple):
 
 
 def compressed_ekf_slam(
-    motion: Motion, sensor: Sensor, capacity: int, *, area: int, **options: Any
+    motion: Motion, sensor: Sensor, capacity: int, *, area: int, **options: Unpack[EkfOptions]
 ) -> Filter:
     """`ekf_slam` with the same results, at a cost a step that depends on the area, not on the map.
 
@@ -96,10 +96,11 @@ def compressed_ekf_slam(
     def init(pose: jax.Array, pose_cov: jax.Array) -> Compressed:
         joint = whole.init(pose, pose_cov)
         if jax.tree.leaves(joint.lin):
-            linearizer = options["linearize"].name
+            linearizer = options["linearize"]
+            assert linearizer is not None  # the default keeps nothing
             raise ValueError(
-                f"compressed_ekf_slam: the linearizer {linearizer} keeps former estimates, which "
-                "is not supported"
+                f"compressed_ekf_slam: the linearizer {linearizer.name} keeps former estimates, "
+                "which is not supported"
             )
         return opened(joint, own)
 

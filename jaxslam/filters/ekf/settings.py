@@ -1,7 +1,7 @@
 """The settings of a Kalman-type SLAM filter, and their validation."""
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal, TypedDict, get_args
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,20 @@ Update = Literal["sequential", "joint"]
 
 Covariance = Literal["plain", "joseph", "square_root"]
 """P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or the update of a root X of P = X Xᵀ"""
+
+
+class EkfOptions(TypedDict, total=False):
+    """The keyword arguments of `ekf_slam`, where they are handed on."""
+
+    chart: Chart | None
+    linearize: Linearizer | None
+    associate: Associate | None
+    update: Update
+    gate: float | None
+    iterations: int
+    covariance: Covariance
+    births: int | None
+    make_room: Life | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,16 +1,14 @@
 """A filter wrapper that closes long loops and merges successive duplicates."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam import validation
 from jaxslam.filters.map_management.loop_closure import (
     Closing,
+    LoopSettings,
     check_recency,
     close_loop,
-    loop_settings,
     no_closing,
 )
 from jaxslam.filters.map_management.successive import merge_histories, successive_duplicate
@@ -30,7 +28,7 @@ def closing(
     every: int = 1,
     reach: float | None = None,
     spread: float = 0.5,
-    **options: Any,
+    settings: LoopSettings | None = None,
 ) -> Filter:
     """The filter with a search for a closed loop after each scan (`close_loop`).
 
@@ -46,15 +44,16 @@ def closing(
             most spread, one pair a scan: so duplicates that were initialized before the loop closed
             are merged too.
         spread: [m]
-        **options: fields of `loop_closure.LoopSettings`.
+        settings: of the search; default `LoopSettings()`.
     Raises:
         ValueError: on no filter or a square-root filter, on every below 1, a reach or spread not
-            above 0, an option that `close_loop` does not have or refuses; from `init`, on a state
-            that is no `slots.Joint` or keeps no times.
+            above 0, settings that are none; from `init`, on a state that is no `slots.Joint` or
+            keeps no times.
     """
     validation.check_record("closing", "filter", filter, Filter)
     check_count("closing: every", every)
-    loop_settings("closing", options)
+    settings = LoopSettings() if settings is None else settings
+    validation.check_record("closing", "settings", settings, LoopSettings)
     if not (reach is None or reach > 0) or not spread > 0:
         raise ValueError(f"closing: expected a reach and a spread above 0, got {reach}, {spread}")
     if filter.square_root:
@@ -73,7 +72,7 @@ def closing(
         before = joint.alive
         joint, report = change_where(
             (joint.life.now % every == 0) & scan.valid.any(),
-            lambda state: close_loop(state[0], chart, **options),
+            lambda state: close_loop(state[0], chart, settings),
             (joint, no_closing()),
         )
         if reach is not None:

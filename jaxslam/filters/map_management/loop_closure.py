@@ -1,8 +1,7 @@
 """Loop closure by matching a cluster of recent landmarks with the old map."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +48,10 @@ class Closing(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class LoopSettings:
-    """The settings of `close_loop`."""
+    """The settings of `close_loop`.
+
+    Raises ValueError on counts below 1, least below 3, or probabilities not between 0 and 1.
+    """
 
     window: int = 50
     """number of scans: a landmark is recent if one of the last `window` scans measured it"""
@@ -70,26 +72,13 @@ class LoopSettings:
     candidates: int = 64
     """number of best agreeing pairs of old landmarks that are tried with each"""
 
-
-def loop_settings(caller: str, options: Mapping[str, Any]) -> LoopSettings:
-    """The settings with these options.
-
-    Raises ValueError, which names the caller, on an unknown option, counts below 1, least below 3,
-    or probabilities not between 0 and 1.
-    """
-    unknown = sorted(set(options) - {field.name for field in dataclasses.fields(LoopSettings)})
-    if unknown:
-        raise ValueError(f"{caller}: expected options of close_loop, got {', '.join(unknown)}")
-    settings = LoopSettings(**options)
-    for name in ("window", "cluster", "sightings"):
-        check_count(f"{caller}: {name}", getattr(settings, name))
-    check_policy(caller, settings.least, settings.margin)
-    if not 0 < settings.drift < 1:
-        raise ValueError(f"{caller}: expected a drift between 0 and 1, got {settings.drift}")
-    search_limits(
-        caller, settings.cluster, settings.probability, settings.pairs, settings.candidates
-    )
-    return settings
+    def __post_init__(self) -> None:
+        for name in ("window", "cluster", "sightings"):
+            check_count(f"LoopSettings: {name}", getattr(self, name))
+        check_policy("LoopSettings", self.least, self.margin)
+        if not 0 < self.drift < 1:
+            raise ValueError(f"LoopSettings: expected a drift between 0 and 1, got {self.drift}")
+        search_limits("LoopSettings", self.cluster, self.probability, self.pairs, self.candidates)
 
 
 def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
@@ -102,7 +91,7 @@ def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
         )
 
 
-def close_loop(joint: Joint, chart: Chart, **options: Any) -> tuple[Joint, Closing]:
+def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Joint, Closing]:
     """The map with recent landmarks matched with the old map and merged, and the report.
 
     A landmark is recent if it was measured within the last `window` scans, and it may be an old one
@@ -120,12 +109,10 @@ def close_loop(joint: Joint, chart: Chart, **options: Any) -> tuple[Joint, Closi
 
     Args:
         joint: whose `life` is that of `life.recency()`.
-        options: fields of `LoopSettings`.
     Raises:
-        ValueError: as `loop_settings`; on a life that is not recency, or a chart, linearizer or
+        ValueError: on a life that is not recency, or a chart, linearizer or
             landmarks that `lost` refuses.
     """
-    settings = loop_settings("close_loop", options)
     check_recency("close_loop", joint, chart)
     recent, candidates = recent_cluster(joint, settings)
     old, report = change_where(

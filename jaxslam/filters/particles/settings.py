@@ -1,7 +1,7 @@
 """The settings of the particle filters, created and validated by the factories."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -157,7 +157,7 @@ def known_map_sensors(
     return tuple(one(part.sensor, part.places, part.sees == "robots") for part in sensor.parts)
 
 
-def check_resampling(name: str, resample: Any, threshold: float) -> None:
+def check_resampling(name: str, resample: object, threshold: float) -> None:
     """Raise ValueError unless the method is a function and the threshold in [0, 1]."""
     if not callable(resample):
         raise ValueError(f"{name}: expected resample to be a function, got {resample!r}")

@@ -111,7 +111,7 @@ def certificate(
 
 def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
     """The poses that are fixed or have a prior."""
-    held = graph.fixed_pose
+    held = jnp.asarray(graph.fixed_pose)
     for name, factor in model.factors:
         if factor.name == "prior":
             held = held.at[plan.who[name][:, 0]].max(graph.tables[name].valid)

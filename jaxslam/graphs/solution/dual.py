@@ -12,6 +12,7 @@ from jaxslam.graphs.solver.plan import Plan
 from jaxslam.graphs.sparse.gathered import summed
 from jaxslam.math import se2
 from jaxslam.math.linalg import total
+from jaxslam.types import JaxOrNumPy
 
 
 def _pose_error(variables: tuple[Array, ...], z: Array) -> Array:
@@ -60,7 +61,7 @@ def _point_rows(z: Array) -> list[list[list[Array]]]:
 ROWS = {"relative_pose": _pose_rows, "relative_position": _point_rows}
 
 
-def weights_of(name: str, information: Float[Array, "E R R B"]) -> Float[Array, "E S B"]:
+def weights_of(name: str, information: Float[JaxOrNumPy, "E R R B"]) -> Float[Array, "E S B"]:
     """τ, τ, κ, κ or τ, τ, as many as chordal residuals; zero for a prior."""
     near = 0.5 * (information[:, 0, 0] + information[:, 1, 1])
     if name == "prior":

@@ -5,7 +5,7 @@ the frame of a pose, X ∘ exp(δ) (`se2.boxplus`); those of a point are added.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +68,7 @@ def _taken(factor: Factor, who: Array, variables: Variables) -> tuple[Array, ...
     )
 
 
-def _over_rows(function: Callable[..., Any], *arguments: PyTree) -> PyTree:
+def _over_rows(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     """The function of one row of one graph, over rows (first axis) and graphs (last axis)."""
     return jax.vmap(jax.vmap(function, -1, -1))(*arguments)
 
@@ -223,7 +223,7 @@ def _jacobians(
 
 def variables_of(graph: Graph) -> Variables:
     """The variables of graphs with a last axis B."""
-    return Variables(graph.poses, graph.points)
+    return Variables(jnp.asarray(graph.poses), jnp.asarray(graph.points))
 
 
 def data_of(graph: Graph, column: Array) -> Data:
@@ -245,6 +245,6 @@ def data_of(graph: Graph, column: Array) -> Data:
             )
             for name, rows in tables
         },
-        {name: rows.valid for name, rows in tables},
+        {name: jnp.asarray(rows.valid) for name, rows in tables},
         jnp.zeros_like(free).at[column].set(free, unique_indices=True),
     )

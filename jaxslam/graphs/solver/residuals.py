@@ -49,5 +49,6 @@ def _squared(*arguments: Factor | Graph) -> dict[str, Float[Array, "E"]]:
             e = factor.residual(values, z)
             return e @ information @ e
 
-        found[key] = jnp.where(table.valid, jax.vmap(square)(*table[:3]), 0.0)
+        who, z, information = (jnp.asarray(part) for part in table[:3])
+        found[key] = jnp.where(table.valid, jax.vmap(square)(who, z, information), 0.0)
     return found

@@ -1,7 +1,5 @@
 """The chordal start: headings from a linear relaxation, then positions."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import coo_array, csc_array
@@ -106,7 +104,7 @@ def _positions(
     return with_poses(graph, poses)._replace(points=as_before(graph.points, points))
 
 
-def _relative_rows(relative: Relative, headings: Float[np.ndarray, "N"]) -> tuple[Any, ...]:
+def _relative_rows(relative: Relative, headings: Float[np.ndarray, "N"]) -> tuple[np.ndarray, ...]:
     """First and second variable, the matrix of the positions, b, Ω and s of relative poses.
 
     e_t = R_zᵀ (R_iᵀ (t_j - t_i) - t_z), and s = Ω_tθ e_θ.
@@ -118,7 +116,9 @@ def _relative_rows(relative: Relative, headings: Float[np.ndarray, "N"]) -> tupl
     return i, j, turn, target, information[:, :2, :2], information[:, :2, 2] * wrapped[:, None]
 
 
-def _point_rows(table: Table, headings: Float[np.ndarray, "N"], count: int) -> tuple[Any, ...]:
+def _point_rows(
+    table: Table, headings: Float[np.ndarray, "N"], count: int
+) -> tuple[np.ndarray, ...]:
     """The same of relative positions, e = R_iᵀ (l - t_i) - z; points are counted from the poses."""
     valid = np.asarray(table.valid)
     who, z = np.asarray(table.who)[valid], np.asarray(table.z, float)[valid]
@@ -132,12 +132,12 @@ def _rotations(angles: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E 2 2"]:
     return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
 
 
-def _least_squares(a: csc_array, b: Any) -> Any:
+def _least_squares(a: csc_array, b: np.ndarray) -> np.ndarray:
     """The x that minimizes |a x - b|²."""
     return _solve(a.conj().T @ a, a.conj().T @ b)
 
 
-def _solve(matrix: csc_array, right: Any) -> Any:
+def _solve(matrix: csc_array, right: np.ndarray) -> np.ndarray:
     """matrix⁻¹ right of a sparse positive definite matrix."""
     if matrix.shape[0] == 0:
         return np.zeros(0)
@@ -148,7 +148,7 @@ def _solve(matrix: csc_array, right: Any) -> Any:
             diag_pivot_thresh=0.0,
             options={"SymmetricMode": True},
         )
-        return factor.solve(right)
+        return np.asarray(factor.solve(right))
     except RuntimeError as error:
         raise ValueError(
             "chordal: the measurements do not determine all headings and positions"

@@ -1,7 +1,7 @@
 """What all starts share: relative poses of all tables, anchors, and the placing of points."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.math import se2
+from jaxslam.types import JaxOrNumPy
 
 Factors = Mapping[str, Factor]
 
@@ -111,7 +112,7 @@ def with_poses(graph: Graph, poses: Float[np.ndarray, "N 3"]) -> Graph:
     return graph._replace(poses=as_before(graph.poses, poses))
 
 
-def as_before(before: Any, values: np.ndarray) -> Any:
+def as_before(before: JaxOrNumPy, values: np.ndarray) -> np.ndarray:
     """The values in the type of those before."""
     return values.astype(np.asarray(before).dtype)
 

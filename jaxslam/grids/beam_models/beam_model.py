@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.grids.grid import Grid
-from jaxslam.types import Beams
+from jaxslam.types import Beams, JaxOrNumPy
 from jaxslam.validation.numbers import is_concrete, shape_told
 
 
@@ -59,7 +59,7 @@ def log_likelihood(
     return jnp.asarray(exponent) * jnp.where(usable, each, 0.0).sum()
 
 
-def usable_beams(beams: Beams) -> Bool[Array, "B"]:
+def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "B"]:
     """Which beams say something: valid ones with a range that is a number and not below 0.
 
     An infinite range is that of a beam that met nothing, and is usable.

@@ -12,7 +12,7 @@ from jaxslam.grids.distance import distance_field
 from jaxslam.grids.grid import Field, Grid
 from jaxslam.grids.interpolation import interpolate, slope
 from jaxslam.math import se2
-from jaxslam.types import Beams
+from jaxslam.types import Beams, JaxOrNumPy
 
 
 def likelihood_field(
@@ -46,7 +46,7 @@ def likelihood_field(
     def prepare(grid: Grid) -> Field:
         return distance_field(grid, truncate=truncate)
 
-    def ends_of(pose: Array, beams: Beams) -> tuple[Bool[Array, "B"], Float[Array, "B 2"]]:
+    def ends_of(pose: Array, beams: Beams) -> tuple[Bool[JaxOrNumPy, "B"], Float[Array, "B 2"]]:
         """Which beams have max_range, and the ends of the others."""
         eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
         far = beams.range >= max_range

@@ -1,10 +1,9 @@
 """Odometry and laser scans as the log that `run` takes, and its scans as beams again."""
 
-from typing import Any
+from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.types import Beams, Log, Scan
@@ -39,7 +38,7 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
             f"beam_log: expected a control (U,) for each of {steps} scans, got {np.shape(control)}"
         )
     concrete = is_concrete(control, beams)
-    xp: Any = np if concrete else jnp
+    xp: ModuleType = np if concrete else jnp
     moved, ranges, angle, valid = (xp.asarray(part) for part in (control, *beams))
     usable = valid & (ranges >= 0)  # NaN is not
     if concrete:
@@ -61,5 +60,5 @@ def beams_of(scan: Scan, every: int) -> Beams:
     """Each n-th beam of a scan of such a log; those not valid are of range 0."""
     z, there = scan.z[::every], scan.valid[::every]
     used = there & (z[:, 0] >= 0)
-    clean: Float[Any, "B 2"] = jnp.where(used[:, None], z, 0.0)
+    clean = jnp.where(used[:, None], z, 0.0)
     return Beams(clean[:, 0], clean[:, 1], used)

@@ -1,12 +1,12 @@
 """The free cells of a map as the region where a robot may be."""
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from jaxslam.filters.particles.states.region import Region
@@ -37,7 +37,7 @@ def free_region(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> 
     cov[:2, :2] = np.cov(places.T, bias=True) + sides.T @ sides / 12
     cov[2, 2] = math.pi**2 / 3
 
-    def draw(size: int, key: Array, dtype: Any) -> Float[Array, "P 3"]:
+    def draw(size: int, key: Array, dtype: DTypeLike) -> Float[Array, "P 3"]:
         key_which, key_where = jax.random.split(key)
         which = jax.random.randint(key_which, (size,), 0, len(places))
         share = jax.random.uniform(key_where, (size, 3), dtype) - 0.5
@@ -45,7 +45,7 @@ def free_region(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> 
         place = jnp.asarray(places, dtype)[which] + offset
         return jnp.concatenate([place, wrap(2 * math.pi * share[:, 2:])], axis=1)
 
-    def moments(dtype: Any) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    def moments(dtype: DTypeLike) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         return jnp.asarray(mean, dtype), jnp.asarray(cov, dtype)
 
     return Region(draw, moments)

@@ -2,14 +2,14 @@
 
 import math
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
-from jaxtyping import Bool, Float
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Bool, Float, PyTree
 
 from jaxslam import validation
 from jaxslam.filters.particles.pose_steps import pose_filter, weigh_particles
@@ -130,7 +130,7 @@ def localize(
     def update(state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
         state, beams = draw_start(state, key, settings), beams_of(scan, every)
 
-        def fit_of(poses: Float[Array, "P 3"], map_of: Any, beams: Beams) -> Float[Array, "P"]:
+        def fit_of(poses: Float[Array, "P 3"], map_of: PyTree, beams: Beams) -> Float[Array, "P"]:
             one = partial(log_likelihood, model, map_of, beams=beams)
             return -jax.vmap(one)(poses)
 
@@ -152,7 +152,7 @@ def localize(
     return pose_filter(settings, update, 2, no_points, np.zeros(0, np.int32))
 
 
-def _in_dtype(prepared: Any, dtype: Any) -> Any:
+def _in_dtype(prepared: PyTree, dtype: DTypeLike) -> PyTree:
     """The numbers of a prepared map in the dtype of the run."""
     return jax.tree.map(
         lambda x: x.astype(dtype) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x,

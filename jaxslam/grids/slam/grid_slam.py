@@ -1,15 +1,16 @@
 """Rao-Blackwellized SLAM with a grid a particle: FastSLAM's idea on occupancy grids."""
 
 import math
+from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
@@ -30,7 +31,7 @@ from jaxslam.math import se2
 from jaxslam.protocols import Filter, Motion, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import effective_size, normalized
-from jaxslam.types import Estimate, Info, Scan
+from jaxslam.types import Beams, Estimate, Info, Scan
 
 
 def grid_slam(
@@ -169,14 +170,14 @@ def grid_slam(
             copied=(source != slot).sum(dtype=jnp.int32),
         )
 
-    def fits(state: GridParticles, beams: Any) -> Any:
+    def fits(state: GridParticles, beams: Beams) -> tuple[PyTree, Callable[[PyTree, Array], Array]]:
         """What the model makes of each map, and the tempered log-likelihood of the scan in it."""
         maps = _occupancy(state, hit, miss)
 
-        def prepare(log_odds: Array) -> Any:
+        def prepare(log_odds: Array) -> PyTree:
             return model.prepare(Grid(log_odds, state.origin, state.resolution))
 
-        def fit(prepared: Any, pose: Array) -> Array:
+        def fit(prepared: PyTree, pose: Array) -> Array:
             return jnp.asarray(exponent, pose.dtype) * log_likelihood(model, prepared, pose, beams)
 
         return jax.vmap(prepare)(maps), fit
@@ -190,7 +191,7 @@ def grid_slam(
             weight = jax.vmap(fit)(prepared, moved)
         else:
 
-            def each(prepared: Any, pose: Array, key: Array) -> tuple[Array, Array]:
+            def each(prepared: PyTree, pose: Array, key: Array) -> tuple[Array, Array]:
                 return propose(
                     partial(fit, prepared),
                     motion,
@@ -285,4 +286,4 @@ def _occupancy(state: GridParticles, hit: ArrayLike, miss: ArrayLike) -> Float[A
     """The log-odds of all maps."""
     none: Int[Array, ""] = jnp.zeros((), jnp.int32)
     counts = Counts(state.hits, state.misses, state.origin, state.resolution, none, none)
-    return occupancy(counts, hit=hit, miss=miss).log_odds.astype(state.pose.dtype)
+    return jnp.asarray(occupancy(counts, hit=hit, miss=miss).log_odds, state.pose.dtype)

@@ -1,7 +1,7 @@
 """Loop closing in rounds: candidates, matches, the loops that agree, the optimum."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -103,8 +103,7 @@ def _final(
         doubted = square > chi2_quantile(settings.consistency, 3)
         loops.outcome[np.flatnonzero(kept)[doubted]] = LoopOutcome.DOUBTED
         table = graph.tables[LOOPS]
-        believed: Any = ~doubted
-        tables = graph.tables | {LOOPS: table._replace(valid=believed)}
+        tables = graph.tables | {LOOPS: table._replace(valid=~doubted)}
         graph = _host(graphs.optimize(graph._replace(tables=tables)).graph)
     return Closed(graph, loops._replace(first=keyframe[loops.first], second=keyframe[loops.second]))
 

@@ -1,7 +1,7 @@
 """Candidates matched: a keyframe in a submap, by correlation over a window and by lines."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -82,7 +82,7 @@ def _submap(
     path: np.ndarray,
     middle: int,
     settings: Settings,
-) -> tuple[Reference, Any]:
+) -> tuple[Reference, Array]:
     around = np.arange(middle - settings.submap, middle + settings.submap + 1)
     inside = (around >= 0) & (around < len(keyframe))
     around = np.clip(around, 0, len(keyframe) - 1)
@@ -93,7 +93,7 @@ def _submap(
     return programs.call(_prepare, (), points, taken(scans.surface, of), there)
 
 
-def _cov(fit: Any, settings: Settings) -> Float[np.ndarray, "3 3"]:
+def _cov(fit: Match, settings: Settings) -> Float[np.ndarray, "3 3"]:
     """Of the coordinates of a match: by its lines, and by the window where these say nothing."""
     sigma = max(settings.sigma, float(fit.residual)) ** 2 * settings.correlation
     edges = np.diag(1 / np.square([WIDE[0], *WIDE]))
@@ -101,13 +101,13 @@ def _cov(fit: Any, settings: Settings) -> Float[np.ndarray, "3 3"]:
     return np.asarray(cov + np.diag(np.square(settings.floor)))
 
 
-def _prepare(points: Points, surface: Surface, there: Array) -> tuple[Reference, Any]:
+def _prepare(points: Points, surface: Surface, there: Array) -> tuple[Reference, Array]:
     reference = gathered(points, surface, there)
     return reference, searched(SEARCHES[0], reference)
 
 
 def _matched(
-    matcher: Matcher, submap: Reference, prepared: Any, scan: Points, z: Array
+    matcher: Matcher, submap: Reference, prepared: Array, scan: Points, z: Array
 ) -> tuple[Match, Array]:
     """By walls, from where a search ends; and the status of the search."""
     found = matcher.match(prepared, thinned(scan), z, None)

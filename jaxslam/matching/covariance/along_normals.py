@@ -1,14 +1,12 @@
 """The closed form with residuals across the surface alone (Bonnabel, Barczyk & Goulette 2016)."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxslam.matching.covariance.record import MatchCovariance, check_sigma, inverse_of, of_prior
-from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.matcher import Match, Matcher, Reference
 from jaxslam.matching.outcome import information_of
 from jaxslam.matching.points import Points
 from jaxslam.matching.surface import surface
@@ -38,7 +36,12 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
     check_sigma("along_normals", sigma)
 
     def of(
-        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+        matcher: Matcher,
+        reference: Reference,
+        points: Points,
+        found: Match,
+        start: Array,
+        key: Array,
     ) -> Float[Array, "3 3"]:
         del start, key
         if not isinstance(reference, Points):

@@ -1,12 +1,10 @@
 """The covariance that a quadratic cost would have: its inverse second derivative."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.matching.covariance.record import MatchCovariance, curvature, inverse_of, of_prior
-from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.matcher import Match, Matcher, Reference
 from jaxslam.matching.points import Points
 
 
@@ -20,7 +18,12 @@ def hessian() -> MatchCovariance:
     """
 
     def of(
-        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+        matcher: Matcher,
+        reference: Reference,
+        points: Points,
+        found: Match,
+        start: Array,
+        key: Array,
     ) -> Float[Array, "3 3"]:
         del start, key
         prepared = matcher.prepare(reference)

@@ -1,7 +1,5 @@
 """The noise of the ranges through the condition that the match is a minimum (Censi 2007)."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -16,7 +14,7 @@ from jaxslam.matching.covariance.record import (
     range_count,
     with_ranges,
 )
-from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.matcher import Match, Matcher, Reference
 from jaxslam.matching.points import Points, moved_along_rays
 
 
@@ -38,7 +36,12 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
     check_sigma("implicit", sigma)
 
     def of(
-        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+        matcher: Matcher,
+        reference: Reference,
+        points: Points,
+        found: Match,
+        start: Array,
+        key: Array,
     ) -> Float[Array, "3 3"]:
         del start, key
         prepared = matcher.prepare(reference)
@@ -47,10 +50,10 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
             changed = with_ranges(reference, of_reference)
             there = matcher.prepare(changed) if isinstance(reference, Points) else prepared
             moved = moved_along_rays(points, of_scan)
-            by_pose: Any = jax.grad(lambda pose: matcher.cost(there, moved, pose, found))(
+            by_pose: Array = jax.grad(lambda pose: matcher.cost(there, moved, pose, found))(
                 found.pose
             )
-            return jnp.asarray(by_pose)
+            return by_pose
 
         dtype = points.position.dtype
         zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)

@@ -1,7 +1,5 @@
 """The covariance of the likelihood over a lattice of poses (Olson 2009)."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +13,7 @@ from jaxslam.matching.covariance.record import (
     inverse_of,
     of_prior,
 )
-from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.matcher import Match, Matcher, Reference
 from jaxslam.matching.points import Points
 from jaxslam.math import linalg
 
@@ -48,7 +46,12 @@ def lattice(
     prior = np.array([window, window, turn_window]) ** -2.0
 
     def of(
-        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+        matcher: Matcher,
+        reference: Reference,
+        points: Points,
+        found: Match,
+        start: Array,
+        key: Array,
     ) -> Float[Array, "3 3"]:
         del start, key
         prepared = matcher.prepare(reference)

@@ -1,16 +1,17 @@
 """The record of a way to state the covariance of a match, and what several of them share."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam import programs
-from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.matcher import Match, Matcher, Reference
 from jaxslam.matching.points import Points, moved_along_rays
 from jaxslam.matching.prior import prior_information
 from jaxslam.math import linalg
@@ -22,7 +23,7 @@ class MatchCovariance:
     """A covariance of the pose of a match, in its coordinates (x, y, θ)."""
 
     name: str
-    of: Callable[[Matcher, Any, Points, Match, Array, Array], Array]
+    of: Callable[[Matcher, Reference, Points, Match, Array, Array], Array]
     """(matcher, reference, points, match, start (3,), key) -> (3, 3), finite; the reference is the
     one that `matcher.prepare` takes. Traceable; of one pair: vmap it."""
 
@@ -30,10 +31,10 @@ class MatchCovariance:
 def covariance(
     way: MatchCovariance,
     matcher: Matcher,
-    reference: Any,
+    reference: Reference,
     points: Points,
     found: Match,
-    start: Any,
+    start: ArrayLike,
     key: Array,
 ) -> Array:
     """The covariance (3, 3) of a match, by a program that is compiled once a structure.
@@ -46,32 +47,32 @@ def covariance(
     return programs.call(_one, (way, matcher), *given)
 
 
-def _one(way: MatchCovariance, matcher: Matcher, *given: Any) -> Array:
+def _one(way: MatchCovariance, matcher: Matcher, *given: PyTree) -> Array:
     return way.of(matcher, *given)
 
 
 def _many(
     way: MatchCovariance,
     matcher: Matcher,
-    reference: Any,
+    reference: Reference,
     points: Points,
     found: Match,
     start: Array,
     key: Array,
 ) -> Array:
     keys = jax.random.split(key, len(start))
-    each: Any = jax.vmap(lambda *pair: way.of(matcher, *pair))
-    return jnp.asarray(each(reference, points, found, start, keys))
+    each = jax.vmap(functools.partial(way.of, matcher))
+    return each(reference, points, found, start, keys)
 
 
-def check_sigma(name: str, sigma: Any) -> None:
+def check_sigma(name: str, sigma: ArrayLike) -> None:
     """Raise ValueError unless sigma, of a range [m], is above 0; a tracer is accepted."""
-    if is_concrete(sigma) and not 0 < float(sigma) < np.inf:
+    if is_concrete(sigma) and not 0 < np.asarray(sigma) < np.inf:
         raise ValueError(f"{name}: expected sigma above 0 [m], got {sigma}")
 
 
 def inverse_of(
-    curvature: Float[Array, "3 3"], otherwise: Float[Array, "3 3"], *, sigma: Any = 1.0
+    curvature: Float[Array, "3 3"], otherwise: Float[Array, "3 3"], *, sigma: ArrayLike = 1.0
 ) -> Float[Array, "3 3"]:
     """The inverse of a cost's second derivative; where that is not positive definite, of another.
 
@@ -85,7 +86,7 @@ def inverse_of(
     return linalg.self_gram(jnp.where(positive, first, jnp.where(usable, second, last)))
 
 
-def curvature(matcher: Matcher, prepared: Any, points: Points, found: Match) -> Array:
+def curvature(matcher: Matcher, prepared: PyTree, points: Points, found: Match) -> Array:
     """∂²E/∂x² (3, 3) of the matcher's cost at the pose, pairs and weights kept."""
     by_pose = jax.hessian(lambda pose: matcher.cost(prepared, points, pose, found))
     return jnp.asarray(by_pose(found.pose))
@@ -96,11 +97,11 @@ def of_prior(found: Match) -> Float[Array, "3 3"]:
     return prior_information(found.prior, found.information)
 
 
-def with_ranges(reference: Any, by: Float[Array, "M"]) -> Any:
+def with_ranges(reference: Reference, by: Float[Array, "M"]) -> Reference:
     """The reference with its ranges changed [m], where it is of points; a grid stays."""
     return moved_along_rays(reference, by) if isinstance(reference, Points) else reference
 
 
-def range_count(reference: Any) -> int:
+def range_count(reference: Reference) -> int:
     """How many ranges a reference is made of; 0 of a grid."""
     return len(reference.valid) if isinstance(reference, Points) else 0

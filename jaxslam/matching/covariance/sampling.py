@@ -1,7 +1,5 @@
 """Covariances by matching again: other starts, other noise."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -14,14 +12,14 @@ from jaxslam.matching.covariance.record import (
     range_count,
     with_ranges,
 )
-from jaxslam.matching.matcher import Match, Matcher
+from jaxslam.matching.matcher import Match, Matcher, Reference
 from jaxslam.matching.points import Points, moved_along_rays
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.validation.numbers import check_count, check_covariance
 
 
-def unscented(sigma: ArrayLike, start_cov: Any) -> MatchCovariance:
+def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
     """What six starts around the start lead to, plus `implicit` of the noise of the ranges.
 
     The starts are start ± √3 L_k, L Lᵀ = start_cov, with weights 1/6 each: Σ (x_k - x̂)(x_k - x̂)ᵀ/6.
@@ -37,7 +35,12 @@ def unscented(sigma: ArrayLike, start_cov: Any) -> MatchCovariance:
     of_noise = implicit(sigma)
 
     def of(
-        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+        matcher: Matcher,
+        reference: Reference,
+        points: Points,
+        found: Match,
+        start: Array,
+        key: Array,
     ) -> Float[Array, "3 3"]:
         root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
         sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
@@ -51,7 +54,7 @@ def unscented(sigma: ArrayLike, start_cov: Any) -> MatchCovariance:
     return MatchCovariance("unscented", of)
 
 
-def sampling(sigma: ArrayLike, start_cov: Any, samples: int = 30) -> MatchCovariance:
+def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> MatchCovariance:
     """The second moment about the match of matches with noise added, from starts that are drawn.
 
     Noise N(0, σ²) is added to the ranges of both scans (of a grid: to those of the scan),
@@ -68,7 +71,12 @@ def sampling(sigma: ArrayLike, start_cov: Any, samples: int = 30) -> MatchCovari
     check_count("sampling: samples", samples)
 
     def of(
-        matcher: Matcher, reference: Any, points: Points, found: Match, start: Array, key: Array
+        matcher: Matcher,
+        reference: Reference,
+        points: Points,
+        found: Match,
+        start: Array,
+        key: Array,
     ) -> Float[Array, "3 3"]:
         root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
 

@@ -11,7 +11,7 @@ import pickle
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +29,10 @@ RESTORED = "/jaxslam/restore_program_duration"
 """The event that `jax.monitoring` gets when a program is restored from a library, with its time."""
 
 
-Program = Callable[..., Any]
+Program: TypeAlias = Callable[..., PyTree]
 """(trees of arrays) -> a tree of arrays, compiled"""
 
-Axes = Any
+Axes: TypeAlias = PyTree
 """Of a tree of arrays the axis that goes over runs, or None; a prefix of the tree."""
 
 

@@ -1,7 +1,6 @@
 """The divergence limit of a campaign, from what an ideal filter would know in run 0."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +43,6 @@ def divergence_limit(
 
 def first_run(leaf: jax.Array, axis: int = 0) -> np.ndarray:
     """Run 0 of an array on the devices, copied from its shard. axis: that of the runs."""
-    shard: Any = next(one for one in leaf.addressable_shards if not one.index[axis].start)
+    shard = next(one for one in leaf.addressable_shards if not one.index[axis].start)
     run: np.ndarray = np.take(np.asarray(shard.data), 0, axis)
     return run.copy()

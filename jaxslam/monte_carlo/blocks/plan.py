@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -63,7 +62,7 @@ class Promises:
         self.complete: Future[None] = Future()
         """done when nothing is being compiled any more"""
 
-    def all(self) -> list[Future[Any]]:
+    def all(self) -> list[Future[Program] | Future[np.ndarray] | Future[None]]:
         """Everything that a block may wait for."""
         by_filter = (*self.drives.values(), *self.statistics.values())
         return [self.draw, *by_filter, self.bound, self.jacobians, self.limit, self.complete]

@@ -21,7 +21,7 @@ no device ever waits for another.
 import contextlib
 from concurrent.futures import Future
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -63,7 +63,7 @@ class FilterResults(NamedTuple):
     """what that monitor had gained after each step"""
 
 
-_RUN_AXES = cast(Any, FilterResults)(1, 1, 1, 0, 1)
+_RUN_AXES = FilterResults._make((1, 1, 1, 0, 1))
 """The axis of `FilterResults` that goes over the runs."""
 
 
@@ -113,7 +113,7 @@ class _Compiling(NamedTuple):
         if before is not None:
             self._statistics(*before, world)
 
-    def limit(self, world: World) -> Future[Any]:
+    def limit(self, world: World) -> Future[Program]:
         """Start what the divergence limit comes from; the promise of it."""
         plan, promises = self.plan, self.promises
         if plan.limit_by_bound:
@@ -149,7 +149,7 @@ class _Compiling(NamedTuple):
 
     def _start(
         self,
-        promise: Future[Any],
+        promise: Future[Program],
         name: str,
         function: Program,
         given: tuple[PyTree, ...],
@@ -171,7 +171,7 @@ class _Compiling(NamedTuple):
         return made.shapes
 
 
-def _keep(promise: Future[Any], compiling: Future[Any]) -> None:
+def _keep(promise: Future[Program], compiling: Future[Program]) -> None:
     """Pass on how a compilation turned out, unless it was cancelled."""
     if compiling.cancelled() or promise.done():
         return
@@ -228,7 +228,7 @@ def bound_variances(
     """The conditional Cramér-Rao bound of each run: position [m²] and heading [rad²] by step."""
 
     def one(i: Array, truth: Truth, log: Log) -> Array:
-        return conditional_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov
+        return jnp.asarray(conditional_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov)
 
     cov = jax.vmap(one)(which, *world)
     position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)

@@ -6,7 +6,7 @@ its greatest value, so that no extreme is lost; numbers have four digits.
 
 import json
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -73,19 +73,19 @@ def embedded_curves(campaign: Campaign) -> Curves:
             [make.panel("information [1/rad²]", "floor", "rotation_information")],
         ),
     ]
-    shown = [chart | {"panels": [p for p in chart["panels"] if p]} for chart in charts]
     content = {
         "filters": list(campaign.filters),
         "steps": campaign.steps,
         "each": each,
-        "charts": [chart for chart in shown if chart["panels"]],
+        "charts": [chart for chart in charts if chart["panels"]],
     }
     text = json.dumps(content, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     return Curves(text.replace("<", "\\u003c"), each)
 
 
-def _chart(figure: str, x: str, panels: list[Any], beside: bool = False) -> Json:
-    return {"figure": figure, "x": x, "beside": beside, "panels": panels}
+def _chart(figure: str, x: str, panels: Sequence[Json | None], beside: bool = False) -> Json:
+    shown = [panel for panel in panels if panel is not None]
+    return {"figure": figure, "x": x, "beside": beside, "panels": shown}
 
 
 class _Panels:
@@ -167,7 +167,9 @@ class _Panels:
             "reference": {"label": "honest", "values": 0},
         }
 
-    def _thinned(self, values: Float[np.ndarray, " T"]) -> list[Any]:
+    def _thinned(
+        self, values: Float[np.ndarray, " T"]
+    ) -> list[float | None] | list[list[float | None]]:
         """The values, or the least and the greatest of every `each` steps."""
         if self.each == 1:
             return _numbers(values)
@@ -181,12 +183,12 @@ class _Panels:
         ]
 
 
-def _banded(bands: Sequence[list[Any] | None], weights: Sequence[float]) -> Json:
+def _banded(bands: Sequence[Sequence[object] | None], weights: Sequence[float]) -> Json:
     """Bands without repetition, each filter's place in them, and the place of the drawn one.
 
     Drawn is the band of the filter with the greatest weight.
     """
-    kept: list[list[Any]] = []
+    kept: list[Sequence[object]] = []
     places: list[int | None] = []
     for band in bands:
         if band is not None and band not in kept:

@@ -1,15 +1,11 @@
 """A figure as the bytes of a file: PNG, PDF or SVG."""
 
 import io
-from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
 
 from jaxslam.results.plot.style import png
-
-_SETTINGS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "jaxslam"}
-"""TrueType fonts in PDF, as publishers ask; the same names of parts in every SVG file."""
 
 _NO_DATE = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
@@ -19,6 +15,7 @@ def encode(figure: Figure, kind: str) -> bytes:
     if kind == "png":
         return png(figure)
     out = io.BytesIO()
-    with matplotlib.rc_context(_SETTINGS):
+    # TrueType fonts in PDF, as publishers ask; the same names of parts in every SVG file.
+    with matplotlib.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "jaxslam"}):
         figure.savefig(out, format=kind, metadata=_NO_DATE[kind])
     return out.getvalue()

@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # re-exported: only this package imports Matplotlib
+from matplotlib.lines import Line2D
 
 Share: TypeAlias = bool | Literal["none", "all", "row", "col"]
 
 Look: TypeAlias = dict[str, Any]
-"""How an artist looks: Matplotlib's properties by name."""
+"""How an artist looks: Matplotlib's properties by name, whose types it does not declare."""
 
 PAGE, COLUMN = 7.16, 3.5
 """Widths [in] of the text and of a column of a two-column paper."""
@@ -147,7 +148,7 @@ def curve(
     if not finite.any():
         axes.plot([], [], ls="none", label=f"{label}: {absent}", gid=CURVE)
         return
-    every: Any = None
+    every: tuple[int, int] | None = None
     if finite.sum() > _FEW:
         apart = max(len(y) // 6, 1)
         every = (int(apart * (0.1 + 0.4 * i % 1)), apart)
@@ -164,7 +165,7 @@ def curve(
     )
 
 
-def curves_of(axes: Axes) -> list[Any]:
+def curves_of(axes: Axes) -> list[Line2D]:
     """The lines that `curve` has drawn."""
     return [line for line in axes.lines if line.get_gid() == CURVE]
 

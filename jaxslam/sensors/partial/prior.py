@@ -1,13 +1,11 @@
 """The prior of the unmeasured landmark parameters: Solà's s ~ N(s̄, S), checked by the factory."""
 
-from typing import Any, cast
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.protocols import Free
+from jaxslam.types import JaxOrNumPy
 from jaxslam.validation.numbers import check_covariance, is_concrete
 
 FreeLike = Free | tuple[ArrayLike, ArrayLike]
@@ -34,13 +32,13 @@ def free_parameters(name: str, free: FreeLike, size: int) -> Free:
     return Free(mean, cov)
 
 
-def _held(values: Any) -> jax.Array:
+def _held(values: ArrayLike) -> JaxOrNumPy:
     """The array on the host in float64, whatever the default width of JAX."""
     if not is_concrete(values):
         return jnp.asarray(values)
     array = np.asarray(values)
-    return cast(jax.Array, array.astype(np.float64) if _is_real(array) else array)
+    return array.astype(np.float64) if _is_real(array) else array
 
 
-def _is_real(array: Any) -> bool:
+def _is_real(array: JaxOrNumPy) -> bool:
     return bool(np.issubdtype(array.dtype, np.number)) and not np.iscomplexobj(array)

@@ -1,7 +1,6 @@
 """Rooms whose walls are the landmarks, lines by distance and direction: an office, a square."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -66,8 +65,7 @@ def from_start(world: LaserWorld) -> Walls:
     x, y, theta = np.asarray(world.pose, np.float64)
     c, s = np.cos(theta), np.sin(theta)
     segments = (np.asarray(world.walls.segments) - [x, y]) @ np.array([[c, -s], [s, c]])
-    made: Any = segments, np.zeros((0, 3))
-    return Walls(*made)
+    return Walls(segments, np.zeros((0, 3)))
 
 
 def _met_by_beams(walls: Walls, max_range: float) -> Callable[[jax.Array, jax.Array], jax.Array]:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -157,7 +157,7 @@ class _Evaluator:
         return _looped(self.function.call)
 
     @cached_property
-    def both_modes(self) -> Callable[..., Any]:
+    def both_modes(self) -> Callable[..., PyTree]:
         """The function of batches of arguments -> Jacobians by forward and by reverse mode."""
 
         def both(*arguments: jax.Array) -> PyTree:
@@ -196,7 +196,7 @@ class _Evaluator:
             first = [jnp.asarray(a[0]) for a in self.arguments]
             try:
                 shaped = self._split(jax.eval_shape(hand, *first))
-                batch: Callable[..., Any] = quick_jit(jax.vmap(hand))
+                batch: Callable[..., PyTree] = quick_jit(jax.vmap(hand))
             except (jax.errors.JAXTypeError, TypeError) as error:
                 shaped = self._split(hand(*first))  # raises again unless tracing was the fault
                 batch = _looped(hand)
@@ -272,7 +272,7 @@ def _worst_gap(methods: dict[str, Values], reference: dict[str, Values]) -> np.n
     return np.where(np.isfinite(worst), worst, 0.0)
 
 
-def _looped(call: Callable[..., Any]) -> Callable[..., Any]:
+def _looped(call: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """The function applied state by state, if it cannot be traced; keeps None in tuples."""
 
     def batch(*arguments: States) -> PyTree:

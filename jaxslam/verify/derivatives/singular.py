@@ -1,11 +1,12 @@
 """Singular places of a function: the operation without a finite value or derivative, its cure."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import Literal
+from jax.extend.core import Jaxpr, Literal, Var
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 _CALLS = ("jit", "pjit", "custom_jvp_call", "custom_vjp_call", "closed_call", "checkpoint")
 """operations that call a function"""
@@ -47,7 +48,7 @@ CURES: dict[str, tuple[str, ...]] = {
 """The cure of each singular operation: a sentence, then lines of code."""
 
 
-def singular_operation(call: Callable[..., Any], state: Sequence[np.ndarray]) -> str:
+def singular_operation(call: Callable[..., PyTree], state: Sequence[np.ndarray]) -> str:
     """The first operation of a function that is singular at a state: a key of `CURES`, or "".
 
     The function is computed operation by operation; a loop counts as one operation.
@@ -59,21 +60,22 @@ def singular_operation(call: Callable[..., Any], state: Sequence[np.ndarray]) ->
         return ""
 
 
-def _first_singular(traced: Any, arguments: Sequence[Any]) -> tuple[str, list[Any]]:
+def _first_singular(traced: Jaxpr, arguments: Sequence[ArrayLike]) -> tuple[str, list[ArrayLike]]:
     """The first singular operation or "", and the values of a traced function."""
     jaxpr, consts = getattr(traced, "jaxpr", traced), getattr(traced, "consts", ())
     known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *arguments), strict=True))
 
-    def value(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else known[atom]
+    def value(atom: Literal | Var) -> ArrayLike:
+        found: ArrayLike = atom.val if isinstance(atom, Literal) else known[atom]
+        return found
 
     for equation in jaxpr.eqns:
         operands = [value(atom) for atom in equation.invars]
         if kind := _kind(equation.primitive.name, equation.params.get("y"), operands):
             return kind, []
         if equation.primitive.name in _CALLS:
-            inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
-            kind, results = _first_singular(inner, operands)
+            inner = "jaxpr" if "jaxpr" in equation.params else "call_jaxpr"
+            kind, results = _first_singular(equation.params[inner], operands)
             if kind:
                 return kind, []
         else:
@@ -83,7 +85,7 @@ def _first_singular(traced: Any, arguments: Sequence[Any]) -> tuple[str, list[An
     return "", [value(atom) for atom in jaxpr.outvars]
 
 
-def _kind(primitive: str, exponent: float | None, operands: list[Any]) -> str:
+def _kind(primitive: str, exponent: float | None, operands: list[ArrayLike]) -> str:
     """The key of `CURES` for an operation that is singular at its operands, or ""."""
     first = np.asarray(operands[0]) if operands else np.zeros(0)
     second = np.asarray(operands[1]) if len(operands) > 1 else np.zeros(())

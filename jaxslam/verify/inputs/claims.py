@@ -2,18 +2,19 @@
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 Claim: TypeAlias = Callable[..., ArrayLike | Sequence[ArrayLike | None]]
 """A hand-derived Jacobian: arguments -> one array, or one array or None for each argument."""
 
 
-def as_claim(claim: Any) -> Any:
+def as_claim(claim: PyTree) -> PyTree:
     """A claimed Jacobian as one array or a tuple of arrays; a list of rows is one array."""
     if claim is None:
         raise ValueError("returns None: is a `return` missing?")
@@ -23,7 +24,9 @@ def as_claim(claim: Any) -> Any:
     return claim
 
 
-def split_claim(claim: Any, rows: int, names: Sequence[str], sizes: Sequence[int]) -> list[Any]:
+def split_claim(
+    claim: PyTree, rows: int, names: Sequence[str], sizes: Sequence[int]
+) -> list[PyTree]:
     """A claimed Jacobian split by argument, None where there is no claim.
 
     Args:

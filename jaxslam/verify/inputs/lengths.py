@@ -2,11 +2,12 @@
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.inputs.claims import Claim, as_claim, split_claim
@@ -27,7 +28,7 @@ class Deduced(NamedTuple):
 
 
 def deduce_lengths(
-    call: Callable[..., Any],
+    call: Callable[..., PyTree],
     claim: Claim | None,
     known: dict[str, int | None],
     rows: int | None,
@@ -79,7 +80,7 @@ def _split(claim: Claim, rows: int, names: Sequence[str], sizes: Sequence[int]) 
     """Raise unless the shapes of a claimed Jacobian are those of arguments of some lengths."""
     parts: list[bool] = []
 
-    def arrays(*arguments: Any) -> list[Any]:
+    def arrays(*arguments: jax.Array) -> list[PyTree]:
         out = as_claim(claim(*arguments))
         whole = out if isinstance(out, tuple) else (out,)
         parts[:] = [isinstance(out, tuple), *(part is not None for part in whole)]
@@ -91,7 +92,7 @@ def _split(claim: Claim, rows: int, names: Sequence[str], sizes: Sequence[int]) 
     split_claim(whole if is_tuple else whole[0], rows, names, sizes)
 
 
-def _shapes(call: Callable[..., Any], sizes: Sequence[int]) -> list[tuple[int, ...]]:
+def _shapes(call: Callable[..., PyTree], sizes: Sequence[int]) -> list[tuple[int, ...]]:
     """The shapes of what a function of vectors returns, traced if it can be, else computed."""
     try:
         traced = [jax.ShapeDtypeStruct((n,), np.float64) for n in sizes]

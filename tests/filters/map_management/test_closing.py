@@ -11,7 +11,7 @@ import pytest
 from jaxslam import association, charts, motion, programs, sensors, slots
 from jaxslam.filters import eif_slam, ekf_slam
 from jaxslam.filters.map_management.closing import closing
-from jaxslam.filters.map_management.loop_closure import close_loop
+from jaxslam.filters.map_management.loop_closure import LoopSettings, close_loop
 from jaxslam.filters.map_management.merging import merge_landmarks
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
@@ -56,7 +56,7 @@ def two_visits(seed=0, drift=4.0, shape=0.05, symmetric=False):
 
 def look(joint, **options):
     """By a program for all values of the options that are no integers."""
-    closed = partial(close_loop, chart=EUCLIDEAN, **(OPTIONS | options))
+    closed = partial(close_loop, chart=EUCLIDEAN, settings=LoopSettings(**(OPTIONS | options)))
     return programs.call(closed, (), joint)
 
 
@@ -177,11 +177,8 @@ def test_a_whole_run_ends_with_each_landmark_once():
             ),
             recency(),
         ),
-        window=10,
-        cluster=8,
-        sightings=2,
-        least=5,
         reach=1.0,
+        settings=LoopSettings(window=10, cluster=8, sightings=2, least=5),
     )
     predict, update = jax.jit(filter.predict), jax.jit(filter.update)
     state = jax.jit(filter.init)(np.zeros(3), np.zeros((3, 3)))
@@ -219,9 +216,9 @@ def test_refusals():
         ({"probability": 0.0}, "probability"),
     ):
         with pytest.raises(ValueError, match=message):
-            close_loop(joint, EUCLIDEAN, **options)
+            LoopSettings(**options)
     with pytest.raises(ValueError, match="recency"):
-        close_loop(joint._replace(life=None), EUCLIDEAN)
+        close_loop(joint._replace(life=None), EUCLIDEAN, LoopSettings())
     with pytest.raises(ValueError, match="spread"):
         association.certain(association.nearest(9.0), 0.0)
     plain = ekf_slam(motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2)), 3)

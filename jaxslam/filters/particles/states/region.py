@@ -3,12 +3,12 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from jaxslam.math.angles import wrap
@@ -18,9 +18,9 @@ from jaxslam.math.angles import wrap
 class Region:
     """A set of places in the plane, each with any heading."""
 
-    draw: Callable[[int, Array, Any], Array]
+    draw: Callable[[int, Array, DTypeLike], Array]
     """(count, key, dtype) -> (count, 3) poses, uniform in it"""
-    moments: Callable[[Any], tuple[Array, Array]]
+    moments: Callable[[DTypeLike], tuple[Array, Array]]
     """(dtype) -> mean (3,) and covariance (3, 3) of a pose drawn"""
 
 

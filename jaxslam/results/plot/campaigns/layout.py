@@ -107,7 +107,7 @@ def add_legends(figure: Figure, rows: Sequence[Row], title: str, across: str) ->
         beside = figure.axes[figure.axes.index(row.panels[-1]) + 1]
         beside.legend(
             curves,
-            [curve.get_label() for curve in curves],
+            [str(curve.get_label()) for curve in curves],
             loc="center left",
             frameon=False,
             fontsize=TEXT,

@@ -1,7 +1,6 @@
 """Figures of occupancy grids, with poses and beams in them."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.colors import Colormap, LinearSegmentedColormap
@@ -104,9 +103,8 @@ def grid_figure(
 
 def shades_of_occupancy() -> Colormap:
     """White for free, black for occupied, and a colour of its own for what is masked: unknown."""
-    shades: Any = LinearSegmentedColormap.from_list("occupancy", ["white", "black"])
-    found: Colormap = shades.with_extremes(bad=_UNKNOWN)
-    return found
+    shades = LinearSegmentedColormap.from_list("occupancy", ["white", "black"])
+    return shades.with_extremes(bad=_UNKNOWN)
 
 
 def shown_occupancy(log_odds: np.ndarray) -> np.ma.MaskedArray:

@@ -1,7 +1,5 @@
 """The figure of a map whose landmarks are the walls' lines."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
@@ -60,13 +58,14 @@ def walls_figure(
     height = inner * (high - low)[1] / (high - low)[0] + 0.9
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
     axes.grid(visible=False)
-    own: dict[str, Any] = {"color": COLORS[1], "zorder": 3}
     axes.add_collection(
         LineCollection(list(segments), color=INK, lw=2.2, alpha=0.45, label="walls")
     )
     band = f"{n_sigma:g} σ of a line"
     axes.add_collection(PolyCollection(bands, color=COLORS[1], alpha=0.25, lw=0, label=band))
-    axes.add_collection(LineCollection(ends, lw=0.9, label="estimated lines", **own))
+    axes.add_collection(
+        LineCollection(ends, color=COLORS[1], lw=0.9, label="estimated lines", zorder=3)
+    )
     if path is not None:
         true = np.asarray(path)
         axes.plot(*true[:, :2].T, color=INK, lw=1.0, ls=(0, (4, 2)), label="true path", zorder=3.5)

@@ -1,7 +1,5 @@
 """The figure of laser SLAM: its path before and after closing, with the loops."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -15,6 +13,7 @@ from jaxslam.results.plot.style import (
     FAINT,
     INK,
     PAGE,
+    Look,
     caption,
     every_handle,
     panels_of,
@@ -57,13 +56,12 @@ def loops_figure(
 def _draw(axes: Axes, path: np.ndarray, ends: np.ndarray, reference: np.ndarray | None) -> None:
     if reference is not None:
         axes.plot(*reference[:, :2].T, color=FAINT, lw=1.6, label="reference", zorder=1)
-    loops: Any = list(path[ends])
     lines = LineCollection(
-        loops, colors=COLORS[1], linewidths=0.5, alpha=0.6, label="loops", zorder=2
+        list(path[ends]), colors=COLORS[1], linewidths=0.5, alpha=0.6, label="loops", zorder=2
     )
     axes.add_collection(lines)
     axes.plot(*path.T, color=COLORS[0], lw=0.8, label="path", zorder=3)
-    start: dict[str, Any] = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5}
+    start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5}
     axes.plot(*path[0], marker="o", label="first pose", zorder=4, **start)
     axes.set_aspect("equal", adjustable="datalim")
 

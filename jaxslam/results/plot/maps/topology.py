@@ -1,7 +1,5 @@
 """The figure of a topological map over its grid."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -9,7 +7,7 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from jaxslam.results.plot.maps.grids import world_of
-from jaxslam.results.plot.style import COLORS, INK, PAGE, caption, every_handle, panels_of
+from jaxslam.results.plot.style import COLORS, INK, PAGE, Look, caption, every_handle, panels_of
 from jaxslam.topology import Route, TopologicalMap
 from jaxslam.topology.places import cell_centers
 
@@ -40,12 +38,12 @@ def topology_figure(
     height = (width - 0.6) * np.ptp(y) / np.ptp(x) + 0.9
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
     axes.grid(visible=False)
-    colours: Any = ListedColormap(_PALE)
-    mesh: dict[str, Any] = {"rasterized": True, "zorder": 0}
+    colours = ListedColormap(_PALE)
+    mesh: Look = {"rasterized": True, "zorder": 0}
     shown = np.ma.masked_array(_coloured(places)[label], mask=label < 0)
     axes.pcolormesh(x, y, shown, cmap=colours, vmin=-0.5, vmax=len(_PALE) - 0.5, **mesh)
     walls = np.ma.masked_array(np.ones(label.shape), mask=np.asarray(grid.log_odds) <= 0)
-    black: Any = ListedColormap(["#555555"])
+    black = ListedColormap(["#555555"])
     axes.pcolormesh(x, y, walls, cmap=black, **mesh)
     where = cell_centers(grid)
     skeleton = where[places.skeleton.cells.reshape(-1)]

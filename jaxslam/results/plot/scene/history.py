@@ -1,13 +1,14 @@
 """What a film shows of a run: everything of the steps that are frames, and little of the others."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.results.film import MOST, frame_steps
-from jaxslam.types import Log, Status, Trace
+from jaxslam.results.plot.scene.probe import Cloud, Links
+from jaxslam.types import Estimate, Log, Status, Trace
 from jaxslam.validation import check_record
 
 
@@ -18,14 +19,14 @@ class History(NamedTuple):
     """the estimated pose of every step"""
     step: Int[np.ndarray, "F"]
     """the step of each frame, from 0"""
-    estimate: Any
-    """an `Estimate` with leading F"""
+    estimate: Estimate
+    """with leading F"""
     tag: Int[np.ndarray, "T M"]
     """of the measurements"""
     status: Int[np.ndarray, "T M"]
     slot: Int[np.ndarray, "T M"]
-    seen: Any = None
-    """a `Cloud` or `Links` with leading F, or None"""
+    seen: Cloud | Links | None = None
+    """with leading F"""
 
 
 def history_of(

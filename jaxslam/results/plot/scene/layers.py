@@ -113,13 +113,13 @@ def weighted_segments(
     """
 
     def layer(axes: Axes) -> Draw:
-        lines: Any = LineCollection([], animated=True, color=color, linewidth=width, **look)
+        lines = LineCollection([], animated=True, color=color, linewidth=width, **look)
         axes.add_collection(lines, autolim=False)
 
         def draw(k: int) -> None:
             heavy = np.sqrt(weights[k])
             lines.set_segments(list(ends[k]))
-            lines.set_linewidth(width * (0.15 + 0.85 * heavy))
+            lines.set_linewidth(list(width * (0.15 + 0.85 * heavy)))
             lines.set_color([to_rgba(color, 0.2 + 0.6 * each) for each in heavy])
 
         return draw

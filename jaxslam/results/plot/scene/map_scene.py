@@ -1,7 +1,6 @@
 """The film of a map that grows."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -54,7 +53,6 @@ def _image(
 ) -> Layer:
     def layer(axes: Axes) -> Draw:
         axes.grid(visible=False)
-        look: dict[str, Any] = {"cmap": shades_of_occupancy(), "vmin": 0, "vmax": 1}
         image = axes.imshow(
             shown_occupancy(log_odds[0]),
             extent=extent,
@@ -62,7 +60,9 @@ def _image(
             interpolation="nearest",
             animated=True,
             zorder=1,
-            **look,
+            cmap=shades_of_occupancy(),
+            vmin=0,
+            vmax=1,
         )
         return lambda k: image.set_data(shown_occupancy(log_odds[k]))
 

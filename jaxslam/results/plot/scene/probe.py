@@ -1,10 +1,10 @@
 """What a film shows of a filter's own state: particles, or links of an information matrix."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.sparse.marginals import local_information
@@ -28,7 +28,7 @@ class Links(NamedTuple):
     """‖Ω_ij‖ / √(‖Ω_ii‖ ‖Ω_jj‖) of the blocks of positions, at most 1; 0 without link"""
 
 
-def probe(state: Any) -> Cloud | Links | None:
+def probe(state: PyTree) -> Cloud | Links | None:
     """What `animate` shows of the state of FastSLAM, of a particle filter or an information filter.
 
         trace = jaxslam.run(filter, log, pose, pose_cov, key, probe=jaxslam.plot.probe)

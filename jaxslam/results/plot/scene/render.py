@@ -17,13 +17,14 @@ What stays is drawn once; of each frame only what changes.
 import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
 from jaxslam.results.film import Film
@@ -136,9 +137,10 @@ class _Stage:
         size = across / dpi, tall / dpi
         figure, (main, beside) = panels_of(*size, 1, 2, share=(False, False), widths=(2.15, 1.0))
         figure.set_dpi(dpi)
-        engine: Any = figure.get_layout_engine()
+        engine = figure.get_layout_engine()
+        assert isinstance(engine, ConstrainedLayoutEngine)
         engine.set(rect=(0.0, 0.0, 1.0, 1.0 - _HEAD / size[1]))
-        canvas: Any = FigureCanvasAgg(figure)  # Matplotlib does not declare its methods' types
+        canvas = FigureCanvasAgg(figure)
         self._draws = _furnish(main, scene.main)
         beside.set_anchor("N")
         if scene.beside is None:
@@ -187,7 +189,7 @@ def _animated(axes: Axes) -> Iterator[Artist]:
 
 def _legend(main: Axes, beside: Axes) -> None:
     """The legend of both panels, each label once, below the one beside."""
-    handles: dict[Any, Artist] = {}
+    handles: dict[object, Artist] = {}
     for axes in (main, beside):
         for handle in axes.get_legend_handles_labels()[0]:
             handles.setdefault(handle.get_label(), handle)

@@ -94,7 +94,8 @@ def _limits(
 ) -> Limits:
     """The limits of the map: of the truth, else the estimate; and of what is near of the rest."""
     alive = history.estimate.alive
-    mapped, covs = history.estimate.points[alive], history.estimate.point_covs[alive]
+    mapped = np.asarray(history.estimate.points)[alive]
+    covs = np.asarray(history.estimate.point_covs)[alive]
     reach = n_sigma * np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
     estimated = [history.path[:, :2], mapped]
     clouds = [np.asarray(each, float)[:, :2] for each in (points, path) if each is not None]
@@ -133,7 +134,7 @@ def _beams(found: Measured) -> list[Layer]:
 
 def _map(history: History, n_sigma: float) -> list[Layer]:
     """The landmarks of the map with their ellipses; none of a filter without a map."""
-    _, _, points, covs, alive, _ = history.estimate
+    _, _, points, covs, alive, _ = map(np.asarray, history.estimate)
     if not np.any(alive):
         return []
     ring: Look = {"color": COLORS[1], "lw": 1.0, "zorder": 4}
@@ -147,7 +148,7 @@ def _map(history: History, n_sigma: float) -> list[Layer]:
 
 def _robot(history: History, n_sigma: float, size: float) -> list[Layer]:
     """The path so far, particles, the robot's ellipse, and the robot."""
-    pose, cov = history.estimate.pose, history.estimate.pose_cov
+    pose, cov = (np.asarray(part) for part in history.estimate[:2])
     line: Look = {"color": COLORS[0], "lw": 1.4, "zorder": 3.5}
     ring: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 5.2}
     robot: Look = {"fc": COLORS[0], "ec": "white", "lw": 0.6, "zorder": 5}
@@ -171,7 +172,8 @@ def _particles(seen: Cloud, origin: np.ndarray, label: str) -> Layer:
 
 def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
     """The robot's position as seen from its estimate: the ellipse, the truth, particles."""
-    pose, cov = history.estimate.pose, history.estimate.pose_cov[:, None, :2, :2]
+    pose, cov = (np.asarray(part) for part in history.estimate[:2])
+    cov = cov[:, None, :2, :2]
     middle, here = np.zeros((len(pose), 1, 2)), np.ones((len(pose), 1), bool)
     contours = ellipses(middle[:, 0], cov[:, 0], n_sigma)
     reach = np.abs(contours[np.isfinite(contours)]).max(initial=0.0)
