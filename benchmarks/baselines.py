@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.gate import Metric, alone
 from jaxslam import catalog, monte_carlo, run, simulate
 from jaxslam.filters import mapping
-from jaxslam.math.linalg import mahalanobis_squared
+from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.math.stats import chi2_band
 from jaxslam.simulation.scenarios import circle
 

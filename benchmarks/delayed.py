@@ -30,7 +30,7 @@ from jaxslam.association import nearest
 from jaxslam.filters import delayed_slam, ekf_slam
 from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.math.angles import wrap
-from jaxslam.math.linalg import mahalanobis_squared
+from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import Scenario

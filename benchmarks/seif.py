@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.gate import Metric, report
 from jaxslam import datasets, filters
 from jaxslam.filters.information.sparse.marginals import blanket_marginals, whole_marginals
-from jaxslam.math.linalg import mahalanobis_squared
+from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import simulate

@@ -16,7 +16,7 @@ from jaxslam import association, plot
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
 from jaxslam.math.angles import wrap
-from jaxslam.math.linalg import root_psd
+from jaxslam.math.roots import root_psd
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors import range_bearing
 from jaxslam.slots import Joint

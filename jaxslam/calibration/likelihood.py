@@ -11,19 +11,20 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
 from jaxslam import programs
+from jaxslam.calibration.errors import (
+    BOUND,
+    LikelihoodPoint,
+    newton_step,
+    observed_information,
+    standard_errors,
+    upper_limit,
+)
 from jaxslam.types import Info, Log, Status
 from jaxslam.validation.numbers import check_count
 
 LOOSE = 1.0
 """Standard error of log σ above which a log does not determine σ: a factor e either way."""
 
-BOUND = 1.35
-"""By how much log L falls at the 95 % upper limit of a parameter whose estimate is 0: half the 0.90
-quantile of χ² with one degree of freedom, since half of the estimates are 0 where the truth is."""
-
-
-CONFOUNDED = 0.9
-"""Correlation of two estimates above which they are named together."""
 
 _POLISH = 5
 
@@ -57,18 +58,6 @@ class NoiseFit(NamedTuple):
     which it allows them (95 %), the other parameters held"""
     loose: dict[str, tuple[str, ...]]
     """parameters that the log does not determine, and those that they are confounded with"""
-
-
-class _Point(NamedTuple):
-    """The likelihood at one set of parameters, by the coordinates q."""
-
-    q: np.ndarray
-    value: float
-    gradient: np.ndarray
-    spread: np.ndarray
-    """Σ g gᵀ over the rows"""
-    nis: float
-    dof: int
 
 
 def fit_noise(
@@ -114,12 +103,12 @@ def fit_noise(
     """
     first, begin, logged, told = _checked(start, guess, names, deviation, iterations, tolerance)
 
-    def tried(q: np.ndarray) -> _Point:
+    def tried(q: np.ndarray) -> LikelihoodPoint:
         found = jax.device_get(programs.call(_evaluate, (info,), q, logged, data))
         value, gradient, spread, nis, dof = (np.asarray(part, np.float64) for part in found)
-        return _Point(q, float(value), gradient, spread, float(nis), int(dof))
+        return LikelihoodPoint(q, float(value), gradient, spread, float(nis), int(dof))
 
-    def at(q: np.ndarray) -> _Point:
+    def at(q: np.ndarray) -> LikelihoodPoint:
         point = tried(q)
         _check_point(point, logged)
         return point
@@ -145,9 +134,9 @@ def fit_noise(
         options={"gtol": scale * tolerance, "maxiter": iterations},
     )
     here = at(np.asarray(found.x))
-    observed = _observed(at, here, logged)
+    observed = observed_information(at, here, logged)
     for _ in range(_POLISH):
-        step, gain = _newton(observed, here.gradient)
+        step, gain = newton_step(observed, here.gradient)
         if gain <= tolerance:
             break
         there = at(here.q + step)
@@ -155,8 +144,8 @@ def fit_noise(
             break
         here = there
         path.append(here.q)
-        observed = _observed(at, here, logged)
-    cov, robust, related = _errors(observed, here.spread)
+        observed = observed_information(at, here, logged)
+    cov, robust, related = standard_errors(observed, here.spread)
     deviations = np.where(logged, np.exp(here.q), 1.0)
     error = np.sqrt(np.diag(cov))
     wide = ~np.isfinite(error) | (logged & (error > LOOSE))
@@ -173,8 +162,8 @@ def fit_noise(
         nis_per_dof=(before.nis / before.dof, here.nis / here.dof),
         dof=here.dof,
         path=np.where(logged, np.exp(np.where(logged, path, 0.0)), path),
-        converged=_newton(observed, here.gradient)[1] <= tolerance,
-        upper={told[i]: _upper(at, here, int(i)) for i in np.flatnonzero(falling)},
+        converged=newton_step(observed, here.gradient)[1] <= tolerance,
+        upper={told[i]: upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
         loose={
             told[i]: tuple(told[j] for j in related[i]) for i in np.flatnonzero(wide & ~falling)
         },
@@ -216,68 +205,6 @@ def _evaluate(
     return value, by_row.sum(axis=0), by_row.T @ by_row, nis, dof
 
 
-def _newton(observed: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
-    """Newton's step, in each direction at most 1, and the gain of log L that it promises.
-
-    Where log L is convex the step goes uphill by as much as it would where it is concave.
-    """
-    values, vectors = np.linalg.eigh(observed)
-    along = vectors.T @ gradient
-    step = np.clip(along / np.maximum(np.abs(values), 1e-300), -1.0, 1.0)
-    return vectors @ step, float(np.abs(along * step).sum() / 2)
-
-
-def _observed(
-    at: Callable[[np.ndarray], _Point], here: _Point, logged: np.ndarray
-) -> Float[np.ndarray, "P P"]:
-    """-∂²log L/∂q², from central differences of the gradient over part of a standard error."""
-    rows = []
-    for i, scale in enumerate(np.diag(here.spread)):
-        h = 0.05 / np.sqrt(scale) if scale > 0 else 1e-3
-        move = (min(h, 0.01) if logged[i] else h) * np.eye(len(here.q))[i]
-        slopes = [at(here.q + sign * move).gradient for sign in (-1, 1)]
-        rows.append((slopes[0] - slopes[1]) / (2 * move[i]))
-    found: np.ndarray = np.array(rows)
-    return np.asarray((found + found.T) / 2)
-
-
-def _upper(at: Callable[[np.ndarray], _Point], here: _Point, i: int) -> float:
-    """The deviation, above that of parameter i, at which log L is lower by `BOUND`; to 2 %."""
-    unit, low, high = np.eye(len(here.q))[i], 0.0, np.log(2.0)
-    while at(here.q + high * unit).value > here.value - BOUND and high < 20:
-        low, high = high, high + np.log(2.0)
-    for _ in range(5):
-        middle = (low + high) / 2
-        inside = at(here.q + middle * unit).value > here.value - BOUND
-        low, high = (middle, high) if inside else (low, middle)
-    return float(np.exp(here.q[i] + (low + high) / 2))
-
-
-def _errors(
-    observed: np.ndarray, spread: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, list[list[int]]]:
-    """The inverse of the observed information, robust errors, and confounded parameters of each.
-
-    A parameter that has part in a direction without information has no error, and the others have
-    that which they have when it is known.
-    """
-    scale = np.sqrt(np.maximum(np.diag(observed), 0.0))
-    unit = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(observed / np.outer(unit, unit))
-    part = np.abs(vectors[:, values < 1e-6]) > 0.3
-    lost = (scale == 0) | part.any(axis=1)
-    keep = np.ix_(~lost, ~lost)
-    inverse = np.linalg.inv(observed[keep])
-    error = np.sqrt(np.diag(inverse))
-    cov, robust = np.diag(np.where(lost, np.inf, 0.0)), np.where(lost, np.inf, 0.0)
-    cov[keep] = inverse
-    robust[~lost] = np.sqrt(np.diag(inverse @ spread[keep] @ inverse))
-    related = part.astype(int) @ part.T > 0
-    related[keep] = np.abs(inverse / np.outer(error, error)) > CONFOUNDED
-    np.fill_diagonal(related, False)
-    return cov, robust, [list(np.flatnonzero(row)) for row in related]
-
-
 def _coordinates(p: np.ndarray, logged: np.ndarray) -> np.ndarray:
     return np.where(logged, np.log(np.where(logged, p, 1.0)), p)
 
@@ -308,7 +235,7 @@ def _checked(
     return first, begin, logged, told
 
 
-def _check_point(point: _Point, logged: np.ndarray) -> None:
+def _check_point(point: LikelihoodPoint, logged: np.ndarray) -> None:
     where = f"at parameters {np.where(logged, np.exp(point.q), point.q)}"
     if not point.dof:
         raise ValueError(f"fit_noise: expected fused measurements, got none {where}")
@@ -316,7 +243,7 @@ def _check_point(point: _Point, logged: np.ndarray) -> None:
         raise ValueError(f"fit_noise: the likelihood or its gradient is not finite {where}")
 
 
-def _check_same(one: _Point, other: _Point, logged: np.ndarray) -> None:
+def _check_same(one: LikelihoodPoint, other: LikelihoodPoint, logged: np.ndarray) -> None:
     if one.dof != other.dof:
         p, q = (np.where(logged, np.exp(point.q), point.q) for point in (one, other))
         raise ValueError(

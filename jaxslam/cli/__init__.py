@@ -11,9 +11,11 @@ from importlib.metadata import version
 import jax
 from threadpoolctl import threadpool_limits
 
-from jaxslam.cli import fit, models, optimize
+from jaxslam.cli import fit, models
 from jaxslam.cli.common import INTERRUPTED, as_folders
 from jaxslam.cli.consistency import options as consistency_options
+from jaxslam.cli.optimize import options as optimize_options
+from jaxslam.cli.optimize.command import COST, ERRORS
 from jaxslam.cli.run import options as run_options
 from jaxslam.cli.runtime import cache, devices
 from jaxslam.cli.runtime.compile_clock import CompileClock
@@ -92,13 +94,13 @@ def _parser() -> argparse.ArgumentParser:
             "table and writes fit.json and fit.toml, lines for dataset.toml.",
         )
     )
-    optimize.add_options(
+    optimize_options.add_options(
         commands.add_parser(
             "optimize",
             help="optimize a pose or landmark graph in a file",
             description="Optimize a graph in a file of g2o or TORO. Prints a table and writes the "
             "poses, the optimized graph, a summary and a figure. The cost is "
-            f"{optimize.COST} {optimize.ERRORS['pose'][1]}. The exit status is 1 if the "
+            f"{COST} {ERRORS['pose'][1]}. The exit status is 1 if the "
             "optimization did not converge, 2 if the file cannot be used.",
         )
     )

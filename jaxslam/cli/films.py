@@ -16,7 +16,7 @@ NAMES = ("film.gif", "film.mp4", "film.html", "film-*.gif", "film-*.mp4", "film-
 def film_files(
     films: Mapping[str, "Film"], *, suffixed: bool
 ) -> dict[str, Callable[[Path], object]]:
-    """What writes each film as MP4, or else GIF, and as a page; by file name.
+    """The functions that write each film as MP4, or else GIF, and as a page; by file name.
 
     Prints in a line how many steps are shown, and why there is no MP4.
 

@@ -59,7 +59,7 @@ SNAPSHOTS = 25
 
 
 class Score(NamedTuple):
-    """Of many runs (leading R). Of a run that is not finite, the rest means nothing."""
+    """The scores of a filter in R runs; those of a run that is not finite mean nothing."""
 
     finite: Bool[np.ndarray, "R"]
     """every number of the run is finite."""

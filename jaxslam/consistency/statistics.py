@@ -22,7 +22,7 @@ _UNROLLED = 4
 
 
 class RunStatistics(NamedTuple):
-    """Of one run; with a leading axis, of many."""
+    """The sums over the steps of one run; with a leading axis, of many."""
 
     finite: Bool[Array, ""]
     """every number of its estimates and infos is finite."""

@@ -224,6 +224,6 @@ def _two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _renormalized(high: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same for |high| >= |low|."""
+    """high + low rounded, and the exact error of that rounding, for |high| >= |low|."""
     out = high + low
     return out, low - (out - high)

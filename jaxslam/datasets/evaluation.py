@@ -16,7 +16,7 @@ SPAN = 1.0
 
 
 class Evaluation(NamedTuple):
-    """What is known of a filter's errors, and the truth as it lies in the filter's map."""
+    """The errors of a filter, as far as they are known, and the truth in the frame of its map."""
 
     errors: dict[str, float]
     """by name with unit, as printed"""

@@ -142,7 +142,7 @@ def _read(path: Path) -> dict[str, Float[np.ndarray, "_ _"]]:
 
 
 def _by_travel(pose: jax.Array, u: jax.Array) -> jax.Array:
-    """`TRAVEL_DENSITY` times the distance travelled."""
+    """The noise covariance: `TRAVEL_DENSITY` times the distance travelled."""
     square = u[0] ** 2 + u[1] ** 2
     moved = square > 0
     travel = jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)

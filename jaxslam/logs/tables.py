@@ -68,7 +68,7 @@ def split_unit(name: str) -> tuple[str, str | None]:
 
 
 def unit_divisor(unit: str | None, wanted: str) -> float | None:
-    """By what a column in a unit is divided to be the wanted column; None where nothing does."""
+    """The divisor that brings a column in a unit to the wanted unit; None where there is none."""
     target = split_unit(wanted)[1] or ""
     if unit is None or unit == target:
         return 1.0

@@ -42,8 +42,12 @@ def gaussian_terms(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Gaussi
 
 def log_det_of(factor: Float[Array, "n n"]) -> Scalar:
     """log |L Lᵀ| of a Cholesky factor L; a pivot that is not positive counts as 1."""
-    pivots = jnp.diagonal(factor)
-    return 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum()
+    return log_det_of_pivots(jnp.diagonal(factor))
+
+
+def log_det_of_pivots(pivots: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """log |L Lᵀ| by the diagonal of L; of L⁻¹ it is the negative."""
+    return 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=-1)
 
 
 def log_density(
@@ -51,3 +55,23 @@ def log_density(
 ) -> Float[Array, "..."]:
     """log N of errors of `size` entries, by their d² and log |cov|."""
     return -0.5 * (distance + log_det + size * LOG_2PI)
+
+
+def mahalanobis_squared(
+    error: Float[Array, "n"], cov: Float[Array, "n n"]
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """eᵀ P⁻¹ e and whether P (n, n) is numerically regular; 0 and False where it is not.
+
+    P is scaled by each coordinate's standard deviation, so that the test does not depend on units.
+    Regular means that each Cholesky pivot exceeds 100 n·eps, i.e. no direction is known exactly,
+    and that e is finite.
+    """
+    n, variance = cov.shape[-1], jnp.diagonal(cov)
+    spread = variance > 0  # √ has an infinite derivative at zero, hence the 1.0
+    unit = jnp.where(spread, 1.0 / jnp.sqrt(jnp.where(spread, variance, 1.0)), 0.0)
+    factor = linalg.cholesky(cov * unit[:, None] * unit[None, :])[0]
+    known = jnp.isfinite(error)
+    squares = linalg.solve_lower(factor, jnp.where(known, error, 0.0) * unit) ** 2
+    regular = jnp.all(jnp.diagonal(factor) ** 2 > 100 * n * jnp.finfo(cov.dtype).eps)
+    regular = regular & jnp.all(known)
+    return jnp.where(regular, jnp.sum(squares), 0.0), regular

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam.math import linalg, se2
+from jaxslam.math import gaussians, linalg, se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.gaussians import log_det_of
 
 Array = jax.Array
 
@@ -70,7 +71,7 @@ def merge(a: Frame, b: Frame) -> tuple[Frame, Array]:
 
 def mahalanobis_squared(a: Frame, b: Frame) -> tuple[Array, Array]:
     """The distance δᵀ (P_a + P_b)⁻¹ δ, δ = x_a ⊖ x_b, of independent frames, and its validity."""
-    return linalg.mahalanobis_squared(_difference(a, b), a.cov + b.cov)
+    return gaussians.mahalanobis_squared(_difference(a, b), a.cov + b.cov)
 
 
 def bhattacharyya(a: Frame, b: Frame) -> tuple[Array, Array]:
@@ -81,12 +82,12 @@ def bhattacharyya(a: Frame, b: Frame) -> tuple[Array, Array]:
     Unlike d², it grows also where one is much less certain than the other (Bhattacharyya 1943).
     """
     middle = 0.5 * (a.cov + b.cov)
-    near, positive = linalg.mahalanobis_squared(_difference(a, b), middle)
+    near, positive = gaussians.mahalanobis_squared(_difference(a, b), middle)
     log_dets = []
     for cov in (middle, a.cov, b.cov):
         factor, good = linalg.cholesky(cov)
         positive = positive & good
-        log_dets.append(2 * jnp.log(jnp.where(good, jnp.diagonal(factor), 1.0)).sum())
+        log_dets.append(log_det_of(factor))
     spread = 0.5 * (log_dets[0] - 0.5 * (log_dets[1] + log_dets[2]))
     return jnp.where(positive, near / 8 + spread, 0.0), positive
 

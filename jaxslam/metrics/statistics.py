@@ -1,4 +1,4 @@
-"""What errors come to: mean, RMSE and the like."""
+"""Statistics of errors: mean, standard deviation, RMSE, median, extremes."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from jaxslam.metrics.relations import Errors
 
 
 class Statistics(NamedTuple):
-    """The figures of some errors, in their unit."""
+    """The statistics of errors, in their unit."""
 
     size: int
     mean: float

@@ -6,24 +6,18 @@ there are and whatever was interrupted; otherwise to rounding. Only scores are k
 memory is that of the blocks in flight however many runs there are.
 """
 
-import contextlib
 import time
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
 
 import jax
-import numpy as np
 from jax.typing import DTypeLike
-from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Summary, Tally, summarize
-from jaxslam.monte_carlo.blocks.block import BOUND, BlockRunner, Glimpse
+from jaxslam.monte_carlo.blocks.block import BOUND, Glimpse
 from jaxslam.monte_carlo.blocks.blockwise import Library
-from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
-from jaxslam.monte_carlo.blocks.programs import compile_programs
+from jaxslam.monte_carlo.blocks.plan import CampaignPlan
 from jaxslam.monte_carlo.candidates import (
     check_dtype,
     check_fits,
@@ -32,28 +26,15 @@ from jaxslam.monte_carlo.candidates import (
     without_noise,
 )
 from jaxslam.monte_carlo.fingerprint import fingerprint
+from jaxslam.monte_carlo.kept import Keep, add_kept
 from jaxslam.monte_carlo.pieces import check_part, cores, in_part, missing
-from jaxslam.monte_carlo.progress import Progress
 from jaxslam.monte_carlo.record import Campaign, Interrupted
 from jaxslam.monte_carlo.together import gathered_tallies, share
+from jaxslam.monte_carlo.work import Work, shown
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario, with_positions
-from jaxslam.types import Estimate, Truth
 from jaxslam.validation import check_record
 from jaxslam.validation.numbers import check_count, check_key
-
-
-class Keep(Protocol):
-    """Where finished blocks are kept: `store.Store`, for one. Claimed before it is read."""
-
-    def claim(self, fingerprint: Mapping[str, str]) -> None:
-        """Note what campaign this is, once; ValueError where it is another that was noted."""
-
-    def save(self, first: int, arrays: Mapping[str, np.ndarray], runs: int) -> object:
-        """Keep runs first … first + runs - 1."""
-
-    def blocks(self) -> Iterable[tuple[int, int, Mapping[str, np.ndarray]]]:
-        """(first, runs, arrays) of each block kept."""
 
 
 def monte_carlo(
@@ -141,12 +122,12 @@ def monte_carlo(
     if keep is not None:
         told = identity or fingerprint(scenario, filters, key, devices[0].platform, bound, dtype)
         keep.claim(told)
-        done = _add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
+        done = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
     pieces = missing(done, runs, plan.wide)
     todo = share([piece for piece in pieces if in_part(piece[0], plan.wide, part)])
-    work = _Work(workers, keep, progress or None, glimpse, {name: Tally() for name in names})
+    work = Work(workers, keep, progress or None, glimpse, {name: Tally() for name in names})
     try:
-        with _shown(work, plan, progress is None):
+        with shown(work, plan, progress is None):
             work.in_blocks_that_fit(plan, todo)
         interrupted = False
     except KeyboardInterrupt:
@@ -209,7 +190,7 @@ def _check(
 
 
 def _summed_up(
-    plan: CampaignPlan, tallies: dict[str, Tally], work: "_Work", seconds: float
+    plan: CampaignPlan, tallies: dict[str, Tally], work: Work, seconds: float
 ) -> Campaign:
     """The campaign of the runs in the tallies."""
     scenario = plan.scenario
@@ -238,117 +219,8 @@ def _summed_up(
     )
 
 
-@dataclass
-class _Work:
-    """Computes the missing blocks of a campaign, and keeps count."""
-
-    workers: int
-    keep: Keep | None
-    progress: Callable[[int, int], None] | None
-    glimpse: Glimpse | None
-    own: dict[str, Tally]
-    """what this process has computed, by filter"""
-    compile_seconds: float = 0.0
-    run_seconds: dict[str, float] = field(default_factory=dict)
-    first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
-
-    def in_blocks_that_fit(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
-        """Compute the pieces, in blocks of half the size each time that memory does not suffice."""
-        while True:
-            try:
-                return self.go(plan, todo)
-            except (jax.errors.JaxRuntimeError, MemoryError) as error:
-                if not (isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)):
-                    raise
-                if plan.block == 1:
-                    raise MemoryError(
-                        "monte_carlo: out of memory with one run on each device (block=1): use "
-                        "fewer steps, landmarks or filters at a time"
-                    ) from error
-                half = plan.block // 2
-                warnings.warn(
-                    f"monte_carlo: out of memory with block={plan.block}; continuing with "
-                    f"block={half}",
-                    stacklevel=3,
-                )
-                plan = replace(plan, block=half)
-
-    def go(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
-        """Add those of the pieces that are not yet there to the tallies."""
-        if not todo:
-            return
-        before = self.own[BOUND].pieces()
-        queue = [
-            piece
-            for first, count in todo
-            for piece in missing([(0, first), *before], first + count, plan.wide)
-        ][::-1]
-        plan = replace(plan, with_first=any(first == 0 for first, _ in queue))
-        promises = Promises(list(plan.filters))
-        runner = BlockRunner(plan, promises, self.glimpse)
-        done = sum(count for _, count in before)
-        total = sum(count for _, count in todo)
-        early = len(queue) > self.workers
-        flight: dict[Future[dict[str, dict[str, np.ndarray]]], tuple[int, int]] = {}
-        stop: BaseException | None = None
-        # XLA uses the cores; threads of the BLAS below its LAPACK would only spin beside it.
-        with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
-            try:
-                while queue and len(flight) <= self.workers:
-                    first, count = queue.pop()
-                    block = pool.submit(runner.block, first, count, early, not flight)
-                    flight[block] = first, count
-                began = time.perf_counter()
-                compile_programs(plan, promises)
-                self.compile_seconds += time.perf_counter() - began
-            except BaseException as error:
-                stop = error
-                promises.give_up(error)
-            while flight:
-                try:
-                    for future in wait(flight, return_when=FIRST_COMPLETED).done:
-                        first, count = flight.pop(future)
-                        if stop is not None and (future.cancelled() or future.exception()):
-                            continue
-                        found = future.result()
-                        if self.keep is not None:
-                            self.keep.save(first, _flat(found, self.own), count)
-                        _add(self.own, first, count, found)
-                        done += count
-                        if self.progress is not None:
-                            self.progress(done, total)
-                    while queue and stop is None and len(flight) <= self.workers:
-                        first, count = queue.pop()
-                        block = pool.submit(runner.block, first, count, True, False)
-                        flight[block] = first, count
-                except BaseException as error:
-                    if stop is not None:
-                        raise
-                    stop = error  # what is at work is finished, and kept
-                    for future in flight:
-                        future.cancel()
-        self.run_seconds = runner.run_seconds()
-        self.first |= runner.first
-        if stop is not None:
-            raise stop
-
-
-@contextlib.contextmanager
-def _shown(work: _Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
-    """A block in which, if wanted, a bar of progress tells of the work where it can be seen."""
-    count = len(plan.filters)
-    bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None
-    if bar is None or not bar.shown:
-        yield
-        return
-    work.progress = bar
-    work.glimpse = work.glimpse or bar.glimpse
-    with bar:
-        yield
-
-
 def _qualified(found: dict[str, Summary], scenario: Scenario) -> dict[str, Summary]:
-    """With a doubt on those that an exact sensor left without a covariance to judge by."""
+    """The summaries, with a doubt on those that an exact sensor left without a covariance."""
     dropped = {name: one.counts.get("singular", 0) for name, one in found.items()}
     exact = without_noise(scenario) if any(dropped.values()) else ""
     if not exact:
@@ -367,51 +239,3 @@ def _qualified(found: dict[str, Summary], scenario: Scenario) -> dict[str, Summa
         else one
         for name, one in found.items()
     }
-
-
-def _add_kept(
-    tallies: dict[str, Tally], keep: Keep, runs: int, wanted: Callable[[int], bool]
-) -> list[tuple[int, int]]:
-    """Add the blocks kept whose first run is wanted; (first, runs) of all of them.
-
-    Raises ValueError where there are runs beyond those asked for.
-    """
-    done = []
-    for first, count, arrays in keep.blocks():
-        if first + count > runs:  # sums over a block cannot be taken apart
-            raise ValueError(
-                f"monte_carlo: keep holds {first + count} runs: expected at least as many, got "
-                f"{runs}"
-            )
-        done.append((first, count))
-        if wanted(first):
-            _add(tallies, first, count, _by_filter(arrays, tallies))
-    return done
-
-
-def _add(
-    tallies: dict[str, Tally], first: int, runs: int, found: dict[str, dict[str, np.ndarray]]
-) -> None:
-    for name, arrays in found.items():
-        tallies[name].add(first, runs, arrays)
-
-
-def _flat(found: dict[str, dict[str, np.ndarray]], names: Iterable[str]) -> dict[str, np.ndarray]:
-    """One mapping of arrays for all filters, which go by their position."""
-    return {
-        f"{i}/{key}": array
-        for i, name in enumerate(names)
-        for key, array in found.get(name, {}).items()
-    }
-
-
-def _by_filter(
-    arrays: Mapping[str, np.ndarray], names: Iterable[str]
-) -> dict[str, dict[str, np.ndarray]]:
-    """The inverse of `_flat`."""
-    out: dict[str, dict[str, np.ndarray]] = {}
-    order = list(names)
-    for label, array in arrays.items():
-        i, _, key = label.partition("/")
-        out.setdefault(order[int(i)], {})[key] = array
-    return out

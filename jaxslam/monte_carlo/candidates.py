@@ -26,7 +26,7 @@ _T = TypeVar("_T")
 
 
 def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: jax.Device) -> int:
-    """Runs that are well computed together on a device: 16 on a CPU, whose caches they fit.
+    """The number of runs computed together on a device: 16 on a CPU, whose caches they fit.
 
     On an accelerator as many as take a quarter of its memory, counting a run's world and what the
     first filter makes of it, which the scores read several times over: a power of two from 32 on,

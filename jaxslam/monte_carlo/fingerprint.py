@@ -92,7 +92,7 @@ def fingerprint(
 
 
 def digest(function: Callable[..., PyTree], *arguments: PyTree) -> str:
-    """Of what a function computes of arguments of these shapes; see the module."""
+    """The digest of what a function computes of arguments of these shapes; see the module."""
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     return _short(f"{jax.tree.structure(shapes)} {_Reader().value(closed)}")
 
@@ -110,7 +110,7 @@ class _Reader:
         self._known: dict[int, tuple[Jaxpr, str]] = {}
 
     def jaxpr(self, jaxpr: Jaxpr) -> str:
-        """A digest: variables go by the order in which they appear."""
+        """The digest of a jaxpr, in which variables go by the order in which they appear."""
         if id(jaxpr) in self._known:
             return self._known[id(jaxpr)][1]
         numbers: dict[Var, int] = {}
@@ -140,7 +140,7 @@ class _Reader:
         return short
 
     def value(self, value: object) -> str:
-        """A constant, or a parameter of a primitive."""
+        """The text of a constant, or of a parameter of a primitive."""
         if hasattr(value, "jaxpr") and hasattr(value, "consts"):
             return f"{self.jaxpr(value.jaxpr)} of {self.value(list(value.consts))}"
         if isinstance(value, Jaxpr):

@@ -40,6 +40,6 @@ def in_part(first: int, block: int, part: tuple[int, int] | None) -> bool:
 
 
 def cores() -> int:
-    """CPU cores this process may use."""
+    """The number of CPU cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1

@@ -7,10 +7,7 @@ the campaign.
 """
 
 import contextlib
-import hashlib
-import json
 import os
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,17 +15,23 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.monte_carlo.pieces import missing
-from jaxslam.results.block_file import (
+from jaxslam.results.campaign_folder.block_file import (
     Block,
     block_order,
-    canonical_json,
     is_unfinished,
     read_block,
     runs_of_name,
-    write_atomically,
     write_block,
 )
-from jaxslam.results.files import Json
+from jaxslam.results.campaign_folder.manifest import (
+    FORMAT,
+    MANIFEST,
+    as_stored,
+    differences_of,
+    digest_of,
+    read_manifest,
+    write_manifest,
+)
 
 __all__ = [
     "FORMAT",
@@ -41,15 +44,6 @@ __all__ = [
     "read_manifest",
     "resume",
 ]
-
-FORMAT = 2
-"""Format of the folder, written in its manifest; others are refused."""
-
-MANIFEST = "manifest.json"
-"""File with the format, the settings, the fingerprint, their digest, and the number of runs."""
-
-_DIGEST = re.compile("[0-9a-f]{16}")
-"""Digest of what is computed, in a fingerprint; its digits tell a user nothing."""
 
 
 @dataclass(frozen=True)
@@ -78,16 +72,16 @@ class Store:
         mine = {str(name): str(value) for name, value in fingerprint.items()}
         if not (self.folder / MANIFEST).exists():  # of `join`
             with contextlib.suppress(FileExistsError):
-                _write_manifest(self.folder, self.settings, mine, self.runs, new=True)
+                write_manifest(self.folder, self.settings, mine, self.runs, new=True)
         there = resume(self.folder, self.settings)  # another process may have claimed it since
-        if there.campaign and (differences := _differences(there.campaign, mine)):
+        if there.campaign and (found := differences_of(there.campaign, mine)):
             raise ValueError(
-                f"{self.folder} holds another campaign: {'; '.join(differences)}; choose another "
+                f"{self.folder} holds another campaign: {'; '.join(found)}; choose another "
                 "folder, or replace its runs (in the command, --overwrite)"
             )
         runs = there.runs if self.runs is None else self.runs
         if not there.campaign or runs != there.runs:
-            _write_manifest(self.folder, there.settings, mine, runs)
+            write_manifest(self.folder, there.settings, mine, runs)
         self.campaign.clear()
         self.campaign.update(mine)
 
@@ -136,7 +130,7 @@ class Store:
 
     def _digest(self) -> str:
         """The digest that ties blocks to this campaign and its settings."""
-        return _digest({"settings": self.settings, "campaign": self.campaign})
+        return digest_of({"settings": self.settings, "campaign": self.campaign})
 
     def _put_aside(self, path: Path, reason: ValueError) -> None:
         """Rename a bad file, and note why."""
@@ -164,10 +158,10 @@ def create(
     Raises:
         ValueError: if the folder holds a campaign.
     """
-    folder, own = _folder(folder), _as_stored(settings or {})
+    folder, own = _folder(folder), as_stored(settings or {})
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        _write_manifest(folder, own, {}, runs, new=True)
+        write_manifest(folder, own, {}, runs, new=True)
     except FileExistsError:
         raise ValueError(
             f"store.create: {folder} holds a campaign with {Store(folder, {}).done()} runs done: "
@@ -194,7 +188,7 @@ def join(
         ValueError: on any difference of settings, naming all, and where the campaign is to have
             more runs.
     """
-    folder, own = _folder(folder), _as_stored(settings or {})
+    folder, own = _folder(folder), as_stored(settings or {})
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / MANIFEST).exists():
         return Store(folder, own, runs)
@@ -235,36 +229,17 @@ def resume(
         not isinstance(own, dict)
         or not isinstance(campaign, dict)
         or not isinstance(total, int | None)
-        or manifest.get("digest") != _digest({"settings": own, "campaign": campaign})
+        or manifest.get("digest") != digest_of({"settings": own, "campaign": campaign})
     ):
         raise ValueError(f"{path}: it was changed since the campaign began")
-    if settings is not None and (differences := _differences(own, _as_stored(settings))):
-        raise ValueError(f"{folder} holds another campaign: {'; '.join(differences)}")
+    if settings is not None and (found := differences_of(own, as_stored(settings))):
+        raise ValueError(f"{folder} holds another campaign: {'; '.join(found)}")
     kept = Store(folder, own, total, campaign)
     if runs is None:
         return kept
     if (end := max((first + count for first, count in kept.spans()), default=0)) > runs:
         raise ValueError(f"{folder} holds {end} runs: expected at least as many, got {runs}")
     return replace(kept, runs=runs)
-
-
-def read_manifest(folder: Path) -> Json:
-    """The content of the manifest of a campaign's folder, in any format.
-
-    Raises ValueError if there is none, or if the file is no manifest.
-    """
-    path = folder / MANIFEST
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ValueError(f"no campaign to resume: there is no {path}") from error
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}, line {error.lineno}: {error.msg}") from error
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not JSON ({error})") from error
-    if not isinstance(manifest, dict) or "format" not in manifest:
-        raise ValueError(f"{path}: not the manifest of a campaign")
-    return manifest
 
 
 def _folder(folder: str | os.PathLike[str]) -> Path:
@@ -275,58 +250,3 @@ def _folder(folder: str | os.PathLike[str]) -> Path:
         raise ValueError(
             f"store: expected a folder, as a path or a string, got {folder!r}"
         ) from None
-
-
-def _write_manifest(
-    folder: Path,
-    settings: Mapping[str, object],
-    campaign: Mapping[str, str],
-    runs: int | None,
-    new: bool = False,
-) -> None:
-    """Write the manifest of a folder; new: raises FileExistsError where there is one."""
-    own = {"settings": settings, "campaign": campaign}
-    manifest = {"format": FORMAT, "digest": _digest(own), "runs": runs, **own}
-    text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
-    write_atomically(folder / MANIFEST, text.encode(), new)
-
-
-def _as_stored(settings: Mapping[str, object]) -> Json:
-    """Settings as the manifest returns them: tuples become lists, keys strings."""
-    plain: Json = json.loads(json.dumps(dict(settings), allow_nan=False))
-    return plain
-
-
-def _digest(settings: Mapping[str, object]) -> str:
-    """SHA-256 of settings."""
-    return hashlib.sha256(canonical_json(settings).encode()).hexdigest()
-
-
-def _differences(
-    there: Mapping[str, object], here: Mapping[str, object], above: str = ""
-) -> list[str]:
-    """A sentence for each setting that differs, in nested settings, too."""
-    found = []
-    for key in {**there, **here}:
-        values = [side[key] for side in (there, here) if key in side]
-        inner = [value for value in values if isinstance(value, dict)]
-        if len(inner) == 2:
-            found += _differences(inner[0], inner[1], f"{above}{key}.")
-        elif len(values) < 2 or canonical_json(values[0]) != canonical_json(values[1]):
-            plain = all(isinstance(value, str) for value in values)
-            old, new = (
-                (str(side[key]) if plain else json.dumps(side[key], ensure_ascii=False))
-                if key in side
-                else "absent"
-                for side in (there, here)
-            )
-            if (
-                len(values) == 2
-                and plain
-                and all(_DIGEST.fullmatch(str(value)) for value in values)
-            ):
-                how = "computes something else than in the stored runs (was its file edited?)"
-            else:
-                how = f"{old} there, {new} here"
-            found.append(f"{above}{key}: {how}")
-    return found

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
-from jaxslam.simulation.worlds import Scenario, Visible, drawn_near, drive, part_scan, side_by_side
+from jaxslam.simulation.scans import Visible, part_scan, side_by_side
+from jaxslam.simulation.worlds import Scenario, drawn_near, drive
 from jaxslam.team import Robot, check_team, motion_of, sensors_of, sizes
 from jaxslam.types import Log, Scan, Truth
 

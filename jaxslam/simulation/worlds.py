@@ -9,27 +9,27 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.angles import wrap
-from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.sensors.suite import Part, Suite
+from jaxslam.sensors.suite import Suite
+from jaxslam.simulation.scans import (
+    Visible,
+    draw_gaussian,
+    everywhere,
+    normals_like,
+    part_scan,
+    sensor_scans,
+    side_by_side,
+)
 from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Log, Scan, Truth
 from jaxslam.validation import check_record
 from jaxslam.validation.numbers import check_covariance, check_key, is_concrete
-
-Visible = Callable[[jax.Array, jax.Array], jax.Array]
-"""(pose, l) -> () bool: whether a sensor reports the landmark from there."""
-
-
-def everywhere(pose: Float[Array, "3"], landmark: Float[Array, "L"]) -> Bool[Array, ""]:
-    """The field of view in which every landmark is seen from every pose."""
-    return jnp.asarray(True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class Scenario:
 
     @property
     def steps(self) -> int:
-        """T."""
+        """The number of steps T."""
         return int(np.shape(self.controls)[0])
 
 
@@ -157,95 +157,6 @@ def _suite_scans(
     return side_by_side(scans, len(sensors.measurements))
 
 
-def sensor_scans(
-    sensor: Sensor,
-    visible: Visible,
-    places: int,
-    poses: Float[Array, "T 3"],
-    targets: Float[Array, "*time C L"],
-    on: Bool[Array, "T"] | None,
-    key: Array,
-) -> tuple[Scan, Int[Array, "T"]]:
-    """The scans (T, …) of one sensor, and how many targets in view had no measurement slot.
-
-    targets: (C, L), or (T, C, L) where they move; tags are their rows. on: when the sensor
-    measures, None for always.
-    """
-    count = targets.shape[-2]
-    places = min(places, count)
-    by_time = None if targets.ndim == 2 else 0
-    seen = jax.vmap(jax.vmap(visible, (None, 0)), (0, by_time))(poses, targets)
-    if on is not None:
-        seen = seen & on[:, None]
-    if places < count:
-        tag = jnp.argsort(~seen, axis=1, stable=True)[:, :places]
-        valid = jnp.take_along_axis(seen, tag, axis=1)
-    else:
-        tag, valid = jnp.broadcast_to(jnp.arange(count), seen.shape), seen
-    keys = jax.random.split(key, poses.shape[0])
-
-    def measure(pose: Array, tags: Array, targets: Array, key: Array) -> Array:
-        exact = jax.vmap(sensor.observe, (None, 0))(pose, targets[tags])
-        noise = jax.vmap(_draw)(jax.vmap(sensor.noise_cov)(exact), _normals(key, exact))
-        return jax.vmap(sensor.residual)(exact + noise, jnp.zeros_like(exact))
-
-    z = jax.vmap(measure, (0, 0, by_time, 0))(poses, tag, targets, keys)
-    scan = Scan(
-        z=jnp.where(valid[:, :, None], z, 0.0),
-        tag=jnp.where(valid, tag, -1).astype(jnp.int32),
-        valid=valid,
-    )
-    return scan, seen.sum(axis=1) - valid.sum(axis=1)
-
-
-def part_scan(
-    part: Part,
-    visible: Visible,
-    poses: Float[Array, "T 3"],
-    targets: Float[Array, "*time C L"],
-    tags: Int[Array, "C"],
-    key: Array,
-) -> tuple[Scan, Int[Array, "T"]]:
-    """The `sensor_scans` one part of a suite, in its measurement slots and at its rate.
-
-    tags: of the targets. An absolute sensor has no tag. Without targets nothing is measured.
-    """
-    step = jnp.arange(poses.shape[0])
-    if targets.shape[-2] == 0:
-        z = jnp.zeros((len(poses), part.places, len(part.sensor.measurements)), poses.dtype)
-        none = jnp.zeros(z.shape[:2], bool)
-        return Scan(z, jnp.full(none.shape, -1, jnp.int32), none), jnp.zeros_like(step)
-    on = (step >= part.start) & ((step - part.start) % part.every == 0)
-    if part.absolute:
-        nothing = jnp.zeros((1, 0), poses.dtype)
-        scan, missed = sensor_scans(part.sensor, everywhere, 1, poses, nothing, on, key)
-        return scan._replace(tag=jnp.full_like(scan.tag, -1)), missed
-    field = visible if part.visible is None else part.visible
-    scan, missed = sensor_scans(part.sensor, field, part.places, poses, targets, on, key)
-    tag = jnp.where(scan.valid, tags[jnp.maximum(scan.tag, 0)], -1).astype(jnp.int32)
-    spare = part.places - tag.shape[1]
-    if spare > 0:  # more slots than there are targets
-        scan = Scan(
-            z=jnp.pad(scan.z, [(0, 0), (0, spare), (0, 0)]),
-            tag=jnp.pad(tag, [(0, 0), (0, spare)], constant_values=-1),
-            valid=jnp.pad(scan.valid, [(0, 0), (0, spare)]),
-        )
-        return scan, missed
-    return scan._replace(tag=tag), missed
-
-
-def side_by_side(scans: list[tuple[Scan, Array]], size_z: int) -> tuple[Scan, Int[Array, "T"]]:
-    """The scans of several sensors as one, z padded with zeros to size_z; and how many targets had
-    no measurement slot."""
-    z = [jnp.pad(s.z, [(0, 0), (0, 0), (0, size_z - s.z.shape[2])]) for s, _ in scans]
-    scan = Scan(
-        z=jnp.concatenate(z, axis=1),
-        tag=jnp.concatenate([s.tag for s, _ in scans], axis=1),
-        valid=jnp.concatenate([s.valid for s, _ in scans], axis=1),
-    )
-    return scan, jnp.stack([missed for _, missed in scans]).sum(axis=0)
-
-
 def with_positions(sensor: Sensor, truth: Truth) -> Truth:
     """The truth with positions (N, 2) for landmarks that are no points, as figures need them."""
     if sensor.of_points or not sensor.landmark:
@@ -255,7 +166,7 @@ def with_positions(sensor: Sensor, truth: Truth) -> Truth:
 
 def drawn_near(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
     """A random pose, from the normal distribution of that mean and covariance (3, 3)."""
-    start = pose + _draw(jnp.asarray(cov, pose.dtype), _normals(key, pose))
+    start = pose + draw_gaussian(jnp.asarray(cov, pose.dtype), normals_like(key, pose))
     return start.at[2].set(wrap(start[2]))
 
 
@@ -267,11 +178,11 @@ def drive(
     noise_on: str = "robot",
 ) -> tuple[Float[Array, "T 3"], Float[Array, "T U"]]:
     """The true poses, and the controls that the robot's log shows."""
-    normals = _normals(key, jnp.zeros((controls.shape[0], len(motion.noises)), controls.dtype))
+    normals = normals_like(key, jnp.zeros((controls.shape[0], len(motion.noises)), controls.dtype))
 
     def step(pose: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         u, normal = row
-        w = _draw(motion.noise_cov(pose, u), normal)
+        w = draw_gaussian(motion.noise_cov(pose, u), normal)
         if noise_on == "robot":
             pose = motion.step(pose, u, w)
             return pose, (pose, u)
@@ -281,16 +192,6 @@ def drive(
 
     _, history = jax.lax.scan(step, start, (controls, normals))
     return history
-
-
-def _normals(key: Array, like: Array) -> Array:
-    """Standard normals, as many as there are in `like`."""
-    return jax.random.normal(key, like.shape, like.dtype)
-
-
-def _draw(cov: Float[Array, "W W"], normal: Float[Array, "W"]) -> Float[Array, "W"]:
-    """A draw of N(0, cov) from standard normals; cov may be singular or zero."""
-    return root_psd(cov) @ normal
 
 
 def _check_table(name: str, values: ArrayLike, columns: int) -> None:

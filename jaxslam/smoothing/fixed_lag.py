@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxslam import validation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.math import linalg
+from jaxslam.math import linalg, roots
 from jaxslam.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
@@ -113,7 +113,7 @@ def fixed_lag(
             motion, sensor, state.prior, state.steps, state.at, first_estimates
         )
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
-        root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
+        root = roots.root_psd(motion.noise_cov(state.joint.pose, u))
         steps, at = shift(state.steps, state.at, u, root, joint.pose)
         return WindowState(joint, prior, steps, at)
 

@@ -145,7 +145,7 @@ def _labelled(
 
 
 def _middle(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2"]:
-    """The one of some points nearest to their mean."""
+    """The point, of some, that is nearest to their mean."""
     off = points - points.mean(axis=0)
     return np.asarray(points[np.argmin((off**2).sum(axis=1))])
 

@@ -1,26 +1,17 @@
 """The function `verify_jacobians`: samples, Jacobians, other checks, and the report."""
 
-import contextlib
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
-from types import ModuleType
-from typing import NamedTuple, TypeAlias
 
-import jax
-import jax.experimental
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
 from jaxslam.grids.beam_models import BeamModel
-from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.verify import properties
 from jaxslam.verify.comparison import compare_methods
-from jaxslam.verify.derivatives.jacobians import Evaluated, evaluate_jacobians
-from jaxslam.verify.errors import describe_error
-from jaxslam.verify.inputs import samples
+from jaxslam.verify.derivatives.jacobians import Evaluated
+from jaxslam.verify.examination import Model, examine, float64, functions_of, typical_linearity
 from jaxslam.verify.inputs.beam_models import FAR, beam_function, beam_samples
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.functions import (
@@ -29,15 +20,10 @@ from jaxslam.verify.inputs.functions import (
     example_line,
     factor_function,
     makes_a_model,
-    motion_functions,
     plain_function,
-    sensor_functions,
 )
 from jaxslam.verify.inputs.samples import Samples
-from jaxslam.verify.linearity import motion_linearity, sensor_linearity
-from jaxslam.verify.record import Check, Report
-
-Model: TypeAlias = Motion | Sensor | Factor | BeamModel | Callable[..., jax.Array]
+from jaxslam.verify.record import Report
 
 MOUNT = (0.4, -0.3, 0.9)
 """The mount of a sensor made by `build`: off the robot's centre, so that all terms contribute."""
@@ -139,11 +125,11 @@ def verify_jacobians(
     elif isinstance(model, Factor):
         kind, name, functions = "factor", model.name, (factor_function(model),)
     elif isinstance(model, BeamModel):
-        with _float64():
+        with float64():
             functions = (beam_function(model),)
         kind, name = "beam model", model.name
     else:
-        with _float64():
+        with float64():
             functions = (plain_function(model, jacobian, arguments, outputs, name, states),)
         kind, name = "function", functions[0].name
     given = None if states is None else _given_samples(functions[0], states)
@@ -156,8 +142,8 @@ def verify_jacobians(
             for evaluated in examined.evaluated
             for finding in compare_methods(evaluated, tolerance, float32_tolerance)
         ]
-    with _float64():
-        linearity = _typical_linearity(model, examined)
+    with float64():
+        linearity = typical_linearity(model, examined)
     notes = tuple(note for one in examined.evaluated for note in notes_of(one, kind))
     return Report(name, kind, tuple(findings), examined.checks, linearity, notes)
 
@@ -186,53 +172,6 @@ def notes_of(evaluated: Evaluated, kind: str) -> Iterator[str]:
         )
 
 
-class Examined(NamedTuple):
-    """All Jacobians of a model at all states, and the results of the other checks."""
-
-    evaluated: tuple[Evaluated, ...]
-    checks: tuple[Check, ...]
-
-
-def examine(
-    model: Model,
-    functions: tuple[Function, ...],
-    given: Samples | None = None,
-    count: int = 24,
-    seed: int = 0,
-) -> Examined:
-    """Evaluate all Jacobians of a model, and run the other checks, in float64.
-
-    Args:
-        model: a `Motion`, a `Sensor`, or a function.
-        functions: of the model, as from `functions_of`.
-        given: the states for the first function, instead of samples.
-        count, seed: of the random states.
-    """
-    with _float64(), np.errstate(all="ignore"):
-        drawn = _samples_of(functions, model, count, seed)
-        if given is not None:
-            drawn = (given, *drawn[1:])
-            if isinstance(model, Sensor) and model.landmark:
-                # Where `observe` fails, its own checks say so, and `invert` keeps the drawn states.
-                with contextlib.suppress(Exception, SystemExit):
-                    drawn = (given, samples.given_inverse(model, given, drawn[1]))
-        evaluated = tuple(
-            evaluate_jacobians(f, sampled) for f, sampled in zip(functions, drawn, strict=True)
-        )
-        checks: list[Check] = []
-        for one in evaluated:
-            checks += [*one.checks, *properties.function_checks(one)]
-            if isinstance(model, Motion | Sensor | BeamModel):
-                checks += properties.dtype_checks(one)
-        checks += _model_checks(model, drawn)
-    return Examined(evaluated, tuple(checks))
-
-
-def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
-    """The functions of a model whose Jacobians are verified."""
-    return motion_functions(model) if isinstance(model, Motion) else sensor_functions(model)
-
-
 def build(factory: Callable[..., Motion | Sensor | BeamModel]) -> Motion | Sensor | BeamModel:
     """A model made by a factory like those of the registries: with noise 0.01 I, or, of a beam
     model, with the maximum range of the trial.
@@ -253,59 +192,6 @@ def build(factory: Callable[..., Motion | Sensor | BeamModel]) -> Motion | Senso
     return factory(0.01 * np.eye(size), **mounted)
 
 
-def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
-    """The checks of a motion model or a sensor as a whole."""
-    try:
-        if isinstance(model, Motion):
-            yield from properties.motion_checks(model, drawn[0])
-        elif isinstance(model, Sensor):
-            yield from properties.sensor_checks(model, *drawn)
-    except (Exception, SystemExit) as error:
-        yield Check("the remaining checks", False, describe_error(error))
-
-
-def _typical_linearity(model: Model, examined: Examined) -> float | None:
-    """The median linearity index over the random states; None for a function or if it fails.
-
-    Standard deviations follow from the units.
-    """
-    if not isinstance(model, Motion | Sensor):
-        return None
-    first = examined.evaluated[0]
-    usual = [i for i, label in enumerate(first.samples.labels) if label in samples.NOMINAL]
-    states = tuple(a[usual] for a in first.samples.values)
-    spread = [
-        np.array([_standard_deviation(e) for e in a.entries]) for a in first.function.arguments
-    ]
-
-    def index(*state: jax.Array) -> jax.Array:
-        if isinstance(model, Motion):
-            return motion_linearity(model, state[0], state[1], np.diag(spread[0]) ** 2).hessian
-        cov = np.diag(np.concatenate(spread)) ** 2
-        return sensor_linearity(model, state[0], state[1], cov).hessian
-
-    try:
-        return float(np.median(np.asarray(quick_jit(jax.vmap(index))(*states))))
-    except (Exception, SystemExit):  # the checks report what is wrong with the model
-        return None
-
-
-def _standard_deviation(entry: str) -> float:
-    """0.05 of an angle or inverse depth, 0.1 of all else."""
-    return 0.05 if entry.endswith(("[rad]", "[1/m]")) else 0.1
-
-
-def _samples_of(
-    functions: tuple[Function, ...], model: Model, count: int, seed: int
-) -> tuple[Samples, ...]:
-    """The states at which each function is evaluated."""
-    if isinstance(model, Sensor):
-        # A sensor whose `embed` fails is tried at states drawn by units alone.
-        with contextlib.suppress(Exception, SystemExit):
-            return samples.sensor_samples(model, count, seed)
-    return tuple(samples.argument_samples(f.arguments, count, seed) for f in functions)
-
-
 def _given_samples(function: Function, states: Sequence[ArrayLike]) -> Samples:
     """The caller's own states; raises ValueError on a wrong shape."""
     tables = [np.asarray(table, np.float64) for table in states]
@@ -318,12 +204,3 @@ def _given_samples(function: Function, states: Sequence[ArrayLike]) -> Samples:
         expected = ", ".join(f"(S, {n})" for n in wanted)
         raise ValueError(f"verify_jacobians: expected states of shapes {expected}, got {shapes}")
     return Samples(tuple(tables), ("given",) * len(tables[0]))
-
-
-def _float64() -> AbstractContextManager[object]:
-    """A block in which JAX has 64-bit types, in this thread."""
-    home: ModuleType = (
-        jax if hasattr(jax, "enable_x64") else jax.experimental
-    )  # from jax 0.8 on, before
-    context: AbstractContextManager[object] = home.enable_x64(True)
-    return context

@@ -10,7 +10,8 @@ from jaxslam import motion, sensors
 from jaxslam.protocols import Motion
 from jaxslam.verify import build, verify_jacobians
 from jaxslam.verify.comparison import compare_methods
-from jaxslam.verify.verifier import FLOAT32_TOLERANCE, TOLERANCE, examine, functions_of
+from jaxslam.verify.examination import examine, functions_of
+from jaxslam.verify.verifier import FLOAT32_TOLERANCE, TOLERANCE
 
 MODELS = motion.REGISTRY | sensors.REGISTRY
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxslam import validation
-from jaxslam.math import linalg
+from jaxslam.math import gaussians, linalg
 
 UNROLLED, LAPACK = [1, 2, 3, 6, 8], [9, 20]  # 8 is the largest that is unrolled
 ROWS = 20
@@ -203,7 +203,7 @@ def test_total_is_the_sum():
 
 # --- Mahalanobis --------------------------------------------------------------------------------
 
-distance = jax.jit(jax.vmap(linalg.mahalanobis_squared))
+distance = jax.jit(jax.vmap(gaussians.mahalanobis_squared))
 
 
 @pytest.mark.parametrize("n", [1, 3, 10])
@@ -238,7 +238,7 @@ def test_mahalanobis_masks_directions_that_are_known_exactly():
     np.testing.assert_array_equal(regular, [False] * 5 + [True])
     np.testing.assert_array_equal(out[:5], np.zeros(5))
     np.testing.assert_allclose(out[5], 2e30 + 1, rtol=1e-12)
-    slopes = jax.grad(lambda e, p: linalg.mahalanobis_squared(e, p)[0], (0, 1))
+    slopes = jax.grad(lambda e, p: gaussians.mahalanobis_squared(e, p)[0], (0, 1))
     by_error, by_cov = jax.jit(jax.vmap(slopes))(error[:4], cov[:4])
     assert not by_error.any()
     assert not by_cov.any()

@@ -12,8 +12,7 @@ import worlds
 
 from jaxslam import catalog, filters, motion, run, sensors, simulate, store
 from jaxslam.filters import reporting
-from jaxslam.monte_carlo import Interrupted, missing, monte_carlo
-from jaxslam.monte_carlo import campaign as campaign_module
+from jaxslam.monte_carlo import Interrupted, missing, monte_carlo, work
 from jaxslam.monte_carlo.blocks.block import BlockRunner
 from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
 from jaxslam.monte_carlo.candidates import fitting_block, without_noise
@@ -149,7 +148,7 @@ def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(campaign_module, "compile_programs", interrupted)
+    monkeypatch.setattr(work, "compile_programs", interrupted)
     with pytest.raises(Interrupted, match="0 of 10") as stopped:
         campaign_of()
     assert stopped.value.campaign is None
@@ -157,7 +156,7 @@ def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
 
 def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_fours):
     tried = []
-    compile_programs = campaign_module.compile_programs
+    compile_programs = work.compile_programs
 
     def little_memory(plan, promises):
         tried.append(plan.wide)
@@ -165,7 +164,7 @@ def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_fours):
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
         compile_programs(plan, promises)
 
-    monkeypatch.setattr(campaign_module, "compile_programs", little_memory)
+    monkeypatch.setattr(work, "compile_programs", little_memory)
     with pytest.warns(UserWarning, match="continuing with block=") as warned:
         campaign = campaign_of(block=18)
     assert (tried, len(warned)) == ([18, 9, 4], 2)
@@ -176,7 +175,7 @@ def test_out_of_memory_for_one_run_says_so(monkeypatch):
     def no_memory(*arguments):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
 
-    monkeypatch.setattr(campaign_module, "compile_programs", no_memory)
+    monkeypatch.setattr(work, "compile_programs", no_memory)
     with pytest.raises(MemoryError, match="block=1"):
         campaign_of(block=1)
 
@@ -185,7 +184,7 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
     def broken(*arguments):
         raise jax.errors.JaxRuntimeError("INTERNAL: something else")
 
-    monkeypatch.setattr(campaign_module, "compile_programs", broken)
+    monkeypatch.setattr(work, "compile_programs", broken)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
         campaign_of()
 

@@ -12,7 +12,8 @@ import worlds
 
 from jaxslam import cli, filters, store
 from jaxslam.monte_carlo import monte_carlo
-from jaxslam.results import block_file, campaign_files
+from jaxslam.results import campaign_files
+from jaxslam.results.campaign_folder import block_file
 
 WORLD = worlds.ring(20)
 RECKONING = filters.dead_reckoning(WORLD.motion, WORLD.sensor)

@@ -8,7 +8,8 @@ import pytest
 import worlds
 
 from jaxslam.consistency import Measure
-from jaxslam.monte_carlo import campaign, monte_carlo, progress
+from jaxslam.monte_carlo import monte_carlo, progress
+from jaxslam.monte_carlo.work import Work
 
 
 def test_on_a_terminal_a_line_tells_of_each_filter_as_soon_as_it_can(capsys, monkeypatch):
@@ -95,13 +96,13 @@ class Begun(Exception):
 def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatch, terminal):
     told = []
 
-    def work(self, plan, todo):
+    def begun(self, plan, todo):
         told.append((self.progress, self.glimpse))
         if self.progress is not None:
             self.progress(3, 10)
         raise Begun
 
-    monkeypatch.setattr(campaign._Work, "in_blocks_that_fit", work)
+    monkeypatch.setattr(Work, "in_blocks_that_fit", begun)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
     world, mine = worlds.ring(5), []
 

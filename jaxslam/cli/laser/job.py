@@ -21,7 +21,7 @@ class Job(NamedTuple):
 
 
 def figure_files(name: str, figure: "Figure", formats: tuple[str, ...]) -> Files:
-    """What writes a figure in some formats."""
+    """The functions that write a figure in some formats, by file name."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
     def saved(kind: str) -> Callable[[Path], object]:

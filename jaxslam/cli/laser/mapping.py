@@ -120,7 +120,7 @@ def _padded(rows: JaxOrNumPy) -> np.ndarray:
 
 
 def beams_told(log: LaserLog, counts: Counts) -> dict[str, int]:
-    """What became of the beams."""
+    """The numbers of beams in the map, without an echo, and unusable: entries of the summary."""
     far = int((np.asarray(log.beams.valid) & (log.beams.range >= log.max_range)).sum())
     return {
         "in the map": int(counts.hits.sum()),

@@ -146,7 +146,7 @@ def _run(
 def _figure(
     data: Dataset, runs: dict[str, _Run], formats: tuple[str, ...]
 ) -> dict[str, Callable[[Path], object]]:
-    """What writes the map: the first filter with ellipses and truth, the others without."""
+    """The function that draws the map: the first filter with ellipses and truth, others without."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
     (name, first), *rest = runs.items()

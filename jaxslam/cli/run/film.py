@@ -30,7 +30,7 @@ def shown(state: PyTree) -> PyTree:
 def films(
     data: Dataset, runs: Mapping[str, tuple[PiecewiseRun, Evaluation]], at: Int[np.ndarray, "F"]
 ) -> dict[str, Callable[[Path], object]]:
-    """What writes the film of each filter, by file name; see `film_files`."""
+    """The functions that write the film of each filter, by file name; see `film_files`."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
     made = {}

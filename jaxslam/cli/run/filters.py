@@ -8,7 +8,7 @@ import numpy as np
 from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS
 from jaxslam.cli.common import pick
 from jaxslam.datasets import Dataset
-from jaxslam.datasets.table.settings import association_options
+from jaxslam.datasets.table.association import association_options
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Truth

@@ -9,7 +9,7 @@ from jaxslam.cli.laser import options as laser_options
 from jaxslam.cli.run.command import run_dataset
 from jaxslam.cli.runtime import cache
 from jaxslam.datasets import READERS
-from jaxslam.datasets.table.settings import METHODS
+from jaxslam.datasets.table.association import METHODS
 from jaxslam.results.campaign_files import FORMATS
 
 

@@ -52,7 +52,7 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
 
 
 def _fields(path: Path, data: bytes, at: int, count: int) -> tuple[list[int], int]:
-    """So many whole numbers of a text from a place on, without comments, and where they end."""
+    """The `count` whole numbers of a text from a place on, without comments, and where they end."""
     if count > 3:  # a body of text: quicker, and it has no end to find
         lines = [line.partition(b"#")[0] for line in data[at:].split(b"\n")]
         words = b" ".join(lines).split()[:count]

@@ -11,7 +11,7 @@ from jaxslam.noise import NoiseCov
 
 
 class RobotCalibration(NamedTuple):
-    """What the odometry and the camera of a robot get wrong, and the noise that is left.
+    """The systematic errors of a robot's odometry and camera, and the noise that remains.
 
     A recorded velocity (v, ω) at time t moves the robot at time t + delay, by
 

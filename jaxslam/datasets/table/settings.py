@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam import association, motion, sensors
+from jaxslam import motion, sensors
+from jaxslam.datasets.table.association import GATE, METHODS, association_options, is_number
 from jaxslam.datasets.table.settings_text import line_number
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
-from jaxslam.math import stats
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.types import JaxOrNumPy
 
@@ -26,13 +26,8 @@ _Value = TypeVar("_Value")
 MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
 MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
 """Default standard deviations by unit."""
-GATE = 0.99
-"""Default probability of the gate of an association."""
-NEW_GATE = 0.9999
-"""Probability beyond which a measurement is of a new landmark."""
 ROOM = 100
 """Default number of landmarks, where identities are unknown."""
-METHODS = ("nearest", "global_nearest", "maximum_likelihood", "joint", "known")
 _FILTER = ("gate", "capacity", "associate", "update", "start", "start_noise")
 _FIRST = ("unicycle", "pose_increment", "range_bearing")
 """Of models with the same columns, those taken by default."""
@@ -239,7 +234,7 @@ class TableSettings:
         if (
             not isinstance(asked, list)
             or len(asked) != len(names)
-            or not all(map(_is_number, asked))
+            or not all(map(is_number, asked))
         ):
             raise ValueError(
                 f"{self._at(section, key)}: expected {len(names)} numbers "
@@ -278,35 +273,6 @@ class TableSettings:
         return where + (f"[{section}] " if section else "") + key
 
 
-def association_options(method: object, gate: object, size: int) -> EkfOptions:
-    """Options of `ekf_slam` for a method by name and a gate by probability.
-
-    Raises ValueError, "associate: …" or "gate: …", on a name that is none and a gate that is no
-    probability. Known identities need no gate (None); other methods take `GATE`.
-
-    Args:
-        method: one of `METHODS`.
-        gate: the probability that a correct measurement passes.
-        size: numbers of a measurement.
-    """
-    probability = None if gate is None else _probability(gate)
-    if not isinstance(method, str) or method not in METHODS:
-        raise ValueError(f"associate: expected one of {', '.join(METHODS)}, got {method!r}")
-    if method == "known":
-        return {} if probability is None else {"gate": stats.chi2_quantile(probability, size)}
-    inner = GATE if probability is None else probability
-    beyond = stats.chi2_quantile(max(inner, NEW_GATE), size)
-    limit = inner if method == "joint" else stats.chi2_quantile(inner, size)
-    return {"associate": getattr(association, method)(limit, beyond)}
-
-
-def _probability(gate: object) -> float:
-    """The probability that a gate is given by; ValueError where it is none."""
-    if not isinstance(gate, int | float) or isinstance(gate, bool) or not 0 < gate < 1:
-        raise ValueError(f"gate: expected a probability between 0 and 1, got {gate!r}")
-    return gate
-
-
 def _fitting(
     section: str,
     registry: Mapping[str, Callable[..., Motion | Sensor]],
@@ -338,9 +304,3 @@ def _fitting(
 def _of_no_noise(*_: object) -> NoReturn:
     """The noise of a model that is made for its names alone, and is never evaluated."""
     raise AssertionError("a model that was made for its names was evaluated")
-
-
-def _is_number(value: object) -> bool:
-    return (
-        isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-    )

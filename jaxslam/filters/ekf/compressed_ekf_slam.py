@@ -113,31 +113,10 @@ def compressed_ekf_slam(
                 f"compressed_ekf_slam: expected area >= {len(scan.tag)}, the measurement slots of "
                 f"a scan, got {area}"
             )
-        joint = state.whole
-        tagged = scan.valid & (scan.tag >= 0)
-        slot, found = slots.find(joint.tag, joint.alive, scan.tag)
-        seen = jnp.zeros(capacity, bool).at[slot].max(tagged & found)
-        new = jnp.minimum((tagged & ~found).sum(), scan.tag.shape[0] if most is None else most)
-        room, room_anywhere = (~state.area.alive).sum(), (~joint.alive).sum()
-        outside = seen & ~jnp.zeros(capacity, bool).at[state.slot].set(True)
-        leave = outside.any() | ((new > room) & (room_anywhere > room))
-
-        def anew(state: Compressed) -> Compressed:
-            joint = up_to_date(state)
-            # The result of a run must not depend on other runs of the batch.
-            other = _opened_at(joint, _chosen(joint, own, sensor, seen, new))
-            both: Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
-            return both
-
-        state = where_any(leave, anew, lambda state: state, state)
+        state = _with_area_of(scan, state, sensor, most)
         inside, info = local.update(state.area, scan, key)
-        joint = state.whole
-        joint = joint._replace(
-            alive=joint.alive.at[state.slot].set(inside.alive[:own]),
-            tag=joint.tag.at[state.slot].set(inside.tag[:own]),
-        )
         in_map = jnp.where(info.slot >= 0, state.slot[jnp.maximum(info.slot, 0)], -1)
-        return state._replace(whole=joint, area=inside), info._replace(slot=in_map)
+        return _with_updated_area(state, inside), info._replace(slot=in_map)
 
     def estimate(state: Compressed) -> Estimate:
         def one(*of_landmark: jax.Array) -> Estimate:
@@ -187,6 +166,41 @@ def up_to_date(state: Compressed) -> Joint:
         landmarks=_moved_map(state),
         cov=cov.at[at].set(now).at[:, at].set(now.T),
     )
+
+
+def _with_area_of(scan: Scan, state: Compressed, sensor: Sensor, most: int | None) -> Compressed:
+    """The state with an area that holds the landmarks of a scan: the same, or another one.
+
+    most: new landmarks a scan.
+    """
+    joint, own = state.whole, state.slot.shape[0]
+    tagged = scan.valid & (scan.tag >= 0)
+    slot, found = slots.find(joint.tag, joint.alive, scan.tag)
+    seen = jnp.zeros(joint.alive.shape, bool).at[slot].max(tagged & found)
+    new = jnp.minimum((tagged & ~found).sum(), scan.tag.shape[0] if most is None else most)
+    room, room_anywhere = (~state.area.alive).sum(), (~joint.alive).sum()
+    outside = seen & ~jnp.zeros(joint.alive.shape, bool).at[state.slot].set(True)
+    leave = outside.any() | ((new > room) & (room_anywhere > room))
+
+    def anew(state: Compressed) -> Compressed:
+        joint = up_to_date(state)
+        # The result of a run must not depend on other runs of the batch.
+        other = _opened_at(joint, _chosen(joint, own, sensor, seen, new))
+        both: Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
+        return both
+
+    after: Compressed = where_any(leave, anew, lambda state: state, state)
+    return after
+
+
+def _with_updated_area(state: Compressed, area: Joint) -> Compressed:
+    """The state with its area updated, and tags and alive slots of the map as in the area."""
+    joint, own = state.whole, state.slot.shape[0]
+    joint = joint._replace(
+        alive=joint.alive.at[state.slot].set(area.alive[:own]),
+        tag=joint.tag.at[state.slot].set(area.tag[:own]),
+    )
+    return state._replace(whole=joint, area=area)
 
 
 def _moved_map(state: Compressed) -> jax.Array:

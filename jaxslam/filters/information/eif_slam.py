@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
-from jaxslam.filters.information import canonical
+from jaxslam.filters.information import canonical, innovation
 from jaxslam.filters.information.settings import InformationSettings
 from jaxslam.filters.information.tag_association import associate_by_table
 from jaxslam.math import linalg
@@ -90,7 +90,7 @@ def eif_slam(
 
     def update(state: CanonicalState, scan: Scan, key: Array) -> tuple[CanonicalState, Info]:
         measured = associate_by_table(state.tag, state.alive, scan)
-        innovations = canonical.innovations(
+        innovations = innovation.innovations(
             settings, state.omega, state.pose, state.landmarks, scan, measured.slot, measured.known
         )
         omega, residual = canonical.measurement_update(state.omega, state.residual, innovations)
@@ -109,7 +109,7 @@ def eif_slam(
             tag=state.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
             refused=state.refused + (scan.valid.any() & ~solved),
         )
-        innovations = canonical.refuse_unless(solved, innovations)
+        innovations = innovation.refuse_unless(solved, innovations)
         return after, canonical.report(scan, measured, innovations, initialized)
 
     def estimate(state: CanonicalState) -> Estimate:

@@ -5,7 +5,7 @@ from jax import Array
 from jaxtyping import Bool, Int
 
 from jaxslam.filters.information import canonical
-from jaxslam.filters.information.canonical import CanonicalInnovations
+from jaxslam.filters.information.innovation import CanonicalInnovations
 from jaxslam.filters.information.settings import RelocationSettings
 from jaxslam.filters.information.sparse.active_set import (
     activate,

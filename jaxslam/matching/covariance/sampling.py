@@ -14,7 +14,7 @@ from jaxslam.matching.covariance.record import (
 )
 from jaxslam.matching.matcher import Match, Matcher, Reference
 from jaxslam.matching.points import Points, moved_along_rays
-from jaxslam.math import linalg
+from jaxslam.math import linalg, roots
 from jaxslam.math.angles import wrap
 from jaxslam.validation.numbers import check_count, check_covariance
 
@@ -42,7 +42,7 @@ def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
         start: Array,
         key: Array,
     ) -> Float[Array, "3 3"]:
-        root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
+        root = roots.root_psd(jnp.asarray(start_cov, start.dtype))
         sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
         prepared = matcher.prepare(reference)
         ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off, found.prior).pose)(
@@ -78,7 +78,7 @@ def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> Match
         start: Array,
         key: Array,
     ) -> Float[Array, "3 3"]:
-        root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
+        root = roots.root_psd(jnp.asarray(start_cov, start.dtype))
 
         def one(key: Array) -> Array:
             key_reference, key_scan, key_start, key_prior = jax.random.split(key, 4)

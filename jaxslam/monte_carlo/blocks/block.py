@@ -101,7 +101,7 @@ class BlockRunner:
         return out
 
     def _drive(self, name: str, which: np.ndarray, world: World) -> FilterResults:
-        """What a filter makes of a block, timed."""
+        """The results of a filter over a block, timed."""
         drive = self.promises.drives[name].result()
         began, quiet = time.perf_counter(), self.promises.complete.done()
         results: FilterResults = jax.block_until_ready(drive(self.plan.key, which, world))

@@ -83,7 +83,7 @@ class Blockwise:
         self._pool = ThreadPoolExecutor(max(cores() // 2, 1))
 
     def close(self) -> None:
-        """What has not begun to be compiled is not."""
+        """Cancel the compilations that have not begun."""
         self._pool.shutdown(cancel_futures=True)
 
     def program(
@@ -201,7 +201,7 @@ class Blockwise:
 
 @functools.cache
 def _load_lapack() -> None:
-    """JAX looks for LAPACK when it first lowers what needs it; what is restored is not lowered."""
+    """Load LAPACK, which JAX does when it lowers what needs it, and restored programs are not."""
     jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.result_type(float)))
 
 

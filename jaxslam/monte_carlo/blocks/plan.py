@@ -63,7 +63,7 @@ class Promises:
         """done when nothing is being compiled any more"""
 
     def all(self) -> list[Future[Program] | Future[np.ndarray] | Future[None]]:
-        """Everything that a block may wait for."""
+        """All the futures that a block may wait for."""
         by_filter = (*self.drives.values(), *self.statistics.values())
         return [self.draw, *by_filter, self.bound, self.jacobians, self.limit, self.complete]
 

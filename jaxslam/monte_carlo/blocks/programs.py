@@ -49,7 +49,7 @@ World = tuple[Truth, Log]
 
 
 class FilterResults(NamedTuple):
-    """What a filter made of the logs of a block, as far as it is scored."""
+    """The results of a filter over the logs of a block, as far as they are scored."""
 
     estimate: Estimate
     """(T, B, …)"""
@@ -196,7 +196,7 @@ def draw_worlds(
 def drive_filter(
     scenario: Scenario, candidate: Candidate, key: Array, which: Int[Array, "B"], world: World
 ) -> FilterResults:
-    """What a filter makes of the logs of these runs."""
+    """The results of a filter over the logs of these runs."""
 
     def one(i: Array, truth: Truth, log: Log) -> FilterResults:
         method, chart = estimator_of(candidate, truth, scenario)

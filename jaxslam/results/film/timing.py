@@ -38,5 +38,5 @@ def frame_steps(
 
 
 def pace(frames: int) -> float:
-    """Frames a second of a film of so many frames."""
+    """The number of frames a second of a film of so many frames."""
     return float(np.clip(frames / SECONDS, SLOWEST, FASTEST))

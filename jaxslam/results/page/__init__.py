@@ -110,7 +110,7 @@ def fragment(
     figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
-    """What a notebook shows of a campaign: verdicts, these figures, and the measures, folded.
+    """The HTML that a notebook shows of a campaign: verdicts, these figures, the measures folded.
 
     The arguments are those of `page`. Its style applies to nothing else on the page.
     """

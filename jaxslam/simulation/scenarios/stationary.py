@@ -1,4 +1,4 @@
-"""A robot that does not move, and a landmark: whoever learns its heading there is mistaken."""
+"""A robot that does not move, and one landmark: its heading is not observable."""
 
 import numpy as np
 

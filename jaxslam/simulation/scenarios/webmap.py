@@ -87,7 +87,7 @@ def webmap(steps: int | None = None, loops: int = 2) -> Scenario:
 
 
 def _visible(pose: jax.Array, landmark: jax.Array) -> jax.Array:
-    """Within 30 m, in the half-plane ahead of the robot."""
+    """The field of view: within 30 m, in the half-plane ahead of the robot."""
     dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
     ahead = dx * jnp.cos(pose[2]) + dy * jnp.sin(pose[2]) > 0
     return ahead & (dx**2 + dy**2 < _FARTHEST**2)

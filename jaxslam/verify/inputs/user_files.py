@@ -16,9 +16,9 @@ from jaxslam.grids.beam_models import BeamModel
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
+from jaxslam.verify.examination import Model
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.functions import makes_a_model
-from jaxslam.verify.verifier import Model
 
 CLAIMS = ("_jacobian", "_jacobians")
 """Endings of names: f_jacobian is the hand-derived Jacobian of f."""

@@ -18,6 +18,7 @@ from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.predicted_measurements import in_chart, projected_cov
 from jaxslam.filters.ekf.steps.whitening import InnovationFactor, factor_of, whiten, whitened_by
 from jaxslam.math import linalg
+from jaxslam.math.gaussians import log_density, log_det_of_pivots
 from jaxslam.math.xla import materialize, no_inline
 from jaxslam.protocols import Here
 from jaxslam.slots import Joint
@@ -260,11 +261,11 @@ def _report(
 ) -> Correction:
     """The `Correction`: NIS of fused measurements from their joint S, of the others each alone."""
     m, size_z = gated.innovation.shape
-    pivots, positive = factored.pivots, gated.positive & factored.regular
-    log_det = 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=1)
+    positive = gated.positive & factored.regular
+    log_det = log_det_of_pivots(factored.pivots)
     log_det = -log_det if m == 1 else log_det  # of L⁻¹, of L
     nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
-    log_likelihood = -0.5 * (nis + log_det + size_z * jnp.log(2 * jnp.pi))
+    log_likelihood = log_density(nis, log_det, size_z)
     return Correction(
         innovation=gated.innovation,
         innovation_cov=gated.cov,

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxslam.filters.information import canonical
-from jaxslam.filters.information.canonical import CanonicalInnovations
+from jaxslam.filters.information import canonical, innovation
+from jaxslam.filters.information.innovation import CanonicalInnovations
 from jaxslam.filters.information.settings import RelocationSettings
 from jaxslam.filters.information.sparse.mean_recovery import recover_active_means
 from jaxslam.filters.information.sparse.sparse_state import (
@@ -44,7 +44,7 @@ def relocate_or_correct(
     """
     of_active = measured.known & matches.any(axis=1)
     index = jnp.argmax(matches, axis=1)
-    innovations = canonical.innovations(
+    innovations = innovation.innovations(
         settings, state.omega, state.pose, active_means(state), scan, index, of_active
     )
     relocate = runs_out(settings, state, measured, matches) & determines_pose(
@@ -74,7 +74,7 @@ def relocate_or_correct(
         cut_nats=state.counts.cut_nats + jnp.where(relocated, nats, 0.0),
     )
     state = state._replace(omega=jnp.where(solved, omega, state.omega), counts=counts)
-    return state, canonical.refuse_unless(solved, innovations), solved
+    return state, innovation.refuse_unless(solved, innovations), solved
 
 
 def runs_out(

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.information import canonical
-from jaxslam.filters.information.canonical import CanonicalInnovations
+from jaxslam.filters.information import canonical, innovation
+from jaxslam.filters.information.innovation import CanonicalInnovations
 from jaxslam.filters.information.settings import SparseSettings
 from jaxslam.filters.information.sparse.marginals import blanket_marginals, whole_marginals
 from jaxslam.filters.information.sparse.mean_recovery import recover_active_means
@@ -73,12 +73,12 @@ def correct_active(
 ) -> tuple[SparseState, Float[Array, "D D"], CanonicalInnovations, Bool[Array, ""]]:
     """The state with its mean corrected by measurements of active landmarks, Ω after them, their
     innovations, and whether the mean could be solved for."""
-    found = canonical.innovations(
+    found = innovation.innovations(
         settings, state.omega, state.pose, active_means(state), scan, index, known
     )
     omega, residual = canonical.measurement_update(state.omega, active_residual(state), found)
     state, solved = recover_active_means(state, omega, residual, found.omega_positive)
-    return state, omega, canonical.refuse_unless(solved, found), solved
+    return state, omega, innovation.refuse_unless(solved, found), solved
 
 
 def initialize_active(

@@ -1,4 +1,4 @@
-"""Figures of what a filter gives against what a step of it takes."""
+"""Figures of a filter's errors against the time of its steps."""
 
 import numpy as np
 from matplotlib.axes import Axes

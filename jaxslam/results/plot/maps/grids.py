@@ -102,7 +102,7 @@ def grid_figure(
 
 
 def shades_of_occupancy() -> Colormap:
-    """White for free, black for occupied, and a colour of its own for what is masked: unknown."""
+    """The colour map of occupancy: white is free, black occupied, and a third colour unknown."""
     shades = LinearSegmentedColormap.from_list("occupancy", ["white", "black"])
     return shades.with_extremes(bad=_UNKNOWN)
 
@@ -115,6 +115,6 @@ def shown_occupancy(log_odds: np.ndarray) -> np.ma.MaskedArray:
 def world_of(
     origin: np.ndarray, resolution: float, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates in cells as world coordinates [m]."""
+    """The world coordinates [m] of coordinates in cells."""
     c, s = np.cos(origin[2]), np.sin(origin[2])
     return origin[0] + resolution * (c * x - s * y), origin[1] + resolution * (s * x + c * y)

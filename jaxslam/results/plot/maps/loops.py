@@ -93,7 +93,7 @@ def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -
 
 
 def _shade(log_odds: np.ndarray, block: int) -> np.ndarray:
-    """White for free, black for occupied, grey for unknown, of blocks of cells by their walls."""
+    """The image of a map by blocks of cells: white is free, black has a wall, grey is unknown."""
     rows, columns = (-(-n // block) * block for n in log_odds.shape)
     whole = np.zeros((rows, columns))
     whole[: log_odds.shape[0], : log_odds.shape[1]] = log_odds

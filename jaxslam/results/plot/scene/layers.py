@@ -20,7 +20,7 @@ _TRIANGLE = np.array([[1.0, 0.0], [-0.6, 0.55], [-0.6, -0.55]])
 
 
 def still(points: Float[np.ndarray, "N 2"], **look: Any) -> Layer:
-    """Points that stay."""
+    """The layer of points that are the same in all frames."""
 
     def layer(axes: Axes) -> Draw:
         axes.plot(*np.asarray(points).T, **look)
@@ -30,7 +30,7 @@ def still(points: Float[np.ndarray, "N 2"], **look: Any) -> Layer:
 
 
 def track(path: Float[np.ndarray, "T C"], until: Int[np.ndarray, "F"], **look: Any) -> Layer:
-    """A path that grows: in frame k its points up to until[k]. A point of NaN interrupts it."""
+    """The layer of a path that grows: in frame k its points up to until[k]; NaN interrupts it."""
 
     def layer(axes: Axes) -> Draw:
         (line,) = axes.plot([], [], animated=True, **look)
@@ -40,7 +40,7 @@ def track(path: Float[np.ndarray, "T C"], until: Int[np.ndarray, "F"], **look: A
 
 
 def marks(points: Float[np.ndarray, "F N 2"], shown: Bool[np.ndarray, "F N"], **look: Any) -> Layer:
-    """Points that come and go."""
+    """The layer of points that are others in each frame."""
 
     def layer(axes: Axes) -> Draw:
         (line,) = axes.plot([], [], ls="none", animated=True, **look)
@@ -50,7 +50,7 @@ def marks(points: Float[np.ndarray, "F N 2"], shown: Bool[np.ndarray, "F N"], **
 
 
 def triangle(poses: Float[np.ndarray, "F 3"], size: float, **look: Any) -> Layer:
-    """A robot: a triangle, `size` long from its position to its tip."""
+    """The layer of a robot: a triangle, `size` long from its position to its tip."""
 
     def layer(axes: Axes) -> Draw:
         patch = Polygon(size * _TRIANGLE, closed=True, animated=True, **look)
@@ -75,7 +75,7 @@ def rings(
     n_sigma: float,
     **look: Any,
 ) -> Layer:
-    """n σ ellipses that grow and shrink; a covariance that has none is left out."""
+    """The layer of n σ ellipses that grow and shrink; a covariance that has none is left out."""
 
     def layer(axes: Axes) -> Draw:
         (line,) = axes.plot([], [], animated=True, **look)
@@ -90,7 +90,7 @@ def rings(
 
 
 def lines_between(ends: Sequence[Float[np.ndarray, "E 2 2"]], **look: Any) -> Layer:
-    """Lines between two points each, other ones in every frame."""
+    """The layer of lines between two points each, others in every frame."""
 
     def layer(axes: Axes) -> Draw:
         (line,) = axes.plot([], [], animated=True, **look)
@@ -107,7 +107,7 @@ def weighted_segments(
     width: float,
     **look: Any,
 ) -> Layer:
-    """Lines between two points each, of weights from 0 to 1: light ones are thin and pale.
+    """The layer of lines with weights from 0 to 1: light ones are thin and pale.
 
     width: of a line of weight 1 [pt].
     """
@@ -130,7 +130,7 @@ def weighted_segments(
 def cloud(
     points: Float[np.ndarray, "F P 2"], weight: Float[np.ndarray, "F P"], **look: Any
 ) -> Layer:
-    """Particles, with areas in proportion to their weights; one of weight zero is left out."""
+    """The layer of particles, with areas by their weights; one of weight zero is left out."""
     areas = 4.0 * weight * weight.shape[1]
 
     def layer(axes: Axes) -> Draw:

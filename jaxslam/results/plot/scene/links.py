@@ -21,7 +21,7 @@ _WEAK = 1e-9
 
 
 def link_layers(history: History) -> list[Layer]:
-    """The links of an information matrix, as wide as they are strong; those cut lately are dotted.
+    """The layers of the links of an information matrix, as wide as strong; lately cut ones dotted.
 
     None of a history without links.
     """

@@ -173,7 +173,7 @@ class _Stage:
 
 
 def _furnish(axes: Axes, panel: Panel) -> list[Draw]:
-    """Set up the axes of a panel; what draws a frame on them."""
+    """Set up the axes of a panel; returns the functions that draw a frame on them."""
     axes.set(xlim=panel.xlim, ylim=panel.ylim, xlabel=panel.xlabel, ylabel=panel.ylabel)
     axes.set(aspect="equal", autoscale_on=False)
     if panel.title:

@@ -109,7 +109,7 @@ def _limits(
 def _truth(
     history: History, points: np.ndarray | None, path: np.ndarray | None, size: float
 ) -> list[Layer]:
-    """The true map, path and robot, in grey."""
+    """The layers of the true map, path and robot, in grey."""
     layers = []
     if points is not None:
         look: Look = {"ls": "none", "marker": "x", "ms": 5, "mew": 1.0, "zorder": 2}
@@ -124,7 +124,7 @@ def _truth(
 
 
 def _beams(found: Measured) -> list[Layer]:
-    """The beams to measured landmarks, of the kinds that occur."""
+    """The layers of the beams to measured landmarks, of the kinds that occur."""
     return [
         lines_between(found.beams[name], label=f"measured, {name}", zorder=3, **look)
         for name, look in _BEAMS.items()
@@ -133,7 +133,7 @@ def _beams(found: Measured) -> list[Layer]:
 
 
 def _map(history: History, n_sigma: float) -> list[Layer]:
-    """The landmarks of the map with their ellipses; none of a filter without a map."""
+    """The layers of the map's landmarks with their ellipses; none of a filter without a map."""
     _, _, points, covs, alive, _ = map(np.asarray, history.estimate)
     if not np.any(alive):
         return []
@@ -147,7 +147,7 @@ def _map(history: History, n_sigma: float) -> list[Layer]:
 
 
 def _robot(history: History, n_sigma: float, size: float) -> list[Layer]:
-    """The path so far, particles, the robot's ellipse, and the robot."""
+    """The layers of the path so far, particles, the robot's ellipse, and the robot."""
     pose, cov = (np.asarray(part) for part in history.estimate[:2])
     line: Look = {"color": COLORS[0], "lw": 1.4, "zorder": 3.5}
     ring: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 5.2}

@@ -13,15 +13,12 @@ import numpy as np
 
 from jaxslam import graphs
 from jaxslam.cli import films
-from jaxslam.cli.common import add_dtype, add_out, pick
-from jaxslam.cli.runtime import cache
+from jaxslam.cli.common import pick
+from jaxslam.cli.optimize.figures import WORST, as_text, figure_writer, film_writers
 from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
-from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
-from jaxslam.graphs.solver.search import METHODS as STEPS
-from jaxslam.graphs.starts import STARTS
 from jaxslam.graphs.validation import label, variables_of
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, csv_text, json_text, versions, write_files
@@ -39,10 +36,6 @@ TRUSTED = ("relative_pose", "prior")
 """Tables without a robust kernel: relative poses of successive poses, and priors."""
 
 NOT_CONVERGED = 1
-WORST = 10
-"""Number of rows with the largest residuals in the summary and the figure."""
-FRAMES = 60
-"""Number of iterations that a film shows at most."""
 
 
 def optimize_graph(options: argparse.Namespace, command: str) -> int:
@@ -116,10 +109,10 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         ),
         "poses.csv": _csv(("x", "y", "theta"), found.pose_id, found.poses, found.fixed_pose),
         "optimized.g2o": g2o.text_of(found),
-        "graph.png": _figure(options, begun, found, squared, costs, status),
+        "graph.png": figure_writer(options, begun, found, squared, costs, status),
     }
     if options.animate:
-        files |= _film(options, begun, factors, doubted, solution)
+        files |= film_writers(options, begun, factors, doubted, solution)
     if len(found.points):
         files["points.csv"] = _csv(("x", "y"), found.point_id, found.points, found.fixed_point)
     written = write_files(options.out, files, replaces=films.NAMES)
@@ -131,7 +124,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
 
 
 def _gauge(read: Graph, given: Graph) -> str:
-    """What holds the graph in place, in words."""
+    """The gauge in words: the fixed poses and points, or the priors."""
     poses, points = int(given.fixed_pose.sum()), int(given.fixed_point.sum())
     if given is not read:
         held = given.pose_id[given.fixed_pose.argmax()]
@@ -149,7 +142,7 @@ def _status(solution: graphs.Solution, found: Graph) -> str:
 
 
 def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, object]:
-    """What is proved of the optimum: entries of the summary."""
+    """The certificate of the optimum: entries of the summary."""
     if not converged or not plain:
         why = "of a robust cost nothing is proved" if converged else "there is no optimum"
         return {"certificate": f"none: {why}"}
@@ -211,116 +204,7 @@ def _csv(names: tuple[str, ...], ids: JaxOrNumPy, values: JaxOrNumPy, fixed: Jax
     )
 
 
-def _figure(
-    options: argparse.Namespace,
-    before: Graph,
-    after: Graph,
-    squared: Mapping[str, np.ndarray],
-    costs: tuple[float | None, float | None],
-    status: str,
-) -> Callable[[Path], object]:
-    """What draws the graph before and after; costs: χ² of both."""
-    from jaxslam.results import plot  # matplotlib is slow to load
-
-    title = Path(options.path).name
-    edges = sum(int(table.valid.sum()) for table in after.tables.values())
-    figure = plot.graph_figure(
-        before,
-        after,
-        squared,
-        worst=WORST,
-        subtitles=(
-            f"start ({options.start}): χ² = {_shown(costs[0])}",
-            f"{status.split(':')[0]}: χ² = {_shown(costs[1])}",
-        ),
-        title=f"{title}: {len(after.poses):,} poses, {edges:,} edges",
-    )
-    return lambda path: path.write_bytes(plot.png(figure))
-
-
-def _film(
-    options: argparse.Namespace,
-    begun: Graph,
-    factors: Mapping[str, Factor],
-    kernel: Mapping[str, graphs.Kernel] | None,
-    solution: graphs.Solution,
-) -> dict[str, Callable[[Path], object]]:
-    """What writes the film of the iterations, by file name.
-
-    Iterate k is where the same optimization stops after k steps; the limit is no part of the
-    compiled program.
-    """
-    from jaxslam.results import plot  # matplotlib is slow to load
-
-    taken = int(solution.iterations)
-    shown = np.unique(np.linspace(1, taken, min(taken, FRAMES)).round().astype(int)).tolist()
-    iterates, costs = [begun], [float(solution.chi2_start)]
-    with Progress(f"{Path(options.path).name}: film", "frames") as progress:
-        for done, steps in enumerate(shown):
-            at = graphs.optimize(
-                begun, factors, method=options.method, kernel=kernel, iterations=steps
-            )
-            iterates.append(jax.tree.map(np.asarray, at.graph))
-            costs.append(float(at.chi2))
-            progress(done + 1, len(shown))
-    note = "" if len(shown) == taken else f"{len(shown)} of {taken} iterations shown"
-    scene = plot.graph_scene(
-        iterates,
-        costs,
-        steps=[0, *shown],
-        factors=factors,
-        title=Path(options.path).name,
-        note=note,
-    )
-    return films.film_files({"optimize": plot.render(scene, fps=2.0)}, suffixed=False)
-
-
 def _table(summary: Mapping[str, object]) -> str:
     """The summary, a line an entry."""
     wide = max(map(len, summary))
-    return "\n".join(f"{key.ljust(wide)}  {_shown(value)}" for key, value in summary.items())
-
-
-def _shown(value: object) -> str:
-    """A value as it is printed; numbers with nine digits, so that optima can be compared."""
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "none"
-    if value is None:
-        return "not finite"
-    return f"{value:.9g}" if isinstance(value, float) else str(value)
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `jaxslam optimize`."""
-    parser.add_argument("path", metavar="FILE", help="a graph in the format of g2o or TORO")
-    for name, default, known, text in (
-        ("start", "given", STARTS, "where to start"),
-        ("method", "levenberg_marquardt", STEPS, "the steps"),
-        ("kernel", None, KERNELS, "a robust kernel for loop edges and measurements of points"),
-        ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
-    ):
-        parser.add_argument(
-            f"--{name}",
-            metavar="NAME",
-            default=default,
-            help=f"{text}, one of: {', '.join(known)} (default: {default or 'none'})",
-        )
-    parser.add_argument(
-        "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
-    )
-    parser.add_argument(
-        "--certificate",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
-    )
-    parser.add_argument(
-        "--animate",
-        action="store_true",
-        help="also write a film of the iterations: film.html to step and play, and film.mp4, or "
-        "film.gif where ffmpeg is missing",
-    )
-    cache.add_options(parser)
-    add_dtype(parser)
-    add_out(parser)
-    parser.set_defaults(command=optimize_graph)
+    return "\n".join(f"{key.ljust(wide)}  {as_text(value)}" for key, value in summary.items())

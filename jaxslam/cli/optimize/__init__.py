@@ -1,0 +1,1 @@
+"""The command `jaxslam optimize`: options, optimization, figure and film."""

@@ -1,0 +1,46 @@
+"""The options of `jaxslam optimize`."""
+
+import argparse
+
+from jaxslam.cli.common import add_dtype, add_out
+from jaxslam.cli.optimize.command import ERRORS, optimize_graph
+from jaxslam.cli.runtime import cache
+from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
+from jaxslam.graphs.solver.search import METHODS as STEPS
+from jaxslam.graphs.starts import STARTS
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam optimize`."""
+    parser.add_argument("path", metavar="FILE", help="a graph in the format of g2o or TORO")
+    for name, default, known, text in (
+        ("start", "given", STARTS, "where to start"),
+        ("method", "levenberg_marquardt", STEPS, "the steps"),
+        ("kernel", None, KERNELS, "a robust kernel for loop edges and measurements of points"),
+        ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
+    ):
+        parser.add_argument(
+            f"--{name}",
+            metavar="NAME",
+            default=default,
+            help=f"{text}, one of: {', '.join(known)} (default: {default or 'none'})",
+        )
+    parser.add_argument(
+        "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
+    )
+    parser.add_argument(
+        "--certificate",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
+    )
+    parser.add_argument(
+        "--animate",
+        action="store_true",
+        help="also write a film of the iterations: film.html to step and play, and film.mp4, or "
+        "film.gif where ffmpeg is missing",
+    )
+    cache.add_options(parser)
+    add_dtype(parser)
+    add_out(parser)
+    parser.set_defaults(command=optimize_graph)

@@ -1,0 +1,130 @@
+"""The missing blocks of a campaign, computed several at once, and the bar of progress."""
+
+import contextlib
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from jaxslam.consistency import Tally
+from jaxslam.monte_carlo.blocks.block import BOUND, BlockRunner, Glimpse
+from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
+from jaxslam.monte_carlo.blocks.programs import compile_programs
+from jaxslam.monte_carlo.kept import Keep, add_block, flat
+from jaxslam.monte_carlo.pieces import missing
+from jaxslam.monte_carlo.progress import Progress
+from jaxslam.types import Estimate, Truth
+
+
+@dataclass
+class Work:
+    """Computes the missing blocks of a campaign, and keeps count."""
+
+    workers: int
+    keep: Keep | None
+    progress: Callable[[int, int], None] | None
+    glimpse: Glimpse | None
+    own: dict[str, Tally]
+    """what this process has computed, by filter"""
+    compile_seconds: float = 0.0
+    run_seconds: dict[str, float] = field(default_factory=dict)
+    first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
+
+    def in_blocks_that_fit(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
+        """Compute the pieces, in blocks of half the size each time that memory does not suffice."""
+        while True:
+            try:
+                return self.go(plan, todo)
+            except (jax.errors.JaxRuntimeError, MemoryError) as error:
+                if not (isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)):
+                    raise
+                if plan.block == 1:
+                    raise MemoryError(
+                        "monte_carlo: out of memory with one run on each device (block=1): use "
+                        "fewer steps, landmarks or filters at a time"
+                    ) from error
+                half = plan.block // 2
+                warnings.warn(
+                    f"monte_carlo: out of memory with block={plan.block}; continuing with "
+                    f"block={half}",
+                    stacklevel=3,
+                )
+                plan = replace(plan, block=half)
+
+    def go(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
+        """Add those of the pieces that are not yet there to the tallies."""
+        if not todo:
+            return
+        before = self.own[BOUND].pieces()
+        queue = [
+            piece
+            for first, count in todo
+            for piece in missing([(0, first), *before], first + count, plan.wide)
+        ][::-1]
+        plan = replace(plan, with_first=any(first == 0 for first, _ in queue))
+        promises = Promises(list(plan.filters))
+        runner = BlockRunner(plan, promises, self.glimpse)
+        done = sum(count for _, count in before)
+        total = sum(count for _, count in todo)
+        early = len(queue) > self.workers
+        flight: dict[Future[dict[str, dict[str, np.ndarray]]], tuple[int, int]] = {}
+        stop: BaseException | None = None
+        # XLA uses the cores; threads of the BLAS below its LAPACK would only spin beside it.
+        with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
+            try:
+                while queue and len(flight) <= self.workers:
+                    first, count = queue.pop()
+                    block = pool.submit(runner.block, first, count, early, not flight)
+                    flight[block] = first, count
+                began = time.perf_counter()
+                compile_programs(plan, promises)
+                self.compile_seconds += time.perf_counter() - began
+            except BaseException as error:
+                stop = error
+                promises.give_up(error)
+            while flight:
+                try:
+                    for future in wait(flight, return_when=FIRST_COMPLETED).done:
+                        first, count = flight.pop(future)
+                        if stop is not None and (future.cancelled() or future.exception()):
+                            continue
+                        found = future.result()
+                        if self.keep is not None:
+                            self.keep.save(first, flat(found, self.own), count)
+                        add_block(self.own, first, count, found)
+                        done += count
+                        if self.progress is not None:
+                            self.progress(done, total)
+                    while queue and stop is None and len(flight) <= self.workers:
+                        first, count = queue.pop()
+                        block = pool.submit(runner.block, first, count, True, False)
+                        flight[block] = first, count
+                except BaseException as error:
+                    if stop is not None:
+                        raise
+                    stop = error  # what is at work is finished, and kept
+                    for future in flight:
+                        future.cancel()
+        self.run_seconds = runner.run_seconds()
+        self.first |= runner.first
+        if stop is not None:
+            raise stop
+
+
+@contextlib.contextmanager
+def shown(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
+    """A block in which, if wanted, a bar of progress tells of the work where it can be seen."""
+    count = len(plan.filters)
+    bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None
+    if bar is None or not bar.shown:
+        yield
+        return
+    work.progress = bar
+    work.glimpse = work.glimpse or bar.glimpse
+    with bar:
+        yield
