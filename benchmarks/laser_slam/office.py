@@ -6,9 +6,12 @@ import jax
 import numpy as np
 
 from benchmarks.gate import Metric
-from jaxslam import laser_slam, scenarios
+from jaxslam import filters, laser_slam, run, scenarios, se2, sensors
 from jaxslam.laser_slam import ScanLog, Settings, poses
+from jaxslam.noise import noise_model
+from jaxslam.protocols import Motion
 from jaxslam.simulation.laser import scan_world
+from jaxslam.types import Log, Scan
 
 EVERY = 4
 """Scans of the world of which one is used: half a metre, or 45°."""
@@ -18,8 +21,8 @@ SETTINGS = Settings(beams=90, max_range=8.0, key_distance=0.3, loop_gap=15, subm
 def logs(runs: int, beams: int = 90):
     """Pairs (true poses, log)."""
     world = scenarios.office(beams=beams)
-    for run in range(runs):
-        history = jax.tree.map(np.asarray, scan_world(world, jax.random.key(run)))
+    for seed in range(runs):
+        history = jax.tree.map(np.asarray, scan_world(world, jax.random.key(seed)))
         speed, turn, interval = history.control.T
         zero = np.zeros_like(speed)
         steps = np.stack([speed * interval, zero, turn * interval], axis=1)
@@ -35,6 +38,38 @@ def logs(runs: int, beams: int = 90):
         true = history.pose[kept]
         start = poses.compose(true[0], poses.inverse(raw[kept][0]))
         yield true, ScanLog(time, beams_of, poses.compose(start, raw[kept]), 8.0)
+
+
+def _increment(pose, u, w):
+    return se2.compose(se2.compose(pose, u[:3]), u[3:].reshape(3, 3) @ w)
+
+
+INCREMENT = Motion(
+    name="laser_odometry",
+    controls=("x [m]", "y [m]", "θ [rad]", *(f"root {i}{j}" for i in range(3) for j in range(3))),
+    noises=("w_0", "w_1", "w_2"),
+    step=_increment,
+    noise_cov=noise_model("laser_odometry", np.eye(3), 3),
+)
+"""A relative pose with a root L of the covariance of its end, pose ∘ z ∘ L w."""
+EKF = filters.dead_reckoning(INCREMENT, sensors.range_bearing(np.eye(2)))
+
+
+def ekf_of(odometry, true):
+    """NEES of the keyframes by an EKF that is driven by the increments and their covariances."""
+    keys = odometry.keyframe
+    roots = np.linalg.cholesky(odometry.cov[keys[1:]]).reshape(-1, 9)
+    control = np.zeros((len(true) - 1, 12))  # at rest after the last, so that runs are alike
+    control[: len(keys) - 1] = np.concatenate([odometry.z[keys[1:]], roots], axis=1)
+    none = (len(control), 1)
+    scan = Scan(np.zeros((*none, 2)), np.full(none, -1), np.zeros(none, bool))
+    trace = run(EKF, Log(control, scan), true[0], np.zeros((3, 3)), jax.random.key(0))
+    pose, cov = (
+        np.asarray(part)[: len(keys) - 1] for part in (trace.estimate.pose, trace.estimate.pose_cov)
+    )
+    error = true[keys[1:]] - pose
+    error[:, 2] = poses.wrapped(error[:, 2])
+    return nees(error, cov)
 
 
 def nees(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -68,6 +103,7 @@ def measure(runs: int = 10) -> list[Metric]:
             odometry = laser_slam.laser_odometry(scans, steps, settings, log.raw[0])
             found.setdefault(f"{name}: a match", []).append(steps_of(odometry, true))
             found.setdefault(f"{name}: the path", []).append(path_of(odometry, true))
+            found.setdefault(f"{name}: an EKF", []).append(ekf_of(odometry, true))
             off = np.hypot(*(odometry.poses - true)[:, :2].T)
             position.setdefault(name, []).append(np.sqrt((off**2).mean()))
         solved = laser_slam.solve(log, SETTINGS)
@@ -86,7 +122,7 @@ def measure(runs: int = 10) -> list[Metric]:
         half = 1.96 * means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else np.nan
         middle = np.median(np.concatenate(runs_of))
         where = name.split(":")[0]
-        rmse = f"{np.mean(position[where]):.3f}" if name.endswith("path") else ""
+        rmse = "" if name.endswith("match") else f"{np.mean(position[where]):.3f}"
         print(f"{name:28}  {means.mean():7.2f} ± {half:5.2f}  {middle:12.2f}    {rmse:>12}")
         metrics.append(Metric(f"office, NEES, {name}", means.mean(), note="3 is honest"))
     metrics.append(Metric("office, chi2 / degrees of freedom", np.mean(chi2), note="1 is honest"))
