@@ -188,4 +188,5 @@ def _named(
         heading = np.degrees(np.arctan2(dy, dx)) % 180
         return f"translation along {heading if heading < 179.95 else 0.0:.1f}°"
     x, y = pose[0] - dy / turn, pose[1] + dx / turn
-    return f"rotation about ({x + 0.0:.2f} m, {y + 0.0:.2f} m)"
+    x, y = round(x, 2) + 0.0, round(y, 2) + 0.0  # no -0.00
+    return f"rotation about ({x:.2f} m, {y:.2f} m)"
