@@ -20,8 +20,6 @@ from jaxslam.types import Status
 
 WORLD = worlds.ring()
 EKF = worlds.ekf(WORLD)
-RECKONING = {"reckoning": filters.dead_reckoning(WORLD.motion, WORLD.sensor)}
-"""Where no filter is the subject: its program is small."""
 LARGE = 100
 """A block as large as those of `lineup`, whose programs it shares; the others are of four runs."""
 
@@ -29,7 +27,7 @@ LARGE = 100
 @pytest.fixture(scope="module")
 def in_fours():
     """Runs 0 to 3, 4 to 7, 8 and 9; one device, one worker."""
-    return campaign_of({"ekf": EKF, "again": worlds.ekf(WORLD)} | RECKONING, workers=1)
+    return campaign_of({"ekf": EKF, "again": worlds.ekf(WORLD)}, workers=1)
 
 
 def campaign_of(candidates=None, *, devices=1, block=4, bound=True, **options):
@@ -60,30 +58,23 @@ def test_blocks_follow_the_memory_of_an_accelerator():
     assert fits("gpu", 10**11) == 4096
 
 
-@pytest.mark.parametrize(
-    ("candidates", "devices", "workers"), [({"ekf": EKF} | RECKONING, 1, 2), (RECKONING, 2, 3)]
-)
-def test_workers_do_not_change_a_bit_and_devices_what_rounding_does(
-    in_fours, candidates, devices, workers
-):
+@pytest.mark.parametrize(("devices", "workers"), [(1, 2), (2, 3)])
+def test_workers_do_not_change_a_bit_and_devices_what_rounding_does(in_fours, devices, workers):
     heard = []
     campaign = campaign_of(
-        candidates,
         devices=devices,
         workers=workers,
         progress=lambda done, total: heard.append((done, total)),
     )
     agree = worlds.assert_identical if devices == 1 else same
-    for name in candidates:
-        agree(campaign.filters[name], in_fours.filters[name])
+    agree(campaign.filters["ekf"], in_fours.filters["ekf"])
     assert [total for _, total in heard] == [10] * -(-10 // (4 * devices))
     assert sorted(done for done, _ in heard)[-1] == 10
 
 
-@pytest.mark.parametrize(("block", "candidates"), [(3, RECKONING), (LARGE, {"ekf": EKF})])
-def test_other_blocks_change_what_rounding_does(in_fours, block, candidates):
-    (name,) = candidates
-    same(campaign_of(candidates, block=block).filters[name], in_fours.filters[name])
+@pytest.mark.parametrize("block", [3, LARGE])
+def test_other_blocks_change_what_rounding_does(in_fours, block):
+    same(campaign_of(block=block).filters["ekf"], in_fours.filters["ekf"])
 
 
 def test_pieces_lie_within_the_blocks_of_their_numbers():
@@ -121,27 +112,27 @@ def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_fours):
             raise KeyboardInterrupt
 
     with pytest.raises(Interrupted, match="of 10 runs done") as stopped:
-        campaign_of(RECKONING, workers=1, keep=first, progress=stop)
+        campaign_of(workers=1, keep=first, progress=stop)
     so_far = stopped.value.campaign
     assert so_far.runs == sum(runs for _, runs in first.saved) < 10
-    assert so_far.filters["reckoning"].counts["runs"] == so_far.runs
+    assert so_far.filters["ekf"].counts["runs"] == so_far.runs
 
     second = Spy(store.resume(tmp_path), fails=[True])
     with pytest.raises(OSError, match="no space"):
-        campaign_of(RECKONING, workers=1, keep=second)
+        campaign_of(workers=1, keep=second)
 
     third = Spy(store.resume(tmp_path))
-    campaign = campaign_of(RECKONING, devices=2, keep=third)
-    worlds.assert_identical(campaign.filters["reckoning"], in_fours.filters["reckoning"])
+    campaign = campaign_of(devices=2, keep=third)
+    worlds.assert_identical(campaign.filters["ekf"], in_fours.filters["ekf"])
     pieces = sorted(first.saved + second.saved + third.saved)
     assert [run for at, runs in pieces for run in range(at, at + runs)] == list(range(10))
 
     finished = Spy(store.resume(tmp_path))
-    began = campaign_of(RECKONING, keep=finished)
+    began = campaign_of(keep=finished)
     assert finished.saved == []
     assert began.compile_seconds == 0
     assert began.divergence_limit == in_fours.divergence_limit
-    worlds.assert_identical(began.filters["reckoning"], in_fours.filters["reckoning"])
+    worlds.assert_identical(began.filters["ekf"], in_fours.filters["ekf"])
 
 
 def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
@@ -255,8 +246,7 @@ def test_another_seed_is_another_campaign(in_fours):
 
 def test_another_key_noise_map_or_more_runs_compile_nothing():
     def campaign(there, runs, seed):
-        reckoning = filters.dead_reckoning(there.motion, there.sensor)
-        tried = {"reckoning": reckoning, "ideal": catalog.ideal(there)}
+        tried = {"ekf": worlds.ekf(there), "ideal": catalog.ideal(there)}
         more = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
         return monte_carlo(there, tried, runs, jax.random.key(seed), **more)
 
@@ -266,8 +256,7 @@ def test_another_key_noise_map_or_more_runs_compile_nothing():
         for there, runs, seed in ((same, 3, 1), (same, 9, 0), (other, 3, 0)):
             found = campaign(there, runs, seed)
             assert found.runs == runs
-            for name, summary in found.filters.items():
-                assert summary.measures != first.filters[name].measures
+            assert found.filters["ekf"].measures != first.filters["ekf"].measures
         assert count() == 0
 
 
@@ -299,9 +288,9 @@ def test_blocks_share_one_trace():
 
 
 def test_float32_sees_the_worlds_of_float64(in_fours):
-    campaign = campaign_of(RECKONING, dtype=jnp.float32, bound=False)
+    campaign = campaign_of({"ekf": EKF}, dtype=jnp.float32, bound=False)
     assert (campaign.dtype, in_fours.dtype) == ("float32", "float64")
-    single, double = (each.filters["reckoning"].per_run for each in (campaign, in_fours))
+    single, double = campaign.filters["ekf"].per_run, in_fours.filters["ekf"].per_run
     np.testing.assert_allclose(single["square_position"], double["square_position"], rtol=0.02)
     with pytest.raises(ValueError, match="float16"):
         campaign_of(dtype=jnp.float16)
