@@ -56,30 +56,23 @@ def draws(graph, scale, runs, block=8):
     one = jax.tree.map(np.asarray, measured(graph, keys[0], scale))
     plan = graphs.plan(one, marginals=True)
     bound = np.asarray(graphs.marginals(one, plan=plan).poses)[1:]
-    solve = jax.jit(jax.vmap(partial(_solved, plan=plan)))
+    solve = jax.jit(jax.vmap(partial(graphs.optimize, plan=plan)))
+    spread = jax.jit(jax.vmap(lambda graph: graphs.marginals(graph, plan=plan).poses[1:]))
     prove = jax.jit(jax.vmap(lambda graph: graphs.certificate(graph, plan=plan).certified))
     draw = jax.jit(jax.vmap(partial(measured, graph, scale=scale)))
     rows = []
     for begin in range(0, runs, block):
         many = jax.device_get(draw(keys[np.arange(begin, begin + block) % runs]))
-        found = jax.device_get(solve(many))
-        again = jax.device_get(solve(_from_chordal(many)))
-        certified = jax.device_get(prove(many._replace(poses=again[0])))
-        error = pose_error(np.asarray(graph.poses), found[0])[:, 1:]
-        cov = found[1][:, 1:]
+        found, again = solve(many), solve(_from_chordal(many))
+        cov, certified = jax.device_get((spread(found.graph), prove(again.graph)))
+        error = pose_error(np.asarray(graph.poses), found.graph.poses)[:, 1:]
         nees = np.einsum("rni,rni->rn", error, np.linalg.solve(cov, error[..., None])[..., 0])
         square = (error[..., :2] ** 2).sum(axis=-1)
-        wrong = again[2] > found[2] * (1 + 1e-6)
-        rows.append((found[2], nees, square, wrong, certified, found[3]))
+        wrong = again.chi2 > found.chi2 * (1 + 1e-6)
+        failed = found.status != graphs.Ending.CONVERGED
+        rows.append(jax.device_get((found.chi2, nees, square, wrong, certified, failed)))
     chi2, nees, square, *flags = (np.concatenate(part)[:runs] for part in zip(*rows, strict=True))
     return Draws(chi2, nees, square, np.trace(bound[:, :2, :2], axis1=1, axis2=2), *flags)
-
-
-def _solved(graph, plan):
-    """Poses, their covariances and χ² at the optimum, and whether it was not reached."""
-    solution = graphs.optimize(graph, plan=plan)
-    cov = graphs.marginals(solution.graph, plan=plan).poses
-    return solution.graph.poses, cov, solution.chi2, solution.status != graphs.Ending.CONVERGED
 
 
 def _from_chordal(many):

@@ -7,7 +7,8 @@ import numpy as np
 
 from benchmarks.gate import Metric
 from jaxslam import filters, laser_slam, run, scenarios, se2, sensors
-from jaxslam.laser_slam import ScanLog, Settings, poses
+from jaxslam.laser_slam import ScanLog, Settings, covariances
+from jaxslam.math import numpy_poses as poses
 from jaxslam.noise import noise_model
 from jaxslam.protocols import Motion
 from jaxslam.simulation.laser import scan_world
@@ -86,9 +87,9 @@ def steps_of(odometry, true):
 def path_of(odometry, true):
     """NEES of the keyframes by the chain of matches."""
     keys = odometry.keyframe
-    total = poses.along(odometry.poses[keys], odometry.cov[keys[1:]])
+    total = covariances.along(odometry.poses[keys], odometry.cov[keys[1:]])
     zero = np.zeros(len(keys) - 1, int)
-    cov = poses.relative_cov(total, odometry.poses[keys], zero, np.arange(1, len(keys)))
+    cov = covariances.relative_cov(total, odometry.poses[keys], zero, np.arange(1, len(keys)))
     return nees(poses.between(odometry.poses[keys[1:]], true[keys[1:]]), cov)
 
 

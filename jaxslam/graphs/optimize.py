@@ -16,7 +16,7 @@ from jaxslam.graphs.solver.batch import in_one_dtype, over_batch, with_batch
 from jaxslam.graphs.solver.gnc import graduated
 from jaxslam.graphs.solver.implicit import followed
 from jaxslam.graphs.solver.kernels import Kernel
-from jaxslam.graphs.solver.linearized import cost, data_of, variables_of
+from jaxslam.graphs.solver.linearized import chi2_of, data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.plan import Plan, plan_for
 from jaxslam.graphs.solver.search import METHODS, Solution, minimize
@@ -81,7 +81,7 @@ def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
     who = {name: jnp.asarray(table.who) for name, table in graph.tables.items()}
     batch = with_batch(graph)
     none = jnp.arange(len(graph.poses) + len(graph.points))
-    return cost(model, who, variables_of(batch), data_of(batch, none))[0]
+    return chi2_of(model, who, variables_of(batch), data_of(batch, none))[0]
 
 
 def _optimize(

@@ -65,7 +65,7 @@ def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
     held = np.asarray(graph.fixed_pose).copy()
     for key, table in graph.tables.items():
         counted = table.valid & np.asarray(table.information).any(axis=(1, 2))
-        who = variables_of(graph, table._replace(valid=counted), factors[key])
+        who = variables_in(graph, table._replace(valid=counted), factors[key])
         pairs += [who[:, [0, k]] for k in range(1, who.shape[1])]
         if factors[key].variables == ("pose",):
             held[who[:, 0]] = True
@@ -77,7 +77,7 @@ def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
     return Parts(part, anchored | (fixed > 1))
 
 
-def variables_of(graph: Graph, table: Table, factor: Factor) -> Int[np.ndarray, "rows K"]:
+def variables_in(graph: Graph, table: Table, factor: Factor) -> Int[np.ndarray, "rows K"]:
     """The variables of the valid rows of a table, points counted on from the poses."""
     shift = [0 if kind == "pose" else len(graph.poses) for kind in factor.variables]
     return np.asarray(np.asarray(table.who)[np.asarray(table.valid)] + np.array(shift, int))
@@ -146,7 +146,7 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
                 f"{name}: {key}, row {row}: {kind} number {who[row, k]} is nowhere, "
                 f"the graph has {count}"
             )
-    of = variables_of(graph, table, factor)
+    of = variables_in(graph, table, factor)
     twice = np.zeros(len(valid), bool)
     twice[valid] = (np.sort(of, axis=1)[:, 1:] == np.sort(of, axis=1)[:, :-1]).any(axis=1)
     scale = np.abs(information).max(axis=(1, 2), initial=0.0)
@@ -162,7 +162,7 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
     ):
         if (bad & valid).any():
             row = int((bad & valid).argmax())
-            here = variables_of(graph, table._replace(valid=np.arange(len(valid)) == row), factor)
+            here = variables_in(graph, table._replace(valid=np.arange(len(valid)) == row), factor)
             between = ", ".join(label(graph, int(variable)) for variable in here[0])
             raise ValueError(f"{name}: {key}, row {row} ({between}): {why}")
 

@@ -6,7 +6,8 @@ from jaxtyping import Float, Int
 from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
 from jaxslam.graphs.loops import LOOPS
-from jaxslam.laser_slam import poses
+from jaxslam.laser_slam import covariances
+from jaxslam.math import numpy_poses as poses
 
 
 def table_of(
@@ -46,7 +47,7 @@ def graph_of(
     )
 
 
-def relative(
+def relative_covs(
     graph: Graph, pairs: Int[np.ndarray, "Q 2"], plan: graphs.Plan | None = None
 ) -> Float[np.ndarray, "Q 3 3"]:
     """The covariance of the end of the second pose in the frame of the first, of each pair.
@@ -57,8 +58,8 @@ def relative(
     at = np.asarray(graph.poses, np.float64)
     i, j = at[pairs[:, 0]], at[pairs[:, 1]]
     # x_i + δ_i is x_i ∘ R(θ_i)ᵀ δ_i to first order, which moves the end by -Ad(z)⁻¹ of it.
-    by_i = -poses.adjoint(poses.between(j, i)) @ poses.turns(-i[:, 2])
-    by_j = poses.turns(-j[:, 2])
+    by_i = -poses.adjoint(poses.between(j, i)) @ covariances.turns(-i[:, 2])
+    by_j = covariances.turns(-j[:, 2])
     both = np.concatenate([by_i, by_j], axis=2)
     whole = np.swapaxes(joint, 2, 3).reshape(-1, 6, 6)
-    return poses.carried(both, whole)
+    return covariances.propagated(both, whole)

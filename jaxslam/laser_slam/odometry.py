@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import programs
-from jaxslam.laser_slam import poses
+from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.raw_odometry import Steps
 from jaxslam.laser_slam.reference import (
     BLUR,
@@ -22,6 +22,7 @@ from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Match, Matcher, Points, Prior
 from jaxslam.matching.surface import Surface
+from jaxslam.math import numpy_poses as poses
 
 NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0))
 """About raw odometry."""
@@ -84,7 +85,7 @@ def laser_odometry(
     for scan in range(1, count):
         key = keys[-1]
         guess = poses.compose(z, steps.step[scan])
-        prior = poses.composed_cov(cov, steps.step[scan], steps.cov[scan])
+        prior = covariances.composed_cov(cov, steps.step[scan], steps.cov[scan])
         of = [one for one in keys[-width:] if scans.usable[one]]
         z, cov = guess, prior
         if scans.usable[scan] and of:
@@ -126,7 +127,7 @@ def _tracked(
     there = poses.between(path[key], path[take]).astype(np.float32)
     points = taken(scans.points, take)
     again = np.arange(len(take)) < len(of)  # padding repeats a keyframe without points
-    wide = poses.of_coordinates(prior, guess)
+    wide = covariances.of_coordinates(prior, guess)
     fit = programs.call(
         _track,
         (matcher,),
@@ -139,8 +140,8 @@ def _tracked(
         np.float32(settings.sigma),
     )
     sigma = max(settings.sigma, float(fit.residual)) ** 2 * settings.correlation
-    seen = poses.semidefinite(np.asarray(fit.information)) / sigma + np.linalg.inv(wide)
-    at_end = poses.at_end(np.linalg.inv(seen), np.asarray(fit.pose, np.float64))
+    seen = covariances.semidefinite(np.asarray(fit.information)) / sigma + np.linalg.inv(wide)
+    at_end = covariances.at_end(np.linalg.inv(seen), np.asarray(fit.pose, np.float64))
     return fit, at_end + np.diag(np.square(settings.floor))
 
 

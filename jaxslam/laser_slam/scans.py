@@ -27,7 +27,7 @@ class Scans(NamedTuple):
     """enough points to match"""
 
 
-def check_log(name: str, log: LogOfScans) -> None:
+def check_laser_log(name: str, log: LogOfScans) -> None:
     """Raise ValueError, which begins with a caller's name, unless a log can be used."""
     shape = np.shape(log.beams.range)
     if len(shape) != 2 or 0 in shape:

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam.laser_slam import poses
 from jaxslam.laser_slam.records import LoopOutcome, Loops, Solved
+from jaxslam.math import numpy_poses as poses
 
 
 class ClosureScore(NamedTuple):

@@ -6,14 +6,15 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxslam import graphs
-from jaxslam.laser_slam import poses
+from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.loops.closing import closed
 from jaxslam.laser_slam.mapping import frame_of, map_of
 from jaxslam.laser_slam.odometry import Odometry, laser_odometry
 from jaxslam.laser_slam.raw_odometry import steps_of
 from jaxslam.laser_slam.records import LogOfScans, LoopOutcome, Loops, Solved
-from jaxslam.laser_slam.scans import check_log, scans_of
+from jaxslam.laser_slam.scans import check_laser_log, scans_of
 from jaxslam.laser_slam.settings import Settings
+from jaxslam.math import numpy_poses as poses
 
 DEFAULT = Settings()
 
@@ -38,7 +39,7 @@ def solve(
     Raises:
         ValueError: on a log whose parts do not fit, or are not finite.
     """
-    check_log("laser_slam.solve", log)
+    check_laser_log("laser_slam.solve", log)
     seconds: dict[str, float] = {}
     began = time.perf_counter()
 
@@ -95,9 +96,9 @@ def _of_scans(graph: graphs.Graph, odometry: Odometry) -> tuple[np.ndarray, np.n
         marginal = np.zeros((1, 3, 3))
     else:
         marginal = np.asarray(graphs.marginals(graph).poses, np.float64)
-    at_key = poses.turns(-at[row, 2]) @ marginal[row] @ poses.turns(at[row, 2])
+    at_key = covariances.turns(-at[row, 2]) @ marginal[row] @ covariances.turns(at[row, 2])
     step = np.where(is_key[:, None, None], 0.0, odometry.cov)
-    return path, poses.of_coordinates(poses.composed_cov(at_key, z, step), path)
+    return path, covariances.of_coordinates(covariances.composed_cov(at_key, z, step), path)
 
 
 def _counts(

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.math.numpy_poses import between
+
 Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """(times (K,), odometry (K, V), rows (T,)) -> control (T, U) that leads to each row"""
 
@@ -140,8 +142,6 @@ def relative(
     before: Float[np.ndarray, "T 3"], after: Float[np.ndarray, "T 3"]
 ) -> Float[np.ndarray, "T 3"]:
     """Poses relative to those before; headings are not wrapped."""
-    step, angle = after[:, :2] - before[:, :2], before[:, 2]
-    c, s = np.cos(angle), np.sin(angle)
-    return np.column_stack(
-        [c * step[:, 0] + s * step[:, 1], -s * step[:, 0] + c * step[:, 1], after[:, 2] - angle]
-    )
+    steps = between(before, after)
+    steps[:, 2] = after[:, 2] - before[:, 2]
+    return steps

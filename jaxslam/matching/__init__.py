@@ -3,10 +3,8 @@
 from jaxslam.matching import covariance
 from jaxslam.matching.correlative import correlative
 from jaxslam.matching.field import field
-from jaxslam.matching.icp import IcpSettings
+from jaxslam.matching.icp import IcpSettings, point_to_line, point_to_point
 from jaxslam.matching.matcher import Match, Matcher, MatchStatus, match
-from jaxslam.matching.point_to_line import point_to_line
-from jaxslam.matching.point_to_point import point_to_point
 from jaxslam.matching.points import Points, moved_along_rays, points, raster, transformed
 from jaxslam.matching.prior import Prior
 

@@ -33,7 +33,7 @@ class Best(NamedTuple):
     """how many blocks were"""
 
 
-def search(
+def best_shift(
     bound_of: Callable[[Nodes], Float[Array, "n"]],
     roots: Nodes,
     bounds: Float[Array, "n"],

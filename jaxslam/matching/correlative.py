@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from jaxslam.grids.distance import distance_field
 from jaxslam.grids.grid import Field, Grid, to_cells
 from jaxslam.grids.interpolation import interpolate
-from jaxslam.matching.branch_and_bound import Nodes, search
+from jaxslam.matching.branch_and_bound import Nodes, best_shift
 from jaxslam.matching.field import field_cost
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import Limits, concluded, length_of
@@ -56,7 +56,7 @@ def correlative(
 
     The maximum is exact on this lattice: blocks of shifts are scored by the largest score of any
     cell that a point meets within the block, less what the prior takes at least there: an upper
-    bound. Those that may hold the best are divided, down to single shifts (`search`).
+    bound. Those that may hold the best are divided, down to single shifts (`best_shift`).
 
     Olson 2009, "Real-time correlative scan matching", ICRA; bounds over sliding blocks as Hess et
     al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA. The pose is one of the lattice:
@@ -149,7 +149,7 @@ def correlative(
         numbers = jnp.arange(len(offsets), dtype=jnp.int32)
         bounds = jax.lax.map(lambda turn: bound_of(roots_of(turn)), numbers).reshape(-1)
         roots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(roots_of)(numbers))
-        best = search(bound_of, roots, bounds, levels, shifts)
+        best = best_shift(bound_of, roots, bounds, levels, shifts)
         elsewhere: Array | bool = False
         if ambiguous < 1:
             by_turn = length_of(points) * turn
@@ -159,7 +159,7 @@ def correlative(
                 return jnp.hypot(*way.T) + by_turn * jnp.abs(nodes.turn - best.turn) > apart
 
             limit = ambiguous * best.value
-            other = search(
+            other = best_shift(
                 bound_of, roots, bounds, levels, shifts, above=limit, counts=far, first=True
             )
             elsewhere = other.value > limit

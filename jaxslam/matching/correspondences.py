@@ -12,7 +12,7 @@ FAR = 1e6
 """Coordinate [m] of a reference point that is not there, so that others are nearer."""
 
 
-def nearest(reference: Float[Array, "M 2"], query: Float[Array, "N 2"]) -> Int[Array, "N"]:
+def nearest_points(reference: Float[Array, "M 2"], query: Float[Array, "N 2"]) -> Int[Array, "N"]:
     """The index of the nearest reference point of each query, by the matrix of all distances.
 
     The index stands in the last ⌈log₂ M⌉ bits of the squared distance, read as an integer, of which

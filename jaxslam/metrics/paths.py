@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.math.numpy_poses import compose, wrapped
+
 
 class PathErrors(NamedTuple):
     """The errors of the poses of a path; `statistics` sums them up."""
@@ -56,21 +58,13 @@ def alignment(source: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "3"]:
 def carried(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
     """Poses (K, 3) or points (K, 2) of a frame, in the coordinates that its pose (3,) is in.
 
-    Headings are wrapped to [-π, π]. Raises ValueError on other shapes and on numbers that are not
+    Headings are wrapped to (-π, π]. Raises ValueError on other shapes and on numbers that are not
     finite.
     """
-    x, y, theta = _table("carried", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)[0]
+    of = _table("carried", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)
     table = _table("carried", rows, 3 if np.shape(rows)[-1:] == (3,) else 2)
-    c, s = np.cos(theta), np.sin(theta)
-    out = [x + c * table[:, 0] - s * table[:, 1], y + s * table[:, 0] + c * table[:, 1]]
-    if table.shape[1] == 3:
-        out.append(wrapped(table[:, 2] + theta))
-    return np.stack(out, axis=1)
-
-
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Angles [rad] in [-π, π]; those that are there already stay as they are."""
-    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
+    width = table.shape[1]
+    return compose(of, np.pad(table, ((0, 0), (0, 3 - width))))[:, :width]
 
 
 def pose_pair(

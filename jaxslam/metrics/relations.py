@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.logs.streams import relative
-from jaxslam.metrics.paths import pose_pair, poses_of, wrapped
+from jaxslam.math.numpy_poses import between, wrapped
+from jaxslam.metrics.paths import pose_pair, poses_of
 
 Spacing = float | Sequence[float] | None
 
@@ -199,6 +199,4 @@ def travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]:
 def _between(
     path: Float[np.ndarray, "K 3"], first: Int[np.ndarray, "R"], second: Int[np.ndarray, "R"]
 ) -> Relations:
-    pose = relative(path[first], path[second])
-    pose[:, 2] = wrapped(pose[:, 2])
-    return Relations(first, second, pose)
+    return Relations(first, second, between(path[first], path[second]))

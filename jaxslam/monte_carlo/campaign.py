@@ -30,7 +30,7 @@ from jaxslam.monte_carlo.kept import Keep, add_kept
 from jaxslam.monte_carlo.pieces import check_part, cores, in_part, missing
 from jaxslam.monte_carlo.record import Campaign, Interrupted
 from jaxslam.monte_carlo.together import gathered_tallies, share
-from jaxslam.monte_carlo.work import Work, shown
+from jaxslam.monte_carlo.work import Work, shown_progress
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario, with_positions
 from jaxslam.validation import check_record
@@ -127,7 +127,7 @@ def monte_carlo(
     todo = share([piece for piece in pieces if in_part(piece[0], plan.wide, part)])
     work = Work(workers, keep, progress or None, glimpse, {name: Tally() for name in names})
     try:
-        with shown(work, plan, progress is None):
+        with shown_progress(work, plan, progress is None):
             work.in_blocks_that_fit(plan, todo)
         interrupted = False
     except KeyboardInterrupt:

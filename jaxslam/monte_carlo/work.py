@@ -117,7 +117,7 @@ class Work:
 
 
 @contextlib.contextmanager
-def shown(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
+def shown_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
     """A block in which, if wanted, a bar of progress tells of the work where it can be seen."""
     count = len(plan.filters)
     bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None

@@ -57,7 +57,7 @@ def line(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
         return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1])])
 
     def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        return carried(sensor_pose(pose), z)
+        return line_from_frame(sensor_pose(pose), z)
 
     def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
         frame = sensor_pose(pose)
@@ -83,13 +83,13 @@ def line(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
         invert=invert,
         position=se2.rectangular,
         embed=lambda pose, point: se2.polar(point),
-        carry=carried,
+        carry=line_from_frame,
         observe_jacobians=observe_jacobians,
         invert_jacobians=invert_jacobians,
     )
 
 
-def carried(frame: Pose, landmark: Landmark) -> Landmark:
+def line_from_frame(frame: Pose, landmark: Landmark) -> Landmark:
     """A line (r, α) of a frame in the coordinates that its pose is in: (r + n·t, α + θ)."""
     alpha = landmark[1] + frame[2]
     return jnp.stack([landmark[0] + _along(alpha, frame), wrap(alpha)])

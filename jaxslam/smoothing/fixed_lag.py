@@ -14,8 +14,8 @@ from jaxslam.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.smoothing.window import (
-    Prior,
     WindowIterate,
+    WindowPrior,
     WindowSteps,
     linearize_window,
     marginalize_oldest,
@@ -34,7 +34,7 @@ class WindowState(NamedTuple):
 
     joint: Joint
     """the newest pose and the map"""
-    prior: Prior
+    prior: WindowPrior
     """of the oldest pose of the window, and of the map before it"""
     steps: WindowSteps
     at: WindowIterate
@@ -161,7 +161,7 @@ def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -
     )
     path = jnp.tile(joint.pose, (window + 1, 1))
     at = WindowIterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
-    return WindowState(joint, Prior(joint, (joint.pose, joint.landmarks)), steps, at)
+    return WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
 
 
 def shift(

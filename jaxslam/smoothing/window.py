@@ -24,7 +24,7 @@ from jaxslam.smoothing.chain import CostToGo, Gain, LinearizedStep, eliminate_st
 from jaxslam.smoothing.linearization import pose_difference, whitened_rows
 
 
-class Prior(NamedTuple):
+class WindowPrior(NamedTuple):
     """The Gaussian of the oldest pose and of the landmarks measured before it."""
 
     joint: Joint
@@ -68,13 +68,19 @@ class WindowSolution(NamedTuple):
 
 
 def linearize_window(
-    motion: Motion, sensor: Sensor, prior: Prior, steps: WindowSteps, at: WindowIterate, first: bool
+    motion: Motion,
+    sensor: Sensor,
+    prior: WindowPrior,
+    steps: WindowSteps,
+    at: WindowIterate,
+    first: bool,
 ) -> LinearizedStep:
     """The steps of the window linearized at an iterate, as `chain.LinearizedStep`.
 
-    first: Jacobians by a variable that the prior is of are taken at `Prior.points`, everything else
-    at the iterate (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag smoothing: algorithm
-    and consistency analysis", ICRA): prior and new terms then share three unobservable directions.
+    first: Jacobians by a variable that the prior is of are taken at `WindowPrior.points`,
+    everything else at the iterate (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag
+    smoothing: algorithm and consistency analysis", ICRA): prior and new terms then share three
+    unobservable directions.
     By the oldest pose F = [I, J(p_1 - p_0); 0, 1] with p_0 there, J = [0, -1; 1, 0].
     """
     landmark_points = at.landmarks
@@ -107,7 +113,7 @@ def linearize_window(
 
 
 def solve_window(
-    prior: Prior, system: LinearizedStep, at: WindowIterate, alive: Bool[Array, "N"]
+    prior: WindowPrior, system: LinearizedStep, at: WindowIterate, alive: Bool[Array, "N"]
 ) -> WindowSolution:
     """The solution of a linearized window. alive: the landmarks of the map.
 
@@ -192,12 +198,12 @@ def newest_cov(system: LinearizedStep, solved: WindowSolution) -> Float[Array, "
 
 
 def marginalize_oldest(
-    prior: Prior,
+    prior: WindowPrior,
     system: LinearizedStep,
     steps: WindowSteps,
     at: WindowIterate,
     tag: Int[Array, "N"],
-) -> Prior:
+) -> WindowPrior:
     """The prior of the second pose, with the first motion and the first scan of the window in it.
 
     The Kalman filter of the linearized step about the iterate: prediction, correction by the whole
@@ -254,6 +260,6 @@ def marginalize_oldest(
         tag[slot],
     )
     points = at.path[1], jnp.where(joint.alive[:, None], prior.points[1], at.landmarks)
-    moved = Prior(after, points)
-    chosen: Prior = jax.tree.map(lambda then, now: jnp.where(there, then, now), moved, prior)
+    moved = WindowPrior(after, points)
+    chosen: WindowPrior = jax.tree.map(lambda then, now: jnp.where(there, then, now), moved, prior)
     return chosen

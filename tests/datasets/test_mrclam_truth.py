@@ -2,6 +2,7 @@
 
 import gzip
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,7 +64,7 @@ def test_files_may_be_packed(tmp_path):
         (tmp_path / f"{file.name}.gz").write_bytes(gzip.compress(file.read_bytes()))
         file.unlink()
     packed = datasets.mrclam(tmp_path, 2)
-    jax.tree.map(np.testing.assert_array_equal, plain.log, packed.log)
+    chex.assert_trees_all_equal(plain.log, packed.log)
     np.testing.assert_array_equal(plain.true_path, packed.true_path)
 
 

@@ -3,9 +3,8 @@
 import os
 import re
 
+import chex
 import hypothesis.strategies as st
-import jax
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from recordings import BONN, MRCLAM, TEAM, VICTORIA, write
@@ -78,10 +77,8 @@ def edited(content, edits):
 
 def assert_whole(data):
     """Finite numbers, in shapes that fit together (`Dataset` checks them)."""
-    for leaf in (*jax.tree.leaves(data.log), data.time, data.pose, data.pose_cov):
-        assert np.isfinite(leaf).all()
-    for maybe in (data.landmarks, data.true_path):
-        assert maybe is None or np.isfinite(maybe).all()
+    chex.assert_tree_all_finite((data.log, data.time, data.pose, data.pose_cov))
+    chex.assert_tree_all_finite((data.landmarks, data.true_path))
 
 
 def assert_told(path, error):

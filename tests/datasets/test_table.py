@@ -3,7 +3,7 @@
 import gzip
 import re
 
-import jax
+import chex
 import numpy as np
 import pytest
 from recordings import write
@@ -92,8 +92,7 @@ def test_windows_lines_degrees_and_other_columns(tmp_path):
     text += "3,-28.64788975654116,b,1100,3\r\n3,28.64788975654116,c,1400,4"
     (tmp_path / "measurements.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
     data = datasets.table(tmp_path)
-    for found, expected in zip(jax.tree.leaves(data.log), jax.tree.leaves(plain.log), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-15)
+    chex.assert_trees_all_close(data.log, plain.log, rtol=1e-14, atol=1e-15)
     assert "column 'note' of measurements.csv is not used" in data.assumed
 
 
@@ -106,8 +105,7 @@ def test_packed_tables_are_read_as_they_are(tmp_path):
     data = datasets.table(tmp_path)
     assert (data.tags, data.assumed) == (plain.tags, plain.assumed)
     for name in ("log", "pose", "landmarks", "true_path"):
-        for pair in zip(*(jax.tree.leaves(getattr(d, name)) for d in (data, plain)), strict=True):
-            np.testing.assert_array_equal(*pair)
+        chex.assert_trees_all_equal(getattr(data, name), getattr(plain, name))
     spoiled = OWN["odometry.csv"].replace("1.2,1.0", "1.2,nan").encode()
     (tmp_path / "odometry.csv.gz").write_bytes(gzip.compress(spoiled))
     place = re.escape(f"{tmp_path / 'odometry.csv.gz'}:3: column 2 (v [m/s]): expected a finite")

@@ -345,15 +345,13 @@ def logs():
 
 
 def runner(capacity, **options):
-    """A whole-log run of the tiny world's filter, to compile or map; counts its traces."""
+    """A whole-log run of the tiny world's filter, to compile or map."""
     scenario = tiny()
     filter = ekf_slam(scenario.motion, scenario.sensor, capacity, **options)
 
     def go(log):
-        go.traces += 1
         return run(filter, log, scenario.pose, scenario.pose_cov, KEY, probe=lambda s: s)
 
-    go.traces = 0
     return go
 
 
@@ -363,23 +361,21 @@ def take(tree, i):
 
 @pytest.fixture(scope="module")
 def single():
-    """The run of one log, compiled, and its count of traces."""
-    go = runner(8)
-    compiled = jax.jit(go)
-    return lambda log: jax.device_get(compiled(log)), lambda: go.traces
+    """The run of one log, compiled; a second trace is an error."""
+    compiled = jax.jit(chex.assert_max_traces(runner(8), n=1))
+    return lambda log: jax.device_get(compiled(log))
 
 
 def test_vmap_is_a_loop_and_one_trace_serves_all_logs(logs, single):
     mapped = jax.device_get(jax.jit(jax.vmap(runner(8)))(logs[1]))
     for i in range(3):
-        assert_same(take(mapped, i), single[0](take(logs[1], i)), atol=1e-11)
-    assert single[1]() == 1
+        assert_same(take(mapped, i), single(take(logs[1], i)), atol=1e-11)
 
 
 def test_capacity_8_is_a_larger_one(logs, single):
     capacity = 70  # P is passed over in another way beyond 128 rows
     roomy = jax.device_get(jax.jit(runner(capacity))(take(logs[1], 0)))
-    tight = single[0](take(logs[1], 0))
+    tight = single(take(logs[1], 0))
     assert tight.estimate.alive[-1].sum() >= 4
     cut = [part[:, :8] for part in roomy.estimate[2:]]
     assert_same([*roomy.estimate[:2], *cut], list(tight.estimate), atol=1e-12)
@@ -388,17 +384,19 @@ def test_capacity_8_is_a_larger_one(logs, single):
     np.testing.assert_array_equal(roomy.final.cov[19:], np.eye(3 + 2 * capacity)[19:])
 
 
-def test_jit_is_no_jit():
-    """Of prediction and estimate; op by op, an update compiles for 20 s and has no branch to test."""
-    joint = jax.tree.map(jnp.asarray, some_joint((True, False)))
-    filter = ekf_slam(MOTION, SENSOR, 2)
+class TestOneStep(chex.TestCase):
+    """Prediction and estimate; op by op, an update compiles for 20 s and has no branch to test."""
 
-    def step(joint, u):
-        joint = filter.predict(joint, u, KEY)
-        return joint, filter.estimate(joint)
+    @chex.variants(with_jit=True, without_jit=True, with_device=True, without_device=True)
+    def test_compiled_or_not_of_host_or_device_arrays(self):
+        joint, filter = some_joint((True, False)), ekf_slam(MOTION, SENSOR, 2)
 
-    u = jnp.array([0.1, 0.2])
-    assert_same(step(joint, u), jax.jit(step)(joint, u), atol=1e-13)
+        def step(joint, u):
+            joint = filter.predict(joint, u, KEY)
+            return joint, filter.estimate(joint)
+
+        u = np.array([0.1, 0.2])
+        assert_same(self.variant(step)(joint, u), jax.jit(step)(joint, u), atol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -449,7 +447,7 @@ def test_jacobians_at_the_truth_make_the_covariance_independent_of_the_data(logs
     observe = jax.jit(jax.vmap(jax.vmap(SENSOR.observe, (None, 0))))
     z = np.asarray(observe(exact.pose, exact.landmarks[log.scan.tag]))
     faultless = log._replace(scan=log.scan._replace(z=z))
-    usual = single[0](faultless)
+    usual = single(faultless)
     np.testing.assert_allclose(ideal(exact, faultless).probe, usual.probe.cov, rtol=0, atol=1e-12)
     np.testing.assert_allclose(usual.estimate.pose, exact.pose, atol=1e-12)
 

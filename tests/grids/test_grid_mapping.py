@@ -2,6 +2,7 @@
 
 import itertools
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def test_order_does_not_matter_and_what_no_beam_saw_is_unknown():
     forward = counted(poses, beams)
     shuffled = np.random.default_rng(1).permutation(len(poses))
     back = counted(poses[shuffled], Beams(*(np.asarray(part)[shuffled] for part in beams)))
-    jax.tree.map(np.testing.assert_array_equal, forward, back)
+    chex.assert_trees_all_equal(forward, back)
     seen = np.asarray(forward.hits + forward.misses) > 0
     for grid in (grids.occupancy(forward, hit=0.8), grids.reflection(forward)):
         assert np.all(np.asarray(grid.log_odds)[~seen] == 0)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from jaxslam.laser_slam import ScanLog, Settings, poses
+from jaxslam.laser_slam import ScanLog, Settings
+from jaxslam.math import numpy_poses as poses
 from jaxslam.types import Beams
 
 SETTINGS = Settings(

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from jaxslam.laser_slam import poses
-from jaxslam.laser_slam.assembly import graph_of, relative, table_of
+from jaxslam.laser_slam import covariances
+from jaxslam.laser_slam.assembly import graph_of, relative_covs, table_of
 from jaxslam.laser_slam.loops.descriptor import SECTORS, descriptors
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
+from jaxslam.math import numpy_poses as poses
 
 
 @pytest.fixture(scope="module")
@@ -17,21 +18,23 @@ def chain():
     root = 0.05 * random.normal(size=(11, 3, 3))
     covs = root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(3)
     path = poses.chain(np.array([1.0, -2.0, 0.7]), steps)
-    return path, steps, covs, poses.along(path, covs)
+    return path, steps, covs, covariances.along(path, covs)
 
 
 def test_covariance_along_a_chain_step_by_step(chain):
     path, steps, covs, total = chain
     cov = np.zeros((3, 3))
     for k in range(4, 9):
-        cov = poses.composed_cov(cov, steps[k], covs[k])
+        cov = covariances.composed_cov(cov, steps[k], covs[k])
     np.testing.assert_allclose(
-        poses.relative_cov(total, path, np.array(4), np.array(9)), cov, rtol=1e-9
+        covariances.relative_cov(total, path, np.array(4), np.array(9)), cov, rtol=1e-9
     )
     z = poses.between(path[4], path[9])
-    back = poses.relative_cov(total, path, np.array(9), np.array(4))
-    np.testing.assert_allclose(poses.moved(cov, poses.inverse(z)), back, rtol=1e-9)
-    np.testing.assert_allclose(poses.at_end(poses.of_coordinates(cov, z), z), cov, rtol=1e-9)
+    back = covariances.relative_cov(total, path, np.array(9), np.array(4))
+    np.testing.assert_allclose(covariances.moved(cov, poses.inverse(z)), back, rtol=1e-9)
+    np.testing.assert_allclose(
+        covariances.at_end(covariances.of_coordinates(cov, z), z), cov, rtol=1e-9
+    )
 
 
 def test_covariance_along_a_chain_is_that_of_the_graph(chain):
@@ -40,7 +43,7 @@ def test_covariance_along_a_chain_is_that_of_the_graph(chain):
     graph = graph_of(path, index, table_of(index[:-1], index[1:], steps, covs))
     pairs = np.array([[2, 7], [0, 11]])
     np.testing.assert_allclose(
-        relative(graph, pairs), poses.relative_cov(total, path, *pairs.T), rtol=1e-6
+        relative_covs(graph, pairs), covariances.relative_cov(total, path, *pairs.T), rtol=1e-6
     )
 
 
@@ -69,7 +72,7 @@ def test_true_loops_agree_as_often_as_their_probability_says(chain):
         error = (root @ random.normal(size=(11, 3, 1)))[..., 0]
         drawn = poses.chain(path[0], poses.compose(steps, error))
         z = poses.compose(true, 1e-3 * random.normal(size=(2, 3)))
-        total = poses.along(drawn, 1e-3 * covs)
+        total = covariances.along(drawn, 1e-3 * covs)
         agreed += consistent(drawn, total, first, second, z, cov, 0.9)[0, 1]
     assert abs(agreed / 300 - 0.9) < 3 * np.sqrt(0.9 * 0.1 / 300)
 

@@ -1,5 +1,6 @@
 """The iterative closest point methods: one step in NumPy, accuracy, outliers, bad scans."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -119,7 +120,7 @@ def test_bad_scans_have_a_status(found):
         end = found[name, None]
         assert list(end.status[4:6]) == [MatchStatus.TOO_FEW] * 2
         assert end.status[6] == MatchStatus.UNLIKE
-        assert all(np.all(np.isfinite(part)) for part in jax.tree.leaves(end))
+        chex.assert_tree_all_finite(end)
         np.testing.assert_allclose(end.pose[4:6], STARTS[4:6])
         assert np.all(end.pair[4:6] == -1) and np.all(end.inliers[4:6] == 0)
 

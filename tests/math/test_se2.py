@@ -12,6 +12,8 @@ import scipy.linalg
 from reference.plane import assert_same_poses, matrix, pose_of
 
 from jaxslam import se2
+from jaxslam.math import numpy_poses
+from jaxslam.math.angles import wrap
 
 
 def poses_of(angles, rng, spread=3.0):
@@ -199,6 +201,17 @@ def test_align_minimises_the_squared_distances():
 def test_align_of_one_point_is_a_translation():
     moved = jax.jit(se2.align)(np.array([[1.0, 2.0]]), np.array([[4.0, -2.0]]))
     np.testing.assert_allclose(moved, [3, -4, 0], atol=1e-15)
+
+
+def test_on_the_host_the_same(cases):
+    a, b, _ = cases
+    for name, of in {"compose": (a, b), "between": (a, b), "inverse": (a,)}.items():
+        assert_same_poses(getattr(numpy_poses, name)(*of), batched(getattr(se2, name), *of), 1e-13)
+    np.testing.assert_allclose(numpy_poses.adjoint(a), batched(se2.adjoint, a), rtol=1e-14)
+    angle = np.concatenate([a[:, 2], a[:, 2] + 6 * np.pi, [np.pi, -np.pi]])
+    np.testing.assert_allclose(numpy_poses.wrapped(angle), jax.jit(wrap)(angle), atol=1e-14)
+    steps = numpy_poses.between(a[:-1], a[1:])
+    assert_same_poses(numpy_poses.chain(a[0], steps), a)
 
 
 def test_float32_in_float32_out(cases):

@@ -2,6 +2,7 @@
 
 import functools
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -183,8 +184,7 @@ def test_a_perfect_sensor_of_a_pose_known_exactly_is_singular_and_changes_nothin
     np.testing.assert_array_equal(trace.info.status, there.astype(np.int32))
     assert (trace.info.slot == -1).all()
     assert not trace.estimate.pose_cov.any()
-    for leaf in jax.tree.leaves((trace.estimate, trace.info)):
-        assert np.isfinite(leaf).all()
+    chex.assert_tree_all_finite((trace.estimate, trace.info))
 
 
 # --- simulated ----------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import dataclasses
 import threading
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,12 +58,9 @@ def test_a_program_gives_what_the_function_does():
     truth, log = simulate(there, key)
     plain = jax.jit(lambda log: run(ekf, log, there.pose, there.pose_cov, key))(log)
     ours = run(ekf, log, there.pose, there.pose_cov, key)
-    assert jax.tree.structure(plain) == jax.tree.structure(ours)
-    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(ours), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    chex.assert_trees_all_close(plain, ours, rtol=1e-9, atol=1e-12)
     drawn = jax.jit(lambda key: simulate(there, key))(key)
-    for a, b in zip(jax.tree.leaves(drawn), jax.tree.leaves((truth, log)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    chex.assert_trees_all_close(drawn, (truth, log), rtol=1e-9, atol=1e-12)
     none = run(worlds.ekf(there, gate=1e-6, update="joint"), log, there.pose, there.pose_cov, key)
     assert int(none.info.tally(Status.REJECTED).sum()) > int(ours.info.tally(Status.REJECTED).sum())
 
@@ -186,8 +184,7 @@ def test_every_kind_of_number_becomes_an_input():
     for s in (1.01, 0.97):
         traced = programs.trace(make(s), x)
         ours = jax.tree.unflatten(traced.out, jax.jit(traced.call)(traced.numbers, x))
-        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(make(s)(x)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-14)
+        chex.assert_trees_all_close(ours, make(s)(x), rtol=1e-14)
         texts.add(jax.jit(traced.call).lower(traced.numbers, x).as_text())
     assert len(texts) == 1
 

@@ -19,7 +19,7 @@ from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
-from jaxslam.graphs.validation import label, variables_of
+from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import check_writable, csv_text, json_text, versions, write_files
 from jaxslam.types import JaxOrNumPy
@@ -181,7 +181,7 @@ def _worst(
     found = []
     for _, key, row in sorted(rows, key=lambda entry: -entry[0])[:WORST]:
         one = graph.tables[key]._replace(valid=np.arange(len(squared[key])) == row)
-        between = variables_of(graph, one, factors[key])[0]
+        between = variables_in(graph, one, factors[key])[0]
         found.append(
             {
                 "table": key,

@@ -16,7 +16,7 @@ from jaxslam.cli.films import NAMES as FILMS
 from jaxslam.cli.laser.command import run_laser
 from jaxslam.cli.laser.options import READERS as LASER_LOGS
 from jaxslam.cli.laser.options import refuse_laser_options
-from jaxslam.cli.run.film import film_steps, films, shown
+from jaxslam.cli.run.film import film_steps, films, shown_state
 from jaxslam.cli.run.filters import chosen_filters, with_options
 from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.datasets import READERS, Dataset, Reader
@@ -122,7 +122,7 @@ def _run(
             check=check,
             progress=progress,
             at=at,
-            watch=shown,
+            watch=shown_state,
         )
     seconds = time.perf_counter() - began
     last = result.last

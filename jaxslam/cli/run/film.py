@@ -20,7 +20,7 @@ def film_steps(data: Dataset) -> Int[np.ndarray, "F"]:
     return frame_steps(data.steps, time=data.time)
 
 
-def shown(state: PyTree) -> PyTree:
+def shown_state(state: PyTree) -> PyTree:
     """What a film shows of a filter's own state."""
     from jaxslam.results import plot  # matplotlib is slow to load
 

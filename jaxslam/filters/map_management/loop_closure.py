@@ -117,7 +117,7 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
     recent, candidates = recent_cluster(joint, settings)
     old, report = change_where(
         candidates.any(axis=1).sum() >= settings.least,
-        lambda _: search(joint, chart, recent, candidates, settings),
+        lambda _: old_slots(joint, chart, recent, candidates, settings),
         (jnp.full(recent.shape, -1, jnp.int32), no_closing()),
     )
     joint = change_where(
@@ -146,7 +146,7 @@ def recent_cluster(
     return cluster, recent[cluster][:, None] & joint.alive[None, :] & later
 
 
-def search(
+def old_slots(
     joint: Joint,
     chart: Chart,
     recent: Int[Array, "M"],

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.solution.dual import FACTORS, dual, weights_of
+from jaxslam.graphs.solution.dual import FACTORS, chordal_weights, dual
 from jaxslam.graphs.solver.batch import in_one_dtype, over_batch
 from jaxslam.graphs.solver.linearized import data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
@@ -134,7 +134,7 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     tables = {}
     for name, factor in model.factors:
         table = graph.tables[name]
-        weights = weights_of(FACTORS[factor.name].name, table.information)
+        weights = chordal_weights(FACTORS[factor.name].name, table.information)
         unit = jnp.eye(weights.shape[1], dtype=dtype)[None, ..., None]
         tables[name] = table._replace(information=unit * weights[:, None])
     chordal = Model(tuple((name, FACTORS[factor.name]) for name, factor in model.factors))

@@ -61,7 +61,7 @@ def _point_rows(z: Array) -> list[list[list[Array]]]:
 ROWS = {"relative_pose": _pose_rows, "relative_position": _point_rows}
 
 
-def weights_of(name: str, information: Float[JaxOrNumPy, "E R R B"]) -> Float[Array, "E S B"]:
+def chordal_weights(name: str, information: Float[JaxOrNumPy, "E R R B"]) -> Float[Array, "E S B"]:
     """τ, τ, κ, κ or τ, τ, as many as chordal residuals; zero for a prior."""
     near = 0.5 * (information[:, 0, 0] + information[:, 1, 1])
     if name == "prior":

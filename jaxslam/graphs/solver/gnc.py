@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.solver.linearized import cost, data_of, row_costs, variables_of
+from jaxslam.graphs.solver.linearized import chi2_of, data_of, row_costs, variables_of
 from jaxslam.graphs.solver.model import Model
 from jaxslam.graphs.solver.plan import Plan
 from jaxslam.graphs.solver.search import Ending, Solution, minimize
@@ -107,7 +107,7 @@ def graduated(
     end = jax.lax.while_loop(again, work, state)
     found, converged = end.found, end.found.status == Ending.CONVERGED
     return found._replace(
-        chi2=cost(model, plan.who, variables_of(found.graph), data),
+        chi2=chi2_of(model, plan.who, variables_of(found.graph), data),
         status=jnp.where(converged & ~end.settled, Ending.EXHAUSTED, found.status),
     )
 

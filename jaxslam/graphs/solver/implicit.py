@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.batch import over_batch, with_batch
 from jaxslam.graphs.solver.linearized import (
-    cost,
+    chi2_of,
     data_of,
-    hessian,
+    half_hessian,
     linearize,
     retract,
     variables_of,
@@ -33,13 +33,13 @@ def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solutio
     points = jnp.where(graph.fixed_point[:, None], graph.points, still[1])
     there = with_batch(graph._replace(poses=poses, points=points))
     variables, data = variables_of(there), data_of(there, plan.column)
-    blocks = jax.lax.stop_gradient(hessian(model, plan, variables, data))
+    blocks = jax.lax.stop_gradient(half_hessian(model, plan, variables, data))
     gradient = linearize(model, plan, variables, data).gradient
     step = _solved(plan, blocks[..., 0], gradient[..., 0])
     end = retract(variables, -step[..., None], plan)
     return jax.lax.stop_gradient(found)._replace(
         graph=graph._replace(poses=end.poses[..., 0], points=end.points[..., 0]),
-        chi2=cost(model, plan.who, variables, data)[0],
+        chi2=chi2_of(model, plan.who, variables, data)[0],
     )
 
 

@@ -88,7 +88,7 @@ def row_costs(
     return e, s, s if kernel is None else kernel.cost(s)
 
 
-def cost(
+def chi2_of(
     model: Model, who: Mapping[str, Array], variables: Variables, data: Data
 ) -> Float[Array, "B"]:
     """χ²."""
@@ -144,7 +144,9 @@ def _assembled(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d
     return out + jnp.where(held[:, None], unit, 0.0)
 
 
-def hessian(model: Model, plan: Plan, variables: Variables, data: Data) -> Float[Array, "M d d B"]:
+def half_hessian(
+    model: Model, plan: Plan, variables: Variables, data: Data
+) -> Float[Array, "M d d B"]:
     """Half the second derivative of χ² by the increments, as `System.blocks`."""
     width, poses = data.free.shape[1], len(variables.poses)
     blocks = []

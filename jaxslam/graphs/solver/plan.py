@@ -13,7 +13,7 @@ from jaxslam.graphs.solver.model import factors_of
 from jaxslam.graphs.sparse.cholesky import CholeskyTables, cholesky_tables
 from jaxslam.graphs.sparse.gathered import Stages, stages
 from jaxslam.graphs.sparse.inverse import InverseTables, inverse_tables
-from jaxslam.graphs.sparse.sweeps import table
+from jaxslam.graphs.sparse.sweeps import index_table
 from jaxslam.graphs.sparse.symbolic import factor_pattern
 from jaxslam.validation.numbers import is_concrete
 
@@ -114,17 +114,17 @@ def plan(
         blocks.append(target.ravel())
     block_column, block_row = pattern.columns[order], pattern.rows[order]
     return Plan(
-        who={name: table(rows) for name, rows in who.items()},
-        order=table(pattern.order),
-        column=table(pattern.position),
+        who={name: index_table(rows) for name, rows in who.items()},
+        order=index_table(pattern.order),
+        column=index_table(pattern.position),
         information=stages(np.concatenate(blocks), len(order)),
         gradient=stages(np.concatenate([column.ravel() for column in columns]), size),
-        block_column=table(block_column),
-        block_row=table(block_row),
-        on_diagonal=table(block_row == block_column),
+        block_column=index_table(block_column),
+        block_row=index_table(block_row),
+        on_diagonal=index_table(block_row == block_column),
         cholesky=cholesky,
         inverse=inverse_tables(pattern, place, *wanted.T) if marginals else None,
-        pairs=table(wanted),
+        pairs=index_table(wanted),
     )
 
 

@@ -17,12 +17,12 @@ from jaxslam.graphs.sparse.sweeps import (
     Sums,
     Sweep,
     finish,
+    index_table,
     nothing,
     padded,
     places,
     subtract_products,
     sweep,
-    table,
 )
 from jaxslam.graphs.sparse.symbolic import Ints, Pattern
 from jaxslam.math.linalg import total
@@ -84,13 +84,13 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
     backward_order, backward_place = places(upward)
     return CholeskyTables(
         factor,
-        diagonal=table(place[pattern.first[:-1]]),
-        pivots=table(np.cumsum([0, *map(len, chunks)])),
-        pivot_base=table(np.concatenate(chunks)),
+        diagonal=index_table(place[pattern.first[:-1]]),
+        pivots=index_table(np.cumsum([0, *map(len, chunks)])),
+        pivot_base=index_table(np.concatenate(chunks)),
         forward=sweep(downward, place, forward_place, one),
-        forward_order=table(forward_order),
+        forward_order=index_table(forward_order),
         backward=sweep(upward, place, backward_place, one),
-        backward_order=table(backward_order),
+        backward_order=index_table(backward_order),
     ), place
 
 

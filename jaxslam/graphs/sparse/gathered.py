@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxslam.graphs.sparse.sweeps import table
+from jaxslam.graphs.sparse.sweeps import index_table
 
 TERMS = 4
 
@@ -26,7 +26,7 @@ def stages(target: Int[np.ndarray, "rows"], size: int) -> Stages:
         sums = np.full((groups.sum(), TERMS), absent, np.int32)
         rank = np.arange(len(owner)) - begin[owner]
         sums[group_begin[owner] + rank // TERMS, rank % TERMS] = numbers
-        out.append(table(sums))
+        out.append(index_table(sums))
         if last:
             return tuple(out)
         owner = np.repeat(np.arange(size), groups)

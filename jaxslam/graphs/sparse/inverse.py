@@ -12,11 +12,11 @@ from jaxslam.graphs.sparse.sweeps import (
     Sums,
     Sweep,
     finish,
+    index_table,
     nothing,
     places,
     subtract_products,
     sweep,
-    table,
 )
 from jaxslam.graphs.sparse.symbolic import Ints, Pattern
 
@@ -62,9 +62,9 @@ def inverse_tables(
     pairs = place[pattern.find(np.maximum(one, other), np.minimum(one, other))]
     return InverseTables(
         sweep(sums, place, cholesky_places, end),
-        table(place[pattern.first[:-1]]),
-        table(pairs),
-        table(one < other),
+        index_table(place[pattern.first[:-1]]),
+        index_table(pairs),
+        index_table(one < other),
     )
 
 

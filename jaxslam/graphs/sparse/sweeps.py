@@ -57,7 +57,7 @@ class Sweep(NamedTuple):
     """whether the left factor is transposed"""
 
 
-def table(numbers: np.ndarray) -> Array:
+def index_table(numbers: np.ndarray) -> Array:
     """A table of integers or flags, on the device."""
     kept = numbers if numbers.dtype == bool else numbers.astype(np.int32)
     return jnp.asarray(jax.device_put(kept))
@@ -118,17 +118,17 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
     ending = order[np.minimum(end_place, size - 1)]
 
     def factors(numbers: Ints, place: Ints) -> Array:
-        return table(place[np.where(real, np.append(numbers, 0)[product], -1)])
+        return index_table(place[np.where(real, np.append(numbers, 0)[product], -1)])
 
     return Sweep(
-        table(np.array(rounds)),
-        table(bases),
+        index_table(np.array(rounds)),
+        index_table(bases),
         factors(sums.left, left),
         factors(sums.right, right),
-        table(np.array(ends)),
-        table(np.array(end_base, int)),
-        table(end[np.where(inside, ending, -1)]),
-        None if sums.flip is None else table(np.append(sums.flip, False)[product]),
+        index_table(np.array(ends)),
+        index_table(np.array(end_base, int)),
+        index_table(end[np.where(inside, ending, -1)]),
+        None if sums.flip is None else index_table(np.append(sums.flip, False)[product]),
     )
 
 

@@ -11,7 +11,7 @@ from jaxslam.graphs.starts.relative import (
     Relative,
     anchors_of,
     as_before,
-    relative_poses,
+    measured_relative_poses,
     with_points,
     with_poses,
 )
@@ -33,7 +33,7 @@ def chordal(graph: Graph, factors: Factors | None = None) -> Graph:
 
     Arguments, points that no relative position places, and errors are those of `odometry`.
     """
-    relative = relative_poses(graph, factors)
+    relative = measured_relative_poses(graph, factors)
     anchors, poses = anchors_of("chordal", graph, relative)
     poses[:, 2] = _headings(relative, anchors, poses[:, 2])
     placed = np.zeros(len(graph.points), bool)

@@ -31,7 +31,7 @@ class Relative(NamedTuple):
     """of e = pose⁻¹ ∘ (xᵢ⁻¹ ∘ xⱼ), to first order"""
 
 
-def relative_poses(graph: Graph, factors: Factors | None) -> Relative:
+def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
     """The relative poses that valid rows between two poses measure, of all tables."""
     found, known = [], factors_of("graphs.starts", graph, factors)
     for key, table in graph.tables.items():

@@ -12,7 +12,7 @@ from jaxslam.graphs.starts.relative import (
     Factors,
     Relative,
     anchors_of,
-    relative_poses,
+    measured_relative_poses,
     with_points,
     with_poses,
 )
@@ -30,7 +30,7 @@ def odometry(graph: Graph, factors: Factors | None = None) -> Graph:
     Raises:
         ValueError: if some pose is not connected to an anchor by relative poses.
     """
-    relative = relative_poses(graph, factors)
+    relative = measured_relative_poses(graph, factors)
     weights = np.abs(relative.second - relative.first).astype(float)
     return with_points(_along_a_tree("odometry", graph, relative, weights), factors)
 
@@ -40,7 +40,7 @@ def spanning_tree(graph: Graph, factors: Factors | None = None) -> Graph:
 
     Arguments, points and errors are those of `odometry`.
     """
-    relative = relative_poses(graph, factors)
+    relative = measured_relative_poses(graph, factors)
     placed = _along_a_tree("spanning_tree", graph, relative, None)
     return with_points(placed, factors)
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.laser_slam import poses
 from jaxslam.laser_slam.settings import Settings
+from jaxslam.math import numpy_poses as poses
 
 SAME = 15
 """Keyframes between submaps that are taken to be of one place."""

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from jaxslam import graphs
 from jaxslam.graphs import Graph
 from jaxslam.graphs.loops import LOOPS
-from jaxslam.laser_slam import poses
-from jaxslam.laser_slam.assembly import graph_of, relative, table_of
+from jaxslam.laser_slam import covariances
+from jaxslam.laser_slam.assembly import graph_of, relative_covs, table_of
 from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_place, near
 from jaxslam.laser_slam.loops.descriptor import descriptors
 from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
@@ -49,7 +49,7 @@ def closed(
     steps, covs = odometry.z[keyframe[1:]], odometry.cov[keyframe[1:]]
     index = np.arange(len(keyframe))
     chain = table_of(index[:-1], index[1:], steps, covs)
-    total = poses.along(at, covs)
+    total = covariances.along(at, covs)
     middle = index[:: max(settings.submap_every, 1)]
     usable = scans.usable[keyframe]
     looks = descriptors(
@@ -65,9 +65,9 @@ def closed(
         path = np.asarray(graph.poses, np.float64)
         pairs = near(path, middle, usable, settings.loop_reach + WIDE[0], settings.loop_gap)
         cov = (
-            poses.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
+            covariances.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
             if turn == 0 or not len(pairs)
-            else relative(graph, pairs)
+            else relative_covs(graph, pairs)
         )
         new = by_place(path, pairs, cov, done, ends, settings, NARROW, WIDE)
         if turn == 0 and settings.appearance:

@@ -1,13 +1,15 @@
 """Candidates matched: a keyframe in a submap, by correlation over a window and by lines."""
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam import programs
-from jaxslam.laser_slam import poses
+from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.loops.candidates import Candidates
 from jaxslam.laser_slam.records import LoopOutcome
 from jaxslam.laser_slam.reference import (
@@ -24,6 +26,7 @@ from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Match, Matcher, MatchStatus, Points
 from jaxslam.matching.surface import Surface
+from jaxslam.math import numpy_poses as poses
 
 NARROW, WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
 """Windows of the search, [m] and [rad] to either side."""
@@ -49,13 +52,16 @@ def matched(
     settings: Settings,
     progress: Callable[[], object],
 ) -> Matches:
-    """The match of each candidate, submap by submap."""
+    """The match of each candidate, submap by submap, on every core."""
     count = len(candidates.first)
     z, cov = np.zeros((count, 3)), np.zeros((count, 3, 3))
     score, outcome = np.zeros(count), np.zeros(count, int)
-    for middle in np.unique(candidates.first):
+
+    def of_submap(middle: np.integer) -> int:
+        """The candidates of one submap; how many."""
         submap, prepared = _submap(scans, keyframe, path, int(middle), settings)
-        for row in np.flatnonzero(candidates.first == middle):
+        rows = np.flatnonzero(candidates.first == middle)
+        for row in rows:
             scan = keyframe[candidates.second[row]]
             fit, status = programs.call(
                 _matched,
@@ -66,13 +72,22 @@ def matched(
                 candidates.z[row].astype(np.float32),
             )
             z[row] = np.asarray(fit.pose, np.float64)
-            cov[row] = poses.at_end(_cov(fit, settings), z[row])
+            cov[row] = covariances.at_end(_cov(fit, settings), z[row])
             score[row] = fit.inliers
             if fit.inliers < settings.loop_inliers:
                 outcome[row] = LoopOutcome.POOR
             elif int(status) == MatchStatus.AMBIGUOUS:
                 outcome[row] = LoopOutcome.AMBIGUOUS
-            progress()
+        return len(rows)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            for done in pool.map(of_submap, np.unique(candidates.first)):
+                for _ in range(done):
+                    progress()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     return Matches(z, cov, score, outcome)
 
 
@@ -97,7 +112,7 @@ def _cov(fit: Match, settings: Settings) -> Float[np.ndarray, "3 3"]:
     """Of the coordinates of a match: by its lines, and by the window where these say nothing."""
     sigma = max(settings.sigma, float(fit.residual)) ** 2 * settings.correlation
     edges = np.diag(1 / np.square([WIDE[0], *WIDE]))
-    cov = np.linalg.inv(poses.semidefinite(np.asarray(fit.information)) / sigma + edges)
+    cov = np.linalg.inv(covariances.semidefinite(np.asarray(fit.information)) / sigma + edges)
     return np.asarray(cov + np.diag(np.square(settings.floor)))
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.laser_slam import poses
+from jaxslam.laser_slam import covariances
+from jaxslam.math import numpy_poses as poses
 from jaxslam.math.stats import chi2_quantile
 
 STARTS = 10
@@ -40,9 +41,11 @@ def consistent(
         back = poses.between(path[second[b]], path[j])
         around = poses.compose(poses.compose(there, z[b]), back)
         error = poses.between(np.broadcast_to(z[a], around.shape), around)
-        spread = poses.relative_cov(total, path, i, first[b])
-        spread = poses.composed_cov(spread, z[b], cov[b])
-        spread = poses.composed_cov(spread, back, poses.relative_cov(total, path, second[b], j))
+        spread = covariances.relative_cov(total, path, i, first[b])
+        spread = covariances.composed_cov(spread, z[b], cov[b])
+        spread = covariances.composed_cov(
+            spread, back, covariances.relative_cov(total, path, second[b], j)
+        )
         spread = spread + cov[a]
         square = np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0])
         out[a, b] = out[b, a] = square < limit

@@ -2,6 +2,7 @@
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,16 +63,6 @@ def expected_z(joint, slot):
     return np.asarray(OBSERVE(joint.pose, joint.landmarks[slot]))
 
 
-def assert_unchanged(before, after):
-    for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-def assert_finite(*trees):
-    for leaf in jax.tree.leaves(trees):
-        assert np.isfinite(leaf).all()
-
-
 # --- what becomes of a measurement --------------------------------------------------------------
 
 
@@ -96,7 +87,7 @@ def test_what_is_dropped_is_told_and_leaves_no_trace(case):
     after, info = updater()(joint, scan_of(*seen))
     assert list(info.status) == wanted + [Status.EMPTY] * (PLACES - len(seen))
     born = [s for s, status in zip(seen, wanted, strict=True) if status == Status.BORN]
-    assert_unchanged(updater()(joint, scan_of(*born))[0] if born else joint, after)
+    chex.assert_trees_all_equal(updater()(joint, scan_of(*born))[0] if born else joint, after)
     assert list(after.tag[count : count + len(born)]) == [tag for tag, *_ in born]
     assert list(info.slot) == [count] * len(born) + [-1] * (PLACES - len(born))
     overflows = wanted.count(Status.OVERFLOW)
@@ -129,7 +120,7 @@ def test_the_gate_rejects_by_the_mahalanobis_distance_of_the_place_alone(update)
             logpdf = scipy.stats.multivariate_normal.logpdf(distance * direction, cov=s)
             np.testing.assert_allclose(info.log_likelihood, logpdf, rtol=1e-10)
         else:
-            assert_unchanged(joint, after)
+            chex.assert_trees_all_equal(joint, after)
             assert float(info.log_likelihood) == 0
 
 
@@ -146,8 +137,8 @@ def test_a_singular_innovation_is_dropped_and_all_stays_finite(update, gate):
     z = expected_z(joint, 1) + 0.01
     after, info = updater(noise=0.0, update=update, gate=gate)(joint, scan_of((1, *z)))
     assert list(info.status) == [Status.SINGULAR, Status.EMPTY, Status.EMPTY]
-    assert_unchanged(joint, after)
-    assert_finite(info)
+    chex.assert_trees_all_equal(joint, after)
+    chex.assert_tree_all_finite(info)
     assert float(info.log_likelihood) == 0
     assert not info.dof.any()
     assert int(info.slot[0]) == -1
@@ -163,8 +154,8 @@ def test_a_half_singular_innovation_is_dropped_whole(update):
     after, info = compiled_update(update=update)(joint, scan_of((1, 2.1, 0.1)), noise)
     assert not info.innovation_cov[0, 0].any()
     assert int(info.status[0]) == Status.SINGULAR
-    assert_unchanged(joint, after)
-    assert_finite(info)
+    chex.assert_trees_all_equal(joint, after)
+    chex.assert_tree_all_finite(info)
 
 
 @pytest.mark.parametrize("places", [3, 5])
@@ -190,8 +181,8 @@ def test_padding_may_hold_nan():
     for update in ("sequential", "joint"):
         expected = updater(update=update, gate=9.0)(joint, good)
         got = updater(update=update, gate=9.0)(joint, spoiled)
-        assert_finite(got)
-        assert_unchanged(expected, got)
+        chex.assert_tree_all_finite(got)
+        chex.assert_trees_all_equal(expected, got)
 
 
 def test_a_removed_landmark_leaves_its_slot_to_the_next():
@@ -218,7 +209,7 @@ def test_starting_where_the_robot_knows_exactly_where_it_is():
     assert int(info.status[0]) == Status.FUSED
     # Twice the data, half the covariance, to first order in the innovation.
     np.testing.assert_allclose(joint.cov[3:5, 3:5], turned @ R @ turned.T / 2, rtol=0.2, atol=1e-4)
-    assert_finite(joint, info)
+    chex.assert_tree_all_finite((joint, info))
 
 
 # --- likelihoods --------------------------------------------------------------------------------
@@ -381,8 +372,7 @@ def test_run_predicts_then_updates_and_records_every_step(good_trace):
         np.testing.assert_allclose(trace.estimate.pose_cov[t], state.cov[:3, :3], atol=1e-14)
         np.testing.assert_allclose(trace.info.log_likelihood[t], info.log_likelihood, atol=1e-11)
         np.testing.assert_array_equal(trace.probe[t], state.tag)
-    for a, b in zip(jax.tree.leaves(trace.final), jax.tree.leaves(state), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-14)
+    chex.assert_trees_all_close(trace.final, state, atol=1e-14, rtol=1e-7)
 
 
 def test_a_repeated_tag_that_escapes_the_check_under_jit_is_born_once(good_trace):
@@ -402,8 +392,8 @@ def test_what_is_not_finite_and_escapes_the_check_under_jit_is_dropped(good_trac
     valid[1, 1] = valid[0, 2] = False
     expected = good_trace(log._replace(scan=log.scan._replace(valid=valid)))
     assert trace.info.status[1, 1] == trace.info.status[0, 2] == Status.REJECTED
-    assert_finite(trace.estimate)
-    assert_unchanged(expected.estimate, trace.estimate)
+    chex.assert_tree_all_finite(trace.estimate)
+    chex.assert_trees_all_equal(expected.estimate, trace.estimate)
     np.testing.assert_array_equal(expected.info.log_likelihood, trace.info.log_likelihood)
 
 

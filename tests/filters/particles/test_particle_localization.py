@@ -322,7 +322,7 @@ def test_runs_of_a_batch_know_nothing_of_each_other_and_float32_stays_float32():
     keys = jax.random.split(KEY, 2)
     batch = jax.jit(jax.vmap(go, (None, 0)))
     both, swapped = batch(log, keys), batch(log, keys[::-1])
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[::-1]), both, swapped)
+    chex.assert_trees_all_equal(both, jax.tree.map(lambda leaf: leaf[::-1], swapped))
     assert np.all(both.final.pose[0] != both.final.pose[1])
     single = worlds.narrow(log)
     for leaf in jax.tree.leaves(jax.eval_shape(go, single, KEY)):

@@ -83,7 +83,7 @@ def moved_cov(
         own = linalg.symmetrize(own if noise is None else own + noise)
         # Stored separately from P, from which it is computed, so that P is written in place.
         robot = materialize(jnp.concatenate([own, robot[:, 3:]], axis=1))
-        return cov.at[:3].set(robot).at[:, :3].set(robot.T)
+        return jnp.asarray(cov).at[:3].set(robot).at[:, :3].set(robot.T)
     if moved.landmark is not None:
         # Stored before it is transposed: each entry would else be computed twice.
         cov = materialize(moved.turn(moved.turn(cov).T))

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.solver.kernels import Kernel
-from jaxslam.matching.closed_form import Quadratic, added, least, of_prior
-from jaxslam.matching.correspondences import Rule, nearest, weights
+from jaxslam.matching.correspondences import Rule, nearest_points, weights
+from jaxslam.matching.icp.closed_form import Quadratic, added, least, of_prior
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import (
     Limits,
@@ -73,7 +73,7 @@ class IcpSettings:
 DEFAULT = IcpSettings()
 
 
-class Pairs(NamedTuple):
+class PairedPoints(NamedTuple):
     """A scan at a pose, and its partners."""
 
     moved: Float[Array, "N 2"]
@@ -91,7 +91,7 @@ class Metric(NamedTuple):
     """(surface, moved points, partners) -> (N,) [m]"""
     usable: Callable[[Surface], Bool[Array, "M"]]
     """which points of the reference may be partners"""
-    quadratic: Callable[[Surface, Pairs, Array], Quadratic]
+    quadratic: Callable[[Surface, PairedPoints, Array], Quadratic]
     """(surface, pairs, middle (2,)) -> Σ w e² of a motion about the middle"""
     cost: Callable[[Surface, Array, Array, Array], Array]
     """(surface, moved points, partners, weights) -> ½ Σ w e²"""
@@ -107,13 +107,13 @@ def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
     rule = Rule(reach, settings.trim, settings.kernel, settings.scale)
     limits = Limits(settings.fewest, settings.least_score, settings.least_condition)
 
-    def pairs_at(of: Surface, points: Points, pose: Array) -> Pairs:
+    def pairs_at(of: Surface, points: Points, pose: Array) -> PairedPoints:
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
-        partner = nearest(of.position, moved)
+        partner = nearest_points(of.position, moved)
         distance = ((moved - of.position[partner]) ** 2).sum(axis=1)
         possible = points.valid & (distance < reach**2) & metric.usable(of)[partner]
         residual = jnp.where(possible, metric.residual(of, moved, partner), 0.0)
-        return Pairs(moved, partner, residual, weights(rule, residual, possible))
+        return PairedPoints(moved, partner, residual, weights(rule, residual, possible))
 
     def match(of: Surface, points: Points, start: Array, prior: Prior | None = None) -> Match:
         length = length_of(points)
@@ -182,7 +182,7 @@ def about(information: Float[Array, "3 3"], arm: Float[Array, "2"]) -> Float[Arr
 
 
 def _information(
-    of: Surface, at: Pairs, pivot: Float[Array, "2"], lone: float
+    of: Surface, at: PairedPoints, pivot: Float[Array, "2"], lone: float
 ) -> Float[Array, "3 3"]:
     """Σ w J Jᵀ turned about the pivot: of the lines of partners, and of those that have none."""
     j, arm = at.partner, at.moved - pivot[None]

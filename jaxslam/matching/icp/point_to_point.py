@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.matching.closed_form import Quadratic, of_points
-from jaxslam.matching.icp import DEFAULT, IcpSettings, Metric, Pairs, icp
+from jaxslam.matching.icp.closed_form import Quadratic, of_points
+from jaxslam.matching.icp.iterations import DEFAULT, IcpSettings, Metric, PairedPoints, icp
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.surface import Surface
 
@@ -28,7 +28,7 @@ def _there(of: Surface) -> Array:
     return jnp.ones(of.straight.shape, bool)
 
 
-def _quadratic(of: Surface, pairs: Pairs, middle: Array) -> Quadratic:
+def _quadratic(of: Surface, pairs: PairedPoints, middle: Array) -> Quadratic:
     used = (pairs.weight > 0)[:, None]
     source = jnp.where(used, pairs.moved - middle[None], 0.0)
     target = jnp.where(used, of.position[pairs.partner] - middle[None], 0.0)

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.matching.closed_form import Quadratic, added, of_lines, of_points
-from jaxslam.matching.icp import DEFAULT, IcpSettings, Metric, Pairs, icp
+from jaxslam.matching.icp.closed_form import Quadratic, added, of_lines, of_points
+from jaxslam.matching.icp.iterations import DEFAULT, IcpSettings, Metric, PairedPoints, icp
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.surface import Surface
 
@@ -30,7 +30,7 @@ def point_to_line(settings: IcpSettings = DEFAULT) -> Matcher:
     def usable(of: Surface) -> Bool[Array, "M"]:
         return of.straight if lone == 0 else jnp.ones_like(of.straight)
 
-    def quadratic(of: Surface, pairs: Pairs, middle: Array) -> Quadratic:
+    def quadratic(of: Surface, pairs: PairedPoints, middle: Array) -> Quadratic:
         j = pairs.partner
         by_line, by_point = _weights(of, j, pairs.weight)
 
