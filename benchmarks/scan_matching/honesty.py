@@ -132,7 +132,7 @@ def error_of(found: matching.Match, truth: np.ndarray) -> tuple[np.ndarray, np.n
     """Error of the pose, and which of the runs have a usable one."""
     error = found.pose - truth
     error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
-    return error, found.status <= MatchStatus.AMBIGUOUS
+    return error, found.status <= MatchStatus.DEGENERATE
 
 
 def scored(world, matcher, way, error, cov, told: Known, usable) -> Row:
