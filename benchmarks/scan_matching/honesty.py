@@ -124,7 +124,7 @@ def judged(runs: int, grid_runs: int) -> tuple[list[Row], list[Error]]:
                 scored(world, name, way, error[usable], cov[usable], told, usable)
                 for way, cov in covs.items()
             ]
-            print(errors[-1], rows[-len(covs) :], file=sys.stderr, flush=True)
+            print(f"{world}, {name}: {errors[-1].statuses}", file=sys.stderr, flush=True)
     return rows, errors
 
 
