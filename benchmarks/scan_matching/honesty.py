@@ -96,8 +96,8 @@ def programs():
                 once = matcher.prepare(reference)  # for all the covariances
                 own = dataclasses.replace(matcher, prepare=lambda _: once)
             found = own.match(own.prepare(reference), scan, start)
-            given = own, reference, scan, found, start, key
-            return found, {way: c.of(*given) for way, c in wanted.items()}
+            scans = ways.MatchedScans(reference, scan, found, start, key)
+            return found, {way: c.of(own, scans) for way, c in wanted.items()}
 
         return jax.jit(lambda rows: jax.lax.map(one, rows))
 

@@ -30,8 +30,8 @@ REFERENCES, SCANS, TRUTH, STARTS = pairs(RUNS, sigma=SIGMA)
 def all_of(matcher, ways):
     def one(reference, scan, start, key):
         found = matcher.match(matcher.prepare(reference), scan, start)
-        given = matcher, reference, scan, found, start, key
-        return found, {name: WAYS[name].of(*given) for name in ways}
+        scans = covariance.MatchedScans(reference, scan, found, start, key)
+        return found, {name: WAYS[name].of(matcher, scans) for name in ways}
 
     keys = jax.random.split(jax.random.key(0), RUNS)
     return jax.device_get(jax.jit(jax.vmap(one))(REFERENCES, SCANS, STARTS, keys))

@@ -5,8 +5,14 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam.matching.covariance.record import MatchCovariance, check_sigma, inverse_of, of_prior
-from jaxslam.matching.matcher import Match, Matcher, Reference
+from jaxslam.matching.covariance.record import (
+    MatchCovariance,
+    MatchedScans,
+    check_sigma,
+    inverse_of,
+    of_prior,
+)
+from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.outcome import information_of
 from jaxslam.matching.points import Points
 from jaxslam.matching.surface import surface
@@ -35,15 +41,8 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
     """
     check_sigma("along_normals", sigma)
 
-    def of(
-        matcher: Matcher,
-        reference: Reference,
-        points: Points,
-        found: Match,
-        start: Array,
-        key: Array,
-    ) -> Float[Array, "3 3"]:
-        del start, key
+    def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, *_ = scans
         if not isinstance(reference, Points):
             raise ValueError(
                 f"along_normals: takes a reference of Points, got {type(reference).__name__}"

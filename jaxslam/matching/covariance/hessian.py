@@ -3,9 +3,14 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.matching.covariance.record import MatchCovariance, curvature, inverse_of, of_prior
-from jaxslam.matching.matcher import Match, Matcher, Reference
-from jaxslam.matching.points import Points
+from jaxslam.matching.covariance.record import (
+    MatchCovariance,
+    MatchedScans,
+    curvature,
+    inverse_of,
+    of_prior,
+)
+from jaxslam.matching.matcher import Matcher
 
 
 def hessian() -> MatchCovariance:
@@ -17,15 +22,8 @@ def hessian() -> MatchCovariance:
     covariance matrix for the IDC algorithm", Robotics and Autonomous Systems 44.
     """
 
-    def of(
-        matcher: Matcher,
-        reference: Reference,
-        points: Points,
-        found: Match,
-        start: Array,
-        key: Array,
-    ) -> Float[Array, "3 3"]:
-        del start, key
+    def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, *_ = scans
         prepared = matcher.prepare(reference)
         free = (found.weight > 0).sum() - (3 if found.prior is None else 0)
         least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(free, 1)

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
+    MatchedScans,
     check_sigma,
     curvature,
     inverse_of,
@@ -14,7 +15,7 @@ from jaxslam.matching.covariance.record import (
     range_count,
     with_ranges,
 )
-from jaxslam.matching.matcher import Match, Matcher, Reference
+from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
 
 
@@ -35,15 +36,8 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
     """
     check_sigma("implicit", sigma)
 
-    def of(
-        matcher: Matcher,
-        reference: Reference,
-        points: Points,
-        found: Match,
-        start: Array,
-        key: Array,
-    ) -> Float[Array, "3 3"]:
-        del start, key
+    def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, *_ = scans
         prepared = matcher.prepare(reference)
 
         def slope(of_reference: Array, of_scan: Array) -> Array:

@@ -8,13 +8,13 @@ from jaxtyping import Array, Float
 
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
+    MatchedScans,
     check_sigma,
     curvature,
     inverse_of,
     of_prior,
 )
-from jaxslam.matching.matcher import Match, Matcher, Reference
-from jaxslam.matching.points import Points
+from jaxslam.matching.matcher import Matcher
 from jaxslam.math import linalg
 
 
@@ -45,15 +45,8 @@ def lattice(
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     prior = np.array([window, window, turn_window]) ** -2.0
 
-    def of(
-        matcher: Matcher,
-        reference: Reference,
-        points: Points,
-        found: Match,
-        start: Array,
-        key: Array,
-    ) -> Float[Array, "3 3"]:
-        del start, key
+    def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, *_ = scans
         prepared = matcher.prepare(reference)
         dtype = found.pose.dtype
         bound = jnp.diag(jnp.asarray(prior, dtype))

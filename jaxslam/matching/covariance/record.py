@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +19,25 @@ from jaxslam.math import linalg
 from jaxslam.validation.numbers import is_concrete
 
 
+class MatchedScans(NamedTuple):
+    """A match with what it was made of."""
+
+    reference: Reference
+    """the one that `matcher.prepare` takes"""
+    points: Points
+    found: Match
+    start: Float[Array, "3"]
+    key: Array
+    """for covariances that draw"""
+
+
 @dataclass(frozen=True, eq=False)
 class MatchCovariance:
     """A covariance of the pose of a match, in its coordinates (x, y, θ)."""
 
     name: str
-    of: Callable[[Matcher, Reference, Points, Match, Array, Array], Array]
-    """(matcher, reference, points, match, start (3,), key) -> (3, 3), finite; the reference is the
-    one that `matcher.prepare` takes. Traceable; of one pair: vmap it."""
+    of: Callable[[Matcher, MatchedScans], Float[Array, "3 3"]]
+    """(matcher, scans) -> (3, 3), finite. Traceable; of one pair: vmap it."""
 
 
 def covariance(
@@ -41,28 +53,18 @@ def covariance(
 
     With a leading axis on the start, and so on all arrays but the key, (B, 3, 3).
     """
-    given = reference, points, found, start, key
-    if np.ndim(start) == 2:
-        return programs.call(_many, (way, matcher), *given)
-    return programs.call(_one, (way, matcher), *given)
+    many = np.ndim(start) == 2
+    keys = jax.random.split(key, len(start)) if many else key
+    scans = MatchedScans(reference, points, found, start, keys)
+    return programs.call(_many if many else _one, (way, matcher), scans)
 
 
-def _one(way: MatchCovariance, matcher: Matcher, *given: PyTree) -> Array:
-    return way.of(matcher, *given)
+def _one(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
+    return way.of(matcher, scans)
 
 
-def _many(
-    way: MatchCovariance,
-    matcher: Matcher,
-    reference: Reference,
-    points: Points,
-    found: Match,
-    start: Array,
-    key: Array,
-) -> Array:
-    keys = jax.random.split(key, len(start))
-    each = jax.vmap(functools.partial(way.of, matcher))
-    return each(reference, points, found, start, keys)
+def _many(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
+    return jax.vmap(functools.partial(way.of, matcher))(scans)
 
 
 def check_sigma(name: str, sigma: ArrayLike) -> None:

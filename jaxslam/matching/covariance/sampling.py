@@ -8,11 +8,12 @@ from jaxtyping import Array, Float
 from jaxslam.matching.covariance.implicit import implicit
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
+    MatchedScans,
     check_sigma,
     range_count,
     with_ranges,
 )
-from jaxslam.matching.matcher import Match, Matcher, Reference
+from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
 from jaxslam.math import linalg, roots
 from jaxslam.math.angles import wrap
@@ -34,14 +35,8 @@ def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
     check_covariance("unscented", start_cov, 3)
     of_noise = implicit(sigma)
 
-    def of(
-        matcher: Matcher,
-        reference: Reference,
-        points: Points,
-        found: Match,
-        start: Array,
-        key: Array,
-    ) -> Float[Array, "3 3"]:
+    def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, start, _ = scans
         root = roots.root_psd(jnp.asarray(start_cov, start.dtype))
         sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
         prepared = matcher.prepare(reference)
@@ -49,7 +44,7 @@ def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
             sides
         )
         apart = _apart(ends, found.pose)
-        return apart.T @ apart / 6 + of_noise.of(matcher, reference, points, found, start, key)
+        return apart.T @ apart / 6 + of_noise.of(matcher, scans)
 
     return MatchCovariance("unscented", of)
 
@@ -70,14 +65,8 @@ def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> Match
     check_covariance("sampling", start_cov, 3)
     check_count("sampling: samples", samples)
 
-    def of(
-        matcher: Matcher,
-        reference: Reference,
-        points: Points,
-        found: Match,
-        start: Array,
-        key: Array,
-    ) -> Float[Array, "3 3"]:
+    def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, start, key = scans
         root = roots.root_psd(jnp.asarray(start_cov, start.dtype))
 
         def one(key: Array) -> Array:
