@@ -4,11 +4,11 @@ from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.grids.distance import distance_field
-from jaxslam.grids.grid import Field, Grid
+from jaxslam.grids.grid import Field, Grid, to_cells
 from jaxslam.grids.interpolation import interpolate
 from jaxslam.matching.correspondences import Rule, weights
 from jaxslam.matching.matcher import Match, Matcher
@@ -79,7 +79,8 @@ def field(
 
     def at_pose(of: Field, points: Points, pose: Array, prior: Prior | None) -> _At:
         residual, jacobian = field_residuals(of, points, pose)
-        weight = weights(rule, residual, points.valid & (residual < reach))
+        there = points.valid & _on_map(of, points, pose) & (residual < reach)
+        weight = weights(rule, residual, there)
         curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
         if prior is not None:
             curvature = curvature + prior.information
@@ -141,6 +142,14 @@ def field(
         return distance_field(grid, truncate=reach)
 
     return Matcher("field", prepare, match, cost, of_grid=True)
+
+
+def _on_map(of: Field, points: Points, pose: Float[Array, "3"]) -> Bool[Array, "N"]:
+    """Which points lie on the grid; beyond, the field is that at the border."""
+    moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
+    cell = to_cells(of.origin, of.resolution, moved)
+    size = jnp.asarray(of.values.shape[::-1], cell.dtype)
+    return jnp.all((cell >= 0) & (cell <= size[None]), axis=1)
 
 
 def field_residuals(

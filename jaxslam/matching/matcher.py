@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
@@ -103,6 +104,7 @@ def match(
             are not finite. A scan without points is a status.
     """
     batch = _checked(matcher, reference, points, start)
+    start = jnp.asarray(start)
     if prior is not None:
         _check_prior(prior, batch)
     call = _many if batch else _one
@@ -147,6 +149,8 @@ def _checked(
     check_points("match", points, batch)
     if isinstance(reference, Points):
         check_points("match", reference, batch)
+        if not reference.valid.shape[-1]:
+            raise ValueError("match: expected a reference of at least one point, valid or not")
     elif not batch:
         check_grid("match", reference)
     elif np.ndim(reference.log_odds) != 3 or len(reference.log_odds) != batch[0]:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.grids.grid import Grid
 from jaxslam.math import se2
 from jaxslam.types import Beams
+from jaxslam.validation.numbers import check_positive
 
 
 class Points(NamedTuple):
@@ -37,7 +38,14 @@ def points(
 
     Args:
         mount: (3,) pose of the laser on the robot.
+    Raises:
+        ValueError: arrays that are not (B,), a max_range that is not above 0.
     """
+    shapes = [np.shape(part) for part in beams]
+    if len(set(shapes)) > 1 or len(shapes[0]) != 1:
+        told = ", ".join(map(str, shapes))
+        raise ValueError(f"points: expected ranges, angles and masks (B,) of one scan, got {told}")
+    check_positive("points", max_range=max_range)
     r = jnp.asarray(beams.range)
     valid = (r > min_range) & (r < jnp.asarray(max_range) * (1 - 1e-6)) & beams.valid
     r = jnp.where(valid, r, 1.0)

@@ -53,6 +53,13 @@ def check_array(
         raise ValueError(f"{name}: expected {kind.__name__} values, got {dtype}")
 
 
+def check_positive(name: str, **values: ArrayLike) -> None:
+    """Raise ValueError unless numbers are above 0 and finite; a tracer is accepted."""
+    for what, value in values.items():
+        if is_concrete(value) and not (np.shape(value) == () and 0 < np.asarray(value) < np.inf):
+            raise ValueError(f"{name}: expected {what} above 0, got {np.asarray(value)}")
+
+
 def check_count(name: str, value: object) -> None:
     """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:

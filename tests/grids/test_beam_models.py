@@ -144,6 +144,10 @@ def test_both_fits_find_the_parameters():
         (lambda m, f: log_likelihood(m, f, np.zeros(3), "scan"), "expected Beams"),
         (lambda m, f: log_likelihood(m, f, np.zeros(3), beams(), every=0), "expected every >= 1"),
         (
+            lambda m, f: likelihood_field(0.0, max_range=1.0),
+            "likelihood_field: expected sigma above 0, got 0.0",
+        ),
+        (
             lambda m, f: likelihood_field(max_range=1.0, hit=0.5),
             "likelihood_field: expected shares",
         ),

@@ -110,3 +110,5 @@ def test_what_a_scan_does_not_determine_is_named(name):
         # Along it the pose is that of the start.
         moved = ((found.pose - start) * scale * ways).sum(axis=1) / np.linalg.norm(ways, axis=1)
         assert np.all(np.abs(moved) < 0.02)
+    off_the_map = matching.match(matcher, grids, scans, start + [[1e3, 1e3, 0.0]])
+    assert np.all(off_the_map.status >= MatchStatus.UNLIKE)

@@ -10,6 +10,7 @@ from scanned_rooms import BEAMS, by_polynomial, moved, pairs, points_at, stacked
 from jaxslam import matching
 from jaxslam.graphs import huber
 from jaxslam.matching import IcpSettings, MatchStatus, Points, Prior
+from jaxslam.types import Beams
 
 COUNT, GOOD = 8, 4
 SPAN, GAP, REACH = 2, 0.8, 0.5
@@ -204,7 +205,12 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
          "expected N positions, rays and masks"),
         (lambda m, p: matching.match(m, p._replace(position=np.nan * p.position), p, np.zeros(3)),
          "expected finite points"),
+        (lambda m, p: matching.match(m, Points(*(part[:0] for part in p)), p, np.zeros(3)),
+         "reference of at least one point"),
         (lambda m, p: matching.match(m, p, p, np.zeros(3), np.eye(3)), "expected a Prior"),
+        (lambda m, p: matching.points(Beams(np.ones(4), np.ones(3), np.ones(4, bool)), 5.0),
+         r"of one scan, got \(4,\), \(3,\), \(4,\)"),
+        (lambda m, p: matching.points(Beams(*np.ones((3, 4))), np.nan), "points: expected max_range"),
         (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.zeros(2), np.eye(3))),
          "expected a prior of a pose 3"),
         (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.zeros(3), -np.eye(3))),

@@ -1,6 +1,7 @@
 """Covariances of a match: the noise through by differences, the truth by many runs, bad input."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scanned_rooms import BEAMS, moved, pairs
@@ -8,6 +9,7 @@ from scanned_rooms import BEAMS, moved, pairs
 from jaxslam import matching, verify_jacobians
 from jaxslam.grids import Field
 from jaxslam.matching import IcpSettings, MatchStatus, Prior, covariance
+from jaxslam.matching.covariance.record import stated
 from jaxslam.matching.field import field_residuals
 from jaxslam.matching.points import Points
 from jaxslam.math.stats import chi2_band
@@ -117,6 +119,22 @@ def whole_run(found):
 
 
 found_neighbours = (np.arange(BEAMS)[:, None] + np.arange(-2, 3)[None]) % BEAMS
+
+
+def test_a_match_that_failed_is_known_by_its_prior_or_not_at_all(by_lines):
+    way = stated("none", lambda matcher, scans: jnp.zeros((3, 3)), SIGMA)
+    first = jax.tree.map(lambda leaf: leaf[0], by_lines[0])
+    known = np.diag([0.01, 0.01, 0.001])
+    prior = Prior(np.zeros(3), SIGMA**2 * np.linalg.inv(known))
+    for status, given, expected in (
+        (MatchStatus.DEGENERATE, None, np.zeros((3, 3))),
+        (MatchStatus.UNLIKE, None, 1e6 * np.eye(3)),
+        (MatchStatus.TOO_FEW, prior, known),
+    ):
+        found = first._replace(status=np.int32(status), prior=given)
+        of = covariance.MatchedScans(None, None, found, STARTS[0], None)
+        np.testing.assert_allclose(way.of(LINES, of), expected, rtol=1e-6)
+    assert {made.of.__qualname__ for made in WAYS.values()} == {way.of.__qualname__}
 
 
 def test_the_noise_through_is_that_of_differences(by_lines):

@@ -48,6 +48,8 @@ def _solved(log: LaserLog, settings: laser_slam.Settings) -> laser_slam.Solved:
 def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
     """Errors of relations, ATE, and which loops are right, by the poses in the file."""
     paths = {"raw odometry": solved.raw, "laser odometry": solved.odometry, "": solved.poses}
+    if np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6):
+        return {"score": "none: the log has no odometry but the poses that would score it"}
     out: dict[str, object] = {}
     try:
         for name, path in paths.items():

@@ -13,6 +13,7 @@ from jaxslam.grids.grid import Field, Grid
 from jaxslam.grids.interpolation import interpolate, slope
 from jaxslam.math import se2
 from jaxslam.types import Beams, JaxOrNumPy
+from jaxslam.validation.numbers import check_positive
 
 
 def likelihood_field(
@@ -41,6 +42,7 @@ def likelihood_field(
         truncate: largest distance [m], None for no limit.
         mount: (3,) pose of the laser on the robot.
     """
+    check_positive("likelihood_field", sigma=sigma, max_range=max_range)
     check_weights("likelihood_field", {"hit": hit, "random": random, "maximum": maximum})
 
     def prepare(grid: Grid) -> Field:

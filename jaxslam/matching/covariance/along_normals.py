@@ -8,15 +8,16 @@ from jaxtyping import Array, Float
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
-    check_sigma,
     inverse_of,
     of_prior,
+    stated,
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.outcome import information_of
 from jaxslam.matching.points import Points
 from jaxslam.matching.surface import surface
 from jaxslam.math import se2
+from jaxslam.validation.numbers import check_positive
 
 
 def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> MatchCovariance:
@@ -39,7 +40,7 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
         sigma: standard deviation of a range [m].
         span, gap: of the lines, as in `point_to_line`.
     """
-    check_sigma("along_normals", sigma)
+    check_positive("along_normals", sigma=sigma)
 
     def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, found, *_ = scans
@@ -64,4 +65,4 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
         gain = inverse_of(shape, shape, sigma=sigma)
         return jnp.asarray(sigma) ** 2 * gain @ (noise + of_prior(found)) @ gain
 
-    return MatchCovariance("along_normals", of)
+    return stated("along_normals", of, sigma)

@@ -9,6 +9,7 @@ from jaxslam.matching.covariance.record import (
     curvature,
     inverse_of,
     of_prior,
+    stated,
 )
 from jaxslam.matching.matcher import Matcher
 
@@ -30,4 +31,4 @@ def hessian() -> MatchCovariance:
         shape = curvature(matcher, prepared, points, found)
         return least * inverse_of(shape, found.information + of_prior(found))
 
-    return MatchCovariance("hessian", of)
+    return stated("hessian", of)

@@ -8,15 +8,16 @@ from jaxtyping import Array, Float
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
-    check_sigma,
     curvature,
     inverse_of,
     of_prior,
     range_count,
+    stated,
     with_ranges,
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
+from jaxslam.validation.numbers import check_positive
 
 
 def implicit(sigma: ArrayLike) -> MatchCovariance:
@@ -34,7 +35,7 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
     Args:
         sigma: standard deviation of a range [m].
     """
-    check_sigma("implicit", sigma)
+    check_positive("implicit", sigma=sigma)
 
     def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, found, *_ = scans
@@ -57,4 +58,4 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
         noise = by_ranges @ by_ranges.T + of_prior(found)
         return jnp.asarray(sigma) ** 2 * gain @ noise @ gain.T
 
-    return MatchCovariance("implicit", of)
+    return stated("implicit", of, sigma)

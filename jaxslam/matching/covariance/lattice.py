@@ -9,13 +9,14 @@ from jaxtyping import Array, Float
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
-    check_sigma,
     curvature,
     inverse_of,
     of_prior,
+    stated,
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.math import linalg
+from jaxslam.validation.numbers import check_positive
 
 
 def lattice(
@@ -35,7 +36,7 @@ def lattice(
         window, turn_window: standard deviations of a prior [m], [rad], beside that of the match.
         steps: along each axis.
     """
-    check_sigma("lattice", sigma)
+    check_positive("lattice", sigma=sigma)
     if steps < 3 or not (window > 0 and turn_window > 0):
         raise ValueError(
             "lattice: expected steps >= 3 and windows above 0, got "
@@ -65,4 +66,4 @@ def lattice(
         apart = offset - mean[None]
         return (weight[:, None] * apart).T @ apart
 
-    return MatchCovariance("lattice", of)
+    return stated("lattice", of, sigma)

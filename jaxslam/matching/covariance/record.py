@@ -7,16 +7,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from jaxslam import programs
-from jaxslam.matching.matcher import Match, Matcher, Reference
+from jaxslam.matching.matcher import Match, Matcher, MatchStatus, Reference
 from jaxslam.matching.points import Points, moved_along_rays
 from jaxslam.matching.prior import prior_information
 from jaxslam.math import linalg
-from jaxslam.validation.numbers import is_concrete
 
 
 class MatchedScans(NamedTuple):
@@ -40,6 +38,29 @@ class MatchCovariance:
     """(matcher, scans) -> (3, 3), finite. Traceable; of one pair: vmap it."""
 
 
+def stated(
+    name: str,
+    of: Callable[[Matcher, MatchedScans], Float[Array, "3 3"]],
+    sigma: ArrayLike | None = None,
+) -> MatchCovariance:
+    """The record of a covariance, which of a match that failed says what the prior alone does.
+
+    That is σ² Λ⁻¹ with the σ of a residual, if that is known; what no prior tells, or all without
+    one, is known to a kilometre or a thousand radians. A match failed if its status is UNLIKE or
+    TOO_FEW.
+    """
+
+    def unless_failed(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        found = scans.found
+        nothing = jnp.zeros_like(found.information)
+        scale = jnp.asarray(1.0 if sigma is None else sigma, nothing.dtype)
+        known = nothing if sigma is None else of_prior(found)
+        unknown = scale**2 * inverse_of(known, nothing, sigma=scale)
+        return jnp.where(found.status >= MatchStatus.UNLIKE, unknown, of(matcher, scans))
+
+    return MatchCovariance(name, unless_failed)
+
+
 def covariance(
     way: MatchCovariance,
     matcher: Matcher,
@@ -51,11 +72,14 @@ def covariance(
 ) -> Array:
     """The covariance (3, 3) of a match, by a program that is compiled once a structure.
 
-    With a leading axis on the start, and so on all arrays but the key, (B, 3, 3).
+    With a leading axis on the start, and so on all arrays but the key, (B, 3, 3). Of a match
+    that is UNLIKE or TOO_FEW it says what the prior does, and else (1 km)² and (1000 rad)². Along
+    `found.weakest` of a DEGENERATE match add what is known of the start.
     """
-    many = np.ndim(start) == 2
-    keys = jax.random.split(key, len(start)) if many else key
-    scans = MatchedScans(reference, points, found, start, keys)
+    begin = jnp.asarray(start)
+    many = begin.ndim == 2
+    keys = jax.random.split(key, len(begin)) if many else key
+    scans = MatchedScans(reference, points, found, begin, keys)
     return programs.call(_many if many else _one, (way, matcher), scans)
 
 
@@ -65,12 +89,6 @@ def _one(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
 
 def _many(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
     return jax.vmap(functools.partial(way.of, matcher))(scans)
-
-
-def check_sigma(name: str, sigma: ArrayLike) -> None:
-    """Raise ValueError unless sigma, of a range [m], is above 0; a tracer is accepted."""
-    if is_concrete(sigma) and not 0 < np.asarray(sigma) < np.inf:
-        raise ValueError(f"{name}: expected sigma above 0 [m], got {sigma}")
 
 
 def inverse_of(

@@ -9,15 +9,15 @@ from jaxslam.matching.covariance.implicit import implicit
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
-    check_sigma,
     range_count,
+    stated,
     with_ranges,
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
 from jaxslam.math import linalg, roots
 from jaxslam.math.angles import wrap
-from jaxslam.validation.numbers import check_count, check_covariance
+from jaxslam.validation.numbers import check_count, check_covariance, check_positive
 
 
 def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
@@ -46,7 +46,7 @@ def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
         apart = _apart(ends, found.pose)
         return apart.T @ apart / 6 + of_noise.of(matcher, scans)
 
-    return MatchCovariance("unscented", of)
+    return stated("unscented", of, sigma)
 
 
 def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> MatchCovariance:
@@ -61,7 +61,7 @@ def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> Match
         start_cov: (3, 3) covariance of the start.
         samples: number of matches.
     """
-    check_sigma("sampling", sigma)
+    check_positive("sampling", sigma=sigma)
     check_covariance("sampling", start_cov, 3)
     check_count("sampling: samples", samples)
 
@@ -91,7 +91,7 @@ def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> Match
         apart = _apart(ends, found.pose)
         return apart.T @ apart / samples
 
-    return MatchCovariance("sampling", of)
+    return stated("sampling", of, sigma)
 
 
 def _inverse_root(information: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
