@@ -33,7 +33,10 @@ def topology_figure(
     grid = places.grid
     label = places.label
     frame = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
-    rows, columns = (np.arange(n + 1) for n in label.shape)
+    occupied = np.asarray(grid.log_odds) > 0
+    there = np.nonzero((label >= 0) | occupied)  # the rest of the map is not shown
+    part = tuple(slice(k.min(), k.max() + 1) for k in there)
+    rows, columns = (np.arange(k.start, k.stop + 1) for k in part)
     x, y = world_of(*frame, columns[None, :] + 0.0 * rows[:, None], rows[:, None] + 0.0 * columns)
     height = (width - 0.6) * np.ptp(y) / np.ptp(x) + 0.9
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
@@ -41,10 +44,10 @@ def topology_figure(
     colours = ListedColormap(_PALE)
     mesh: Look = {"rasterized": True, "zorder": 0}
     shown = np.ma.masked_array(_coloured(places)[label], mask=label < 0)
-    axes.pcolormesh(x, y, shown, cmap=colours, vmin=-0.5, vmax=len(_PALE) - 0.5, **mesh)
-    walls = np.ma.masked_array(np.ones(label.shape), mask=np.asarray(grid.log_odds) <= 0)
+    axes.pcolormesh(x, y, shown[part], cmap=colours, vmin=-0.5, vmax=len(_PALE) - 0.5, **mesh)
+    walls = np.ma.masked_array(np.ones(label.shape), mask=~occupied)
     black = ListedColormap(["#555555"])
-    axes.pcolormesh(x, y, walls, cmap=black, **mesh)
+    axes.pcolormesh(x, y, walls[part], cmap=black, **mesh)
     where = cell_centers(grid)
     skeleton = where[places.skeleton.cells.reshape(-1)]
     axes.plot(*skeleton.T, ".", color=INK, ms=1.0, label="skeleton", zorder=2)
