@@ -146,9 +146,9 @@ def _checked(
     batch: tuple[int, ...] = np.shape(start)[:-1]
     if len(batch) > 1 or np.shape(start)[-1:] != (3,):
         raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_told(start)}")
-    check_points("match", points, batch)
+    check_points("match: points", points, batch)
     if isinstance(reference, Points):
-        check_points("match", reference, batch)
+        check_points("match: reference", reference, batch)
         if not reference.valid.shape[-1]:
             raise ValueError("match: expected a reference of at least one point, valid or not")
     elif not batch:

@@ -83,8 +83,8 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
     np.testing.assert_allclose(rows[:, 0], 100 + 0.25 * np.arange(10, 31, 2))
     left_out = json.loads((out / "summary.json").read_text())["scans left out"]
     assert left_out == {
-        "not in --scans": STEPS - 21,
-        "between each --every": 10,
+        "outside --scans": STEPS - 21,
+        "skipped by --every": 10,
         "without a valid beam": 0,
     }
 
@@ -151,6 +151,8 @@ def test_a_robot_is_localized_in_a_map_by_odometry_and_scans(log_file, room_map,
     assert summary["scans left out"]["without a valid beam"] == 1
     assert 0 < summary["particles in use, mean"] <= 500
     assert summary["hypotheses at the end"] >= 1
+    heaviest = summary["weight of the heaviest"]
+    assert summary["localized at the end"].startswith("yes" if heaviest > 0.5 else "no")
 
 
 @pytest.mark.parametrize(

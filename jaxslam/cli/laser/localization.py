@@ -112,7 +112,8 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
         ),
         "hypotheses at the end": len(groups.weight),
         "weight of the heaviest": float(groups.weight[0]),
-        "final pose": [float(value) for value in path.pose[-1]],
+        "localized at the end": "yes" if groups.weight[0] > 0.5 else "no: hypotheses disagree",
+        "final pose [m, m, rad]": [float(value) for value in path.pose[-1]],
     } | scores(np.asarray(path.pose), log.corrected)
 
     def figures(formats: tuple[str, ...]) -> Files:

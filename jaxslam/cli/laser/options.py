@@ -117,8 +117,8 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
     blind = int((~np.asarray(log.beams.valid).any(axis=1)).sum())
     if blind == len(keep):
         raise ValueError(f"{log.source}: none of {blind} scans has a valid beam")
-    left_out = {"not in --scans": total - (last - first), "between each --every": last - first}
-    left_out["between each --every"] -= len(keep)
+    left_out = {"outside --scans": total - (last - first), "skipped by --every": last - first}
+    left_out["skipped by --every"] -= len(keep)
     return log, left_out | {"without a valid beam": blind}
 
 
