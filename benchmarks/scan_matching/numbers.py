@@ -68,7 +68,7 @@ def convergence(beams: int = 1440, steps: int = 30) -> dict[str, np.ndarray]:
     start = second + jnp.array([0.12, -0.08, 0.06])
     found = {}
     for make in (matching.point_to_point, matching.point_to_line):
-        one = make(iterations=1)
+        one = make(matching.IcpSettings(iterations=1))
         poses = [np.asarray(start)]
         while len(poses) < 400 and (len(poses) < 2 or np.any(poses[-1] != poses[-2])):
             poses.append(np.asarray(matching.match(one, reference, scan, poses[-1]).pose))
