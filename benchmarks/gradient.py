@@ -2,8 +2,7 @@
 
 The log-likelihood of 200 steps of `cloister`, driven by a steered car, by the noise, the mounting
 pose and the wheelbase (8 parameters): time of `jax.value_and_grad` over that of the forward run,
-both compiled, and the memory it holds. With joint correction; place by place, each of 7,200 small
-corrections is many small programs on the way back, and the ratio is several times as large.
+both compiled, and the memory it holds; with joint and with sequential correction.
 """
 
 import dataclasses

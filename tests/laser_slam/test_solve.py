@@ -143,9 +143,10 @@ def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_
     true, log, found = drive
     monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
     lines = []
-    for k, (pose, ranges) in enumerate(zip(true, np.asarray(log.beams.range), strict=True)):
-        told = " ".join(f"{value:.6f}" for value in pose)
-        lines.append(f"ODOM {told} 0 0 0 {k} host {k}")
+    rows = zip(true, log.raw, np.asarray(log.beams.range), strict=True)
+    for k, (pose, raw, ranges) in enumerate(rows):
+        told, driven = (" ".join(f"{value:.6f}" for value in each) for each in (pose, raw))
+        lines.append(f"ODOM {driven} 0 0 0 {k} host {k}")
         ranges = " ".join(f"{value:.3f}" for value in ranges)
         lines.append(f"FLASER 60 {ranges} {told} {told} {k} host {k}")
     (tmp_path / "ring.log").write_text("\n".join(lines))
@@ -158,3 +159,8 @@ def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_
     assert summary["loops that agree with the poses in the file"] == f"{kept} of {kept}"
     names = {path.name for path in out.iterdir()}
     assert {"trajectory.tum", "graph.g2o", "map.pgm", "map_before.svg", "graph.svg"} <= names
+    # Without odometry the poses in the file are all that is known of it, and score nothing.
+    (tmp_path / "ring.log").write_text("\n".join(lines[1::2]))
+    assert main([*command, "--figures", "svg"]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["score"].startswith("none: ") and "ATE, RMSE [m]" not in summary

@@ -4,6 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
+from jaxslam.datasets import LaserLog
 from jaxslam.results.files import Files, Json
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
@@ -18,6 +21,13 @@ class Job(NamedTuple):
     files: Files
     figures: Callable[[tuple[str, ...]], Files]
     """(formats) -> the figures"""
+
+
+def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
+    """The score by the poses in the file, or why there is none: they were the odometry as well."""
+    if np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6):
+        return {"score": "none: the log has no odometry but the poses that would score it"}
+    return score()
 
 
 def figure_files(name: str, figure: "Figure", formats: tuple[str, ...]) -> Files:

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from jaxslam import grids, motion
-from jaxslam.cli.laser.job import Job, figure_files
+from jaxslam.cli.laser.job import Job, figure_files, scored
 from jaxslam.cli.laser.options import start_pose
 from jaxslam.cli.run.piecewise import run_in_pieces
 from jaxslam.datasets import LaserLog
 from jaxslam.grids import Grid
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
-from jaxslam.results.files import Files
+from jaxslam.results.files import Files, Json
 from jaxslam.types import Info
 
 START_DEVIATION = np.array([0.2, 0.2, np.deg2rad(10.0)])
@@ -114,7 +114,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
         "weight of the heaviest": float(groups.weight[0]),
         "localized at the end": "yes" if groups.weight[0] > 0.5 else "no: hypotheses disagree",
         "final pose [m, m, rad]": [float(value) for value in path.pose[-1]],
-    } | scores(np.asarray(path.pose), log.corrected)
+    } | scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
 
     def figures(formats: tuple[str, ...]) -> Files:
         from jaxslam.results import plot  # matplotlib is slow to load
@@ -151,7 +151,7 @@ def _on(grid: Grid, pose: Float[np.ndarray, "3"]) -> bool:
 
 def scores(
     pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]
-) -> dict[str, float | int | None]:
+) -> Json:
     """Distances from the poses in the file, a reference in the frame of the map or of nothing."""
     apart = np.hypot(*(pose[:, :2] - reference[:, :2]).T)
     turned = np.rad2deg(np.abs(np.angle(np.exp(1j * (pose[:, 2] - reference[:, 2])))))

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxslam import laser_slam, metrics
 from jaxslam.cli.films import film_files
-from jaxslam.cli.laser.job import Job
+from jaxslam.cli.laser.job import Job, scored
 from jaxslam.datasets import LaserLog
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import laser_slam as results
@@ -25,7 +25,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> Job:
             made = results.film(log, solved, settings, title=log.name, progress=progress)
         files |= film_files({"slam": made}, suffixed=False)
     return Job(
-        results.result_summary(solved) | _scores(log, solved),
+        results.result_summary(solved) | scored(log, lambda: _scores(log, solved)),
         files,
         lambda formats: results.figures(solved, formats, log.corrected),
     )
@@ -48,8 +48,6 @@ def _solved(log: LaserLog, settings: laser_slam.Settings) -> laser_slam.Solved:
 def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
     """Errors of relations, ATE, and which loops are right, by the poses in the file."""
     paths = {"raw odometry": solved.raw, "laser odometry": solved.odometry, "": solved.poses}
-    if np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6):
-        return {"score": "none: the log has no odometry but the poses that would score it"}
     out: dict[str, object] = {}
     try:
         for name, path in paths.items():

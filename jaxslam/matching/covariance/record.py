@@ -35,7 +35,8 @@ class MatchCovariance:
 
     name: str
     of: Callable[[Matcher, MatchedScans], Float[Array, "3 3"]]
-    """(matcher, scans) -> (3, 3), finite. Traceable; of one pair: vmap it."""
+    """(matcher, scans) -> (3, 3), finite. Traceable; of one pair: vmap it. One of your own should
+    go through `record.stated`, so that a match that failed is not certain."""
 
 
 def stated(
