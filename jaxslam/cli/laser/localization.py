@@ -149,9 +149,7 @@ def _on(grid: Grid, pose: Float[np.ndarray, "3"]) -> bool:
     return bool(np.all((at >= 0) & (at <= [width, height])))
 
 
-def scores(
-    pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]
-) -> Json:
+def scores(pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]) -> Json:
     """Distances from the poses in the file, a reference in the frame of the map or of nothing."""
     apart = np.hypot(*(pose[:, :2] - reference[:, :2]).T)
     turned = np.rad2deg(np.abs(np.angle(np.exp(1j * (pose[:, 2] - reference[:, 2])))))
