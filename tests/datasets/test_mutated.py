@@ -11,7 +11,8 @@ from recordings import BONN, MRCLAM, TEAM, VICTORIA, write
 from test_plaza import written
 from test_table import OWN, SETTINGS, TRUTH
 
-from jaxslam import datasets
+from jaxslam import datasets, grids
+from jaxslam.datasets.formats import g2o, ros_map
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
 """How many times as many examples are tried, as by `python -m benchmarks.fuzz`."""
@@ -81,13 +82,80 @@ def assert_whole(data):
     chex.assert_tree_all_finite((data.landmarks, data.true_path))
 
 
+def assert_graph(loaded, path):
+    """Finite numbers of the type of the file's, and every line in a table or counted."""
+    graph = loaded.graph
+    chex.assert_tree_all_finite((graph.poses, graph.points))
+    chex.assert_tree_all_finite([(t.z, t.information) for t in graph.tables.values()])
+    fixed = sum(len(row) - 1 for row in rows_of(path) if row[0] == "FIX")
+    assert graph.fixed_pose.sum() + graph.fixed_point.sum() <= fixed
+    kept = sum(len(table.who) for table in graph.tables.values())
+    placed = 0 if loaded.placed else len(graph.poses) + len(graph.points)
+    holding = sum(row[0] != "FIX" for row in rows_of(path))
+    assert kept + placed + sum(loaded.skipped.values()) == holding
+
+
+def assert_laser_log(log, path):
+    """Finite numbers, and every line a scan, odometry, or counted."""
+    chex.assert_tree_all_finite((log.time, log.beams, log.corrected, log.raw, log.odometry))
+    assert (log.beams.range[log.beams.valid] > 0).all()
+    left_out = sum(n for what, n in log.dropped.items() if what != "beams without a range")
+    assert len(log.time) + len(log.odometry) + left_out == len(rows_of(path))
+
+
+def assert_map(grid, path):
+    """Log-odds within their bounds, and a resolution that is one."""
+    assert (abs(grid.log_odds) <= ros_map.CERTAIN).all()
+    assert grid.resolution > 0
+    chex.assert_tree_all_finite((grid.log_odds, grid.origin))
+
+
+def rows_of(path):
+    """The fields of each line that has any."""
+    rows = (line.split() for line in path.read_bytes().decode().split("\n"))
+    return [row for row in rows if row]
+
+
+GRAPH = """# by hand
+VERTEX_SE2 7 0.5 -1.25 0.1
+VERTEX_SE2 3 1.5 0 3.5
+VERTEX_XY 9 2 2
+FIX 7
+EDGE_SE2 7 3 1 0.25 -0.5 4 1 0.5 5 0.25 6
+EDGE2 7 3 1 0.25 -0.5 4 0 4 9 0 0
+EDGE_SE2_XY 3 9 0.5 1 2 0.5 3
+EDGE_BEARING_SE2_XY 7 9 0.33 25
+"""
+EDGES = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0.5 1 0 0 1 0 1\n"
+LASER = """PARAM a b
+ODOM 1 0.5 7.0 0.1 0.2 0 12.5 host 1
+FLASER 4 1.5 nan 81.91 0 1 2 0.5 1 2 0.5 3.25 host 2
+ROBOTLASER1 0 -1.5 3.0 0.5 50 0.1 0 3 1 2 60 1 9 4 5 0.5 6 7 -0.5 0 0 0 0 0 1.0 x 8.5
+"""
+YAML = """image: map.pgm
+resolution: 0.05   # metres
+origin: [-1.5, 2.0, 0.25]
+negate: 0
+mode: scale
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+OTHERS = {
+    "g2o": ({"graph.g2o": GRAPH}, g2o.load, assert_graph),
+    "edges alone": ({"graph.g2o": EDGES}, g2o.load, assert_graph),
+    "carmen": ({"room.log": LASER}, datasets.carmen, assert_laser_log),
+    "map": ({"map.yaml": YAML, "map.pgm": "P5\n3 2\n127\nabcdef"}, grids.read_map, assert_map),
+    "text map": ({"map.yaml": YAML, "map.pgm": "P2 3 2 9 1 2 3 4 5 6"}, grids.read_map, assert_map),
+}
+
+
 def assert_told(path, error):
     """One line, which begins with a file of the folder and, in a text, the number of a line of it."""
     message = str(error)
     assert "\n" not in message
     found = re.match(re.escape(f"{path}{os.sep}") + r"([\w.]+):(?:(\d+):)? ", message)
     assert found, message
-    if not found[1].endswith((".toml", ".mat")):
+    if not found[1].endswith((".toml", ".mat", ".pgm")):
         assert found[2], message
         assert 1 <= int(found[2]) <= (path / found[1]).read_bytes().count(b"\n") + 1
 
@@ -109,6 +177,23 @@ def test_text_with_other_bytes(name, data, tmp_path):
         assert_whole(found)
         if name != "table":  # cells may be quoted over several lines
             assert found.measurements + sum(found.dropped.values()) == measured(name, tmp_path)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+@fuzz
+@given(data=st.data())
+def test_graphs_laser_logs_and_maps_with_other_bytes(name, data, tmp_path):
+    files, read, assert_read = OTHERS[name]
+    write(tmp_path, files)
+    file = data.draw(st.sampled_from(sorted(files)))
+    (tmp_path / file).write_bytes(edited(files[file].encode(), data.draw(EDITS)))
+    first = tmp_path / min(files, key=lambda one: not one.endswith(".yaml"))
+    try:
+        found = read(first)
+    except ValueError as error:
+        assert_told(tmp_path, error)
+    else:
+        assert_read(found, first)
 
 
 @fuzz

@@ -236,8 +236,13 @@ def _assembled(
         pose_id=ids["pose"],
         point_id=ids["point"],
     )
-    placed = len(ids["pose"]) + len(ids["point"]) if unplaced else 0
-    return Loaded(odometry(graph) if unplaced else graph, skipped, placed)
+    if not unplaced:
+        return Loaded(graph, skipped, 0)
+    try:
+        return Loaded(odometry(graph), skipped, len(ids["pose"]) + len(ids["point"]))
+    except ValueError as problem:
+        why = str(problem).removeprefix("odometry: ")
+        raise file.end_error(f"no vertices in the file to start from, and {why}") from problem
 
 
 def _table(file: TextFile, rows: _Rows, index: dict[str, dict[int, int]]) -> Table:
