@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.datasets.formats import g2o
-from jaxslam.grids import write_map
+from jaxslam.grids import Grid, write_map
 from jaxslam.laser_slam import LoopOutcome, Settings, Solved
 from jaxslam.laser_slam.mapping import growing_maps
 from jaxslam.laser_slam.records import LogOfScans
@@ -57,9 +57,14 @@ def figures(
     reference = None if corrected is None else np.asarray(corrected, float)
     pictures = {
         "map_before": lambda: plot.grid_figure(
-            solved.map_before, title="Laser odometry, before closing", width=plot.PAGE
+            solved.map_before,
+            poses=solved.odometry,
+            title="Laser odometry, before closing",
+            width=plot.PAGE,
         ),
-        "map_after": lambda: plot.grid_figure(solved.map, title="After closing", width=plot.PAGE),
+        "map_after": lambda: plot.grid_figure(
+            solved.map, poses=solved.poses, title="After closing", width=plot.PAGE
+        ),
         "graph": lambda: plot.loops_figure(solved, reference),
     }
 
@@ -111,9 +116,18 @@ def result_summary(solved: Solved) -> dict[str, object]:
         "degrees of freedom": solved.dof,
         "chi2 / degrees of freedom": solved.chi2 / solved.dof if solved.dof > 0 else None,
         "covariances": _verdict(solved),
-        "map [cells]": " x ".join(str(n) for n in solved.map.log_odds.shape[::-1]),
-        "resolution [m]": float(solved.map.resolution),
+        **map_size(solved.map),
         **{f"seconds, {stage}": round(value, 2) for stage, value in solved.seconds.items()},
+    }
+
+
+def map_size(grid: Grid) -> dict[str, object]:
+    """The size of a map: entries of the summary."""
+    height, width = grid.log_odds.shape
+    return {
+        "map, cells wide": width,
+        "map, cells high": height,
+        "resolution [m]": float(grid.resolution),
     }
 
 

@@ -18,7 +18,7 @@ def named(figure):
 def test_cells_stand_where_they_are_and_unknown_ones_are_told_apart():
     figure = plot.grid_figure(GRID, title="a map")
     mesh = figure.axes[0].collections[0]
-    assert named(figure) == ["occupied", "free", "unknown"]
+    assert named(figure) == ["occupied", "free", "in between", "unknown"]
     shown = mesh.get_array().reshape(2, 3)
     np.testing.assert_array_equal(np.ma.getmaskarray(shown), GRID.log_odds == 0)
     np.testing.assert_allclose(shown[0, 0], 1 / (1 + np.exp(-2)))

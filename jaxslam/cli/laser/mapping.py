@@ -15,6 +15,7 @@ from jaxslam.grids import Counts, Grid
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
 from jaxslam.results.files import Files
+from jaxslam.results.laser_slam import map_size
 from jaxslam.types import Beams, Estimate, JaxOrNumPy
 
 TOGETHER = 64
@@ -131,11 +132,10 @@ def beams_told(log: LaserLog, counts: Counts) -> dict[str, int]:
 
 def map_told(grid: Grid) -> dict[str, object]:
     """Size and certainty of a map: entries of the summary."""
-    height, width = grid.log_odds.shape
     known = np.asarray(grid.known)
     bits = np.asarray(grids.entropy(grid))[known]
     return {
-        "cells": f"{width} × {height} of {float(grid.resolution):g} m",
+        **map_size(grid),
         "cells known": int(known.sum()),
         "cells occupied": int((np.asarray(grid.log_odds) > 0).sum()),
         "mean entropy of a known cell [bit]": float(bits.mean()),

@@ -26,8 +26,8 @@ DEFAULTS: dict[str, object] = {
 ALONE = ("map", "localize", *DEFAULTS)
 """Options that only a laser log has."""
 
-OTHERS = {"filters": "ekf", "gate": None, "associate": None, "check_every": None, "robot": None}
-"""Options, with their defaults, that a laser log does not have."""
+OTHERS = "filters", "gate", "associate", "check_every", "robot"
+"""Options that a laser log does not have."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -77,8 +77,8 @@ def refuse_laser_options(options: argparse.Namespace) -> None:
 
 def complete(options: argparse.Namespace) -> argparse.Namespace:
     """The options with their defaults; raises ValueError on what a laser log cannot have."""
-    for name, default in OTHERS.items():
-        if getattr(options, name) != default:
+    for name in OTHERS:
+        if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')}: not of a laser log")
     if options.animate and (options.map is not None or options.localize is not None):
         raise ValueError("--animate: of a laser log only without --map and --localize")

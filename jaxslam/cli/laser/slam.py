@@ -60,7 +60,7 @@ def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
         return {"score": f"none: {problem}"}
     score = laser_slam.closure_score(solved, log.corrected)
     out["ATE, RMSE [m]"] = float(np.sqrt((ate**2).mean()))
-    out["loops that agree with the poses in the file"] = f"{score.correct} of {score.kept}"
+    out["loops kept that agree with the poses in the file"] = score.correct
     if score.revisits:
         out["recall of revisits"] = score.recall
     return out

@@ -41,7 +41,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     formats = check_figure_formats("--figures", options.figures.split(","))
     data = _reader(options.dataset)(options.path, options.robot)
     data = with_options(data, options)
-    filters = chosen_filters(data, options.filters)
+    filters = chosen_filters(data, options.filters or "ekf")
     check_writable(options.out)
     at = film_steps(data) if options.animate else None
     runs = {name: _run(name, filter, data, options, at) for name, filter in filters.items()}

@@ -25,7 +25,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--filters",
-        default="ekf",
         help=f"some of: {','.join(ALL)}; comma-separated (default: ekf)",
     )
     parser.add_argument(

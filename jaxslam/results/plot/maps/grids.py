@@ -66,6 +66,9 @@ def grid_figure(
             Patch(fc="black", ec=INK, label="occupied"),
             Patch(fc="white", ec=INK, label="free"),
         ]
+        p = 1 / (1 + np.exp(-np.abs(values)))
+        if np.any((p > 0.5) & (p < 0.9)):
+            handles.append(Patch(fc="0.5", ec=INK, label="in between"))
         if np.any(values == 0):
             handles.append(Patch(fc=_UNKNOWN, ec=INK, label="unknown"))
     else:

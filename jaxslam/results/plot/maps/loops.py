@@ -57,7 +57,7 @@ def _draw(axes: Axes, path: np.ndarray, ends: np.ndarray, reference: np.ndarray 
     if reference is not None:
         axes.plot(*reference[:, :2].T, color=FAINT, lw=1.6, label="reference", zorder=1)
     lines = LineCollection(
-        list(path[ends]), colors=COLORS[1], linewidths=0.5, alpha=0.6, label="loops", zorder=2
+        list(path[ends]), colors=COLORS[1], linewidths=1.2, alpha=0.8, label="loops", zorder=3.5
     )
     axes.add_collection(lines)
     axes.plot(*path.T, color=COLORS[0], lw=0.8, label="path", zorder=3)
