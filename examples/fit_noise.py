@@ -20,7 +20,8 @@ import numpy as np
 
 import jaxslam
 from jaxslam.calibration import NoiseFit, fit_noise
-from jaxslam.datasets.mrclam.reader import ODOMETRY_DENSITY, mrclam, white_noise
+from jaxslam.datasets import mrclam
+from jaxslam.datasets.mrclam.robot import ODOMETRY_DENSITY, white_noise
 from jaxslam.types import Info
 
 OFF = np.array([5.0, 0.2, 0.2, 5.0])

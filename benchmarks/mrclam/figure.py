@@ -40,7 +40,7 @@ def draw(paths, out: Path) -> None:
         middle = float(np.median(path.nees))
         nees = np.clip(path.nees, 0.02, None)
         ax.semilogy(path.time - begin, nees, color=COLORS[1 if robot == 1 else 0], lw=0.8)
-        what = "fitted on it" if robot == 1 else "test"
+        what = "noise fitted on it" if robot == 1 else "test"
         told = f"robot {robot} ({what}), median {middle:.1f}"
         ax.set_title(told, fontsize="small", loc="left", pad=3)
         ax.margins(x=0.01)

@@ -1,4 +1,4 @@
-"""The calibration of `datasets.mrclam`, fitted on the true path of robot 1 alone; NumPy only."""
+"""Calibrations by a robot's true path; `MRCLAM_CALIBRATION` is robot 1's. NumPy only."""
 
 from pathlib import Path
 
@@ -16,42 +16,53 @@ FIT, NOISE = 2.0, 8.0
 """Windows of the fit of the odometry, and of its noise [s]."""
 LOSS = 0.008, 0.012
 """Scales of the robust loss (soft L1): of the logarithm of a range, of a bearing [rad]."""
+MISREAD, LEAST = 0.3, 1e-3
+"""A measurement further off, relative or in rad, is of another barcode; least depth [m]."""
 TOLERANCE = 0.05, 0.01
 """Of the constants in the package against a new fit: relative, and absolute."""
 
 
-def camera(folder: Path) -> tuple[np.ndarray, float, np.ndarray]:
-    """(depth, ahead), the time from a measurement to the truth, and the residuals' deviations."""
+def camera(folder: Path, robot: int, turned: bool) -> tuple[np.ndarray, float, np.ndarray]:
+    """(depth, ahead, yaw, axis), the time from a measurement to the truth, and the residuals'
+    deviations. Unless turned, yaw and axis are zero. Misread barcodes are left out."""
     subject_of, names, points, _ = read_landmarks(folder, errata=True)
-    truth, (_, seen) = read_truth(folder, 1), read_robot(folder, 1)
+    truth, (_, seen) = read_truth(folder, robot), read_robot(folder, robot)
     index = [names.index(s) if (s := subject_of.get(int(b))) in names else -1 for b in seen[:, 1]]
     which = np.array(index)
-    keep = (which >= 0) & (seen[:, 0] < truth[-1, 0] - 1)
+    keep = (which >= 0) & (seen[:, 0] > truth[0, 0] + 1) & (seen[:, 0] < truth[-1, 0] - 1)
     begin = truth[0, 0]  # since 1970; differences of the shift would be lost in it
     clock, t = truth[:, 0] - begin, seen[keep, 0] - begin
     z, at = seen[keep, 2:], points[which[keep]]
 
     def residuals(p):
-        depth, ahead, shift = p
+        depth, ahead, shift, yaw, axis = p
         pose = interpolate_poses(clock, truth[:, 1:], t + shift)
         gap, c, s = at - pose[:, :2], np.cos(pose[:, 2]), np.sin(pose[:, 2])
         x, y = c * gap[:, 0] + s * gap[:, 1] - ahead, c * gap[:, 1] - s * gap[:, 0]
-        return np.stack([np.log(z[:, 0] / (depth * x)), z[:, 1] - np.arctan2(y, x)])
+        bearing = np.angle(np.exp(1j * (np.arctan2(y, x) - yaw)))
+        along = np.maximum(np.hypot(x, y) * np.cos(bearing - axis), LEAST)
+        return np.stack([np.log(z[:, 0] / (depth * along)), z[:, 1] - bearing])
+
+    good = (np.abs(residuals([1.0, 0.0, 0.0, 0.0, 0.0])) < MISREAD).all(axis=0)
+
+    def whole(p):
+        return [*p, 0.0, 0.0][:5]
 
     def scaled(p):
-        return (residuals(p) / np.array(LOSS)[:, None]).ravel()
+        return (residuals(whole(p))[:, good] / np.array(LOSS)[:, None]).ravel()
 
-    found = least_squares(scaled, [1.0, 0.0, 0.0], loss="soft_l1").x
-    return found[:2], float(found[2]), residuals(found).std(axis=1)
+    found = whole(least_squares(scaled, np.eye(5 if turned else 3)[0], loss="soft_l1").x)
+    deviations = residuals(found)[:, good].std(axis=1)
+    return np.array([found[0], found[1], *found[3:]]), float(found[2]), deviations
 
 
-def odometry(folder: Path) -> tuple[np.ndarray, float, np.ndarray]:
+def odometry(folder: Path, robot: int) -> tuple[np.ndarray, float, np.ndarray]:
     """(forward, outer, turn), the time from a command to the truth, and the noise.
 
     The noise is the deviation per √s over windows of `NOISE`: of travel, of heading where the robot
     goes straight, and of heading per |ω| beyond that where it turns.
     """
-    truth, (lines, _) = read_truth(folder, 1), read_robot(folder, 1)
+    truth, (lines, _) = read_truth(folder, robot), read_robot(folder, robot)
     grid = np.arange(lines[0, 0] + 1, truth[-1, 0] - 1, 1 / RATE)
     path = interpolate_poses(truth[:, 0], truth[:, 1:], grid)
     heading = np.unwrap(path[:, 2])
@@ -101,11 +112,12 @@ def odometry(folder: Path) -> tuple[np.ndarray, float, np.ndarray]:
     return np.array([forward, outer, turn]), float(delay), noise
 
 
-def fit(folder: Path) -> RobotCalibration:
-    """The calibration; the camera's yaw is left at zero, since it differs from robot to robot."""
-    (depth, ahead), shift, seen = camera(folder)
-    (forward, outer, turn), delay, moved = odometry(folder)
-    return RobotCalibration(delay - shift, forward, outer, turn, depth, ahead, 0.0, *moved, *seen)
+def fit(folder: Path, robot: int = 1, *, turned: bool = False) -> RobotCalibration:
+    """The calibration by a robot's true path. Unless turned, the camera's yaw and axis are left at
+    zero: they differ from robot to robot."""
+    (depth, *place), shift, seen = camera(folder, robot, turned)
+    (forward, outer, turn), delay, moved = odometry(folder, robot)
+    return RobotCalibration(delay - shift, forward, outer, turn, depth, *place, *moved, *seen)
 
 
 def measure(folder: Path) -> list[Metric]:

@@ -12,7 +12,9 @@ from jaxslam.datasets.bonn import bonn
 from jaxslam.datasets.carmen import LaserLog, carmen
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
-from jaxslam.datasets.mrclam.reader import mrclam, mrclam_team
+from jaxslam.datasets.mrclam.own_log import OwnCalibration, mrclam_calibration
+from jaxslam.datasets.mrclam.reader import mrclam
+from jaxslam.datasets.mrclam.team import mrclam_team
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza import plaza
 from jaxslam.datasets.table.reader import table
@@ -49,11 +51,13 @@ __all__ = [
     "Dataset",
     "DatasetFit",
     "LaserLog",
+    "OwnCalibration",
     "RobotCalibration",
     "bonn",
     "carmen",
     "fit",
     "mrclam",
+    "mrclam_calibration",
     "mrclam_team",
     "plaza",
     "table",

@@ -103,7 +103,9 @@ def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) 
         if gap.size and lost == len(gap):
             excess_away = np.full_like(gap, np.inf)  # nothing was compared, which is no pass
     relative, relative32 = _relative(gap, scale), _relative(gap32, scale32)
-    in_double = np.maximum(relative / tolerance, excess_away)
+    # What cancels is rounded by more than its size says: in float64 by 2⁻²⁹ of float32's error.
+    in_double = _relative(gap, tolerance * scale + 2.0**-28 * evaluation.single_error)
+    in_double = np.maximum(in_double, excess_away)
     # The hand-derived Jacobian need not be more accurate in float32 than autodiff.
     in_single = _relative(gap32, float32_tolerance * scale32 + 2 * evaluation.single_error)
     return _Compared(

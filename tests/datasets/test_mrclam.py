@@ -10,7 +10,7 @@ from recordings import EPOCH, MRCLAM, assert_log, assert_spoiled, folder, mapped
 
 from jaxslam import datasets
 from jaxslam.datasets.mrclam.files import EXCHANGED
-from jaxslam.datasets.mrclam.reader import white_noise
+from jaxslam.datasets.mrclam.robot import white_noise
 
 
 def test_mrclam_by_hand(tmp_path):

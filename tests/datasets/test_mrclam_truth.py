@@ -21,7 +21,7 @@ TRUTH = """# Time x y theta
 1248272273.400 2.0 2.0 0.0
 1248272273.500 2.0 3.0 0.0
 """
-PLAIN = RobotCalibration(0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.01, 0.02, 0.5, 0.1, 0.02)
+PLAIN = RobotCalibration(0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.5, 0.1, 0.02)
 
 
 def with_truth(path, files=MRCLAM, robot=2, text=TRUTH):
@@ -114,12 +114,13 @@ def test_only_zeros_at_the_end_and_after_the_truth_are_cut():
 
 def test_a_calibration_corrects_what_a_robot_recorded(tmp_path):
     own = PLAIN._replace(delay=0.5, forward=2.0, outer=0.5, turn=0.5, depth=2.0, ahead=0.1, yaw=0.2)
+    own = own._replace(axis=0.05)
     raw, data = (datasets.mrclam(write(tmp_path, MRCLAM), 2, calibration=c) for c in (PLAIN, own))
     # The first line (0.5 m/s, 0.125 rad/s) at 0.5 s moves the robot from 1 s on.
     row = np.searchsorted(data.time - EPOCH, 1.0) + 1
     np.testing.assert_allclose(data.log.control[row, :2], [2 * 0.5 - 0.5 * 0.125, 0.0625])
     z, seen = raw.log.scan.z[raw.log.scan.valid], data.log.scan.z[data.log.scan.valid]
-    np.testing.assert_allclose(seen[:, 0], z[:, 0] / 2)
+    np.testing.assert_allclose(seen[:, 0], z[:, 0] * np.cos(z[:, 1]) / np.cos(z[:, 1] - 0.05) / 2)
     np.testing.assert_array_equal(seen[:, 1], z[:, 1])
     assert z[0, 0] == pytest.approx(1.5 / np.cos(0.25))
     # A camera 0.1 m ahead and turned by 0.2 rad sees a point 1.1 m ahead at 1 m and -0.2 rad.

@@ -160,7 +160,6 @@ def test_of_a_sensor_the_measurements_are_named():
 @pytest.mark.parametrize(
     ("function", "state", "kind"),
     [
-        (lambda p: jnp.hypot(*p), (0, 0), "a square root of 0"),
         (lambda p: jnp.linalg.norm(p), (0, 0), "a square root of 0"),
         (lambda p: jnp.abs(p) ** 0.5, (0, 1), "a square root of 0"),
         (lambda p: jnp.sqrt(p), (-1, 1), "a square root of a negative number"),
@@ -182,7 +181,7 @@ def test_a_singular_operation_is_named(function, state, kind):
 
 def test_a_singular_place_comes_with_its_cure():
     states = [np.array([[0.0, 0.0], [3.0, 4.0]])]
-    report = verify_jacobians(lambda point: jnp.hypot(*point)[None], name="f", states=states)
+    report = verify_jacobians(lambda point: jnp.linalg.norm(point)[None], name="f", states=states)
     check = by_name(report, "f and its derivatives are finite")
     assert check.cure[1:] == CURES["a square root of 0"][1:]
     assert "safe = jnp.where(r2 > 0, r2, 1.0)" in str(report)

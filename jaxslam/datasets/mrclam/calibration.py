@@ -1,6 +1,6 @@
 """Systematic errors and noise of MRCLAM's robots, as a record that the readers apply."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.noise import NoiseCov
+
+Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 
 
 class RobotCalibration(NamedTuple):
@@ -19,9 +21,12 @@ class RobotCalibration(NamedTuple):
 
     since v is rather the speed of the outer wheel, half a track `outer` from the centre. The camera
     is at (ahead, 0, yaw) on the robot. Its range r is `depth` times the depth along the optical
-    axis, as the height of a barcode in the image gives it; with the recorded bearing φ the range is
+    axis, as the height of a barcode in the image gives it. That axis has the bearing `axis`, so
+    that with the recorded bearing φ the range is
 
-        r' = r / (depth cos φ)
+        r' = r / (depth cos(φ - axis))
+
+    Arrays and fields may be NumPy's or traced.
 
     White noise per second has the variance forward_noise² of travel and turn_noise² +
     (turn_share ω')² of heading. The range has the standard deviation range_share r', the bearing
@@ -39,6 +44,8 @@ class RobotCalibration(NamedTuple):
     """[m]"""
     yaw: float
     """[rad]"""
+    axis: float
+    """[rad]"""
     forward_noise: float
     """[m/√s]"""
     turn_noise: float
@@ -52,20 +59,28 @@ class RobotCalibration(NamedTuple):
     def odometry(self, recorded: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
         """The lines (t, v, ω) corrected, at the times when the robot moves."""
         t, v, omega = recorded.T
-        forward = self.forward * v - self.outer * np.abs(omega)
-        return np.column_stack([t + self.delay, forward, self.turn * omega])
+        return np.column_stack([t + self.delay, *self.velocities(v, omega)])
+
+    def velocities(self, v: Numbers, omega: Numbers) -> tuple[Numbers, Numbers]:
+        """(v', ω') of the recorded ones."""
+        return self.forward * v - self.outer * abs(omega), self.turn * omega
+
+    def range(self, recorded: Numbers, bearing: Numbers) -> Numbers:
+        """r' of the recorded range and bearing."""
+        cos = jnp.cos if isinstance(bearing, jax.Array) else np.cos
+        return recorded / (self.depth * cos(bearing - self.axis))
 
     def measurements(self, recorded: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:
         """The lines (t, barcode, range, bearing) with ranges corrected.
 
         Raises ValueError on a bearing beyond a right angle, behind the image plane.
         """
-        beyond = np.abs(recorded[:, 3]) >= np.pi / 2
+        beyond = np.abs(recorded[:, 3] - self.axis) >= np.pi / 2
         if beyond.any():
             bearing = recorded[beyond, 3][0]
             raise ValueError(f"Calibration: expected bearings below π/2, got {bearing}")
         corrected = recorded.copy()
-        corrected[:, 2] /= self.depth * np.cos(recorded[:, 3])
+        corrected[:, 2] = self.range(recorded[:, 2], recorded[:, 3])
         return corrected
 
     @property
@@ -101,6 +116,7 @@ MRCLAM_CALIBRATION = RobotCalibration(
     depth=1.017,
     ahead=-0.034,
     yaw=0.0,
+    axis=0.0,
     forward_noise=0.0091,
     turn_noise=0.0236,
     turn_share=0.183,
@@ -108,6 +124,9 @@ MRCLAM_CALIBRATION = RobotCalibration(
     bearing_noise=0.0183,
 )
 """Fitted on the true path of robot 1 of data set 6 (`python -m benchmarks.mrclam --fit`).
+
+The yaw and the axis of the camera are left at zero, since they differ from robot to robot;
+`mrclam_calibration` finds them in a robot's own log.
 
 The ranges of that robot deviate from the survey by 0.12 m as recorded, by a function of the
 bearing, and by 1 % of the range once corrected. Errors that last are counted in full: the noise of

@@ -39,7 +39,8 @@ class Jacobians(NamedTuple):
     single: dict[str, Values]
     """the same computed in float32, held in float64"""
     single_error: np.ndarray
-    """(S, m, n) error of autodiff in float32, at the states rounded to float32; () if unknown"""
+    """(S, m, n) error of autodiff in float32: of its arithmetic at the states rounded to float32,
+    plus that of rounding the states; () if unknown"""
     quotient: Quotient | None
     how: str
     """the kind of quotient: differences or complex step"""
@@ -83,17 +84,20 @@ class _Evaluator:
         double = self._autodiff(self.arguments)
         single = self._autodiff(rounded)
         reference = self._autodiff(tuple(a.astype(np.float64) for a in rounded))
-        autodiff32 = dict(single)
+        autodiff32, autodiff64 = dict(single), dict(double)
         self._add_hand(double, single)
         values = np.asarray(self.values(*self.arguments), np.float64)
         evaluations = []
         for k in self.over:
             quotient, how = self._quotient(k)
+            exact = _of_argument(reference, k)
+            arithmetic = _worst_gap(_of_argument(autodiff32, k), exact)
+            rounding = _worst_gap(exact, _of_argument(autodiff64, k))
             evaluations.append(
                 Jacobians(
                     _of_argument(double, k),
                     _of_argument(single, k),
-                    _worst_gap(_of_argument(autodiff32, k), _of_argument(reference, k)),
+                    arithmetic + rounding,
                     quotient,
                     how,
                 )

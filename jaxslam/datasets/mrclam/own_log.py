@@ -1,0 +1,88 @@
+"""The systematic errors of a robot of MRCLAM, found in its own log."""
+
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.calibration import Calibration, calibrate
+from jaxslam.charts import right_invariant
+from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
+from jaxslam.datasets.mrclam.reader import mrclam
+from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.math.stats import sigma_gate
+from jaxslam.motion import unicycle
+from jaxslam.run import run
+from jaxslam.sensors import range_bearing
+from jaxslam.types import Info
+
+FITTED = ("forward", "outer", "turn", "ahead", "yaw", "axis")
+"""What a log tells of a `RobotCalibration`; it does not tell `depth` beside `forward`."""
+
+
+class OwnCalibration(NamedTuple):
+    """The calibration of a robot by its own log, and how it was found."""
+
+    robot: RobotCalibration
+    found: Calibration
+    """of `FITTED`, in that order"""
+
+
+def mrclam_calibration(
+    folder: str | Path,
+    robot: int = 1,
+    *,
+    known: RobotCalibration = MRCLAM_CALIBRATION,
+    gate: float = 5.0,
+    errata: bool = True,
+) -> OwnCalibration:
+    """The systematic errors of one robot that make its innovations least, by its own log.
+
+    `calibration.calibrate` on the innovations of the right-invariant EKF: wheels (`forward`,
+    `outer`, `turn`), place and yaw of the camera (`ahead`, `yaw`), and its optical axis (`axis`).
+    Neither the true path nor the survey is used. Delay, noise and `depth` are those of `known`:
+    ranges and odometry in proportion larger are the same log of a larger world, so the scale of the
+    map is that of `depth`.
+
+        own = mrclam_calibration(folder, 5)
+        data = mrclam(folder, 5, calibration=own.robot)
+
+    Args:
+        folder, robot, errata: as for `mrclam`.
+        known: what is held, and where the search starts.
+        gate: [σ] of innovations.
+    Raises:
+        ValueError: as `mrclam` and `calibrate` do.
+    """
+    data = mrclam(
+        folder,
+        robot,
+        calibration=known._replace(forward=1.0, outer=0.0, turn=1.0, depth=1.0, axis=0.0),
+        errata=errata,
+    )
+    bearing = np.asarray(data.log.scan.z[..., 1])
+    depth = np.asarray(data.log.scan.z[..., 0]) * np.cos(bearing)
+
+    def info(p: jax.Array) -> Info:
+        traced = cast("dict[str, float]", dict(zip(FITTED, p, strict=True)))
+        own = known._replace(**traced)
+        v, omega, dt = jnp.asarray(data.log.control).T
+        control = jnp.stack([*own.velocities(v, omega), dt], axis=-1)
+        phi = jnp.asarray(bearing)
+        z = jnp.stack([own.range(jnp.asarray(depth), phi), phi], axis=-1)
+        filter = ekf_slam(
+            unicycle(own.odometry_cov()),
+            range_bearing(
+                own.measurement_cov(), mount=jnp.stack([own.ahead, 0.0 * own.ahead, own.yaw])
+            ),
+            data.capacity,
+            **(data.filter_options | {"gate": sigma_gate(gate), "chart": right_invariant()}),
+        )
+        log = data.log._replace(control=control, scan=data.log.scan._replace(z=z))
+        return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)).info
+
+    found = calibrate(info, [getattr(known, name) for name in FITTED])
+    values = dict(zip(FITTED, found.parameters.tolist(), strict=True))
+    return OwnCalibration(known._replace(**values), found)

@@ -1,0 +1,62 @@
+"""A robot's systematic errors found in its own log: a log simulated with known ones."""
+
+import numpy as np
+import pytest
+from recordings import write
+
+from jaxslam import datasets
+from jaxslam.datasets import RobotCalibration
+from jaxslam.datasets.mrclam.own_log import FITTED
+
+KNOWN = RobotCalibration(0.0, 1.0, 0.05, 1.0, 1.02, 0.0, 0.0, 0.0, 0.003, 0.01, 0.0, 0.01, 0.01)
+TRUE = KNOWN._replace(forward=1.04, outer=0.1, turn=0.94, ahead=-0.05, yaw=0.03, axis=0.05)
+POINTS = np.array([[3.0, 1], [0, 4], [-3, 2], [-2, -3], [2, -3], [5, -1]])
+
+
+def recorded(steps=900, dt=0.2, seed=0):
+    """The files of a robot with the errors TRUE; of a landmark in view, each few steps."""
+    rng = np.random.default_rng(seed)
+    x, y, theta = 0.0, 0.0, 0.0
+    odometry, seen = [], []
+    for k in range(steps):
+        t = 1000 + k * dt
+        v = 0.15 + 0.1 * np.sin(0.1 * k * dt)
+        omega = 0.5 * np.sin(0.23 * k * dt) + 0.15
+        odometry.append(f"{t:.3f} {v:.9f} {omega:.9f}")
+        moved = TRUE.forward * v - TRUE.outer * abs(omega)
+        moved += rng.normal(0, TRUE.forward_noise / np.sqrt(dt))
+        turned = TRUE.turn * omega + rng.normal(0, TRUE.turn_noise / np.sqrt(dt))
+        x, y = x + moved * dt * np.cos(theta), y + moved * dt * np.sin(theta)
+        theta += turned * dt
+        if k % 2 == 0:
+            heading = theta + TRUE.yaw
+            camera = x + TRUE.ahead * np.cos(theta), y + TRUE.ahead * np.sin(theta)
+            gap = POINTS - camera
+            bearing = np.angle(np.exp(1j * (np.arctan2(*gap.T[::-1]) - heading)))
+            for i in np.flatnonzero(np.abs(bearing) < 0.7)[:2]:
+                r = np.hypot(*gap[i]) * (1 + rng.normal(0, TRUE.range_share))
+                told = r * TRUE.depth * np.cos(bearing[i] - TRUE.axis)
+                phi = bearing[i] + rng.normal(0, TRUE.bearing_noise)
+                seen.append(f"{t + dt:.3f} {50 + i} {told:.9f} {phi:.9f}")
+    barcodes = "".join(f"{6 + i} {50 + i}\n" for i in range(len(POINTS)))
+    survey = "".join(f"{6 + i} {a} {b} 0 0\n" for i, (a, b) in enumerate(POINTS))
+    return {
+        "Barcodes.dat": barcodes,
+        "Landmark_Groundtruth.dat": survey,
+        "Robot1_Odometry.dat": "\n".join(odometry) + "\n",
+        "Robot1_Measurement.dat": "\n".join(seen) + "\n",
+    }
+
+
+def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
+    own = datasets.mrclam_calibration(write(tmp_path, recorded()), 1, known=KNOWN)
+    assert own.found.converged
+    error = own.found.parameters - [getattr(TRUE, name) for name in FITTED]
+    assert error @ np.linalg.solve(own.found.cov, error) < 20.0  # 6 degrees of freedom: p = 0.003
+    sigma = np.sqrt(np.diag(own.found.cov))
+    start = [getattr(TRUE, name) - getattr(KNOWN, name) for name in FITTED]
+    assert (np.abs(start) > 4 * sigma).all()  # so that finding them is something
+    assert own.robot == KNOWN._replace(
+        **dict(zip(FITTED, own.found.parameters.tolist(), strict=True))
+    )
+    assert own.found.misfit[-1] == pytest.approx(1.0, abs=0.15)
