@@ -104,7 +104,8 @@ def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) 
             excess_away = np.full_like(gap, np.inf)  # nothing was compared, which is no pass
     relative, relative32 = _relative(gap, scale), _relative(gap32, scale32)
     # What cancels is rounded by more than its size says: in float64 by 2⁻²⁹ of float32's error.
-    in_double = _relative(gap, tolerance * scale + 2.0**-28 * evaluation.single_error)
+    rounded = gap <= 2.0**-28 * evaluation.single_error
+    in_double = np.where(rounded, np.minimum(relative / tolerance, 1.0), relative / tolerance)
     in_double = np.maximum(in_double, excess_away)
     # The hand-derived Jacobian need not be more accurate in float32 than autodiff.
     in_single = _relative(gap32, float32_tolerance * scale32 + 2 * evaluation.single_error)
