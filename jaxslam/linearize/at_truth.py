@@ -25,19 +25,27 @@ def at_truth(truth: Truth) -> Linearizer:
     path = jnp.concatenate([jnp.asarray(truth.start)[None], truth.pose])
     landmarks = jnp.asarray(truth.landmarks)
 
+    def at(step: Array, here: Here) -> Array:
+        """The true pose (3,) in the dtype of the run."""
+        return path[step].astype(here.pose.dtype)
+
+    def seen(tag: Array, here: Here) -> Array:
+        """The true landmark (L,) of a tag, likewise."""
+        return landmarks[jnp.maximum(tag, 0)].astype(here.pose.dtype)
+
     def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, Array]:
-        old, new = path[here.joint.lin], path[here.joint.lin + 1]
+        old, new = at(here.joint.lin, here), at(here.joint.lin + 1, here)
         moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, old)
         ahead = motion.step(old, u, jnp.zeros(len(motion.noises), old.dtype))
         return moved, with_lever_arm(by_pose, new[:2] - ahead[:2]), noise, here.joint.lin + 1
 
     def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        true_landmark = landmarks[jnp.maximum(here.joint.tag[here.slot], 0)]
-        return first_order.observe_at(sensor, here, path[here.joint.lin], true_landmark)
+        true_landmark = seen(here.joint.tag[here.slot], here)
+        return first_order.observe_at(sensor, here, at(here.joint.lin, here), true_landmark)
 
     def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
-        at_pose = path[here.joint.lin]
-        true_z = sensor.observe(at_pose, landmarks[jnp.maximum(tag, 0)])
+        at_pose = at(here.joint.lin, here)
+        true_z = sensor.observe(at_pose, seen(tag, here))
         return first_order.invert_at(sensor, here.pose, z, at_pose, true_z)
 
     return Linearizer(

@@ -9,6 +9,7 @@ from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
+from jaxslam.validation.numbers import largest
 
 Array = jax.Array
 
@@ -46,6 +47,8 @@ def observability() -> Linearizer:
         arms = joint.landmarks - joint.pose[None, :2] - old.landmarks + old.robot[None]
         arms = jnp.where(joint.alive[:, None], arms, 0.0)
         shift = arms.sum(axis=0) / (1 + joint.alive.sum())
+        # Of numbers whose squares overflow, the EKF's point.
+        shift = jnp.where(jnp.abs(shift) <= largest(shift), shift, 0.0)
         robot = old.robot + moved[:2] - joint.pose[:2] - shift
         return moved, with_lever_arm(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
 

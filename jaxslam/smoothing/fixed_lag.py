@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam import validation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
@@ -69,7 +69,9 @@ def fixed_lag(
     with fixed-lag smoothing: algorithm and consistency analysis", ICRA). A window as long as the
     log marginalizes nothing: then the newest pose and the map are those of `batch_map`.
 
-    A measurement with a singular R is dropped as `Status.SINGULAR`. O(W N²) for the window, and
+    A measurement with a singular R is dropped as `Status.SINGULAR`. Where the numbers of the window
+    are not finite (it is optimized without step control), it begins anew from the EKF-SLAM's state,
+    and `exhausted` is set. O(W N²) for the window, and
     O(N³) for the prior, an iteration.
 
     Args:
@@ -104,7 +106,9 @@ def fixed_lag(
         check_count(f"fixed_lag: {name}", value)
 
     def init(pose: Array, pose_cov: Array) -> WindowState:
-        joint = ekf.init(pose, pose_cov)
+        return begun(ekf.init(pose, pose_cov))
+
+    def begun(joint: Joint) -> WindowState:
         return empty_window(joint, (len(motion.controls), len(motion.noises)), (window, places))
 
     def predict(state: WindowState, u: Array, key: Array) -> WindowState:
@@ -113,9 +117,10 @@ def fixed_lag(
             motion, sensor, state.prior, state.steps, state.at, first_estimates
         )
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
+        state = finite_or(state._replace(prior=prior), begun(state.joint))
         root = roots.root_psd(motion.noise_cov(state.joint.pose, u))
         steps, at = shift(state.steps, state.at, u, root, joint.pose)
-        return WindowState(joint, prior, steps, at)
+        return WindowState(joint, state.prior, steps, at)
 
     def update(state: WindowState, scan: Scan, key: Array) -> tuple[WindowState, Info]:
         if scan.z.shape[0] > places:
@@ -137,8 +142,10 @@ def fixed_lag(
             system = linearize_window(motion, sensor, state.prior, steps, at, first_estimates)
             solved = solve_window(state.prior, system, at, joint.alive)
             at = moved_by(motion, steps, at, solved)
-        joint = with_newest(joint, at, newest_cov(system, solved))
-        return WindowState(joint, state.prior, steps, at), info
+        newest = with_newest(joint, at, newest_cov(system, solved))
+        after = WindowState(newest, state.prior, steps, at)
+        exhausted = jnp.asarray(info.exhausted) | ~is_finite(after)
+        return finite_or(after, begun(joint)), info._replace(exhausted=exhausted)
 
     def estimate(state: WindowState) -> Estimate:
         return ekf.estimate(state.joint)
@@ -162,6 +169,18 @@ def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -
     path = jnp.tile(joint.pose, (window + 1, 1))
     at = WindowIterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
     return WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
+
+
+def is_finite(state: WindowState) -> Bool[Array, ""]:
+    """Whether all numbers of a state are finite."""
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(state)]).all()
+
+
+def finite_or(state: WindowState, other: WindowState) -> WindowState:
+    """The state if all its numbers are finite, else the other one."""
+    finite = is_finite(state)
+    chosen: WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, other)
+    return chosen
 
 
 def shift(

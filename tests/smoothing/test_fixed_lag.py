@@ -3,6 +3,7 @@
 import dataclasses
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +40,16 @@ def test_a_window_as_long_as_the_log_is_the_batch(short):
         ours, theirs = (np.asarray(getattr(t.estimate, name))[-1] for t in (trace, batch))
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(trace.final.at.path[0], batch.final.start, atol=1e-8)
+
+
+def test_a_window_without_finite_numbers_begins_anew_and_says_so(short):
+    """Gauss-Newton without step control, and a landmark that was started 1e30 m away."""
+    world, log = short
+    z = log.scan.z.at[0, 0, 0].set(1e30)
+    wild = log._replace(scan=log.scan._replace(z=z))
+    trace = run(lag(world, window=8, iterations=5), wild, world.pose, world.pose_cov, KEY)
+    assert trace.info.exhausted.any()
+    chex.assert_tree_all_finite((trace.estimate, trace.final))
 
 
 def test_in_a_linear_world_it_is_the_kalman_filter():
