@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from recordings import write
+from recordings import TEAM, write
 
 from jaxslam import datasets
 from jaxslam.datasets import RobotCalibration
@@ -46,6 +46,28 @@ def recorded(steps=900, dt=0.2, seed=0):
         "Robot1_Odometry.dat": "\n".join(odometry) + "\n",
         "Robot1_Measurement.dat": "\n".join(seen) + "\n",
     }
+
+
+def test_what_is_no_calibration_is_refused(tmp_path):
+    for read in (
+        lambda: datasets.mrclam(tmp_path, 1, calibration={1: KNOWN}),
+        lambda: datasets.mrclam_calibration(tmp_path, 1, known=None),
+    ):
+        with pytest.raises(ValueError, match="expected a RobotCalibration, got"):
+            read()
+    write(tmp_path, TEAM)
+    for calibration, why in (({1: KNOWN}, "robot 2 has no calibration"), (3, "got int")):
+        with pytest.raises(ValueError, match=why):
+            datasets.mrclam_team(tmp_path, (1, 2), calibration=calibration)
+    shared, each = (
+        datasets.mrclam_team(tmp_path, (1, 2), calibration=calibration)
+        for calibration in (KNOWN, {1: KNOWN, 2: KNOWN._replace(forward=2.0)})
+    )
+    np.testing.assert_array_equal(each.log.control[:, 0], shared.log.control[:, 0])
+    outer = KNOWN.outer * np.abs(shared.log.control[:, 4])
+    np.testing.assert_allclose(
+        each.log.control[:, 3] + outer, 2 * (shared.log.control[:, 3] + outer)
+    )
 
 
 def test_the_constants_of_a_simulated_robot_are_found(tmp_path):

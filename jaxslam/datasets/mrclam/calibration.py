@@ -133,6 +133,12 @@ bearing, and by 1 % of the range once corrected. Errors that last are counted in
 the odometry is that of windows of 8 s, that of the camera of single measurements and the truth."""
 
 
+def check_calibration(name: str, calibration: object) -> None:
+    """Raise ValueError, which begins with the caller's name, unless it is a RobotCalibration."""
+    if not isinstance(calibration, RobotCalibration):
+        raise ValueError(f"{name}: expected a RobotCalibration, got {type(calibration).__name__}")
+
+
 def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
     """The diagonal covariance density/Δt of velocities over Δt, zero where Δt = 0."""
     moving = dt > 0

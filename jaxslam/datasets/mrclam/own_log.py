@@ -9,7 +9,11 @@ import numpy as np
 
 from jaxslam.calibration import Calibration, calibrate
 from jaxslam.charts import right_invariant
-from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
+from jaxslam.datasets.mrclam.calibration import (
+    MRCLAM_CALIBRATION,
+    RobotCalibration,
+    check_calibration,
+)
 from jaxslam.datasets.mrclam.reader import mrclam
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.math.stats import sigma_gate
@@ -56,6 +60,7 @@ def mrclam_calibration(
     Raises:
         ValueError: as `mrclam` and `calibrate` do.
     """
+    check_calibration("mrclam_calibration", known)
     data = mrclam(
         folder,
         robot,

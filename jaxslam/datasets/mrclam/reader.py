@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.mrclam.calibration import RobotCalibration
+from jaxslam.datasets.mrclam.calibration import RobotCalibration, check_calibration
 from jaxslam.datasets.mrclam.files import ROBOTS, read_landmarks
 from jaxslam.datasets.mrclam.robot import (
     SOURCE,
@@ -65,10 +65,13 @@ def mrclam(
             `mrclam.files.EXCHANGED`; `Dataset.corrections` then says so.
     Raises:
         ValueError: `path:line: reason` on a malformed line, a time that decreases, a negative
-            range, or a subject without survey; and on a robot other than 1 to 5.
+            range, or a subject without survey; on a robot other than 1 to 5, and a calibration
+            that is none.
     """
     if type(robot) is not int or robot not in ROBOTS:
         raise ValueError(f"mrclam: expected a robot from 1 to 5, got {robot!r}")
+    if calibration is not None:
+        check_calibration("mrclam", calibration)
     subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
     own = read_lines(Path(folder), robot, calibration)
     time = np.unique(np.concatenate([own.odometry[:, 0], own.seen[:, 0]]))

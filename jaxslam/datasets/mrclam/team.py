@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.mrclam.calibration import RobotCalibration
+from jaxslam.datasets.mrclam.calibration import RobotCalibration, check_calibration
 from jaxslam.datasets.mrclam.files import ROBOTS, read_landmarks
 from jaxslam.datasets.mrclam.robot import (
     DROPS,
@@ -73,6 +73,9 @@ def mrclam_team(
         each = [calibration[robot] for robot in asked]
     elif calibration is not None:
         each = [calibration] * len(asked)
+    for constants in each:
+        if constants is not None:
+            check_calibration("mrclam_team", constants)
     files = [read_lines(Path(folder), *one) for one in zip(asked, each, strict=True)]
     time = np.unique(np.concatenate([t[:, 0] for own in files for t in (own.odometry, own.seen)]))
     team, scans, controls, dropped = [], [], [], dict.fromkeys(DROPS, 0)
