@@ -119,7 +119,13 @@ def solution(
 
 
 def with_singular(info: Info, used: Bool[Array, "T M"]) -> Info:
-    """The filter's infos, with SINGULAR for measurements that the smoother cannot use."""
+    """The filter's infos, with SINGULAR for measurements that the smoother cannot use: they have no
+    landmark, distance or degrees of freedom."""
     taken = (info.status == Status.FUSED) | (info.status == Status.BORN)
-    status = jnp.where(taken & ~used, Status.SINGULAR, info.status)
-    return info._replace(status=status.astype(info.status.dtype))
+    singular = taken & ~used
+    return info._replace(
+        status=jnp.where(singular, Status.SINGULAR, info.status).astype(info.status.dtype),
+        slot=jnp.where(singular, -1, info.slot),
+        nis=jnp.where(singular, 0.0, info.nis),
+        dof=jnp.where(singular, 0, info.dof),
+    )

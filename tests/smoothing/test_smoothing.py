@@ -169,6 +169,9 @@ def test_measurements_of_singular_noise_are_left_out_and_counted():
     np.testing.assert_array_equal(np.argwhere(status == Status.SINGULAR), [[6, 0]])
     used = (status == Status.FUSED) | (status == Status.BORN)
     np.testing.assert_array_equal(used, log.scan.valid & (log.scan.z[:, :, 0] != MARK))
+    np.testing.assert_array_equal(trace.info.slot >= 0, used)
+    np.testing.assert_array_equal(trace.info.dof > 0, status == Status.FUSED)
+    assert trace.info.nis[6, 0] == 0
 
 
 def test_it_can_be_differentiated():
