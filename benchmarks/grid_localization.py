@@ -1,6 +1,6 @@
-"""Localization in grids: `python -m benchmarks.grid_localization [--runs 30] [--part logs]`.
+"""Localization in grids: `python -m benchmarks.grid_localization [--runs 100] [--part logs]`.
 
-Default sizes are meant for ten minutes on two idle cores.
+Default sizes are meant for a quarter of an hour on two idle cores.
 
 `office`: the likelihood-field filter on the same draws for each exponent of the likelihood, in a
 map made from another drive: does the 95 % set of its particles cover the truth in 95 % of the
@@ -266,7 +266,7 @@ def found_in(name, seeds=100, particles=5000, steps=60):
     ]
 
 
-def measure(runs=30, part="office,logs"):
+def measure(runs=100, part="office,logs"):
     """The metrics of the parts named."""
     wanted, metrics = part.split(","), []
     if "office" in wanted:
@@ -283,7 +283,7 @@ if __name__ == "__main__":
         alone(
             "grid_localization",
             measure,
-            runs={"type": int, "default": 30},
+            runs={"type": int, "default": 100},
             part={"default": "office,logs"},
         )
     )
