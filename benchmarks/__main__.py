@@ -113,7 +113,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         ),
         "plain_particles": lambda: plain_particles.measure(8 if quick else 20),
         "grids": measure_grids,
-        "grid_localization": lambda: grid_localization.measure(10 if quick else 30),
+        "grid_localization": lambda: grid_localization.measure(10 if quick else 100),
         "grid_slam": lambda: grid_slam.measure(2 if quick else 6, drawn("grid_slam.png")),
         "laser_slam": lambda: measure_laser_slam(quick),
         "scan_matching": lambda: measure_matching(quick),
