@@ -201,6 +201,7 @@ BAD = [
     ("truth.csv", "1.3,", "0.8,", ":3: column 1 (t [s]): expected a time above 0.9, got 0.8"),
     ("truth.csv", None, "t [s],x [m],y [m],theta [rad]\n5,0,0,0\n", ": expected times within those"),
     ("landmarks.csv", "9,0,0", "7,0,0", ":3: column 1 (tag): expected a tag of its own, got 7 again"),
+    ("landmarks.csv", "9,0,0\n3,1,5", "\v9,0,0\n7,1,5", ":4: column 1 (tag): expected a tag of its own"),
 ]  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """CSV files with a header of names and units; errors as `path:line: column 2 (v [m/s]): reason`."""
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +31,7 @@ class CsvTable:
             raise self._error(
                 text.count("\n", 0, text.index("\0")) + 1, "expected text, got a zero byte"
             )
-        reader = csv.reader(text.splitlines(keepends=True))
+        reader = csv.reader(io.StringIO(text, newline=""))
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
         lines = [(number, cells) for number, cells in lines if any(cells)]
         if not lines:
