@@ -50,8 +50,8 @@ def mrclam(
     0.19 m, with errors that persist for seconds, so that innovations show 0.11 m; 0.15 is between.
     With odometry noise of 0.01 m/√s and 0.05 rad/√s, NIS/dof is then 0.78, 1.22 and 0.92. Since the
     errors of ranges persist, the map's covariance is too small for any choice. A `calibration`
-    removes what causes them, see `MRCLAM_CALIBRATION`. There is no gate; a gate at 5 σ changes the
-    maps by millimetres.
+    removes what causes them, see `MRCLAM_CALIBRATION` and `mrclam_calibration`. There is no gate; a
+    gate at 5 σ changes the maps by millimetres.
 
     Source: Leung, Halpern, Barfoot, Liu, International Journal of Robotics Research 30(8), 2011.
 
