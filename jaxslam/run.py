@@ -92,9 +92,11 @@ def _drive(
     key: jax.Array,
 ) -> Trace:
     """The trace of a filter over a checked log."""
-    # Never constants of the program: XLA of jax 0.10 compiles some loops over a constant `valid`
-    # (`run` in a user's jit, the log closed over) to wrong numbers.
-    log = jax.lax.optimization_barrier(jax.tree.map(jnp.asarray, log))
+    log = jax.tree.map(jnp.asarray, log)
+    if jax.__version_info__ < (0, 11):
+        # Its XLA compiles some loops over a constant `valid` (`run` in a user's jit, the log closed
+        # over) to wrong numbers.
+        log = jax.lax.optimization_barrier(log)
     dtype = jnp.result_type(log.control, log.scan.z)
     tag = log.scan.tag.astype(jnp.int32)  # of any integers, unsigned ones too
     log = Log(log.control.astype(dtype), Scan(log.scan.z.astype(dtype), tag, log.scan.valid))

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.formats.lines import stored
 from jaxslam.datasets.mrclam.calibration import RobotCalibration, check_calibration
 from jaxslam.datasets.mrclam.files import ROBOTS, read_landmarks
 from jaxslam.datasets.mrclam.robot import (
@@ -58,8 +59,8 @@ def mrclam_team(
         sighting_cov: (2, 2) covariance of (range, bearing) of another robot, or a function of z;
             default measurement_cov.
     Raises:
-        ValueError: as `mrclam`, on a robot without calibration where others have one, and unless
-            robots are different numbers from 1 to 5.
+        ValueError: as `mrclam`, on a robot that measured nothing, on one without calibration where
+            others have one, and unless robots are different numbers from 1 to 5.
     """
     asked = tuple(robots)
     good = all(type(robot) is int and robot in ROBOTS for robot in asked)
@@ -83,10 +84,15 @@ def mrclam_team(
     sights = {one: eye for one, (_, eye) in models.items()}
     if sighting_cov is not None:
         sights = {one: models_of(one, None, sighting_cov)[1] for one in models}
-    for own, constants in zip(files, each, strict=True):
+    for robot, own, constants in zip(asked, files, each, strict=True):
         (model, eye), sight = models[constants], sights[constants]
         row, tag, kept, lost = associated(own.seen, time, subject_of, names + asked)
         dropped = {why: dropped[why] + lost[why] for why in dropped}
+        if not tag:
+            seen = Path(folder) / f"Robot{robot}_Measurement.dat"
+            raise ValueError(
+                f"{stored(seen)}:1: no measurement of a landmark, or of a robot in {asked}"
+            )
         tags, rows = np.array(tag), np.array(row)
         controls.append(hold(own.odometry[:, 0], own.odometry[:, 1:], time))
         parts = []
