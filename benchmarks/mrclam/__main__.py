@@ -4,8 +4,8 @@
 
 EKF-SLAM and the right-invariant EKF of each robot alone: with the default noise of the reader; with
 `MRCLAM_CALIBRATION`, which is fitted on robot 1; with the constants that each robot's own log tells
-(`datasets.mrclam_calibration`, no truth); and, as a bound of what a calibration can do, with
-constants and noise fitted on each robot's own truth. Then robots 2 to 5 in one map (`team_slam`),
+(`datasets.mrclam_calibration`, no truth); and, for reference, with constants
+and noise fitted on each robot's own truth. Then robots 2 to 5 in one map (`team_slam`),
 constants of their own logs, without and with their sightings of each other. A run starts at the
 true pose of the first scan; landmarks have no prior. ATE is in that frame, and after the SE(2)
 motion that fits the path best; σ [m] is what the filter claims of it. The gate is 5 σ: some

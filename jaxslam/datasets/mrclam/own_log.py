@@ -46,7 +46,8 @@ def mrclam_calibration(
 
     `calibration.calibrate` on the innovations of the right-invariant EKF: wheels (`forward`,
     `outer`, `turn`), place and yaw of the camera (`ahead`, `yaw`), and its optical axis (`axis`).
-    Neither the true path nor the survey is used. Delay, noise and `depth` are those of `known`:
+    Neither the true path nor the survey is used (where there is a true path, `mrclam` cuts lines
+    (0, 0) after its end). Delay, noise and `depth` are those of `known`:
     ranges and odometry in proportion larger are the same log of a larger world, so the scale of the
     map is that of `depth`.
 
