@@ -1,6 +1,7 @@
 """Calibrations by a robot's true path; `MRCLAM_CALIBRATION` is robot 1's. NumPy only."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -14,6 +15,8 @@ RATE = 50.0
 """Of the grid on which odometry is compared with the truth [Hz]."""
 FIT, NOISE = 2.0, 8.0
 """Windows of the fit of the odometry, and of its noise [s]."""
+WINDOWS = 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0
+"""Windows over which errors of the heading are shown [s]."""
 LOSS = 0.008, 0.012
 """Scales of the robust loss (soft L1): of the logarithm of a range, of a bearing [rad]."""
 MISREAD, LEAST = 0.3, 1e-3
@@ -56,11 +59,24 @@ def camera(folder: Path, robot: int, turned: bool) -> tuple[np.ndarray, float, n
     return np.array([found[0], found[1], *found[3:]]), float(found[2]), deviations
 
 
-def odometry(folder: Path, robot: int) -> tuple[np.ndarray, float, np.ndarray]:
-    """(forward, outer, turn), the time from a command to the truth, and the noise.
+class Odometry(NamedTuple):
+    """What a robot's true path tells of its odometry."""
 
-    The noise is the deviation per √s over windows of `NOISE`: of travel, of heading where the robot
-    goes straight, and of heading per |ω| beyond that where it turns.
+    constants: np.ndarray
+    """(forward, outer, turn, curvature)"""
+    delay: float
+    """the time from a command to the truth [s]"""
+    noise: np.ndarray
+    """(forward, straight, share); the deviation per √s"""
+    heading: np.ndarray
+    """the deviation of the heading's error per √s, over `WINDOWS` [rad/√s]"""
+
+
+def odometry(folder: Path, robot: int, window: float = NOISE) -> Odometry:
+    """Constants and noise of a robot's odometry.
+
+    The noise is the deviation per √s over windows of so many seconds: of travel, of heading where
+    the robot goes straight, and of heading per |ω| beyond that where it turns.
     """
     truth, (lines, _) = read_truth(folder, robot), read_robot(folder, robot)
     grid = np.arange(lines[0, 0] + 1, truth[-1, 0] - 1, 1 / RATE)
@@ -85,7 +101,9 @@ def odometry(folder: Path, robot: int) -> tuple[np.ndarray, float, np.ndarray]:
         change = heading[n:] - heading[:-n]
         turn = turned @ change / (turned @ turned)
         best = min(best, (np.std(change - turn * turned), delay, turn))
-    _, delay, turn = best
+    _, delay, _ = best
+    columns = np.column_stack([told(omega, delay, n), told(v, delay, n)])
+    turn, curvature = np.linalg.lstsq(columns, heading[n:] - heading[:-n], rcond=None)[0]
     columns = np.column_stack([told(v, delay, n), -told(np.abs(omega), delay, n)])
     forward, outer = np.linalg.lstsq(columns, along(FIT), rcond=None)[0]
 
@@ -94,30 +112,35 @@ def odometry(folder: Path, robot: int) -> tuple[np.ndarray, float, np.ndarray]:
     middle = (heading[1:] + heading[:-1]) / 2
     off_along = np.cos(middle) * step[:, 0] + np.sin(middle) * step[:, 1]
     off_along = off_along - forward * told(v, delay, 1) + outer * told(np.abs(omega), delay, 1)
-    off_heading = np.diff(heading) - turn * one / RATE
+    off_heading = np.diff(heading) - turn * one / RATE - curvature * told(v, delay, 1)
 
-    def density(error, rows):
+    def density(error, rows, window=window):
         """Of the errors of these rows alone, per second in which there are any."""
         total = np.concatenate([[0], np.cumsum(np.where(rows, error, 0))])
-        n = int(NOISE * RATE)
+        n = int(window * RATE)
         gap = total[n:] - total[:-n]
-        return np.sqrt((gap**2).mean() / NOISE / rows.mean())
+        return np.sqrt((gap**2).mean() / window / rows.mean())
 
     turning = np.abs(one) > 0.1
     going = (told(v, delay, 1) * RATE > 0.02) & (np.abs(one) < 0.05)
     straight = density(off_heading, going)
     omega_turning = turn * np.sqrt((one[turning] ** 2).mean())
     share = np.sqrt(density(off_heading, turning) ** 2 - straight**2) / omega_turning
-    noise = np.array([density(off_along, np.ones(len(one), bool)), straight, share])
-    return np.array([forward, outer, turn]), float(delay), noise
+    every = np.ones(len(one), bool)
+    noise = np.array([density(off_along, every), straight, share])
+    heading = np.array([density(off_heading, every, each) for each in WINDOWS])
+    return Odometry(np.array([forward, outer, turn, curvature]), float(delay), noise, heading)
 
 
-def fit(folder: Path, robot: int = 1, *, turned: bool = False) -> RobotCalibration:
+def fit(
+    folder: Path, robot: int = 1, *, turned: bool = False, window: float = NOISE
+) -> RobotCalibration:
     """The calibration by a robot's true path. Unless turned, the camera's yaw and axis are left at
-    zero: they differ from robot to robot."""
+    zero: they differ from robot to robot. window: of the noise of the odometry [s]."""
     (depth, *place), shift, seen = camera(folder, robot, turned)
-    (forward, outer, turn), delay, moved = odometry(folder, robot)
-    return RobotCalibration(delay - shift, forward, outer, turn, depth, *place, *moved, *seen)
+    found = odometry(folder, robot, window)
+    wheels, delay = found.constants, found.delay - shift
+    return RobotCalibration(delay, *wheels, depth, *place, *found.noise, *seen)
 
 
 def measure(folder: Path) -> list[Metric]:

@@ -2,10 +2,12 @@
 
 `calibrate` finds parameters of which the noise covariances do not depend, by Gauss-Newton on the
 whitened innovations, also where associations change; `fit_noise` maximizes the likelihood, for
-standard deviations and what else is in it, with the associations held.
+standard deviations and what else is in it, with the associations held; `consider_cov` is what the
+uncertainty of parameters adds to the covariance of a result.
 """
 
+from jaxslam.calibration.consider import consider_cov
 from jaxslam.calibration.innovations import Calibration, calibrate
 from jaxslam.calibration.likelihood import NoiseFit, as_associated, fit_noise
 
-__all__ = ["Calibration", "NoiseFit", "as_associated", "calibrate", "fit_noise"]
+__all__ = ["Calibration", "NoiseFit", "as_associated", "calibrate", "consider_cov", "fit_noise"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam import association, motion, run, sensors
-from jaxslam.calibration import calibrate
+from jaxslam.calibration import calibrate, consider_cov
 from jaxslam.filters import ekf_slam
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
@@ -43,6 +43,58 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
     assert abs(found.cov[0, 1]) < 1e-12
     assert found.converged and len(found.misfit) == 2 and found.path.shape == (3, 2)
     np.testing.assert_array_equal(found.dof, 2 * (steps - 1))
+
+
+def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimate():
+    """Of a robot that never turns, whose odometry has a scale p to be found from the same log."""
+    rng, steps, start = np.random.default_rng(1), 9, 0.2**2
+    control = np.column_stack([rng.uniform(0.5, 1.0, (steps, 2)), np.zeros(steps)])
+    z = np.array([5.0, -3.0]) - np.cumsum(control[:, :2], axis=0)
+    scan = Scan(z[:, None], np.zeros((steps, 1), np.int32), np.ones((steps, 1), bool))
+
+    def trace(p):
+        filter = ekf_slam(motion.pose_increment(Q), sensors.relative_position(R), 1, update="joint")
+        scaled = control * jnp.concatenate([1 + p, jnp.ones(1)])[None]
+        known = np.diag([start, start, 0.0])
+        return run(filter, Log(scaled, scan), np.zeros(3), known, KEY)
+
+    found = calibrate(lambda p: trace(p).info, np.zeros(2))
+    added = consider_cov(lambda p: trace(p).estimate.pose, found.parameters, found.cov)
+    assert added.shape == (steps, 3, 3)
+    total = trace(jnp.asarray(found.parameters)).estimate.pose_cov[-1] + added[-1]
+    for axis in range(2):
+        # Unknowns: start, positions 1 to T, landmark, scale.
+        size = steps + 3
+        information = np.zeros((size, size))
+        rows = [(np.eye(size)[0], start)]
+        for k in range(1, steps + 1):
+            step = np.eye(size)[k] - np.eye(size)[k - 1] - control[k - 1, axis] * np.eye(size)[-1]
+            rows += [(step, Q[axis, axis]), (np.eye(size)[-2] - np.eye(size)[k], R[axis, axis])]
+        for row, variance in rows:
+            information += np.outer(row, row) / variance
+        joint = np.linalg.inv(information)
+        np.testing.assert_allclose(total[axis, axis], joint[steps, steps], rtol=1e-6)
+        assert added[-1, axis, axis] > 0.1 * joint[steps, steps]
+
+
+@pytest.mark.parametrize(
+    ("result", "parameters", "cov", "why"),
+    [
+        (lambda p: p, [np.nan], 1.0, "finite"),
+        (lambda p: p, [], np.eye(0), "finite"),
+        (lambda p: p, [[1.0]], 1.0, "shape"),
+        (lambda p: p, [1.0, 2.0], np.eye(3), r"shape \(2, 2\)"),
+        (lambda p: p, [1.0, 2.0], [[1.0, 0.5], [0.0, 1.0]], "symmetric"),
+        (lambda p: p, [1.0, 2.0], -np.eye(2), "negative eigenvalue"),
+        (lambda p: p.sum(), [1.0, 2.0], np.eye(2), "array"),
+        (lambda p: (p, p), [1.0], 1.0, "array"),
+        (lambda p: p > 0, [1.0], 1.0, "real numbers"),
+        (lambda p: jnp.sqrt(p), [0.0], 1.0, "derivatives"),
+    ],
+)
+def test_what_adds_no_covariance_is_refused(result, parameters, cov, why):
+    with pytest.raises(ValueError, match=f"consider_cov: .*{why}"):
+        consider_cov(result, parameters, cov)
 
 
 def drive(seed, steps=160, drift=0.02, turn=0.1):

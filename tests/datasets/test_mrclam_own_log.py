@@ -8,8 +8,12 @@ from jaxslam import datasets
 from jaxslam.datasets import RobotCalibration
 from jaxslam.datasets.mrclam.own_log import FITTED
 
-KNOWN = RobotCalibration(0.0, 1.0, 0.05, 1.0, 1.02, 0.0, 0.0, 0.0, 0.003, 0.01, 0.0, 0.01, 0.01)
-TRUE = KNOWN._replace(forward=1.04, outer=0.1, turn=0.94, ahead=-0.05, yaw=0.03, axis=0.05)
+KNOWN = RobotCalibration(
+    0.0, 1.0, 0.05, 1.0, 0.0, 1.02, 0.0, 0.0, 0.0, 0.003, 0.01, 0.0, 0.01, 0.01
+)
+TRUE = KNOWN._replace(
+    forward=1.04, outer=0.1, turn=0.94, curvature=-0.2, ahead=-0.05, yaw=0.03, axis=0.05
+)
 POINTS = np.array([[3.0, 1], [0, 4], [-3, 2], [-2, -3], [2, -3], [5, -1]])
 
 
@@ -25,7 +29,9 @@ def recorded(steps=900, dt=0.2, seed=0):
         odometry.append(f"{t:.3f} {v:.9f} {omega:.9f}")
         moved = TRUE.forward * v - TRUE.outer * abs(omega)
         moved += rng.normal(0, TRUE.forward_noise / np.sqrt(dt))
-        turned = TRUE.turn * omega + rng.normal(0, TRUE.turn_noise / np.sqrt(dt))
+        turned = (
+            TRUE.turn * omega + TRUE.curvature * v + rng.normal(0, TRUE.turn_noise / np.sqrt(dt))
+        )
         x, y = x + moved * dt * np.cos(theta), y + moved * dt * np.sin(theta)
         theta += turned * dt
         if k % 2 == 0:
@@ -74,7 +80,7 @@ def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
     own = datasets.mrclam_calibration(write(tmp_path, recorded()), 1, known=KNOWN)
     assert own.found.converged
     error = own.found.parameters - [getattr(TRUE, name) for name in FITTED]
-    assert error @ np.linalg.solve(own.found.cov, error) < 20.0  # 6 degrees of freedom: p = 0.003
+    assert error @ np.linalg.solve(own.found.cov, error) < 20.0  # 7 degrees of freedom: p = 0.006
     sigma = np.sqrt(np.diag(own.found.cov))
     start = [getattr(TRUE, name) - getattr(KNOWN, name) for name in FITTED]
     assert (np.abs(start) > 4 * sigma).all()  # so that finding them is something
@@ -82,3 +88,16 @@ def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
         **dict(zip(FITTED, own.found.parameters.tolist(), strict=True))
     )
     assert own.found.misfit[-1] == pytest.approx(1.0, abs=0.15)
+    data = datasets.mrclam(tmp_path, 1, calibration=own.robot)
+    log, motion, sensor = own.at(own.found.parameters)
+    np.testing.assert_allclose(log.control, data.log.control, rtol=1e-12)
+    np.testing.assert_allclose(log.scan.z, data.log.scan.z, rtol=1e-12)
+    larger, _, farther = own.at(own.found.parameters, scale=2.0)
+    np.testing.assert_allclose(larger.scan.z, np.asarray(log.scan.z) * [2.0, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(
+        larger.control, np.asarray(log.control) * [2.0, 1.0, 1.0], rtol=1e-12
+    )
+    # A world twice as large, seen by a camera twice as far off: twice the range, the same bearing.
+    pose, point = np.array([0.0, 0.0, 0.3]), np.array([2.0, 1.0])
+    near, far = sensor.observe(pose, point), farther.observe(pose, 2 * point)
+    np.testing.assert_allclose(far, np.asarray(near) * [2.0, 1.0], rtol=1e-12)

@@ -21,7 +21,7 @@ TRUTH = """# Time x y theta
 1248272273.400 2.0 2.0 0.0
 1248272273.500 2.0 3.0 0.0
 """
-PLAIN = RobotCalibration(0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.5, 0.1, 0.02)
+PLAIN = RobotCalibration(0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.5, 0.1, 0.02)
 
 
 def with_truth(path, files=MRCLAM, robot=2, text=TRUTH):

@@ -17,12 +17,13 @@ class RobotCalibration(NamedTuple):
 
     A recorded velocity (v, ω) at time t moves the robot at time t + delay, by
 
-        v' = forward v - outer |ω|,    ω' = turn ω
+        v' = forward v - outer |ω|,    ω' = turn ω + curvature v
 
-    since v is rather the speed of the outer wheel, half a track `outer` from the centre. The camera
-    is at (ahead, 0, yaw) on the robot. Its range r is `depth` times the depth along the optical
-    axis, as the height of a barcode in the image gives it. That axis has the bearing `axis`, so
-    that with the recorded bearing φ the range is
+    since v is rather the speed of the outer wheel, half a track `outer` from the centre, and since
+    wheels of unequal size bend the path of a robot that is told to go straight (Borenstein & Feng
+    1996). The camera is at (ahead, 0, yaw) on the robot. Its range r is `depth` times the depth
+    along the optical axis, as the height of a barcode in the image gives it. That axis has the
+    bearing `axis`, so that with the recorded bearing φ the range is
 
         r' = r / (depth cos(φ - axis))
 
@@ -39,6 +40,8 @@ class RobotCalibration(NamedTuple):
     outer: float
     """[m]"""
     turn: float
+    curvature: float
+    """[rad/m]"""
     depth: float
     ahead: float
     """[m]"""
@@ -63,7 +66,7 @@ class RobotCalibration(NamedTuple):
 
     def velocities(self, v: Numbers, omega: Numbers) -> tuple[Numbers, Numbers]:
         """(v', ω') of the recorded ones."""
-        return self.forward * v - self.outer * abs(omega), self.turn * omega
+        return self.forward * v - self.outer * abs(omega), self.turn * omega + self.curvature * v
 
     def range(self, recorded: Numbers, bearing: Numbers) -> Numbers:
         """r' of the recorded range and bearing."""
@@ -112,14 +115,15 @@ MRCLAM_CALIBRATION = RobotCalibration(
     delay=0.265,
     forward=1.049,
     outer=0.098,
-    turn=0.951,
+    turn=0.956,
+    curvature=-0.039,
     depth=1.017,
     ahead=-0.034,
     yaw=0.0,
     axis=0.0,
     forward_noise=0.0091,
-    turn_noise=0.0236,
-    turn_share=0.183,
+    turn_noise=0.0219,
+    turn_share=0.186,
     range_share=0.0098,
     bearing_noise=0.0183,
 )

@@ -1,5 +1,6 @@
 """The systematic errors of a robot of MRCLAM, found in its own log."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -18,11 +19,12 @@ from jaxslam.datasets.mrclam.reader import mrclam
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion import unicycle
+from jaxslam.protocols import Motion, Sensor
 from jaxslam.run import run
 from jaxslam.sensors import range_bearing
-from jaxslam.types import Info
+from jaxslam.types import Info, Log
 
-FITTED = ("forward", "outer", "turn", "ahead", "yaw", "axis")
+FITTED = ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
 """What a log tells of a `RobotCalibration`; it does not tell `depth` beside `forward`."""
 
 
@@ -32,6 +34,9 @@ class OwnCalibration(NamedTuple):
     robot: RobotCalibration
     found: Calibration
     """of `FITTED`, in that order"""
+    at: Callable[..., tuple[Log, Motion, Sensor]]
+    """(p (7,), scale=1.0) -> the log and the models with those parameters, and with ranges and
+    travel, which no log tells apart, both larger by a scale"""
 
 
 def mrclam_calibration(
@@ -45,7 +50,8 @@ def mrclam_calibration(
     """The systematic errors of one robot that make its innovations least, by its own log.
 
     `calibration.calibrate` on the innovations of the right-invariant EKF: wheels (`forward`,
-    `outer`, `turn`), place and yaw of the camera (`ahead`, `yaw`), and its optical axis (`axis`).
+    `outer`, `turn`, `curvature`), place and yaw of the camera (`ahead`, `yaw`), and its optical
+    axis (`axis`).
     Neither the true path nor the survey is used (where there is a true path, `mrclam` cuts lines
     (0, 0) after its end). Delay, noise and `depth` are those of `known`:
     ranges and odometry in proportion larger are the same log of a larger world, so the scale of the
@@ -65,30 +71,35 @@ def mrclam_calibration(
     data = mrclam(
         folder,
         robot,
-        calibration=known._replace(forward=1.0, outer=0.0, turn=1.0, depth=1.0, axis=0.0),
+        calibration=known._replace(
+            forward=1.0, outer=0.0, turn=1.0, curvature=0.0, depth=1.0, axis=0.0
+        ),
         errata=errata,
     )
     bearing = np.asarray(data.log.scan.z[..., 1])
     depth = np.asarray(data.log.scan.z[..., 0]) * np.cos(bearing)
 
-    def info(p: jax.Array) -> Info:
+    def at(p: jax.Array, scale: jax.Array | float = 1.0) -> tuple[Log, Motion, Sensor]:
         traced = cast("dict[str, float]", dict(zip(FITTED, p, strict=True)))
         own = known._replace(**traced)
         v, omega, dt = jnp.asarray(data.log.control).T
-        control = jnp.stack([*own.velocities(v, omega), dt], axis=-1)
+        forward, turn = own.velocities(v, omega)
         phi = jnp.asarray(bearing)
-        z = jnp.stack([own.range(jnp.asarray(depth), phi), phi], axis=-1)
-        filter = ekf_slam(
-            unicycle(own.odometry_cov()),
-            range_bearing(
-                own.measurement_cov(), mount=jnp.stack([own.ahead, 0.0 * own.ahead, own.yaw])
-            ),
-            data.capacity,
-            **(data.filter_options | {"gate": sigma_gate(gate), "chart": right_invariant()}),
+        z = jnp.stack([scale * own.range(jnp.asarray(depth), phi), phi], axis=-1)
+        log = data.log._replace(
+            control=jnp.stack([scale * forward, turn, dt], axis=-1),
+            scan=data.log.scan._replace(z=z),
         )
-        log = data.log._replace(control=control, scan=data.log.scan._replace(z=z))
+        ahead = scale * own.ahead
+        mount = jnp.stack([ahead, 0.0 * ahead, own.yaw])
+        return log, unicycle(own.odometry_cov()), range_bearing(own.measurement_cov(), mount=mount)
+
+    def info(p: jax.Array) -> Info:
+        log, motion, sensor = at(p)
+        options = data.filter_options | {"gate": sigma_gate(gate), "chart": right_invariant()}
+        filter = ekf_slam(motion, sensor, data.capacity, **options)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)).info
 
     found = calibrate(info, [getattr(known, name) for name in FITTED])
     values = dict(zip(FITTED, found.parameters.tolist(), strict=True))
-    return OwnCalibration(known._replace(**values), found)
+    return OwnCalibration(known._replace(**values), found, at)

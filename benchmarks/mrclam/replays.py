@@ -1,0 +1,150 @@
+"""Which errors the noise alone allows: simulated odometry and measurements along the true paths."""
+
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxslam
+from benchmarks.mrclam import fit as fitting
+from jaxslam import charts, datasets, linearize
+from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.filters import ekf_slam
+from jaxslam.math import se2
+from jaxslam.motion import pose_increment
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.sensors import range_bearing
+from jaxslam.types import Log, Scan, Truth
+
+RUNS = 300
+WHITE = 2.0
+"""Window of the noise of the odometry [s]: what lasts longer is taken to be known exactly."""
+LONGEST = 0.5
+"""Between rows of a simulated log [s]."""
+
+
+class Course(NamedTuple):
+    """What is the same in all simulated runs of a robot."""
+
+    truth: Truth
+    start_cov: np.ndarray
+    control: jax.Array
+    """(T, 6) true increments, and the standard deviations of theirs"""
+    scan: Scan
+    """without noise"""
+    motion: Motion
+    sensor: Sensor
+    options: dict[str, object]
+
+
+class Replayed(NamedTuple):
+    """Of the runs of a robot."""
+
+    ate: np.ndarray
+    """(K,) [m]"""
+    nees: np.ndarray
+    """(K,) median of the pose NEES"""
+    bound: float
+    """root of the mean of the ideal EKF's position variance [m]"""
+
+
+def course(folder: Path, robot: int) -> Course:
+    """The true path of a robot, and whom it saw when, with noise fitted on its truth."""
+    from benchmarks.mrclam.__main__ import from_first_scan
+
+    own = fitting.fit(folder, robot, turned=True, window=WHITE)
+    data = datasets.mrclam(folder, robot, calibration=own)
+    row, log = from_first_scan(data)
+    time, path, known = data.time[row:], data.true_path[row:], data.true_at[row:]
+    keep, last = log.scan.valid.any(axis=1), time[0]
+    for k, now in enumerate(time):  # scans, and rows between them where none is for long
+        keep[k] |= k == 0 or now - last >= LONGEST
+        last = now if keep[k] else last
+    keep &= known
+    time, path = time[keep], jnp.asarray(path[keep])
+    scan = jax.tree.map(lambda leaf: jnp.asarray(leaf[keep]), log.scan)
+    dt = np.diff(time, prepend=time[0])
+    increment = jax.vmap(se2.between)(jnp.concatenate([path[:1], path[:-1]]), path)
+    omega = np.asarray(increment[:, 2]) / np.where(dt > 0, dt, 1.0)
+    turn = np.hypot(own.turn_noise, own.turn_share * omega)
+    density = np.stack([np.full(len(dt), own.forward_noise), 0 * turn, turn], axis=1)
+    control = jnp.concatenate([increment, np.sqrt(dt)[:, None] * density], axis=1)
+    told = pose_increment(lambda pose, u: jnp.diag(u[3:] ** 2))
+    motion = Motion(
+        name="pose_increment_with_deviations",
+        controls=(*told.controls, "σ forward [m]", "σ left [m]", "σ turn [rad]"),
+        noises=told.noises,
+        step=lambda pose, u, w: told.step(pose, u[:3], w),
+        noise_cov=told.noise_cov,
+    )
+    sensor = range_bearing(own.measurement_cov(), mount=own.mount)
+    landmarks = jnp.asarray(data.landmarks)
+    at = landmarks[jnp.maximum(scan.tag, 0)]
+    z = jax.vmap(jax.vmap(sensor.observe, (None, 0)))(path, at)
+    truth = Truth(path, landmarks, np.zeros(len(path), np.int32), path[0])
+    scan = scan._replace(z=z)
+    options = dict(data.filter_options)
+    return Course(truth, data.pose_cov, control, scan, motion, sensor, options)
+
+
+def replay(folder: Path, robot: int, runs: int = RUNS) -> Replayed:
+    """Errors of the right-invariant EKF that knows all constants and the noise exactly."""
+    at = course(folder, robot)
+    capacity = len(at.truth.landmarks)
+
+    def run(key: jax.Array, ideal: bool) -> tuple[jax.Array, jax.Array]:
+        moved, seen, first, rest = jax.random.split(key, 4)
+        noise = at.control[:, 3:] * jax.random.normal(moved, at.control[:, 3:].shape)
+        control = at.control.at[:, :3].add(noise)
+        deviation = jax.vmap(jax.vmap(lambda z: jnp.sqrt(jnp.diag(at.sensor.noise_cov(z)))))
+        z = at.scan.z + deviation(at.scan.z) * jax.random.normal(seen, at.scan.z.shape)
+        start = jax.random.multivariate_normal(first, at.truth.start, at.start_cov)
+        kind = (
+            {"linearize": linearize.at_truth(at.truth)}
+            if ideal
+            else {"chart": charts.right_invariant()}
+        )
+        filter = ekf_slam(at.motion, at.sensor, capacity, **at.options, **kind)
+        log = Log(control, at.scan._replace(z=z))
+        estimate = jaxslam.run(filter, log, start, at.start_cov, rest).estimate
+        return estimate.pose, estimate.pose_cov
+
+    def several(keys: jax.Array, ideal: bool) -> tuple[np.ndarray, np.ndarray]:
+        found = jax.jit(jax.vmap(partial(run, ideal=ideal)))(keys)
+        poses, covs = jax.device_get(found)
+        return poses, covs
+
+    true = np.asarray(at.truth.pose)
+    poses, covs = several(jax.random.split(jax.random.key(robot), runs), False)
+    ate, nees = np.empty(runs), np.empty(runs)
+    for k in range(runs):
+        error = pose_error(true, poses[k])
+        ate[k] = np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())
+        each, regular = block_nees(poses[k], error, error, covs[k])["pose"]
+        nees[k] = np.median(each[regular])
+    _, (cov,) = several(jax.random.split(jax.random.key(robot), 1), True)
+    bound = float(np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]).mean()))
+    return Replayed(ate, nees, bound)
+
+
+def table(folder: Path, robots: range, asked: tuple[float, float]) -> dict[int, Replayed]:
+    """Prints noise of the heading by window, and what simulated runs come to."""
+    print("\n| robot | " + " | ".join(f"{w:g} s" for w in fitting.WINDOWS) + " |")
+    print("|" + " --- |" * (1 + len(fitting.WINDOWS)))
+    for robot in robots:
+        heading = fitting.odometry(folder, robot).heading
+        print(f"| {robot} | " + " | ".join(f"{each:.4f}" for each in heading) + " |", flush=True)
+    print(f"\n| robot | bound [m] | ATE 5, 50, 95 % [m] | ATE at most {asked[0]} | ", end="")
+    print(f"NEES 5, 50, 95 % | NEES at most {asked[1]:g} |\n|" + " --- |" * 6)
+    found = {}
+    for robot in robots:
+        found[robot] = one = replay(folder, robot)
+        ate, nees = (np.quantile(values, [0.05, 0.5, 0.95]) for values in (one.ate, one.nees))
+        cells = [f"{robot}", f"{one.bound:.3f}", ", ".join(f"{x:.3f}" for x in ate)]
+        cells += [f"{(one.ate <= asked[0]).mean():.3f}", ", ".join(f"{x:.2f}" for x in nees)]
+        cells += [f"{(one.nees <= asked[1]).mean():.3f}"]
+        print("| " + " | ".join(cells) + " |", flush=True)
+    return found
