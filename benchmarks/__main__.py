@@ -60,6 +60,10 @@ from benchmarks.speed.__main__ import gated
 from benchmarks.speed.__main__ import measure as measure_speed
 
 FIGURES = Path(__file__).parent / "figures"
+SOAKED = Path(__file__).parents[1] / ".cache" / "soak"
+"""Where the long campaign goes on from, if it was interrupted."""
+LONG = ("graph_draws_thousand", "soak_million")
+"""Benchmarks of hours, which run where they are named."""
 
 
 def command_seconds() -> list[Metric]:
@@ -128,6 +132,8 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "monte_carlo_localization": lambda: monte_carlo_localization.measure(
             4 if quick else 12, out=drawn("monte_carlo_localization.png")
         ),
+        "graph_draws_thousand": lambda: measure_graphs(quick, ["draws"], 1000),
+        "soak_million": lambda: soak.measure(1_000_000, folder=str(SOAKED)),
     }
 
 
@@ -154,7 +160,11 @@ def main(names: Sequence[str] = ()) -> int:
     parser.add_argument("--record", action="store_true", help="write RESULTS.md")
     options = parser.parse_args()
     known = parts(options.quick)
-    wanted = [name for name in options.only.split(",") if name] or names or list(known)
+    wanted = (
+        [name for name in options.only.split(",") if name]
+        or names
+        or [name for name in known if name not in LONG]
+    )
     if unknown := sorted(set(wanted) - set(known)):
         parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(known)}")
     jax.config.update("jax_enable_x64", True)

@@ -4,7 +4,8 @@ EKF and invariant EKF over 50 steps of `cloister`. The runs are computed in one 
 several processes, each of which is interrupted (the last is not) and resumed by the next. Measured:
 whether any number is NaN that is not of a run counted as not finite; whether both give the same
 bits; and by how much resident memory grows a run, over what the result holds of each. A million
-runs are a campaign of hours: give a folder, so that a second call goes on where the first ended.
+runs are a campaign of hours: give a folder, so that a second call of the same code goes on where
+the first ended, with the records of the processes that are done.
 """
 
 import json
@@ -12,9 +13,11 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +33,7 @@ jax.config.update("jax_compilation_cache_dir", sys.argv[1])
 runs, stop_at, folder = int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
 soak.share(runs, stop_at, folder)
 """
+Record = dict[str, Any]
 FROM_SHOTS = ("noncredibility", "inclination")
 STEADY = 4096
 """runs from which memory is measured: before, programs are compiled, and snapshots kept of runs"""
@@ -100,11 +104,21 @@ def finite(campaign: object) -> dict[str, int]:
     return {"nan": nan, "not finite": lost, "held": held}
 
 
-def process(cache: Path, runs: int, stop_at: int, folder: Path) -> Mapping[str, object]:
+def process(cache: Path, runs: int, stop_at: int, folder: Path) -> Record:
     """The record of a process that goes on until so many runs are done."""
     command = [sys.executable, "-c", SHARE, str(cache), str(runs), str(stop_at), str(folder)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    record: dict[str, object] = json.loads(done.stdout.splitlines()[-1])
+    record: Record = json.loads(done.stdout.splitlines()[-1])
+    return record
+
+
+def recorded(file: Path, make: Callable[[], Record]) -> Record:
+    """The record in a file, which is made where there is none."""
+    if not file.exists():
+        new = file.with_suffix(".new")
+        new.write_text(json.dumps(make()), encoding="utf-8")
+        new.replace(file)
+    record: Record = json.loads(file.read_text(encoding="utf-8"))
     return record
 
 
@@ -132,7 +146,10 @@ def measure(runs: int = 1_000_000, resumptions: int = 4, folder: str = "") -> li
         for name, parts in (("one go", 1), ("interrupted", resumptions + 1)):
             for number in range(1, parts + 1):
                 stop_at = runs * number // parts
-                record = process(place / "cache", runs, stop_at, place / name)
+                record = recorded(
+                    place / f"{name} {number}.json",
+                    partial(process, place / "cache", runs, stop_at, place / name),
+                )
                 grown, rate, peak = growth(record["marks"])
                 label = name if parts == 1 else f"{name}, process {number}"
                 cells = f"{record['done']:>12,}{rate:>8.0f}{peak / 1e6:>11.0f}{grown:>16.0f}"
