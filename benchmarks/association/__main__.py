@@ -17,9 +17,9 @@ from benchmarks.gate import Metric, report
 
 def table(title, rows, columns):
     """rows: {name: {column: value}}."""
-    print(f"\n{title}\n{'':24}" + "".join(f"{column:>18}" for column in columns))
+    print(f"\n{title}\n{'':24}" + "".join(f"{column:>20}" for column in columns))
     for name, values in rows.items():
-        cells = (f"{values[c]:18.4g}" if c in values else f"{'-':>18}" for c in columns)
+        cells = (f"{values[c]:20.4g}" if c in values else f"{'-':>20}" for c in columns)
         print(f"{name:24}" + "".join(cells))
 
 

@@ -32,7 +32,7 @@ from benchmarks.real_data import DATA
 from jaxslam import charts, datasets, metrics
 from jaxslam.calibration import consider_cov
 from jaxslam.consistency.nees import block_nees, pose_error
-from jaxslam.datasets.mrclam.own_log import FITTED
+from jaxslam.datasets import MRCLAM_FITTED
 from jaxslam.filters import ekf_slam, team_slam
 from jaxslam.math.stats import sigma_gate
 from jaxslam.team import poses
@@ -108,7 +108,7 @@ def row_of(robot, filter, noise, path, nis, rejected, unseen):
 
 
 def constants_row(robot, source, constants, sigma):
-    values = [getattr(constants, name) for name in FITTED]
+    values = [getattr(constants, name) for name in MRCLAM_FITTED]
     cells = [f"{value:.4f}" for value in values]
     if sigma is not None:
         cells = [f"{cell} ± {s:.4f}" for cell, s in zip(cells, sigma, strict=True)]
@@ -203,7 +203,7 @@ def measure(fit=False, out=FIGURE):
     robots = range(1, 6)
     own = {robot: datasets.mrclam_calibration(folder, robot) for robot in robots}
     true = {robot: fitting.fit(folder, robot, turned=True) for robot in robots}
-    print("\n| robot | source | " + " | ".join(FITTED) + " | depth |\n|" + " --- |" * 10)
+    print("\n| robot | source | " + " | ".join(MRCLAM_FITTED) + " | depth |\n|" + " --- |" * 10)
     for robot, each in own.items():
         print(constants_row(robot, "own log", each.robot, np.sqrt(np.diag(each.found.cov))))
         print(constants_row(robot, "own truth", true[robot], None), flush=True)
@@ -237,7 +237,7 @@ def measure(fit=False, out=FIGURE):
     # What robots 2 to 5 would meet together if all constants and the noise were known exactly.
     chance = float(np.prod([(simulated[r].ate <= ASKED[0]).mean() for r in HELD]))
     note = f"that simulated runs of all four have an ATE of {ASKED[0]} m"
-    metrics.append(Metric("chance of the ATE asked", chance, high=0.1, note=note))
+    metrics.append(Metric("chance of the ATE asked", chance, high=0.2, note=note))
     if out is not None:
         from benchmarks.mrclam.figure import draw
 

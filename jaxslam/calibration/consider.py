@@ -5,14 +5,17 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
+from jaxslam.validation.numbers import is_concrete
 
 
 def consider_cov(
-    result: Callable[[jax.Array], jax.Array], parameters: ArrayLike, cov: ArrayLike
+    result: Callable[[Float[Array, "P"]], Float[Array, "*shape n"]],
+    parameters: ArrayLike,
+    cov: ArrayLike,
 ) -> Float[np.ndarray, "*shape n n"]:
     """The covariance that uncertain parameters add to each row of a result.
 
@@ -21,42 +24,73 @@ def consider_cov(
     A filter takes the constants of its models for exact. Where they have the covariance C and its
     estimate the covariance P for given p, the estimate's covariance is P + J C Jᵀ to first order
     (consider covariance: Schmidt 1966; Tapley, Schutz & Born, "Statistical Orbit Determination",
-    2004, section 6.4). J is of the whole run, in forward mode.
+    2004, section 6.4). J is of the whole run, in forward mode; gates and associations stay as they
+    are decided at p.
 
-        added = consider_cov(lambda p: run(filter_of(p), …).estimate.pose, found.parameters,
-            found.cov)
-        honest = trace.estimate.pose_cov + added
+        added = consider_cov(lambda p: run(filter_of(p), …).estimate.pose, constants, cov)
+        cov = trace.estimate.pose_cov + added
+
+    This holds for constants that are independent of the log. Constants found in the same log, as by
+    `calibrate`, depend on its noise: P + J C Jᵀ is then right at the last row, where it is the
+    covariance of the joint estimate of state and constants, and in general too large before.
 
     Args:
         result: p (P,) -> an array (*shape, n), as poses (T, 3). Traced once.
-        parameters: (P,), or a number: where J is taken.
-        cov: (P, P) C, or a number.
+        parameters: where J is taken; a number counts as (1,).
+        cov: (P, P) C, or a number for one parameter.
     Raises:
-        ValueError: on parameters that are no finite vector, a covariance that is none or of another
-            size, a result that is a scalar or not real, or whose derivatives are not finite.
+        ValueError: within a trace; on parameters that are no finite vector; on a covariance of
+            another size, or that is none; on a result that is no array (*shape, n) of real numbers,
+            or that is not finite at p, itself or its derivatives.
     """
+    if not callable(result):
+        raise ValueError(
+            f"consider_cov: expected result to be a function of p, got {type(result).__name__}"
+        )
+    if not (is_concrete(parameters) and is_concrete(cov)):
+        raise ValueError("consider_cov: computes on the host; call it outside jit, vmap and grad")
     p = np.atleast_1d(np.asarray(parameters, np.float64))
     if p.ndim != 1 or not p.size or not np.isfinite(p).all():
         raise ValueError(
             f"consider_cov: expected parameters of shape (P,), finite, got {parameters!r}"
         )
-    c = np.asarray(cov, np.float64)
-    c = c.reshape(1, 1) if c.ndim == 0 else c
-    if c.shape != (p.size, p.size) or not np.isfinite(c).all() or not np.allclose(c, c.T):
-        raise ValueError(
-            f"consider_cov: expected a covariance of shape {(p.size, p.size)}, symmetric, got one "
-            f"of shape {c.shape}"
-        )
-    if np.linalg.eigvalsh(c)[0] < -1e-9 * np.abs(c).max(initial=0.0):
-        raise ValueError("consider_cov: expected a covariance, got one with a negative eigenvalue")
-    what = jax.eval_shape(result, jax.ShapeDtypeStruct(p.shape, jnp.asarray(p).dtype))
-    shape, dtype = getattr(what, "shape", ()), getattr(what, "dtype", None)
-    if not shape or dtype is None or not jnp.issubdtype(dtype, jnp.floating):
-        raise ValueError(
-            "consider_cov: expected result to return an array (*shape, n) of real numbers, got "
-            f"{what}"
-        )
-    jacobian = np.asarray(jax.device_get(programs.call(jax.jacfwd(result), (), jnp.asarray(p))))
-    if not np.isfinite(jacobian).all():
-        raise ValueError(f"consider_cov: the derivatives at {p} are not finite")
+    c = _covariance(cov, p.size)
+
+    def both(p: Float[Array, "P"]) -> tuple[Array, Array]:
+        value = result(p)
+        dtype = getattr(value, "dtype", None)
+        if not getattr(value, "shape", ()) or not jnp.issubdtype(dtype, jnp.floating):
+            what = f"{value.shape} {dtype}" if dtype is not None else type(value).__name__
+            raise ValueError(
+                "consider_cov: expected result to return an array (*shape, n) of real numbers, as "
+                f"trace.estimate.pose, got {what}"
+            )
+        return value, value
+
+    differentiated = jax.jacfwd(both, has_aux=True)
+    found = jax.device_get(programs.call(differentiated, (), jnp.asarray(p)))
+    jacobian, value = (np.asarray(each, np.float64) for each in found)
+    if not (np.isfinite(jacobian).all() and np.isfinite(value).all()):
+        raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
     return np.asarray(jacobian @ c @ np.swapaxes(jacobian, -1, -2))
+
+
+def _covariance(cov: ArrayLike, size: int) -> Float[np.ndarray, "P P"]:
+    """A covariance of so many parameters; raises ValueError on what is none, in any units."""
+    c = np.asarray(cov, np.float64)
+    c = c.reshape(1, 1) if c.ndim == 0 and size == 1 else c
+    if c.shape != (size, size):
+        raise ValueError(
+            f"consider_cov: expected a covariance of shape {(size, size)}, got one of {c.shape}"
+        )
+    if not np.isfinite(c).all():
+        raise ValueError("consider_cov: expected a covariance, got one that is not finite")
+    if not np.allclose(c, c.T):
+        raise ValueError("consider_cov: expected a covariance, got one that is not symmetric")
+    deviation = np.sqrt(np.maximum(np.diag(c), 0.0))
+    scale = np.outer(deviation, deviation)
+    correlation = c / np.where(scale > 0, scale, 1.0)
+    none = (np.diag(c) < 0).any() or (c[scale == 0] != 0).any()
+    if none or np.linalg.eigvalsh(correlation)[0] < -1e-9:
+        raise ValueError("consider_cov: expected a covariance, got one with a negative eigenvalue")
+    return c

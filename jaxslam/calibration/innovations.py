@@ -58,7 +58,9 @@ def calibrate(
 
     Args:
         info: p (P,) -> the `Info` of a run, `lambda p: jaxslam.run(…).info`, where p may enter the
-            controls, the models or the mounting. Traced once.
+            controls, the models or the mounting. Neither a noise covariance nor the size of the
+            measurements may depend on it: the innovations would be least where the noise is
+            largest, or the measurements smallest; `fit_noise` finds such parameters. Traced once.
         start: (P,), or a number.
         iterations: steps at most.
         tolerance: done when no parameter moves by more than so many of its standard deviations.
@@ -81,6 +83,11 @@ def calibrate(
     ) -> tuple[Float[Array, "K"], tuple[Float[Array, "K"], Int[Array, ""]]]:
         """The whitened innovations, twice (one for `jacfwd`), and their degrees of freedom."""
         found = info(p)
+        if not isinstance(found, Info):
+            raise ValueError(
+                "calibrate: expected info to return the Info of a run, `run(…).info`, got "
+                f"{type(found).__name__}"
+            )
         fused = found.status == Status.FUSED
         count, size = fused.size, found.innovation.shape[-1]
         there = fused.reshape(count)
@@ -96,6 +103,7 @@ def calibrate(
     path, misfit, dofs, converged = [p], [], [], False
     for _ in range(iterations):
         jacobian, (w, dof) = jax.device_get(programs.call(step, (), jnp.asarray(p)))
+        rounding = np.sqrt(np.finfo(jacobian.dtype).eps)
         jacobian, w, dof = np.asarray(jacobian, np.float64), np.asarray(w, np.float64), int(dof)
         if not dof:
             raise ValueError(
@@ -109,7 +117,7 @@ def calibrate(
         # Columns of unit length: whether parameters can be distinguished does not depend on units.
         length = np.linalg.norm(jacobian, axis=0)
         left, values, right = np.linalg.svd(jacobian / np.where(length > 0, length, 1.0), False)
-        if values[-1] <= len(p) * np.sqrt(np.finfo(np.float64).eps) * values[0]:
+        if values[-1] <= len(p) * rounding * values[0]:
             raise ValueError(
                 f"calibrate: the log does not determine all parameters at {p}: fix one, or use a "
                 "log with more motion"

@@ -12,7 +12,11 @@ from jaxslam.datasets.bonn import bonn
 from jaxslam.datasets.carmen import LaserLog, carmen
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
-from jaxslam.datasets.mrclam.own_log import OwnCalibration, mrclam_calibration
+from jaxslam.datasets.mrclam.own_log import (
+    MRCLAM_FITTED,
+    OwnCalibration,
+    mrclam_calibration,
+)
 from jaxslam.datasets.mrclam.reader import mrclam
 from jaxslam.datasets.mrclam.team import mrclam_team
 from jaxslam.datasets.noise_fit import DatasetFit, fit
@@ -47,6 +51,7 @@ READERS: dict[str, Reader] = {
 
 __all__ = [
     "MRCLAM_CALIBRATION",
+    "MRCLAM_FITTED",
     "READERS",
     "Dataset",
     "DatasetFit",

@@ -86,6 +86,11 @@ def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimat
         (lambda p: p, [1.0, 2.0], np.eye(3), r"shape \(2, 2\)"),
         (lambda p: p, [1.0, 2.0], [[1.0, 0.5], [0.0, 1.0]], "symmetric"),
         (lambda p: p, [1.0, 2.0], -np.eye(2), "negative eigenvalue"),
+        (lambda p: p, [1.0, 2.0], np.diag([1.0, -1e-9]), "negative eigenvalue"),
+        (lambda p: p, [1.0, 2.0], [[1.0, 1e-9], [1e-9, 0.0]], "negative eigenvalue"),
+        (lambda p: p, [1.0, 2.0], [[1.0, np.nan], [np.nan, 1.0]], "not finite"),
+        (3.0, [1.0], 1.0, "a function of p, got float"),
+        (lambda p: jnp.where(p > 0, jnp.nan, p), [1.0], 1.0, "not finite"),
         (lambda p: p.sum(), [1.0, 2.0], np.eye(2), "array"),
         (lambda p: (p, p), [1.0], 1.0, "array"),
         (lambda p: p > 0, [1.0], 1.0, "real numbers"),
@@ -95,6 +100,16 @@ def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimat
 def test_what_adds_no_covariance_is_refused(result, parameters, cov, why):
     with pytest.raises(ValueError, match=f"consider_cov: .*{why}"):
         consider_cov(result, parameters, cov)
+
+
+def test_uncertain_parameters_are_not_considered_within_a_trace():
+    with pytest.raises(ValueError, match="consider_cov: .*outside jit"):
+        jax.jit(lambda p: jnp.asarray(consider_cov(lambda q: q, p, 1.0)))(1.0)
+
+
+def test_a_calibration_of_what_is_no_run_is_refused():
+    with pytest.raises(ValueError, match="calibrate: expected info to return the Info of a run"):
+        calibrate(lambda p: p, [1.0])
 
 
 def drive(seed, steps=160, drift=0.02, turn=0.1):

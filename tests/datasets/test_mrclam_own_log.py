@@ -5,8 +5,7 @@ import pytest
 from recordings import TEAM, write
 
 from jaxslam import datasets
-from jaxslam.datasets import RobotCalibration
-from jaxslam.datasets.mrclam.own_log import FITTED
+from jaxslam.datasets import MRCLAM_FITTED, RobotCalibration
 
 KNOWN = RobotCalibration(
     0.0, 1.0, 0.05, 1.0, 0.0, 1.02, 0.0, 0.0, 0.0, 0.003, 0.01, 0.0, 0.01, 0.01
@@ -61,6 +60,14 @@ def test_what_is_no_calibration_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match="expected a RobotCalibration, got"):
             read()
+    for wrong, why in (
+        ({"depth": 0.0}, "depth of a calibration to be a finite number above 0"),
+        ({"bearing_noise": -1.0}, "bearing_noise of a calibration to be a finite number >= 0"),
+        ({"axis": np.nan}, "axis of a calibration to be a finite number, got nan"),
+        ({"turn": "fast"}, "turn of a calibration to be a finite number, got 'fast'"),
+    ):
+        with pytest.raises(ValueError, match=f"mrclam: expected the {why}"):
+            datasets.mrclam(tmp_path, 1, calibration=KNOWN._replace(**wrong))
     write(tmp_path, TEAM)
     for calibration, why in (({1: KNOWN}, "robot 2 has no calibration"), (3, "got int")):
         with pytest.raises(ValueError, match=why):
@@ -79,19 +86,22 @@ def test_what_is_no_calibration_is_refused(tmp_path):
 def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
     own = datasets.mrclam_calibration(write(tmp_path, recorded()), 1, known=KNOWN)
     assert own.found.converged
-    error = own.found.parameters - [getattr(TRUE, name) for name in FITTED]
+    error = own.found.parameters - [getattr(TRUE, name) for name in MRCLAM_FITTED]
     assert error @ np.linalg.solve(own.found.cov, error) < 20.0  # 7 degrees of freedom: p = 0.006
     sigma = np.sqrt(np.diag(own.found.cov))
-    start = [getattr(TRUE, name) - getattr(KNOWN, name) for name in FITTED]
+    start = [getattr(TRUE, name) - getattr(KNOWN, name) for name in MRCLAM_FITTED]
     assert (np.abs(start) > 4 * sigma).all()  # so that finding them is something
     assert own.robot == KNOWN._replace(
-        **dict(zip(FITTED, own.found.parameters.tolist(), strict=True))
+        **dict(zip(MRCLAM_FITTED, own.found.parameters.tolist(), strict=True))
     )
     assert own.found.misfit[-1] == pytest.approx(1.0, abs=0.15)
     data = datasets.mrclam(tmp_path, 1, calibration=own.robot)
     log, motion, sensor = own.at(own.found.parameters)
     np.testing.assert_allclose(log.control, data.log.control, rtol=1e-12)
     np.testing.assert_allclose(log.scan.z, data.log.scan.z, rtol=1e-12)
+    for p, scale in ((own.found.parameters[:-1], 1.0), (own.found.parameters, 0.0)):
+        with pytest.raises(ValueError, match="OwnCalibration.at: expected constants of shape"):
+            own.at(p, scale)
     larger, _, farther = own.at(own.found.parameters, scale=2.0)
     np.testing.assert_allclose(larger.scan.z, np.asarray(log.scan.z) * [2.0, 1.0], rtol=1e-12)
     np.testing.assert_allclose(

@@ -138,9 +138,25 @@ the odometry is that of windows of 8 s, that of the camera of single measurement
 
 
 def check_calibration(name: str, calibration: object) -> None:
-    """Raise ValueError, which begins with the caller's name, unless it is a RobotCalibration."""
+    """Raise ValueError, which begins with the caller's name, unless it is a RobotCalibration of
+    finite numbers, its depth above 0, its noise not negative."""
     if not isinstance(calibration, RobotCalibration):
         raise ValueError(f"{name}: expected a RobotCalibration, got {type(calibration).__name__}")
+    for field, value in calibration._asdict().items():
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = np.nan
+        low = -np.inf
+        if field in ("depth", "turn_share", "range_share") or field.endswith("_noise"):
+            low = 0.0
+        if not (np.isfinite(number) and number >= low) or (field == "depth" and number == 0):
+            wanted = "a finite number"
+            if low == 0:
+                wanted += " above 0" if field == "depth" else " >= 0"
+            raise ValueError(
+                f"{name}: expected the {field} of a calibration to be {wanted}, got {value!r}"
+            )
 
 
 def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:

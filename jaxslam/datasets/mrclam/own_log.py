@@ -23,20 +23,33 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.run import run
 from jaxslam.sensors import range_bearing
 from jaxslam.types import Info, Log
+from jaxslam.validation.numbers import is_concrete
 
-FITTED = ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
+MRCLAM_FITTED = ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
 """What a log tells of a `RobotCalibration`; it does not tell `depth` beside `forward`."""
 
 
 class OwnCalibration(NamedTuple):
-    """The calibration of a robot by its own log, and how it was found."""
+    """The calibration of a robot by its own log, and how it was found.
+
+    `at(p, scale=1.0)` returns the log and the models (`Log`, `Motion`, `Sensor`) with other
+    constants p (7,), in the order of `MRCLAM_FITTED`; ranges and travel, which no log tells apart,
+    are both larger by a scale. p and the scale may be traced:
+
+        def poses(p):
+            log, motion, sensor = own.at(p[:-1], scale=1 + p[-1])
+            filter = ekf_slam(motion, sensor, data.capacity, **data.filter_options)
+            return run(filter, log, data.pose, data.pose_cov, key).estimate.pose
+
+        p = [*own.found.parameters, 0.0]
+        added = calibration.consider_cov(poses, p, block_diag(own.found.cov, 0.02**2))
+    """
 
     robot: RobotCalibration
     found: Calibration
-    """of `FITTED`, in that order"""
+    """of `MRCLAM_FITTED`, in that order"""
     at: Callable[..., tuple[Log, Motion, Sensor]]
-    """(p (7,), scale=1.0) -> the log and the models with those parameters, and with ranges and
-    travel, which no log tells apart, both larger by a scale"""
+    """(p (7,), scale=1.0) -> log, motion, sensor"""
 
 
 def mrclam_calibration(
@@ -80,7 +93,12 @@ def mrclam_calibration(
     depth = np.asarray(data.log.scan.z[..., 0]) * np.cos(bearing)
 
     def at(p: jax.Array, scale: jax.Array | float = 1.0) -> tuple[Log, Motion, Sensor]:
-        traced = cast("dict[str, float]", dict(zip(FITTED, p, strict=True)))
+        if np.shape(p) != (len(MRCLAM_FITTED),) or (is_concrete(scale) and not float(scale) > 0):
+            raise ValueError(
+                f"OwnCalibration.at: expected constants of shape {(len(MRCLAM_FITTED),)} and a scale "
+                f"above 0, got {np.shape(p)} and {scale}"
+            )
+        traced = cast("dict[str, float]", dict(zip(MRCLAM_FITTED, p, strict=True)))
         own = known._replace(**traced)
         v, omega, dt = jnp.asarray(data.log.control).T
         forward, turn = own.velocities(v, omega)
@@ -100,6 +118,6 @@ def mrclam_calibration(
         filter = ekf_slam(motion, sensor, data.capacity, **options)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)).info
 
-    found = calibrate(info, [getattr(known, name) for name in FITTED])
-    values = dict(zip(FITTED, found.parameters.tolist(), strict=True))
+    found = calibrate(info, [getattr(known, name) for name in MRCLAM_FITTED])
+    values = dict(zip(MRCLAM_FITTED, found.parameters.tolist(), strict=True))
     return OwnCalibration(known._replace(**values), found, at)
