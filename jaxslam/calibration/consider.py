@@ -58,9 +58,9 @@ def consider_cov(
 
     def both(p: Float[Array, "P"]) -> tuple[Array, Array]:
         value = result(p)
-        dtype = getattr(value, "dtype", None)
-        if not getattr(value, "shape", ()) or not jnp.issubdtype(dtype, jnp.floating):
-            what = f"{value.shape} {dtype}" if dtype is not None else type(value).__name__
+        array = isinstance(value, jax.Array)
+        if not array or not value.shape or not jnp.issubdtype(value.dtype, jnp.floating):
+            what = f"{value.shape} {value.dtype}" if array else type(value).__name__
             raise ValueError(
                 "consider_cov: expected result to return an array (*shape, n) of real numbers, as "
                 f"trace.estimate.pose, got {what}"

@@ -103,7 +103,7 @@ def test_what_adds_no_covariance_is_refused(result, parameters, cov, why):
 
 
 def test_uncertain_parameters_are_not_considered_within_a_trace():
-    with pytest.raises(ValueError, match="consider_cov: .*outside jit"):
+    with pytest.raises(ValueError, match=r"consider_cov: .*outside jit"):
         jax.jit(lambda p: jnp.asarray(consider_cov(lambda q: q, p, 1.0)))(1.0)
 
 

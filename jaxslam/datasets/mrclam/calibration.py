@@ -147,13 +147,12 @@ def check_calibration(name: str, calibration: object) -> None:
             number = float(value)
         except (TypeError, ValueError):
             number = np.nan
-        low = -np.inf
-        if field in ("depth", "turn_share", "range_share") or field.endswith("_noise"):
-            low = 0.0
-        if not (np.isfinite(number) and number >= low) or (field == "depth" and number == 0):
-            wanted = "a finite number"
-            if low == 0:
-                wanted += " above 0" if field == "depth" else " >= 0"
+        good, wanted = np.isfinite(number), "a finite number"
+        if field == "depth":
+            good, wanted = good and number > 0, f"{wanted} above 0"
+        elif field.endswith(("_noise", "_share")):
+            good, wanted = good and number >= 0, f"{wanted} >= 0"
+        if not good:
             raise ValueError(
                 f"{name}: expected the {field} of a calibration to be {wanted}, got {value!r}"
             )

@@ -95,8 +95,8 @@ def mrclam_calibration(
     def at(p: jax.Array, scale: jax.Array | float = 1.0) -> tuple[Log, Motion, Sensor]:
         if np.shape(p) != (len(MRCLAM_FITTED),) or (is_concrete(scale) and not float(scale) > 0):
             raise ValueError(
-                f"OwnCalibration.at: expected constants of shape {(len(MRCLAM_FITTED),)} and a scale "
-                f"above 0, got {np.shape(p)} and {scale}"
+                f"OwnCalibration.at: expected constants of shape {(len(MRCLAM_FITTED),)} and a "
+                f"scale above 0, got {np.shape(p)} and {scale}"
             )
         traced = cast("dict[str, float]", dict(zip(MRCLAM_FITTED, p, strict=True)))
         own = known._replace(**traced)
