@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, Measure
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.campaigns.layout import TOGETHER, head, kinds_of, runs_of
+from jaxslam.results.plot.campaigns.layout import TOGETHER, head, kinds_of, numbers_of, runs_of
 from jaxslam.results.plot.campaigns.scale import mark_beyond, power, set_positive
 from jaxslam.results.plot.style import (
     INK,
@@ -76,10 +76,11 @@ def _listed(campaign: Campaign, times: dict[str, float], width: float) -> Figure
     for axes, key in zip(panels[1:], _LABELS, strict=True):
         _scale(axes, _values(campaign, key), "x")
     names, heights, middle, at = [], [], [], 0
+    numbers = numbers_of(list(times))
     for _, members in groups:
         middle.append(at + (len(members) - 1) / 2)
-        for i, name in enumerate(members):
-            measures = campaign.filters[name].measures
+        for name in members:
+            i, measures = numbers[name], campaign.filters[name].measures
             _point(panels[0], i, at, name, Measure(times[name], np.nan, np.nan))
             for axes, key in zip(panels[1:], _LABELS, strict=True):
                 _point(axes, i, at, name, measures.get(key, _NONE))
