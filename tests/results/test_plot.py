@@ -11,9 +11,10 @@ from matplotlib.colors import to_rgb
 
 from jaxslam import plot
 from jaxslam.catalog import ALL, KINDS
-from jaxslam.consistency import DOF, LAGS, LEVELS
+from jaxslam.consistency import DOF, LAGS, LEVELS, Measure
 from jaxslam.results.page.curves import embedded_curves
 from jaxslam.results.page.style import CSS
+from jaxslam.results.plot.campaigns.cost import INTERVAL
 from jaxslam.results.plot.campaigns.layout import kinds_of, numbers_of
 from jaxslam.results.plot.campaigns.scale import BEYOND, set_positive
 from jaxslam.results.plot.style import HUES, SHADE, TEXT, curves_of, look, panels_of
@@ -263,6 +264,34 @@ def test_points_of_cost_stay_off_the_frame(five):
     assert "no filter was timed" in [text.get_text() for text in untimed.axes[0].texts]
     assert "ekf: not timed" in named(untimed)
     untimed.canvas.draw()
+
+
+@pytest.mark.parametrize("names", [FIVE[:3], TWELVE])
+def test_intervals_of_cost_set_the_scale_and_have_an_arrow_where_they_leave_it(names):
+    found = drawn.campaign(names)
+    measures = {
+        "dead_reckoning": Measure(1.0, 0.3, 4.0),
+        "ekf": Measure(0.5, 0.4, np.inf),
+        "fej": Measure(0.5, 1e-4, 2.0),
+    }
+    for name, s in found.filters.items():
+        s.measures["rmse_position"] = measures.get(name, Measure(0.5, 0.4, 0.6))
+    figure = plot.cost_figure(found)
+    axes = figure.axes[1 if len(names) > 5 else 0]
+    along = 0 if len(names) > 5 else 1
+    low, high = (axes.get_xlim, axes.get_ylim)[along]()
+    assert low < 0.3 and 4.0 < high < 10
+    drawn_there = [each for each in axes.lines if each.get_gid() == INTERVAL]
+    lines = [each.get_xydata()[:, along] for each in drawn_there if len(each.get_xdata()) == 2]
+    assert len(lines) == len(names)
+    for ends in ([0.3, 4.0], [0.4, high], [low, 2.0]):
+        assert any(np.allclose(line, ends) for line in lines)
+    arrows = {
+        each.get_marker(): each.get_xydata()[0, along]
+        for each in drawn_there
+        if each.get_marker() != "None"
+    }
+    assert arrows == dict(zip("<>" if along == 0 else "v^", (low, high), strict=True))
 
 
 def test_many_filters_are_listed_by_cost(every):
