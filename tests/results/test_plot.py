@@ -201,6 +201,16 @@ def test_the_band_is_seen_whatever_a_degenerate_covariance_gives(names):
     assert len(extreme) == 3
 
 
+def test_low_panels_of_nees_have_the_powers_of_ten_and_the_honest_one(every):
+    figure = plot.nees_figure(every)
+    figure.draw_without_rendering()
+    for axes, dof in zip(panels(figure)[:3], DOF.values(), strict=True):
+        low, high = axes.get_ylim()
+        shown = [tick for tick in axes.get_yticks() if low <= tick <= high]
+        assert {10.0, 100.0} <= set(shown)
+        assert dof > 1 or 1.0 in shown
+
+
 def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
     figure = plot.bound_figure(five)
     assert named(figure)[-1] == "conditional Cramér-Rao bound"
@@ -224,9 +234,12 @@ def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
 
 def test_coverage_is_drawn_about_the_diagonal(five):
     figure = plot.coverage_figure(five)
+    figure.draw_without_rendering()
     for axes, (block, dof) in zip(figure.axes, DOF.items(), strict=True):
         assert axes.get_title("left") == f"{block} (dof {dof})"
         assert axes.get_box_aspect() == 1
+        gap = figure.legends[0].get_window_extent().y0 - axes.get_tightbbox().y1
+        assert 0 < gap < 0.15 * figure.dpi
         np.testing.assert_array_equal(*axes.lines[0].get_data())
         np.testing.assert_array_equal(line(axes, "ekf").get_xdata(), LEVELS)
         share = line(axes, "ekf").get_ydata()

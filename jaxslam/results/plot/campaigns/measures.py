@@ -65,7 +65,7 @@ def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     More than five filters are drawn by kind. width [in].
     """
     titles = [f"{block} (dof {dof})" for block, dof in DOF.items()]
-    height = width / len(DOF) + 0.3
+    height = (width - 0.95) / len(DOF) + 0.44
     figure, rows = sheet(campaign, titles, width=width, height=height, across=True)
     ticks = np.linspace(0, 1, 5 if width > 5 else 3)
     for row in rows:
@@ -78,7 +78,7 @@ def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             axes.xaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_major_formatter("{x:g}")
             if not row.kind:
-                axes.set_box_aspect(1)
+                axes.set(box_aspect=1, anchor="N")
     if not rows[0].kind:
         rows[0].panels[0].set_ylabel("share of truth within")
     add_legends(
