@@ -1,20 +1,26 @@
 """Figures of campaigns: what is drawn, what sets a scale, and that nothing overlaps."""
 
 import dataclasses
+import json
 from itertools import pairwise
 
 import drawn
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from jaxslam import plot
 from jaxslam.catalog import ALL, KINDS
-from jaxslam.consistency import DOF, LAGS, LEVELS
-from jaxslam.results.plot.campaigns.layout import kinds_of
+from jaxslam.consistency import DOF, LAGS, LEVELS, Measure
+from jaxslam.results.page.curves import embedded_curves
+from jaxslam.results.page.style import CSS
+from jaxslam.results.plot.campaigns.cost import INTERVAL
+from jaxslam.results.plot.campaigns.layout import kinds_of, numbers_of
 from jaxslam.results.plot.campaigns.scale import BEYOND, set_positive
-from jaxslam.results.plot.style import COLORS, TEXT, curves_of, look, panels_of
+from jaxslam.results.plot.style import HUES, SHADE, TEXT, curves_of, look, panels_of
 
 FIVE = ("dead_reckoning", "ekf", "fej", "right_invariant", "fastslam1")
+TWELVE = (*FIVE, "localization", "ideal", "oc", "ukf", "seif", "batch_map", "fastslam2")
 OVER_STEPS = (
     plot.nees_figure,
     plot.bound_figure,
@@ -72,7 +78,7 @@ def kinds(figure, columns):
 def test_filters_are_told_apart_by_colour_and_without():
     thirty = [look(i) for i in range(30)]
     assert len({(each["color"], each["ls"]) for each in thirty}) == 30
-    assert {each["color"] for each in thirty} <= set(COLORS)
+    assert len({each["color"] for each in thirty}) == 6
     for five in (thirty[:5], thirty[5:10]):
         assert len({each["ls"] for each in five}) == len({each["marker"] for each in five}) == 5
 
@@ -91,6 +97,39 @@ def test_an_ordinate_is_logarithmic_beyond_a_decade_and_has_numbers(low, high, s
         ticks = [tick for tick in axis.locator() if bottom <= tick <= top]
         shown += filter(None, axis.formatter.format_ticks(ticks))
     assert len(shown) >= 2
+
+
+def drawn_looks(figure):
+    """{(filter, colour, mark)} of the lines of filters in a figure."""
+    lines = [each for axes in figure.axes for each in axes.lines if len(each.get_xdata())]
+    found = [(each.get_label().split(" (")[0], each) for each in lines]
+    return {(name, each.get_color(), each.get_marker()) for name, each in found if name in TWELVE}
+
+
+@pytest.mark.parametrize("names", [FIVE, TWELVE])
+def test_a_filter_has_one_look_in_all_figures_and_in_the_page(names):
+    found = drawn.campaign(names)
+    numbers = numbers_of(names)
+    expected = {n: (look(i)["color"], look(i)["marker"]) for n, i in numbers.items()}
+    assert len(set(expected.values())) == len(names)
+    for draw in (*OVER_STEPS, plot.cost_figure):
+        seen = drawn_looks(draw(found))
+        assert len(seen) >= len(names) / 2
+        assert {(name, *expected[name]) for name, *_ in seen} == seen
+    assert json.loads(embedded_curves(found).text)["looks"] == [numbers[name] for name in names]
+    for _, mine in kinds_of(list(names)):
+        assert len({look(numbers[name])["marker"] for name in mine}) == len(mine)
+
+
+def test_filters_have_the_colours_of_the_page_and_stand_out_from_the_band():
+    assert [CSS.split(f"--c{i}: ")[1][:7] for i in range(len(HUES))] == list(HUES)
+    band = 1 - 0.35 * (1 - np.array(to_rgb(SHADE)))
+    assert min((_luminance(band) + 0.05) / (_luminance(to_rgb(hue)) + 0.05) for hue in HUES) > 2.3
+
+
+def _luminance(rgb):
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in rgb]
+    return float(np.dot([0.2126, 0.7152, 0.0722], linear))
 
 
 def test_every_filter_of_the_family_has_one_kind():
@@ -162,6 +201,16 @@ def test_the_band_is_seen_whatever_a_degenerate_covariance_gives(names):
     assert len(extreme) == 3
 
 
+def test_low_panels_of_nees_have_the_powers_of_ten_and_the_honest_one(every):
+    figure = plot.nees_figure(every)
+    figure.draw_without_rendering()
+    for axes, dof in zip(panels(figure)[:3], DOF.values(), strict=True):
+        low, high = axes.get_ylim()
+        shown = [tick for tick in axes.get_yticks() if low <= tick <= high]
+        assert {10.0, 100.0} <= set(shown)
+        assert dof > 1 or 1.0 in shown
+
+
 def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
     figure = plot.bound_figure(five)
     assert named(figure)[-1] == "conditional Cramér-Rao bound"
@@ -185,9 +234,12 @@ def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
 
 def test_coverage_is_drawn_about_the_diagonal(five):
     figure = plot.coverage_figure(five)
+    figure.draw_without_rendering()
     for axes, (block, dof) in zip(figure.axes, DOF.items(), strict=True):
         assert axes.get_title("left") == f"{block} (dof {dof})"
         assert axes.get_box_aspect() == 1
+        gap = figure.legends[0].get_window_extent().y0 - axes.get_tightbbox().y1
+        assert 0 < gap < 0.15 * figure.dpi
         np.testing.assert_array_equal(*axes.lines[0].get_data())
         np.testing.assert_array_equal(line(axes, "ekf").get_xdata(), LEVELS)
         share = line(axes, "ekf").get_ydata()
@@ -227,6 +279,34 @@ def test_points_of_cost_stay_off_the_frame(five):
     untimed.canvas.draw()
 
 
+@pytest.mark.parametrize("names", [FIVE[:3], TWELVE])
+def test_intervals_of_cost_set_the_scale_and_have_an_arrow_where_they_leave_it(names):
+    found = drawn.campaign(names)
+    measures = {
+        "dead_reckoning": Measure(1.0, 0.3, 4.0),
+        "ekf": Measure(0.5, 0.4, np.inf),
+        "fej": Measure(0.5, 1e-4, 2.0),
+    }
+    for name, s in found.filters.items():
+        s.measures["rmse_position"] = measures.get(name, Measure(0.5, 0.4, 0.6))
+    figure = plot.cost_figure(found)
+    axes = figure.axes[1 if len(names) > 5 else 0]
+    along = 0 if len(names) > 5 else 1
+    low, high = (axes.get_xlim, axes.get_ylim)[along]()
+    assert low < 0.3 and 4.0 < high < 10
+    drawn_there = [each for each in axes.lines if each.get_gid() == INTERVAL]
+    lines = [each.get_xydata()[:, along] for each in drawn_there if len(each.get_xdata()) == 2]
+    assert len(lines) == len(names)
+    for ends in ([0.3, 4.0], [0.4, high], [low, 2.0]):
+        assert any(np.allclose(line, ends) for line in lines)
+    arrows = {
+        each.get_marker(): each.get_xydata()[0, along]
+        for each in drawn_there
+        if each.get_marker() != "None"
+    }
+    assert arrows == dict(zip("<>" if along == 0 else "v^", (low, high), strict=True))
+
+
 def test_many_filters_are_listed_by_cost(every):
     figure = plot.cost_figure(every)
     times, errors, nees = figure.axes[:3]
@@ -234,7 +314,7 @@ def test_many_filters_are_listed_by_cost(every):
     assert listed == [name for _, names in kinds_of(list(ALL)) for name in names]
     for axes in (times, errors):
         left, right = axes.get_xlim()
-        points = [each for each in axes.lines if each.get_marker() != "None"]
+        points = [each for each in axes.lines if each.get_label() in ALL]
         assert len(points) == len(ALL)
         assert all(left < each.get_xdata()[0] < right for each in points)
     assert nees.get_xlim()[1] < 1e3

@@ -63,6 +63,34 @@ def test_a_map_has_equal_aspect_units_a_start_and_an_end():
     assert plot.png(figure, 40).startswith(b"\x89PNG")
 
 
+def test_paths_that_coincide_can_all_be_seen_in_a_map():
+    truth, estimate = drawn.run_of("ekf")
+    others = {f"other{i}": estimate for i in range(12)}
+    (axes,) = plot.map_figure(estimate, truth=truth, others=others).axes
+    first = line(axes, "estimated path")
+    assert first.get_linestyle() == "-"
+    over = [line(axes, name) for name in others]
+    assert all(each.get_zorder() > first.get_zorder() for each in over)
+    assert {each.get_linestyle() for each in over} == {"--"}  # of all that are not solid
+    looks = {(each.get_color(), str(each._dash_pattern)) for each in over}
+    assert len(looks) == 12 and first.get_color() not in {color for color, _ in looks}
+
+
+@pytest.mark.parametrize("count", [3, 5, 7, 11])
+def test_the_lowest_map_of_each_column_has_the_abscissa(count):
+    figure = plot.run_map_figure(drawn.campaign([f"filter{i}" for i in range(count)]))
+    figure.draw_without_rendering()
+    shown = [axes for axes in figure.axes if axes.axison]
+    columns = 3 if count <= 9 else 4
+    for i, axes in enumerate(shown):
+        lowest = i + columns >= count
+        assert axes.get_xlabel() == ("x [m]" if lowest else "")
+        assert any(tick.label1.get_visible() for tick in axes.xaxis.get_major_ticks()) == lowest
+        assert axes.get_tightbbox().y0 > 0
+    boxes = [axes.get_tightbbox() for axes in shown]
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[i + 1 :])
+
+
 def test_maps_without_landmarks_and_with_broken_covariances_can_be_drawn():
     _, estimate = drawn.run_of("ekf")
     nothing = estimate._replace(alive=np.zeros_like(estimate.alive))

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jaxslam.consistency import DOF, LEVELS
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.files import Json
+from jaxslam.results.plot.campaigns.layout import numbers_of
 
 NUMBERS = 120_000
 """About as many numbers at most stand in a page, in up to 1 MB."""
@@ -73,8 +74,10 @@ def embedded_curves(campaign: Campaign) -> Curves:
             [make.panel("information [1/rad²]", "floor", "rotation_information")],
         ),
     ]
+    numbers = numbers_of(list(campaign.filters))
     content = {
         "filters": list(campaign.filters),
+        "looks": [numbers[name] for name in campaign.filters],
         "steps": campaign.steps,
         "each": each,
         "charts": [chart for chart in charts if chart["panels"]],

@@ -25,8 +25,9 @@
     return button;
   };
   const visible = () => order.filter((i) => !hidden.has(i));
-  const look = (i) => ({ // thirty filters differ in colour and dashes
-    stroke: `var(--c${i % HUES})`, "stroke-dasharray": DASHES[i % DASHES.length], fill: "none",
+  const hue = (i) => `var(--c${data.looks[i] % HUES})`;
+  const look = (i) => ({ // as in the figures: thirty filters differ in colour and dashes
+    stroke: hue(i), "stroke-dasharray": DASHES[data.looks[i] % DASHES.length], fill: "none",
   });
   const swatch = (i) =>
     draw("svg", { class: "swatch", width: 26, height: 8, "aria-hidden": "true" },
@@ -247,7 +248,7 @@
       lines.append(draw("path", { class: i === picked ? "curve on" : "curve", "data-filter": i, ...look(i), d: path(panel.values[i], i) }));
       if (known.length === 1) {
         const j = known[0];
-        lines.append(draw("circle", { cx: px(x(panel, j)), cy: py(ends(panel.values[i], j)[1], i), r: 3, fill: `var(--c${i % HUES})` }));
+        lines.append(draw("circle", { cx: px(x(panel, j)), cy: py(ends(panel.values[i], j)[1], i), r: 3, fill: hue(i) }));
       }
     }
     const grid = draw("g", { class: "axes" });
@@ -308,7 +309,7 @@
       for (const i of visible().filter((i) => other.values[i])) {
         for (const v of new Set(ends(other.values[i], j))) {
           if (v === null || v > other.high) continue;
-          other.over.append(draw("circle", { cx: other.px(x(other, j)), cy: other.py(v, i), r: i === picked ? 4.5 : 2.5, fill: `var(--c${i % HUES})` }));
+          other.over.append(draw("circle", { cx: other.px(x(other, j)), cy: other.py(v, i), r: i === picked ? 4.5 : 2.5, fill: hue(i) }));
         }
       }
     }

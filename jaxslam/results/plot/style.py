@@ -28,8 +28,10 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#00
 INK, FAINT, SHADE, RULE = "#333333", "#777777", "#bdbdbd", "#dddddd"
 """Colours of what is no filter's: lines and text, dead reckoning, bands, the grid."""
 
-_HUES = 6
-_DASHES = ("-", (0, (5, 1.4)), (0, (1.4, 1.1)), (0, (6, 1.3, 1.4, 1.3)), (0, (9, 2)))
+HUES = (*COLORS[:4], "#c98500", "#7d5f1f")
+"""Colours of filters, those of the page too: its yellow and brown can be seen on a grey band."""
+
+_DASHES = ("-", (0, (5, 1.4)), (0, (1.4, 1.1)), (0, (6, 1.3, 1.4, 1.3)), (4.5, (9, 2)))
 _MARKS = ("o", "s", "^", "D", "v")
 
 CURVE = "curve"
@@ -45,10 +47,10 @@ def look(i: int) -> Look:
     Thirty differ in colour and dashes; five differ in dashes and marks alone, without colour.
     """
     return {
-        "color": COLORS[i % _HUES],
+        "color": HUES[i % len(HUES)],
         "ls": _DASHES[i % len(_DASHES)],
         "marker": _MARKS[i % len(_MARKS)],
-        "mec": "white",
+        "mec": INK,
         "mew": 0.4,
     }
 
@@ -171,8 +173,9 @@ def curves_of(axes: Axes) -> list[Line2D]:
 
 
 def band(axes: Axes, x: np.ndarray, low: np.ndarray, high: np.ndarray, label: str) -> None:
-    """Shade what lies between two curves."""
-    axes.fill_between(x, low, high, color=SHADE, alpha=0.6, lw=0, label=label, zorder=1)
+    """Shade what lies between two curves: light, so that curves stand out, within thin edges."""
+    look: Look = {"fc": (SHADE, 0.35), "ec": FAINT, "lw": 0.4}
+    axes.fill_between(x, low, high, label=label, zorder=1, **look)
 
 
 def plain(name: str) -> str:

@@ -6,12 +6,13 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, Measure
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.plot.campaigns.layout import TOGETHER, head, kinds_of, runs_of
+from jaxslam.results.plot.campaigns.layout import TOGETHER, head, kinds_of, numbers_of, runs_of
 from jaxslam.results.plot.campaigns.scale import mark_beyond, power, set_positive
 from jaxslam.results.plot.style import (
     INK,
     PAGE,
     TEXT,
+    Look,
     caption,
     curve,
     every_handle,
@@ -30,27 +31,33 @@ _NONE = Measure(np.nan, np.nan, np.nan)
 _CAP = 100.0
 """The scale of the NEES ends at so many times dof."""
 
+_WIDE = 10.0
+"""Ends of intervals set a scale up to so many times the largest value, and down to as little."""
+
+INTERVAL = "interval"
+"""`gid` of the lines of intervals, and of the arrows where they leave the scale."""
+
 
 def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Position error and pose NEES of every filter against the time of a step.
 
-    More than five filters are listed, a row each, with their intervals, and columns of time, error
-    and NEES. A NEES over 100 times dof is marked at the edge. Filters that were not timed are named
-    only. width [in].
+    Error and NEES have their 95 % intervals, with an arrow where one leaves the scale. More than
+    five filters are listed, a row each, with columns of time, error and NEES. A NEES over 100 times
+    dof is marked at the edge. Filters that were not timed are named only. width [in].
     """
     times = {name: 1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters}
     if len(times) > TOGETHER:
         return _listed(campaign, times, max(width, PAGE))
     figure, panels = panels_of(width, 0.4 * width + 1.4, 2)
     for axes, (key, named) in zip(panels, _LABELS.items(), strict=True):
-        for i, (name, summary) in enumerate(campaign.filters.items()):
-            y = summary.measures[key].value if key in summary.measures else np.nan
-            x = times[name]
-            absent = "no value" if np.isfinite(x) else "not timed"
-            curve(axes, i, np.array([x]), np.array([y]), name, absent=absent)
-            axes.lines[-1].set(markersize=7.0, linestyle="none")
-        ordinate(axes, named, 0.2 * width + 0.3)
         _scale(axes, _values(campaign, key), "y")
+        for i, (name, summary) in enumerate(campaign.filters.items()):
+            x, measure = times[name], summary.measures.get(key, _NONE)
+            absent = "no value" if np.isfinite(x) else "not timed"
+            curve(axes, i, np.array([x]), np.array([measure.value]), name, absent=absent)
+            axes.lines[-1].set(markersize=7.0, linestyle="none")
+            _interval(axes, x, measure, look(i)["color"], "y")
+        ordinate(axes, named, 0.2 * width + 0.3)
     honest = panels[-1].axhline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
     panels[-1].set_xlabel("time of a step [µs]")
     if np.isfinite(list(times.values())).any():
@@ -76,10 +83,11 @@ def _listed(campaign: Campaign, times: dict[str, float], width: float) -> Figure
     for axes, key in zip(panels[1:], _LABELS, strict=True):
         _scale(axes, _values(campaign, key), "x")
     names, heights, middle, at = [], [], [], 0
+    numbers = numbers_of(list(times))
     for _, members in groups:
         middle.append(at + (len(members) - 1) / 2)
-        for i, name in enumerate(members):
-            measures = campaign.filters[name].measures
+        for name in members:
+            i, measures = numbers[name], campaign.filters[name].measures
             _point(panels[0], i, at, name, Measure(times[name], np.nan, np.nan))
             for axes, key in zip(panels[1:], _LABELS, strict=True):
                 _point(axes, i, at, name, measures.get(key, _NONE))
@@ -98,17 +106,18 @@ def _listed(campaign: Campaign, times: dict[str, float], width: float) -> Figure
     for axes, named in zip(panels[1:], _LABELS.values(), strict=True):
         axes.set_xlabel(named)
     honest = panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
-    caption(figure, f"{_title(campaign)}; lines: 95 % intervals", [honest])
+    caption(figure, f"{_title(campaign)}", [honest])
     return figure
 
 
 def _point(axes: Axes, i: int, at: float, name: str, measure: Measure) -> None:
     """Draw a measure with its interval at a height; beyond the scale a triangle with its value."""
-    value, low, high = measure
+    value = measure.value
     if not np.isfinite(value):
         return
-    left, right = axes.get_xlim()
+    _, right = axes.get_xlim()
     style = look(i)
+    _interval(axes, at, measure, style["color"], "x")
     if value > right:
         axes.plot(right, at, ">", color=style["color"], mec=INK, mew=0.4, ms=5.0, clip_on=False)
         axes.annotate(
@@ -120,19 +129,39 @@ def _point(axes: Axes, i: int, at: float, name: str, measure: Measure) -> None:
             va="center",
             fontsize=7,
             color=INK,
+            bbox={"fc": "white", "ec": "none", "pad": 0.5},
         )
         return
-    if np.isfinite(low):
-        axes.plot([max(low, left), min(high, right)], [at, at], color=style["color"], lw=1.0)
-    axes.plot(value, at, color=style["color"], marker=style["marker"], ms=5.0, label=plain(name))
+    mark: Look = {key: style[key] for key in ("color", "marker", "mec", "mew")}
+    axes.plot(value, at, ms=5.0, label=plain(name), **mark)
+
+
+def _interval(axes: Axes, at: float, measure: Measure, color: str, which: str) -> None:
+    """Draw the interval of a measure along an axis (x or y); an arrow where it leaves the scale."""
+    if not np.isfinite([at, measure.value, measure.low]).all():
+        return
+    ends = axes.get_xlim() if which == "x" else axes.get_ylim()
+    shown = np.clip(measure[1:], *ends)
+    style: Look = {"color": color, "gid": INTERVAL, "zorder": 2.8}
+    across = np.full(2, at)
+    axes.plot(*((shown, across) if which == "x" else (across, shown)), lw=1.0, **style)
+    cut = (measure.low < ends[0], measure.high > ends[1])
+    for end, mark, beyond in zip(ends, "<>" if which == "x" else "v^", cut, strict=True):
+        if beyond:
+            place = (end, at) if which == "x" else (at, end)
+            axes.plot(*place, mark, ms=3.5, mew=0, clip_on=False, **style)
 
 
 def _values(campaign: Campaign, key: str) -> np.ndarray:
-    """A measure of each filter, at most a hundred times dof if it is the NEES."""
-    found = [s.measures[key].value for s in campaign.filters.values() if key in s.measures]
+    """What sets the scale of a measure: values and ends of intervals, not the extreme ones."""
+    found = np.array([s.measures.get(key, _NONE) for s in campaign.filters.values()])
     if key == _NEES:
-        return np.minimum([*found, DOF["pose"]], _CAP * DOF["pose"])
-    return np.array(found)
+        found = np.minimum([*found, [DOF["pose"]] * 3], _CAP * DOF["pose"])
+    values: np.ndarray = found[np.isfinite(found[:, 0]) & (found[:, 0] > 0), 0]
+    if not values.size:
+        return values
+    ends = found[:, 1:][np.isfinite(found[:, 1:])]
+    return np.concatenate([values, ends.clip(values.min() / _WIDE, _WIDE * values.max())])
 
 
 def _scale(axes: Axes, values: np.ndarray, which: str) -> None:
@@ -143,4 +172,5 @@ def _scale(axes: Axes, values: np.ndarray, which: str) -> None:
 
 
 def _title(campaign: Campaign) -> str:
-    return f"{head(campaign)}: error and NEES against the time of a step, {runs_of(campaign)}"
+    what = "error and NEES, with 95 % intervals, against the time of a step"
+    return f"{head(campaign)}: {what}, {runs_of(campaign)}"

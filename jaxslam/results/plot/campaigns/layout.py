@@ -1,6 +1,6 @@
 """How the filters of a campaign are divided into panels: all in one, or a row for each kind."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import NamedTuple
 
 from matplotlib.axes import Axes
@@ -27,7 +27,8 @@ class Row(NamedTuple):
     """Filters that are drawn together."""
 
     kind: str
-    names: list[str]
+    names: dict[str, int]
+    """each with its number (`numbers_of`)"""
     panels: list[Axes]
     """one for each quantity"""
 
@@ -42,27 +43,42 @@ def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
     return found
 
 
+def numbers_of(names: Sequence[str]) -> dict[str, int]:
+    """The number of each filter of a campaign, which gives its look (`look`) in every figure.
+
+    It is the place among the filters, by kind where there are more than five; so those of a panel
+    have successive numbers.
+    """
+    if len(names) > TOGETHER:
+        names = [name for _, members in kinds_of(names) for name in members]
+    return {name: i for i, name in enumerate(names)}
+
+
 def sheet(
-    names: Sequence[str],
+    campaign: Campaign,
     quantities: Sequence[str],
     *,
     width: float,
+    only: Container[str] | None = None,
     height: float | None = None,
     across: bool = False,
 ) -> tuple[Figure, list[Row]]:
     """An empty figure and its rows of panels, one panel for each quantity in each row.
 
-    Up to five filters share a row, with the panels below each other, or side by side (across). More
-    filters have a row for each kind, and the figure is as wide as a page at least; panels of a
-    quantity have the same ordinate.
+    Up to five filters share a row, with the panels below each other, or side by side (across). The
+    filters of a larger campaign have a row for each kind, and the figure is as wide as a page at
+    least; panels of a quantity have the same ordinate.
 
     Args:
         quantities: what the panels show, with units.
         width: of the figure [in].
+        only: the filters shown; default all.
         height: of a panel [in] of few filters; default by the width.
     """
     count = len(quantities)
-    if len(names) <= TOGETHER:
+    numbers = numbers_of(list(campaign.filters))
+    groups = kinds_of([name for name in numbers if only is None or name in only])
+    if len(numbers) <= TOGETHER or not groups:
         height = 0.22 * width + 0.35 if height is None else height
         tall = height * (1 if across else count) + 0.6
         shape = (1, count) if across else (count, 1)
@@ -72,8 +88,8 @@ def sheet(
                 titled(axes, quantity)
             else:
                 ordinate(axes, quantity, height)
-        return figure, [Row("", list(names), panels)]
-    groups = kinds_of(names)
+        mine = {name: i for name, i in numbers.items() if only is None or name in only}
+        return figure, [Row("", mine, panels)]
     figure, panels = panels_of(
         max(width, PAGE),
         1.05 * len(groups) + 0.7,
@@ -84,10 +100,10 @@ def sheet(
     )
     rows = []
     for i, (kind, members) in enumerate(groups):
-        *mine, beside = panels[i * (count + 1) : (i + 1) * (count + 1)]
+        *own, beside = panels[i * (count + 1) : (i + 1) * (count + 1)]
         beside.set_axis_off()
-        mine[0].set_ylabel(kind.replace(" ", "\n"))
-        rows.append(Row(kind, members, mine))
+        own[0].set_ylabel(kind.replace(" ", "\n"))
+        rows.append(Row(kind, {name: numbers[name] for name in members}, own))
     for axes, quantity in zip(rows[0].panels, quantities, strict=True):
         titled(axes, quantity)
     return figure, rows

@@ -28,7 +28,7 @@ def bound_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     edge mark what lies beyond, and the largest value is written above. width [in].
     """
     quantities = {"position": "position RMSE [m]", "heading_deg": "heading RMSE [°]"}
-    figure, rows = sheet(list(campaign.filters), list(quantities.values()), width=width)
+    figure, rows = sheet(campaign, list(quantities.values()), width=width)
     step = np.arange(1, campaign.steps + 1)
     setters = scale_setters(campaign)
     bounds = {
@@ -46,7 +46,7 @@ def bound_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         for row in rows:
             axes = row.panels[j]
             axes.set(xlim=step_limits(campaign.steps), ylim=(0.0, 1.06 * top or 1.0))
-            for i, name in enumerate(row.names):
+            for name, i in row.names.items():
                 curve(axes, i, step, curves[name], name)
             for bound in bounds[key][:1]:
                 label = "conditional Cramér-Rao bound"
@@ -65,20 +65,20 @@ def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     More than five filters are drawn by kind. width [in].
     """
     titles = [f"{block} (dof {dof})" for block, dof in DOF.items()]
-    height = width / len(DOF) + 0.3
-    figure, rows = sheet(list(campaign.filters), titles, width=width, height=height, across=True)
+    height = (width - 0.95) / len(DOF) + 0.44
+    figure, rows = sheet(campaign, titles, width=width, height=height, across=True)
     ticks = np.linspace(0, 1, 5 if width > 5 else 3)
     for row in rows:
         for axes, block in zip(row.panels, DOF, strict=True):
             axes.plot([0, 1], [0, 1], color=INK, lw=0.8, label="honest", zorder=1.5)
-            for i, name in enumerate(row.names):
+            for name, i in row.names.items():
                 share = campaign.filters[name].coverage[block]
                 curve(axes, i, np.asarray(LEVELS), share, name)
             axes.set(xlim=(0, 1), ylim=(0, 1), xticks=ticks, yticks=ticks)
             axes.xaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_major_formatter("{x:g}")
             if not row.kind:
-                axes.set_box_aspect(1)
+                axes.set(box_aspect=1, anchor="N")
     if not rows[0].kind:
         rows[0].panels[0].set_ylabel("share of truth within")
     add_legends(
@@ -97,7 +97,7 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     is named, without a curve. Each curve is moved a little to the side, so that none hides
     another. More than five filters are drawn by kind. width [in].
     """
-    figure, rows = sheet(list(campaign.filters), ["autocorrelation"], width=width, height=2.4)
+    figure, rows = sheet(campaign, ["autocorrelation"], width=width, height=2.4)
     every = campaign.filters.values()
     widest = max(every, key=lambda s: np.nan_to_num(s.autocorrelation_band[0])).autocorrelation_band
     inner = 1.5 * _peak(widest) or 0.1
@@ -107,10 +107,10 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         axes.axhline(0.0, color=INK, lw=0.8, zorder=1.5)
         lags = np.arange(1, len(widest) + 1)
         band(axes, lags, -widest, widest, "95 % band")
-        for i, name in enumerate(row.names):
+        for place, (name, i) in enumerate(row.names.items()):
             values = campaign.filters[name].autocorrelation
             lags = np.arange(1, len(values) + 1)
-            aside = _ASIDE * (i - (len(row.names) - 1) / 2)
+            aside = _ASIDE * (place - (len(row.names) - 1) / 2)
             curve(axes, i, lags + aside, values, name, absent="no innovations")
         axes.set(xticks=lags, ylim=(-1.1 * extreme, 1.1 * extreme))
     title = f"{head(campaign)}: whiteness of innovations, {runs_of(campaign)}"
@@ -129,15 +129,15 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     key, what = "rotation_information", "information [1/rad²]"
     curves = {name: s.curves[key] for name, s in campaign.filters.items() if key in s.curves}
     others = [name for name in campaign.filters if name not in curves]
-    figure, rows = sheet(list(curves), [what], width=width, height=2.6)
+    figure, rows = sheet(campaign, [what], width=width, height=2.6, only=curves)
     top = 3 * max([1.0, *(_peak(values) for values in curves.values())])
     decades = np.log10(top / _NOTHING)
     strip = decades * _STRIP / (1 - _STRIP)
     step = np.arange(1, campaign.steps + 1)
     for row in rows:
         (axes,) = row.panels
-        for i, name in enumerate(row.names):
-            lane = _NOTHING * 10 ** (-strip * (i + 1) / (len(row.names) + 1))
+        for place, (name, i) in enumerate(row.names.items(), start=1):
+            lane = _NOTHING * 10 ** (-strip * place / (len(row.names) + 1))
             values = curves[name]
             curve(axes, i, step, np.where(values < _NOTHING, lane, values), name)
         axes.axhspan(_NOTHING * 10**-strip, _NOTHING, color=RULE, alpha=0.5, lw=0, zorder=1)

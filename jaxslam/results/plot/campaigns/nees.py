@@ -24,14 +24,14 @@ def nees_figure(
     larger values, and the largest is written above. width [in]: `COLUMN` is that of a paper.
     """
     titles = [f"{block} NEES (dof {DOF[block]})" for block in blocks]
-    figure, rows = sheet(list(campaign.filters), titles, width=width)
+    figure, rows = sheet(campaign, titles, width=width)
     step = np.arange(1, campaign.steps + 1)
     for axes, block in zip(rows[0].panels, blocks, strict=True):
         nees_scale(axes, campaign, block)
     for row in rows:
         for axes, block in zip(row.panels, blocks, strict=True):
             _draw_band(axes, campaign, block)
-            for i, name in enumerate(row.names):
+            for name, i in row.names.items():
                 summary = campaign.filters[name]
                 label = f"{name} ({summary.verdict})"
                 curve(axes, i, step, summary.curves[f"nees_{block}"], label, absent="no NEES")

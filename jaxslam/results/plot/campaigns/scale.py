@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import LogLocator, NullLocator
 
 from jaxslam.consistency import DOF
 from jaxslam.monte_carlo import Campaign
@@ -16,6 +16,9 @@ _NEES = (1 / 10, 10.0, 100.0)
 
 _BAND = 0.06
 """share of the height of a panel that the 95 % band fills at least, where the scale allows it"""
+
+_POWERS = 6
+"""a logarithmic axis has a label at every power of ten if they are at most so many"""
 
 BEYOND = "beyond"
 """`gid` of the marks of what lies beyond an axis."""
@@ -82,7 +85,8 @@ def set_positive(
 ) -> None:
     """Set an axis (x or y) for numbers from low to high, with a margin as a share of the length.
 
-    It is logarithmic if the largest is over `linear` times the smallest.
+    It is logarithmic if the largest is over `linear` times the smallest, with labels at 1, 2 and 5
+    of each decade, or 1 and 3, or 1 alone, as there is room.
     """
     axis = axes.yaxis if which == "y" else axes.xaxis
     set_limits = axes.set_ylim if which == "y" else axes.set_xlim
@@ -93,16 +97,15 @@ def set_positive(
     axes.set(**{f"{which}scale": "log"})
     room = (high / low) ** margin
     set_limits(low / room, high * room)
+    axis.set_major_locator(LogLocator(numticks=_POWERS))
     axis.set_major_formatter(_short)
-    if high < (100 if which == "y" else 20) * low:  # an abscissa has less room for labels
-        axis.set_minor_formatter(few_digits)
+    length, label = (axes.bbox.height, 11) if which == "y" else (axes.bbox.width, 28)  # [pt]
+    decade = 72 / axes.figure.dpi * length / np.log10(high / low)
+    digits = next((d for d in ("25", "3") if np.log10(int(d[0])) * decade > label), "")
+    if digits:
+        axis.set_minor_formatter(lambda x, _: _short(x) if f"{x:.0e}"[0] in digits else "")
     else:
         axis.set_minor_locator(NullLocator())
-
-
-def few_digits(x: float, _: float) -> str:
-    """The label of a minor tick on a logarithmic axis: 2 and 5 of each decade have one."""
-    return _short(x) if f"{x:.0e}"[0] in "25" else ""
 
 
 def _short(x: float, _: float = 0.0) -> str:

@@ -14,13 +14,13 @@ from jaxslam.results.plot.maps.geometry import ellipses, extent, square_limits
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,
+    HUES,
     INK,
     PAGE,
     SHADE,
     Look,
     caption,
     every_handle,
-    look,
     panels_of,
     plain,
     titled,
@@ -31,6 +31,10 @@ _ARROW = Path([(1.2, 0.0), (-0.6, 0.6), (-0.25, 0.0), (-0.6, -0.6), (1.2, 0.0)])
 
 _NEAR = 1.5
 """Dead reckoning is shown in full if it enlarges the map by at most this factor."""
+
+_OTHERS = tuple(HUES[i] for i in (3, 4, 5, 2))
+_DASHES = ((0, (4, 5)), (0, (1.5, 3)), (0, (6, 3, 1.5, 3)))
+"""Looks of the paths of other filters over the first one's: twelve, with gaps to see it."""
 
 _UPRIGHT = 15
 """largest number of landmarks whose names stand side by side"""
@@ -79,11 +83,12 @@ def map_figure(
         path = np.asarray(dead_reckoning)[:, :2]
         axes.plot(*path.T, color=FAINT, lw=1.0, ls=(0, (1, 1.2)), label="dead reckoning", zorder=2)
         shown += [path] if extent([*shown, path]) < _NEAR * extent(shown) else []
-    for i, (name, other) in enumerate((others or {}).items(), start=3):
-        line = {key: look(i)[key] for key in ("color", "ls")}
-        axes.plot(*np.asarray(other.pose)[:, :2].T, lw=1.0, label=plain(name), zorder=2.5, **line)
+    for i, (name, other) in enumerate((others or {}).items()):
+        color, dashes = _OTHERS[i % len(_OTHERS)], _DASHES[i % len(_DASHES)]
+        path = np.asarray(other.pose)[:, :2]
+        axes.plot(*path.T, lw=1.3, label=plain(name), zorder=3.6, color=color, ls=dashes)
         points = np.asarray(other.points[-1])[np.asarray(other.alive[-1])]
-        axes.plot(*points.T, ".", color=line["color"], ms=3, zorder=4.2)
+        axes.plot(*points.T, ".", color=color, ms=3, zorder=5.2)
     _limit(axes, shown)
     if names is not None:
         _draw_residuals(axes, panels[1], estimate, np.asarray(true_points), names, n_sigma)
@@ -110,7 +115,8 @@ def run_map_figure(
         columns = 2
     rows = -(-len(campaign.first) // columns)
     side = width / columns
-    figure, panels = panels_of(width, side * rows + 0.7, rows, columns, share=(True, True))
+    tall = side * rows + (0.7 if rows * columns == len(campaign.first) else 1.0)
+    figure, panels = panels_of(width, tall, rows, columns, share=(True, True))
     for axes, (name, (truth, estimate)) in zip(panels, campaign.first.items(), strict=False):
         shown = _draw_truth(axes, np.asarray(truth.pose), np.asarray(truth.landmarks)[:, :2])
         _draw_estimate(axes, estimate, n_sigma)
@@ -118,8 +124,10 @@ def run_map_figure(
         titled(axes, plain(name))
     for axes in panels[len(campaign.first) :]:
         axes.set_axis_off()
-    for i, axes in enumerate(panels):
-        axes.set_xlabel("x [m]" if i >= len(panels) - columns else "")
+    for i, axes in enumerate(panels[: len(campaign.first)]):
+        lowest = i + columns >= len(campaign.first)
+        axes.tick_params(labelbottom=lowest)
+        axes.set_xlabel("x [m]" if lowest else "")
         axes.set_ylabel("y [m]" if i % columns == 0 else "")
     caption(figure, title, every_handle(panels))
     return figure
