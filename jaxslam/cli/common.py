@@ -14,10 +14,14 @@ OUT = Path("out")
 """Default folder of results."""
 
 
-def pick(kind: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
-    """The entry of `known` with a name; raises ValueError with the known names and `more`."""
+def pick(option: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
+    """The entry of `known` with a name that an option gives, as `filters`.
+
+    Raises ValueError with the known names and `more`.
+    """
     if name not in known:
-        raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(known)}{more}")
+        kind = option.removesuffix("s")
+        raise ValueError(f"--{option}: unknown {kind} {name!r}; known: {', '.join(known)}{more}")
     return known[name]
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from jaxslam import cli
 from jaxslam.cli.run.command import positive_definite
+from jaxslam.cli.run.filters import NAMES
 from jaxslam.results import plot
 from jaxslam.results.film import encoding
 
@@ -93,6 +94,13 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, asked, spo
     dataset, *options = asked
     refused(["run", "--dataset", dataset, data, *options, "--out", out], message)
     assert not out.exists()
+
+
+def test_the_help_names_whole_filters_and_only_those_of_a_data_set(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert cli.main(["run", "--help"]) == 0
+    words = capsys.readouterr().out.replace(",", " ").split()
+    assert {*NAMES} <= {*words} and not {"ideal", "batch_map"} & {*words}
 
 
 def test_a_covariance_is_judged_on_the_host():
