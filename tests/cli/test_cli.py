@@ -76,10 +76,10 @@ def test_the_version_is_told(capsys):
     [
         (["--scenario", "moon"], "--scenario: unknown scenario 'moon'"),
         (["--filters", "ekf,magic"], "--filters: unknown filter 'magic'"),
-        (["--runs", "0"], "runs"),
+        (["--runs", "0"], "--runs: expected an integer >= 1, got 0"),
         (["--runs", "many"], "invalid int"),
-        (["--steps", "0"], "steps"),
-        (["--block", "-1"], "block"),
+        (["--steps", "0"], "circle: steps: expected an integer >= 1"),
+        (["--block", "-1"], "--block: expected"),
         (["--seed", "-1"], "seed"),
         (["--dtype", "float16"], "invalid choice"),
         (["--devices", "0"], "--devices: expected at least 1"),

@@ -286,7 +286,7 @@ def test_between_ranges_excludes_both_ends_and_reads_the_position_alone():
 BLIND = dataclasses.replace(motion.increment(Q), perturb=None)
 
 BAD = {
-    "landmark size": ({"landmarks": np.zeros((3, 3))}, "landmarks: expected shape"),
+    "landmark size": ({"landmarks": np.zeros((3, 3))}, "^Scenario '.*': landmarks: expected shape"),
     "no landmark": ({"landmarks": np.zeros((0, 2))}, "landmarks: expected shape"),
     "landmark nan": ({"landmarks": [[0.0, np.nan]]}, "landmarks: expected finite"),
     "control size": ({"controls": np.zeros((5, 3))}, "controls: expected shape"),

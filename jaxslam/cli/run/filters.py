@@ -13,7 +13,6 @@ from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Truth
 
-
 NAMES = tuple(name for name in ALL if name not in ("ideal", "batch_map"))
 """Those that run on a data set: no truth is needed, and no whole log at once."""
 
