@@ -77,6 +77,8 @@ class Scenario:
         size_l, size_u = len(self.sensor.landmark), len(self.motion.controls)
         _check_table(f"{what}: landmarks", self.landmarks, size_l)
         _check_table(f"{what}: controls", self.controls, size_u)
+        if np.shape(self.pose) != (3,):
+            raise ValueError(f"{what}: pose: expected shape (3,), got {np.shape(self.pose)}")
         _check_table(f"{what}: pose", np.reshape(self.pose, (1, -1)), 3)
         check_covariance(f"{what}: pose_cov", self.pose_cov, 3)
         if self.noise_on not in ("robot", "odometry"):

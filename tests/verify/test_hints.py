@@ -122,10 +122,11 @@ def test_a_function_of_other_arguments_is_told():
 
 def test_a_derivative_that_is_not_finite_is_no_difference_of_0():
     """Though all methods agree on NaN, and a function without a value has none to compare."""
-    rows = [verify_jacobians(lambda point, k=k: jnp.sqrt(k * point), name="f") for k in (0, -1)]
-    for report, said in zip(
-        rows, ("a derivative is not finite", "no value is finite"), strict=True
+    for function, said in (
+        (lambda point: jnp.sqrt(0 * point), "a derivative is not finite"),
+        (lambda point: jnp.nan * point, "no value is finite"),
     ):
+        report = verify_jacobians(function, lambda point: jnp.full((2, 2), jnp.nan), name="f")
         assert f"FAIL  f by point: {said}; " in str(report)
 
 
