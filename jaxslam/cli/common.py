@@ -5,6 +5,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from jaxslam.results.meanings import count_label
+
 _T = TypeVar("_T")
 
 INTERRUPTED = 130
@@ -95,7 +97,7 @@ def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
 def _shown(value: object) -> str:
     """A value of the summary as it is printed."""
     if isinstance(value, dict):
-        return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
+        return ", ".join(f"{count_label(key)} {count:,}" for key, count in value.items()) or "-"
     if isinstance(value, list):
         lines = all(isinstance(part, str) for part in value)
         return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"

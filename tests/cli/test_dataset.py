@@ -33,7 +33,7 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
     assert cli.main(run) == 0
     assert jax.config.jax_enable_x64
     printed = capsys.readouterr().out
-    assert "fused 4, born 2, rejected 0" in printed
+    assert "fused 4, initialized 2, rejected 0" in printed
     assert "at 2 of 2 checked steps" in printed
     assert {path.name for path in out.iterdir()} == {
         "trajectory.csv",
@@ -129,10 +129,10 @@ def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["ATE [m]"] < 0.2
     # Of one landmark the joint NEES is its own.
-    assert summary["map NEES is"] == "joint, 2 dof"
+    assert summary["map NEES of"] == "all landmarks, 2 dof"
     np.testing.assert_allclose(summary["map NEES"], summary["landmark NEES (2 is honest)"])
     assert 0 < summary["map NEES"] < 10
-    assert summary["map NEES, 95% of honest maps"] == [0.05064, 7.378]
+    assert summary["map NEES, 95 % of honest maps"] == [0.05064, 7.378]
     assert summary["map verdict"] in ("consistent", "optimistic")
     assert summary["status"]["born"] == 2
     # The landmark without a tag has no name.
