@@ -67,7 +67,7 @@ def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more:
         "--figures",
         default="png",
         metavar="FORMATS",
-        help=f"formats of figures, of {','.join(formats)}; comma-separated (default: png{more})",
+        help=f"formats of figures, of {', '.join(formats)}; comma-separated (default: png{more})",
     )
 
 

@@ -65,7 +65,10 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
     filters = ["--filters", "ekf,dead_reckoning", "--check-every", "0"]
     run = ["run", "--dataset", "bonn", str(data), *filters, "--animate", "--out", str(out)]
     assert cli.main(run) == 0
-    assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in printed
+    (likely,) = (line for line in printed.splitlines() if line.startswith("log-likelihood"))
+    assert likely.endswith(" -")  # dead reckoning has no innovation
     for name in ("ekf", "dead_reckoning"):
         assert (out / f"film-{name}.gif").read_bytes().startswith(b"GIF")
         assert "jaxslam-film" in (out / f"film-{name}.html").read_text()
