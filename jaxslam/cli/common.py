@@ -5,6 +5,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from jaxslam.results.meanings import count_label
+
 _T = TypeVar("_T")
 
 INTERRUPTED = 130
@@ -14,10 +16,14 @@ OUT = Path("out")
 """Default folder of results."""
 
 
-def pick(kind: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
-    """The entry of `known` with a name; raises ValueError with the known names and `more`."""
+def pick(option: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
+    """The entry of `known` with a name that an option gives, as `filters`.
+
+    Raises ValueError with the known names and `more`.
+    """
     if name not in known:
-        raise ValueError(f"unknown {kind} {name!r}; known: {', '.join(known)}{more}")
+        kind = option.removesuffix("s")
+        raise ValueError(f"--{option}: unknown {kind} {name!r}; known: {', '.join(known)}{more}")
     return known[name]
 
 
@@ -61,7 +67,7 @@ def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more:
         "--figures",
         default="png",
         metavar="FORMATS",
-        help=f"formats of figures, of {','.join(formats)}; comma-separated (default: png{more})",
+        help=f"formats of figures, of {', '.join(formats)}; comma-separated (default: png{more})",
     )
 
 
@@ -91,7 +97,7 @@ def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
 def _shown(value: object) -> str:
     """A value of the summary as it is printed."""
     if isinstance(value, dict):
-        return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "-"
+        return ", ".join(f"{count_label(key)} {count:,}" for key, count in value.items()) or "-"
     if isinstance(value, list):
         lines = all(isinstance(part, str) for part in value)
         return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"

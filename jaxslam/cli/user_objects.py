@@ -145,10 +145,21 @@ def _in_file(asked: str) -> bool:
 
 def _of_catalog(name: str, scenario: Scenario) -> tuple[str, Candidate]:
     """The name and a filter of the catalog; raises ValueError if it cannot run the scenario."""
-    make = pick("filter", name, ALL, _OWN)
+    make = pick("filters", name, ALL, _OWN)
     try:
         return name, make(scenario, watch=True)
     except ValueError as error:
+        fit = ",".join(other for other in ALL if _can_run(other, scenario))
         raise ValueError(
-            f"filter {name!r} cannot run scenario {scenario.name!r}: {error}"
+            f"--filters: {name} cannot run scenario {scenario.name!r}: {error}"
+            + f"; those of the catalog that can: --filters {fit}" * bool(fit)
         ) from error
+
+
+def _can_run(name: str, scenario: Scenario) -> bool:
+    """Whether a filter of the catalog can be made for the scenario."""
+    try:
+        ALL[name](scenario)
+    except ValueError:
+        return False
+    return True

@@ -9,7 +9,14 @@ from jaxslam.consistency.bound import (
     van_trees,
 )
 from jaxslam.consistency.credibility import credibility
-from jaxslam.consistency.intervals import LEVEL, Measure, interval, lopsided, positive_interval
+from jaxslam.consistency.intervals import (
+    LEVEL,
+    Measure,
+    interval,
+    lopsided,
+    percentage,
+    positive_interval,
+)
 from jaxslam.consistency.localization import (
     LocalizationScores,
     LocalizationSummary,
@@ -56,6 +63,7 @@ __all__ = [
     "mean_pose_nees",
     "monitor_of",
     "own_error_of",
+    "percentage",
     "positive_interval",
     "posterior_bound",
     "power_of",

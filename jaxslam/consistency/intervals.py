@@ -14,6 +14,11 @@ SKEW = 1.5
 """The factor by which the skewness of a run's average NEES reduces degrees of freedom."""
 
 
+def percentage(share: float, digits: int = 0) -> str:
+    """A share as a percentage, as in 95 %."""
+    return f"{100 * share:.{digits}f} %"
+
+
 class Measure(NamedTuple):
     """An average over all runs, with its 95 % interval from the spread between runs."""
 

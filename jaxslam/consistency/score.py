@@ -126,7 +126,10 @@ def score(
         measures[name] = curves[name].sum(axis=1), steps
     measures["square_landmarks"] = found.landmark_squares[:, 0], found.landmark_squares[:, 1]
     measures["nis_per_dof"] = curves["nis"].sum(axis=1), curves["nis_dof"].sum(axis=1)
-    measures["log_likelihood"] = info.log_likelihood.sum(axis=1, dtype=np.float64), 1
+    measures["log_likelihood"] = (
+        info.log_likelihood.sum(axis=1, dtype=np.float64),
+        curves["nis_dof"].any(axis=1),  # none without an innovation
+    )
     sums["autocorrelation"] = np.asarray(found.autocorrelation)
     measures["autocorrelation"] = found.autocorrelation[:, 0, 0], found.autocorrelation[:, 0, 1]
 

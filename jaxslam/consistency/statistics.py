@@ -31,7 +31,8 @@ class RunStatistics(NamedTuple):
     regular_landmarks: Float[Array, "T"]
     """how many of them have a NEES."""
     landmark_squares: Float[Array, "2"]
-    """of the final map, unaligned: Σ |p̂ - p|² [m²], and over how many landmarks that is."""
+    """of the final map, unaligned: Σ |p̂ - p|² [m²], and over how many landmarks that is; 0 of a map
+    that is known, without covariances."""
     autocorrelation: Float[Array, "LAGS 3"]
     """of whitened innovations: Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and how many
     products of numbers that is. Of the same landmark at t and t + l, w = L⁻¹ν with S = L Lᵀ;
@@ -96,7 +97,7 @@ def run_statistics(trace: Trace, truth: Truth, sensor: Sensor) -> RunStatistics:
     product, left, right, pairs = (pair.sum(axis=1) for pair in sums.pairs)
     both = left * right
     length = jnp.where(both > 0, jnp.sqrt(jnp.where(both > 0, both, 1.0)), 0.0)
-    named = held[-1] >= 0
+    named = (held[-1] >= 0) & (estimate.point_covs[-1] != 0).any()  # a known map has no errors
     off = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
     square = jnp.where(named, (off**2).sum(axis=-1), 0.0).sum()
     return RunStatistics(

@@ -45,10 +45,11 @@ class Summary:
     landmarks and steps. nis_per_dof (1). coverage_95_pose, _position, _heading: share of steps with
     the truth in the 95 % ellipsoid. noncredibility and inclination [dB] (0). autocorrelation of
     innovations at lag 1 (0). rmse_position [m], rmse_heading_deg [°], rmse_landmarks [m] (final
-    map, unaligned); bound_ratio_position and _heading: those over the conditional Cramér-Rao bound
-    (about 1 at best; see `conditional_bound`). unobservable (3) and rotation_information [1/rad²]
-    (0): the dimension of the filter's unobservable subspace, and what it has learnt of a turn of
-    the whole frame. log_likelihood (mean a run). In a world with spurious data: precision and
+    map, unaligned; none of a known map); bound_ratio_position and _heading: those over the
+    conditional Cramér-Rao bound (about 1 at best; see `conditional_bound`). unobservable (3) and
+    rotation_information [1/rad²] (0): the dimension of the filter's unobservable subspace, and what
+    it has learnt of a turn of the whole frame. log_likelihood (mean a run; none without an
+    innovation). In a world with spurious data: precision and
     recall of associations, and false_landmarks; see `associations`.
     """
     nis_band: tuple[float, float] | None
@@ -79,6 +80,8 @@ class Summary:
     what "consistent" says, which means not rejected"""
     doubts: tuple[str, ...] = ()
     """sentences that qualify the verdict: most measurements dropped, directions lost"""
+    honest_nis: float = 1.0
+    """nis_per_dof from here on up to 1 is honest: below 1 where a gate dropped measurements"""
 
     def __repr__(self) -> str:
         there = (name for name in _IN_REPR if name in self.measures)
@@ -161,6 +164,7 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
         by=verdict.by,
         noticed=verdict.noticed,
         doubts=verdict.doubts,
+        honest_nis=verdict.honest_nis,
         measures=measures,
         nis_band=nis_band,
         inside=inside,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.consistency.intervals import LEVEL, Spread, spread
+from jaxslam.consistency.intervals import LEVEL, Spread, percentage, spread
 from jaxslam.consistency.nees import DOF
 from jaxslam.consistency.score import DROPS, KEPT
 from jaxslam.math.stats import normal_quantile, truncated_chi2_mean
@@ -39,6 +39,8 @@ class Verdict(NamedTuple):
     and of at least high (∞: none), with probability `POWER` or more"""
     doubts: tuple[str, ...] = ()
     """sentences that qualify the word"""
+    honest_nis: float = 1.0
+    """the NIS/dof from which on up to 1 is honest; below 1 where a gate dropped measurements"""
 
 
 def judge(
@@ -70,10 +72,10 @@ def judge(
             `Summary.counts`; what is absent counts as 0.
         nis_dof: the degrees of freedom of all NIS together.
     """
-    doubts = _doubts(per_run, counts)
+    doubts, honest_nis = _doubts(per_run, counts), _after_gate(counts, nis_dof)
     lost = counts["not_finite"] + counts["divergent"]
     if lost > 0.5 * (counts["runs"] + counts["not_finite"]):
-        return Verdict("diverged", doubts=doubts)
+        return Verdict("diverged", (), {}, doubts, honest_nis)
     there = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
     level = LEVEL ** (1 / max(len(there), 1))
     signs: dict[str, int] = {}
@@ -83,15 +85,17 @@ def judge(
         of_nees = name == "nees_pose"
         found = spread(values, level, skewed=of_nees)
         assert found is not None
-        honest = (DOF["pose"],) * 2 if of_nees else (_after_gate(counts, nis_dof), 1.0)
+        honest = (DOF["pose"],) * 2 if of_nees else (honest_nis, 1.0)
         signs[name], noticed[name] = _side(found, *honest), _noticed(found, *honest)
         wide = wide and not (of_nees and found.above <= 2)
     by = tuple(name for name, sign in signs.items() if sign)
     if by:
-        return Verdict("optimistic" if signs[by[0]] > 0 else "pessimistic", by, noticed, doubts)
-    if wide:
-        return Verdict("undecided", by, noticed, doubts)
-    return Verdict("incomplete" if _starved(counts) else "consistent", by, noticed, doubts)
+        word = "optimistic" if signs[by[0]] > 0 else "pessimistic"
+    elif wide:
+        word = "undecided"
+    else:
+        word = "incomplete" if _starved(counts) else "consistent"
+    return Verdict(word, by, noticed, doubts, honest_nis)
 
 
 def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
@@ -101,7 +105,7 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
         beyond = [f"above {high:.3g}"] * bool(high < np.inf) + [f"below {low:.3g}"] * bool(low > 0)
         if beyond:
             parts.append(f"a {TESTS[name]} {' or '.join(beyond)}")
-    return f"{POWER:.0%} power to reject {', '.join(parts)}" if parts else ""
+    return f"{percentage(POWER)} power to reject {', '.join(parts)}" if parts else ""
 
 
 def _side(found: Spread, low: float, high: float) -> int:

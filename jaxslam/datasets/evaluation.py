@@ -56,13 +56,13 @@ def evaluate(
         pose, cov = np.asarray(path.pose)[known], np.asarray(path.pose_cov)[known]
         true = np.asarray(data.true_path)[known]
     if true is not None and not np.isfinite(pose).all():  # the filter failed
-        errors |= {f"ATE{after} [m]": np.nan, f"heading RMSE{after} [deg]": np.nan}
+        errors |= {f"ATE{after} [m]": np.nan, f"heading RMSE{after} [°]": np.nan}
     elif true is not None:
         of_path = metrics.ate(pose, true, align=not data.one_frame)
         true = metrics.carried(of_path.frame, true)
         errors[f"ATE{after} [m]"] = metrics.statistics(of_path.translation).rmse
         turn = np.rad2deg(of_path.rotation)
-        errors[f"heading RMSE{after} [deg]"] = metrics.statistics(turn).rmse
+        errors[f"heading RMSE{after} [°]"] = metrics.statistics(turn).rmse
         of_steps = metrics.rpe(true, pose, seconds=SPAN, time=np.asarray(data.time)[known])
         if len(of_steps.translation):
             errors[f"RPE over {SPAN:g} s [m]"] = metrics.statistics(of_steps.translation).rmse

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from jaxslam import programs
-from jaxslam.consistency import LEVEL
+from jaxslam.consistency import LEVEL, percentage
 from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.protocols import Chart, Filter
@@ -38,11 +38,12 @@ class MapTest(NamedTuple):
 
     def rows(self) -> dict[str, object]:
         """The test as rows of a summary."""
-        what = f"joint, {self.dof} dof" if self.joint else "largest of a landmark"
+        what = f"all landmarks, {self.dof} dof" if self.joint else "the worst landmark"
+        band = [float(f"{end:.4g}") for end in self.band]
         return {
             "map NEES": self.nees,
-            "map NEES is": what,
-            f"map NEES, {LEVEL:.0%} of honest maps": [float(f"{end:.4g}") for end in self.band],
+            "map NEES of": what,
+            f"map NEES, {percentage(LEVEL)} of honest maps": band,
             "map verdict": self.verdict,
         }
 

@@ -1,6 +1,7 @@
 """Results as text: a campaign's table, JSON and CSV, and CSV of a single run."""
 
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -13,11 +14,13 @@ from jaxslam.consistency import (
     Measure,
     Summary,
     lopsided,
+    percentage,
     power_of,
 )
 from jaxslam.consistency.verdict import TESTS
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.files import csv_text, json_text, versions
+from jaxslam.results.meanings import VERDICTS, count_label, notes_on
 from jaxslam.types import Estimate
 
 ROWS = (
@@ -48,14 +51,6 @@ ROWS = (
 _COLUMNS = 5
 
 
-_RARE = {
-    "undecided": "too few runs, or too unequal, to reject even a pose NEES of 6: take more runs.",
-    "incomplete": "not rejected, but over half of the measurements were dropped.",
-    "diverged": "over half of the runs diverged or were not finite.",
-}
-"""What verdicts mean that a table seldom has."""
-
-
 def campaign_table(campaign: Campaign) -> str:
     """The campaign as a text table: a column a filter, a row a measure, and notes below.
 
@@ -67,16 +62,16 @@ def campaign_table(campaign: Campaign) -> str:
     title = f"{campaign.scenario}: {campaign.size}"
     notes = [
         "honest: the average of a consistent filter; NEES is not divided by its dof.",
-        f"± or [low, high]: {LEVEL:.0%} interval over the runs.",
-        "verdict: optimistic where the interval of pose NEES or of NIS / dof lies above the honest",
-        "value (covariances too small), pessimistic where it lies below, with the rejecting test.",
-        f"The tests' intervals are wider than {LEVEL:.0%}: together they reject {1 - LEVEL:.0%} of "
-        "honest filters.",
-        "consistent: neither test rejects, which is no proof.",
+        f"± or [low, high]: {percentage(LEVEL)} interval over the runs.",
+        "verdict: by two tests, of pose NEES and of NIS / dof, with the one that rejects. Their",
+        f"intervals are wider than {percentage(LEVEL)}: together they reject "
+        f"{percentage(1 - LEVEL)} of honest filters of a linear problem.",
         *_explained(campaign),
         f"divergent: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the ideal "
         "EKF.",
     ]
+    for term, said in notes_on(campaign):
+        notes += textwrap.wrap(f"{term}: {said}.", 100)
     notes += qualified(campaign)
     notes += not_finite(campaign)
     if campaign.dtype == "float32":
@@ -90,9 +85,10 @@ def campaign_table(campaign: Campaign) -> str:
 
 
 def _explained(campaign: Campaign) -> list[str]:
-    """The meaning of the rarer verdicts that this campaign has."""
+    """The meanings of the verdicts that this campaign has."""
     found = {summary.verdict for summary in campaign.filters.values()}
-    return [f"{word}: {meaning}" for word, meaning in _RARE.items() if word in found]
+    told = [f"{word}: {meaning}." for word, meaning in VERDICTS.items() if word in found]
+    return [line for one in told for line in textwrap.wrap(one, 100)]
 
 
 def qualified(campaign: Campaign) -> list[str]:
@@ -136,6 +132,7 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
                 for key, measure in s.measures.items()
             },
             "nis_band": s.nis_band,
+            "honest_nis": s.honest_nis,
             "steps_inside_band": s.inside,
             "coverage": {block: _finite_or_none(share) for block, share in s.coverage.items()},
             "autocorrelation": _finite_or_none(s.autocorrelation),
@@ -228,13 +225,15 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
         if any(figure is not None for figure in note):
             figures = ["" if figure is None else f"{figure:.4g}" for figure in note]
             lines.append(["  published", "", *figures])
-    lines.append([f"NIS / dof, {LEVEL:.0%} band", "", *(_band_text(s.nis_band) for s in summaries)])
+    lines.append(
+        [f"NIS / dof, {percentage(LEVEL)} band", "", *(_band_text(s.nis_band) for s in summaries)]
+    )
     first = [s.autocorrelation_band[0] for s in summaries]
     lags = [f"± {half:.4f}" if np.isfinite(half) else "-" for half in first]
-    lines.append([f"autocorrelation, {LEVEL:.0%} band", "", *lags])
+    lines.append([f"autocorrelation, {percentage(LEVEL)} band", "", *lags])
     for block in DOF:
-        shares = [f"{s.inside[block]:.1%}" if block in s.inside else "-" for s in summaries]
-        lines.append([f"steps in {block} band", f"{LEVEL:.1%}", *shares])
+        shares = [percentage(s.inside[block], 1) if block in s.inside else "-" for s in summaries]
+        lines.append([f"steps in {block} band", percentage(LEVEL, 1), *shares])
     took = [campaign.step_seconds.get(name) for name in names]
     if any(took):
         cells = ["-" if one is None else f"{1e6 * one:.3g}" for one in took]
@@ -244,7 +243,7 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
         counts = [s.counts.get(key) for s in summaries]
         if key in always or any(counts):
             shown = ("-" if count is None else f"{count:,}" for count in counts)
-            lines.append([key.replace("_", " "), "", *shown])
+            lines.append([count_label(key), "", *shown])
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     text = [
         "  ".join(

@@ -231,7 +231,10 @@ def resume(
         or not isinstance(total, int | None)
         or manifest.get("digest") != digest_of({"settings": own, "campaign": campaign})
     ):
-        raise ValueError(f"{path}: it was changed since the campaign began")
+        raise ValueError(
+            f"{path}: it was changed since the campaign began: put the original back, or begin a "
+            "new campaign in another folder"
+        )
     if settings is not None and (found := differences_of(own, as_stored(settings))):
         raise ValueError(f"{folder} holds another campaign: {'; '.join(found)}")
     kept = Store(folder, own, total, campaign)

@@ -73,24 +73,25 @@ class Scenario:
     """where the experiment is published."""
 
     def __post_init__(self) -> None:
+        what = f"Scenario {self.name!r}"
         size_l, size_u = len(self.sensor.landmark), len(self.motion.controls)
-        _check_table(f"{self.name}: landmarks", self.landmarks, size_l)
-        _check_table(f"{self.name}: controls", self.controls, size_u)
-        _check_table(f"{self.name}: pose", np.reshape(self.pose, (1, -1)), 3)
-        check_covariance(f"{self.name}: pose_cov", self.pose_cov, 3)
+        _check_table(f"{what}: landmarks", self.landmarks, size_l)
+        _check_table(f"{what}: controls", self.controls, size_u)
+        if np.shape(self.pose) != (3,):
+            raise ValueError(f"{what}: pose: expected shape (3,), got {np.shape(self.pose)}")
+        _check_table(f"{what}: pose", np.reshape(self.pose, (1, -1)), 3)
+        check_covariance(f"{what}: pose_cov", self.pose_cov, 3)
         if self.noise_on not in ("robot", "odometry"):
             raise ValueError(
-                f'{self.name}: expected noise_on "robot" or "odometry", got {self.noise_on!r}'
+                f'{what}: expected noise_on "robot" or "odometry", got {self.noise_on!r}'
             )
         if self.noise_on == "odometry" and self.motion.perturb is None:
-            raise ValueError(
-                f"{self.name}: expected a motion with `perturb` for noise on the odometry"
-            )
+            raise ValueError(f"{what}: expected a motion with `perturb` for noise on the odometry")
         if self.places is not None and self.places < 1:
-            raise ValueError(f"{self.name}: expected places >= 1, got {self.places}")
+            raise ValueError(f"{what}: expected places >= 1, got {self.places}")
         if isinstance(self.sensor, Suite) and (self.places or self.spurious) is not None:
             raise ValueError(
-                f"{self.name}: expected neither places nor spurious with a suite: each Part has "
+                f"{what}: expected neither places nor spurious with a suite: each Part has "
                 "its own places"
             )
 
@@ -200,6 +201,6 @@ def _check_table(name: str, values: ArrayLike, columns: int) -> None:
         return  # a tracer, as when maps are drawn under vmap
     table = np.asarray(values)
     if table.ndim != 2 or table.shape[1] != columns or table.shape[0] == 0:
-        raise ValueError(f"{name}: expected shape (at least 1, {columns}), got {table.shape}")
+        raise ValueError(f"{name}: expected shape (N, {columns}) with N >= 1, got {table.shape}")
     if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
         raise ValueError(f"{name}: expected finite numbers")

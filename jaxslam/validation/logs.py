@@ -45,13 +45,13 @@ def check_log(
         return
     there, tags = np.asarray(valid), np.asarray(tag)
     most = largest(control, z)
-    for what, values, used in (
-        ("log.control", control, np.ones(steps, bool)),
-        ("log.scan.z: a valid measurement", z, there),
+    for what, values, used, then in (
+        ("log.control", control, np.ones(steps, bool), "correct or leave out this row"),
+        ("log.scan.z: a valid measurement", z, there, "set log.scan.valid to False there"),
     ):
         size = np.abs(np.asarray(values, np.float64)).max(axis=-1, initial=0.0)
-        _refuse(name, used & ~np.isfinite(size), f"{what} is not finite")
-        _refuse(name, used & (size > most), f"{what} is beyond ±{most:.2g}")
+        _refuse(name, used & ~np.isfinite(size), f"{what} is not finite", then)
+        _refuse(name, used & (size > most), f"{what} is beyond ±{most:.2g}", then)
     _refuse(name, there & (tags < -1), "log.scan.tag: a tag is below -1")
     _refuse(name, there & (tags > np.iinfo(np.int32).max), "log.scan.tag: a tag is beyond int32")
     named = np.where(there & (tags >= 0), tags, -1 - np.arange(places))
@@ -61,8 +61,12 @@ def check_log(
         _refuse(name, repeats, "log.scan.tag: a tag repeats within the scan")
 
 
-def _refuse(name: str, bad: np.ndarray, why: str) -> None:
-    """Raise ValueError if an entry of `bad` is set, by row or by row and measurement slot."""
+def _refuse(name: str, bad: np.ndarray, why: str, then: str = "") -> None:
+    """Raise ValueError if an entry of `bad` is set, by row or by row and measurement slot.
+
+    then: the next step.
+    """
     if bad.any():
         at = zip(("row", "slot"), np.argwhere(bad)[0], strict=False)
-        raise ValueError(f"{name}: {why} ({', '.join(f'{what} {i}' for what, i in at)})")
+        where = ", ".join(f"{what} {i}" for what, i in at)
+        raise ValueError(f"{name}: {why} ({where})" + f": {then}" * bool(then))

@@ -123,6 +123,19 @@ def check_associate(name: str, associate: object) -> None:
         return
 
 
+def unfit_signature(function: Callable[..., object], count: int) -> str | None:
+    """The parameters of a function that does not take `count` arguments; None of one that does."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # a builtin has none
+        return None
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        return f"({', '.join(signature.parameters)})"
+    return None
+
+
 def _numbers(*shape: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
 
@@ -136,6 +149,9 @@ def _check_size(
 ) -> None:
     """Raise ValueError unless the model's function returns this shape for these arguments."""
     function: Callable[..., object] = getattr(model, field)
+    if (got := unfit_signature(function, len(arguments))) is not None:
+        wanted = f"{model.name}.{field} to take ({', '.join(arguments)})"
+        raise ValueError(f"{name}: expected {wanted}, got {got}")
     told = ", ".join(f"{key} {_told(value.shape)}" for key, value in arguments.items())
     call = f"{model.name}.{field}({told})"
     try:

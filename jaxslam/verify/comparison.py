@@ -160,13 +160,15 @@ def _finding(
         entries.append(entry(int(np.argmax(excess)), int(i), int(j)))
     entries.sort(key=lambda e: -e.states)
     has_quotient = evaluation.quotient is not None
+    # Where no method has a finite derivative, their differences say nothing.
+    lost = bool(wrong[~np.isfinite(list(evaluation.methods.values())).any(axis=0)].any())
     return Finding(
         function=function.name,
         argument=argument.name,
         passed=not entries and len(samples.labels) > 0,
         methods=(*evaluation.methods, *(("differences",) if has_quotient else ())),
-        absolute=float(compared.gap.max(initial=0.0)),
-        relative=float(compared.relative.max(initial=0.0)),
+        absolute=np.inf if lost else float(compared.gap.max(initial=0.0)),
+        relative=np.inf if lost else float(compared.relative.max(initial=0.0)),
         tolerance=tolerance,
         float32=float(compared.relative32.max(initial=0.0)) if evaluation.single else None,
         float32_tolerance=float32_tolerance,

@@ -92,14 +92,16 @@ class Finding:
 
     def lines(self) -> Iterator[str]:
         """The finding as lines of text, longer where it failed."""
-        single = "" if self.float32 is None else f", float32 {_two_digits(self.float32)}"
-        quotient = ""
-        if self.differences is not None:
-            quotient = f", {self.quotient} {_two_digits(self.differences)}"
         odd = f" ({self.no_derivative} without a derivative)" if self.no_derivative else ""
         verdict = "ok  " if self.passed else "FAIL"
         worst = f"worst {_two_digits(self.absolute)} abs, {_two_digits(self.relative)} rel"
-        yield f"{verdict}  {self.name}: {worst}{single}{quotient}; {self.samples} states{odd}"
+        if self.float32 is not None:
+            worst += f", float32 {_two_digits(self.float32)}"
+        if self.differences is not None:
+            worst += f", {self.quotient} {_two_digits(self.differences)}"
+        if not (self.samples and math.isfinite(self.absolute)):
+            worst = "a derivative is not finite" if self.samples else "no value is finite"
+        yield f"{verdict}  {self.name}: {worst}; {self.samples} states{odd}"
         for entry in self.wrong_entries[:_SHOWN]:
             yield from (f"      {line}" for line in entry.lines(self.samples))
         if len(self.wrong_entries) > _SHOWN:

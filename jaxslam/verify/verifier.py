@@ -17,10 +17,11 @@ from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.functions import (
     Function,
     at_state,
-    example_line,
+    example_of,
     factor_function,
     makes_a_model,
     plain_function,
+    told_signatures,
 )
 from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.record import Report
@@ -121,6 +122,7 @@ def verify_jacobians(
         )
     if isinstance(model, Motion | Sensor):
         kind, name = "motion" if isinstance(model, Motion) else "sensor", model.name
+        model = told_signatures(model)
         functions = functions_of(model)
     elif isinstance(model, Factor):
         kind, name, functions = "factor", model.name, (factor_function(model),)
@@ -155,10 +157,10 @@ def notes_of(evaluated: Evaluated, kind: str) -> Iterator[str]:
         if argument.deduced:
             count = len(argument.entries)
             entries = "1 entry" if count == 1 else f"{count} entries"
+            example = example_of(function.name, {argument.name: count})
             yield (
-                f"{argument.name}: {entries}, deduced from shapes. Name them with their units, "
-                f"as {function.name}_arguments = {example_line([argument.name])} in the file or "
-                "arguments= in Python, and difficult values are tried too"
+                f"{argument.name}: {entries}, deduced from shapes. Difficult values are tried too "
+                f"if you name them with their units: {example}"
             )
     for jump in evaluated.jumps if kind != "motion" else ():
         output, turn = function.outputs[jump.output], "2π" if jump.unit == "[rad]" else "360"

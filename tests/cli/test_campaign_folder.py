@@ -107,7 +107,7 @@ def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys, refused, un
     difference = "--seed is 0 there, 3 here; --filters is dead_reckoning,localization there, ekf"
     parts = (difference, "leave these options out")
     refused([*again, "--seed", "3", "--filters", "ekf"], *parts)
-    refused(["consistency", "--resume", tmp_path], "no campaign to resume")
+    refused(["consistency", "--resume", tmp_path], "no campaign to resume", "or begin a new one")
 
     # More runs extend it, to what a campaign of as many gives; fewer than there are do not.
     assert cli.main([*again, "--runs", "5", "--block", "1", "--devices", "1"]) == 0

@@ -74,12 +74,12 @@ def test_the_version_is_told(capsys):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (["--scenario", "moon"], "unknown scenario 'moon'"),
-        (["--filters", "ekf,magic"], "unknown filter 'magic'"),
-        (["--runs", "0"], "runs"),
+        (["--scenario", "moon"], "--scenario: unknown scenario 'moon'"),
+        (["--filters", "ekf,magic"], "--filters: unknown filter 'magic'"),
+        (["--runs", "0"], "--runs: expected an integer >= 1, got 0"),
         (["--runs", "many"], "invalid int"),
-        (["--steps", "0"], "steps"),
-        (["--block", "-1"], "block"),
+        (["--steps", "0"], "circle: steps: expected an integer >= 1"),
+        (["--block", "-1"], "--block: expected"),
         (["--seed", "-1"], "seed"),
         (["--dtype", "float16"], "invalid choice"),
         (["--devices", "0"], "--devices: expected at least 1"),
@@ -139,8 +139,13 @@ def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refuse
     )
     monkeypatch.setitem(scenarios.SCENARIOS, "signs", lambda steps: three_parameters())
     asked = ["consistency", "--scenario", "signs", "--steps", "5", "--filters", "ekf,fej"]
-    parts = ("filter 'fej' cannot run scenario 'ring'", "range_bearing_signature")
-    refused([*asked, "--out", tmp_path], *parts)
+    parts = (
+        "--filters: fej cannot run scenario 'ring'",
+        "needs landmarks (x, y), not those of range_bearing_signature: choose linearize.at_est",
+        "those of the catalog that can: --filters ekf,ideal,iterated,ukf,",
+    )
+    said = refused([*asked, "--out", tmp_path], *parts)
+    assert "chart" not in said and "fej" not in said.split("can: ")[1]
 
 
 def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, refused, monkeypatch):

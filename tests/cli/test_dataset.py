@@ -8,6 +8,7 @@ import pytest
 
 from jaxslam import cli
 from jaxslam.cli.run.command import positive_definite
+from jaxslam.cli.run.filters import NAMES
 from jaxslam.results import plot
 from jaxslam.results.film import encoding
 
@@ -32,7 +33,7 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
     assert cli.main(run) == 0
     assert jax.config.jax_enable_x64
     printed = capsys.readouterr().out
-    assert "fused 4, born 2, rejected 0" in printed
+    assert "fused 4, initialized 2, rejected 0" in printed
     assert "at 2 of 2 checked steps" in printed
     assert {path.name for path in out.iterdir()} == {
         "trajectory.csv",
@@ -64,7 +65,10 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
     filters = ["--filters", "ekf,dead_reckoning", "--check-every", "0"]
     run = ["run", "--dataset", "bonn", str(data), *filters, "--animate", "--out", str(out)]
     assert cli.main(run) == 0
-    assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in printed
+    (likely,) = (line for line in printed.splitlines() if line.startswith("log-likelihood"))
+    assert likely.endswith(" -")  # dead reckoning has no innovation
     for name in ("ekf", "dead_reckoning"):
         assert (out / f"film-{name}.gif").read_bytes().startswith(b"GIF")
         assert "jaxslam-film" in (out / f"film-{name}.html").read_text()
@@ -95,6 +99,13 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, asked, spo
     assert not out.exists()
 
 
+def test_the_help_names_whole_filters_and_only_those_of_a_data_set(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert cli.main(["run", "--help"]) == 0
+    words = capsys.readouterr().out.replace(",", " ").split()
+    assert {*NAMES} <= {word.strip(";") for word in words} and not {"ideal", "batch_map"} & {*words}
+
+
 def test_a_covariance_is_judged_on_the_host():
     assert positive_definite(np.diag([1.0, 1e-12]))
     assert not positive_definite(np.diag([1.0, -1e-12]))
@@ -121,10 +132,10 @@ def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["ATE [m]"] < 0.2
     # Of one landmark the joint NEES is its own.
-    assert summary["map NEES is"] == "joint, 2 dof"
+    assert summary["map NEES of"] == "all landmarks, 2 dof"
     np.testing.assert_allclose(summary["map NEES"], summary["landmark NEES (2 is honest)"])
     assert 0 < summary["map NEES"] < 10
-    assert summary["map NEES, 95% of honest maps"] == [0.05064, 7.378]
+    assert summary["map NEES, 95 % of honest maps"] == [0.05064, 7.378]
     assert summary["map verdict"] in ("consistent", "optimistic")
     assert summary["status"]["born"] == 2
     # The landmark without a tag has no name.

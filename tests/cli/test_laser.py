@@ -92,10 +92,16 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--map", "known", "--filters", "seif"], "--filters: not of a laser log"),
-        (["--map", "known", "--animate"], "--animate: of a laser log only without --map"),
-        (["--map", "known", "--start", "global"], "--start: only with --localize"),
-        (["--localize", "m.yaml", "--resolution", "1"], "--resolution: only of a map"),
+        (["--map", "known", "--filters", "seif"], "--filters: a laser log does not have this"),
+        (["--map", "known", "--animate"], "--animate: a laser log has a film of laser SLAM alone"),
+        (
+            ["--map", "known", "--start", "global"],
+            "--start: expected --localize MAP.yaml beside it",
+        ),
+        (
+            ["--localize", "m.yaml", "--resolution", "1"],
+            "--resolution: --localize reads a map, which has its own",
+        ),
         (["--map", "known", "--resolution", "0"], "--resolution: expected a number above 0"),
         (["--map", "known", "--resolution", "1e-4"], "--resolution: cells of 0.0001 m make a map"),
         (["--map", "known", "--max-range", "-1"], "--max-range: expected a number above 0"),
@@ -122,7 +128,7 @@ def test_a_log_that_ends_in_a_line_is_refused_with_the_line(log_file, tmp_path, 
 
 def test_options_of_laser_logs_are_of_no_other_data_set(tmp_path, refused):
     run = ["run", "--dataset", "bonn", tmp_path, "--map", "known"]
-    refused(run, "--map: only of a laser log (--dataset carmen)")
+    refused(run, "--map: expected a laser log, --dataset carmen")
     refused(["run", "--dataset", "moon", tmp_path], "unknown dataset 'moon'; known: ", ", carmen")
 
 

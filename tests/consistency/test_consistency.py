@@ -41,7 +41,7 @@ def synthetic(rng, runs, claimed=1.0, singular=0):
         pose=pose,
         pose_cov=cov,
         points=rng.normal(size=(runs, STEPS, SLOTS, 2)),
-        point_covs=np.zeros((runs, STEPS, SLOTS, 2, 2)),
+        point_covs=np.tile(np.diag([1.0, 0.0]), (runs, STEPS, SLOTS, 1, 1)),
         alive=np.tile([True, False, True], (runs, STEPS, 1)),
         tag=np.tile(tag, (runs, STEPS, 1)),
     )

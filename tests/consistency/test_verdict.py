@@ -120,7 +120,7 @@ def test_few_runs_say_what_they_would_have_noticed():
     low, high = found.noticed["nees_pose"]
     assert 1 < low < 3 < high < 5
     said = power_of(found.noticed)
-    assert said == f"90% power to reject a pose NEES above {high:.3g} or below {low:.3g}"
+    assert said == f"90 % power to reject a pose NEES above {high:.3g} or below {low:.3g}"
     more = judge({"nees_pose": np.repeat(nees, 25)}, COUNTS).noticed["nees_pose"]
     assert low < more[0] < 3 < more[1] < high
     wide = judge({"nees_pose": np.array([1.0, 5.0, 3.0])}, COUNTS)

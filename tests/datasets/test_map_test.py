@@ -53,7 +53,7 @@ def test_without_the_correlations_the_largest_nees_is_judged():
     assert sum(one.verdict == "optimistic" for one in found) < 0.05 * DRAWS + 3 * 4.4
     assert not any(one.verdict == "pessimistic" for one in found)
     assert found[0].band == (0, chi2_quantile(1 - 0.05 / COUNT, 2))
-    assert not found[0].joint and found[0].rows()["map NEES is"] == "largest of a landmark"
+    assert not found[0].joint and found[0].rows()["map NEES of"] == "the worst landmark"
     far = judged(False, scale=8.0)
     assert sum(one.verdict == "optimistic" for one in far) > 0.7 * DRAWS
 

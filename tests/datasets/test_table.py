@@ -292,7 +292,7 @@ def test_errors_against_the_truth_by_hand(tmp_path):
     found = evaluate(data, *estimates(data, 0.2))
     expected = {
         "ATE [m]": 0.2,
-        "heading RMSE [deg]": 0.0,
+        "heading RMSE [°]": 0.0,
         "pose NEES, mean (3 is honest)": 4.0,
         "pose NEES, median (2.37 is honest)": 4.0,
         "map RMSE [m]": 0.2,
@@ -308,7 +308,7 @@ def test_errors_in_frames_of_their_own_are_taken_after_an_alignment(tmp_path):
     found = evaluate(data, *estimates(data, 0.2))
     assert list(found.errors) == [
         "ATE after alignment [m]",
-        "heading RMSE after alignment [deg]",
+        "heading RMSE after alignment [°]",
         "map RMSE after alignment [m]",
         "landmark NEES after alignment (honest: below 2)",
     ]

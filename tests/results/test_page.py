@@ -184,6 +184,16 @@ def test_every_label_of_the_table_is_shown_where_it_is_measured():
     assert "consistency of 1 filter" in "".join(reader.words)
 
 
+def test_notes_of_the_measures_stand_below_them():
+    of = dataclasses.replace(summary("consistent", GOOD), honest_nis=0.95)
+    of.counts.update(born=3, fused=9, rejected=2)
+    reader = Reader(page(campaign(a=of), report.ROWS, "", None, {}, {}))
+    words = " ".join("".join(reader.words).split())
+    assert "so that NIS / dof is honest from 0.950 (a) to 1" in words
+    assert "initialized, measurements that started a landmark" in words
+    assert row(reader, "initialized")[2] == "3"
+
+
 def test_parameters_and_conventions_are_in_words(read):
     words = " ".join("".join(read.words).split())
     for said in ("1234", "jax 9.8.7", "A & B, https://doi.org/10.1/2", "4.5 m", "float32"):

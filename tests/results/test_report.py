@@ -10,6 +10,7 @@ import pytest
 import worlds
 
 from jaxslam import report
+from jaxslam.catalog import BASELINES
 from jaxslam.results import files
 from jaxslam.types import Estimate
 
@@ -33,6 +34,27 @@ def test_the_table_shows_every_measure_and_verdict(campaign):
         assert summary.verdict in text
         assert f"{summary.measures['nees_pose'].value:.4g}" in text
     assert "not divided by its dof" in text
+
+
+def test_the_notes_explain_the_gate_the_likelihood_and_the_counts(campaign):
+    ekf = campaign.filters["ekf"]
+    counts = ekf.counts | {"rejected": 7, "fused": ekf.counts["fused"] - 7}
+    gated = dataclasses.replace(ekf, honest_nis=0.9454, counts=counts)
+    text = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf, "b": gated}))
+    assert "gate: a gate drops the largest innovations" in text and "0.945 (b) to 1" in text
+    assert "log-likelihood: comparable only between filters that fused the same" in text
+    assert "initialized, measurements that started a landmark" in " ".join(text.split())
+    assert "born" not in text
+    alone = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf}))
+    assert "gate:" not in alone and "log-likelihood:" not in alone
+
+
+def test_what_a_filter_does_not_estimate_has_no_number():
+    """The log-likelihood of dead reckoning, the map of localization."""
+    filters = {name: BASELINES[name](WORLD) for name in ("dead_reckoning", "localization")}
+    reckoned, localized = worlds.campaign(WORLD, filters, 2).filters.values()
+    assert "log_likelihood" not in reckoned.measures and "rmse_landmarks" not in localized.measures
+    assert "log_likelihood" in localized.measures
 
 
 def test_json_holds_the_measures_and_no_nan(campaign):

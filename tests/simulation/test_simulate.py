@@ -308,7 +308,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_inconsistent_scenarios_are_refused(case):
     changes, message = BAD[case]
-    with pytest.raises(ValueError, match=f"test: .*{message}"):
+    with pytest.raises(ValueError, match=f"^Scenario 'test': .*{message}"):
         world(**changes)
 
 

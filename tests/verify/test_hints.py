@@ -81,7 +81,10 @@ def test_a_deduced_length_is_noted_and_verified():
     assert report.passed, str(report)
     (note,) = report.notes
     assert note.startswith("u: 1 entry, deduced from shapes")
-    assert 'f_arguments = {"u": (' in note
+    assert 'f_arguments = {"u": ("u0 [unit]",)} in the file' in note
+    (note,) = verify_jacobians(lambda state: jnp.stack([state @ jnp.ones(3)])).notes
+    assert 'arguments={"state": ("x [m]", "y [m]", "theta [rad]")} in Python' in note
+    assert "<lambda>" not in note and "define a function" in note
 
 
 @pytest.mark.parametrize(
@@ -90,11 +93,11 @@ def test_a_deduced_length_is_noted_and_verified():
         (lambda u: u, None, ["argument 'u'", "f accepts more than one"]),
         (lambda u: u, lambda u: jnp.eye(len(u)), ["f and its Jacobian accept more than one"]),
         # Only the argument that is not determined is asked for.
-        (lambda a, b: a[0] * b, lambda a, b: (b[:, None], None), ["argument 'b'?"]),
+        (lambda a, b: a[0] * b, lambda a, b: (b[:, None], None), ["argument 'b' is"]),
         (
             lambda a, b: (a * 2).reshape(2) + b[0],
             None,
-            ["argument 'b'?", 'f_arguments = {"b": ("v [m/s]", "omega [rad/s]")}'],
+            ["argument 'b' is", 'f_arguments = {"b": ("v [m/s]", "omega [rad/s]")}'],
         ),
         (lambda u: u.reshape(20), None, ["f fails with 1 to 12 entries", "reshape"]),
         (lambda u: (u, u), None, ["it returns shapes [(12,), (12,)], expected (m,)"]),
@@ -102,12 +105,29 @@ def test_a_deduced_length_is_noted_and_verified():
     ],
 )
 def test_lengths_that_are_not_determined_are_asked_for(function, claim, whys):
-    with pytest.raises(ValueError, match="what is the length of its argument") as error:
+    with pytest.raises(ValueError, match=r"the length of its argument .* is not known") as error:
         lengths(function, claim, name="f")
     message = str(error.value)
     assert "\n" not in message
     for why in whys:
         assert why in message
+
+
+def test_a_function_of_other_arguments_is_told():
+    sensor = dataclasses.replace(build(sensors.bearing_only), invert=lambda pose, z: z)
+    assert "invert can be called: invert takes (pose, z, s), got a function of (pose, z)" in str(
+        verify_jacobians(sensor)
+    )
+
+
+def test_a_derivative_that_is_not_finite_is_no_difference_of_0():
+    """Though all methods agree on NaN, and a function without a value has none to compare."""
+    for function, said in (
+        (lambda point: jnp.sqrt(0 * point), "a derivative is not finite"),
+        (lambda point: jnp.nan * point, "no value is finite"),
+    ):
+        report = verify_jacobians(function, lambda point: jnp.full((2, 2), jnp.nan), name="f")
+        assert f"FAIL  f by point: {said}; " in str(report)
 
 
 # --- angles that are not named --------------------------------------------------------------------

@@ -158,7 +158,7 @@ def test_one_of_them_by_name(verify):
         ("", "", "mine.py: defines nothing to verify"),
         (GOOD, ":g", "mine.py: there is no g to verify; it defines: "),
         (GOOD.replace("f_jacobian", "f_slope"), ":f", "there is no f_jacobian"),
-        (UNTOLD, "", "what is the length of its argument 'u'"),
+        (UNTOLD, "", "the length of its argument 'u' is not known"),
         (GOOD + "\nf_jacobians = f_jacobian\n", "", "expected f_jacobian or f_jacobians, got both"),
         (GOOD + "\nf_states = (1.0,)\n", "", "expected states of shapes (S, 3), (S, 1)"),
         (MODELS.replace("return jaxslam.sensors", "return 1 / jaxslam.sensors"), "", "mine.py:9: "),

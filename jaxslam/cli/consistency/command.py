@@ -50,9 +50,9 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     filters = files.filters(asked.filters, scenario)
     if not 0 <= asked.seed < 2**32:
         raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {asked.seed}")
-    check_count("runs", asked.runs)
+    check_count("--runs", asked.runs)
     if options.block is not None:
-        check_count("block", options.block)
+        check_count("--block", options.block)
     check_writable(out)
     # What is missing of a campaign of parts is computed as the parts would.
     most = settings.get("devices")

@@ -51,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--table",
         default="",
         metavar="FORMATS",
-        help=f"also write each run's averages as runs.csv, …; formats of {','.join(RUN_FORMATS)}",
+        help=f"also write each run's averages as runs.csv, …; formats of {', '.join(RUN_FORMATS)}",
     )
     films.add_options(parser)
     earlier = parser.add_mutually_exclusive_group()

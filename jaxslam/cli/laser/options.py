@@ -72,23 +72,35 @@ def refuse_laser_options(options: argparse.Namespace) -> None:
     given = [name for name in ALONE if getattr(options, name, None) is not None]
     if given:
         name = given[0].replace("_", "-")
-        raise ValueError(f"--{name}: only of a laser log (--dataset {', '.join(READERS)})")
+        raise ValueError(
+            f"--{name}: expected a laser log, --dataset {', '.join(READERS)}: leave it out"
+        )
 
 
 def complete(options: argparse.Namespace) -> argparse.Namespace:
     """The options with their defaults; raises ValueError on what a laser log cannot have."""
     for name in OTHERS:
         if getattr(options, name) is not None:
-            raise ValueError(f"--{name.replace('_', '-')}: not of a laser log")
+            raise ValueError(
+                f"--{name.replace('_', '-')}: a laser log does not have this option: leave it out"
+            )
     if options.animate and (options.map is not None or options.localize is not None):
-        raise ValueError("--animate: of a laser log only without --map and --localize")
+        raise ValueError(
+            "--animate: a laser log has a film of laser SLAM alone: leave out --animate, or --map "
+            "and --localize"
+        )
     for_localization = [
         n for n in ("start", "particles", "seed") if getattr(options, n) is not None
     ]
     if options.localize is None and for_localization:
-        raise ValueError(f"--{for_localization[0]}: only with --localize")
+        raise ValueError(
+            f"--{for_localization[0]}: expected --localize MAP.yaml beside it: add it, or leave "
+            "this option out"
+        )
     if options.localize is not None and options.resolution is not None:
-        raise ValueError("--resolution: only of a map that is made; --localize reads one")
+        raise ValueError(
+            "--resolution: --localize reads a map, which has its own: leave this option out"
+        )
     given = {n: v for n, v in vars(options).items() if v is not None}
     made = argparse.Namespace(**(vars(options) | DEFAULTS | given))
     for name in ("resolution", "max_range", "every", "particles"):

@@ -127,14 +127,18 @@ def _run(
     seconds = time.perf_counter() - began
     last = result.last
     nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
+    dof = int(result.dof.sum())
+    innovations = {  # of a filter that has some
+        "NIS / dof": float(nis / max(dof, 1)),
+        "log-likelihood": float(result.log_likelihood.sum()),
+    }
     found = evaluate(data, result.path, last, joint_map_cov(filter, result.final))
     summary = {
         "landmarks": int(last.alive.sum()),
         "status": {
             s.name.lower(): int((result.status == s).sum()) for s in Status if s != Status.EMPTY
         },
-        "NIS / dof": float(nis / max(int(result.dof.sum()), 1)),
-        "log-likelihood": float(result.log_likelihood.sum()),
+        **(innovations if dof else {}),
         "P positive definite": _definiteness(result),
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),

@@ -13,6 +13,9 @@ from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Truth
 
+NAMES = tuple(name for name in ALL if name not in ("ideal", "batch_map"))
+"""Those that run on a data set: no truth is needed, and no whole log at once."""
+
 
 def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
     """The data set with the gate and the association that the command asks for."""
@@ -52,7 +55,7 @@ def chosen_filters(data: Dataset, asked: str) -> dict[str, Filter]:
         places=data.log.scan.tag.shape[1],
         filter_options=data.filter_options,
     )
-    return {name: _filter(name, pick("filter", name, ALL)(world), data) for name in names}
+    return {name: _filter(name, pick("filters", name, ALL)(world), data) for name in names}
 
 
 def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:

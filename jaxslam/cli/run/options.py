@@ -2,11 +2,11 @@
 
 import argparse
 
-from jaxslam.catalog import ALL
 from jaxslam.cli import films
 from jaxslam.cli.common import add_dtype, add_figures, add_out
 from jaxslam.cli.laser import options as laser_options
 from jaxslam.cli.run.command import run_dataset
+from jaxslam.cli.run.filters import NAMES
 from jaxslam.cli.runtime import cache
 from jaxslam.datasets import READERS
 from jaxslam.datasets.table.association import METHODS
@@ -25,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--filters",
-        help=f"some of: {','.join(ALL)}; comma-separated (default: ekf)",
+        help=f"some of: {', '.join(NAMES)}; with commas between them (default: ekf)",
     )
     parser.add_argument(
         "--gate",

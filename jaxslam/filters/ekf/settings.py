@@ -116,7 +116,7 @@ def check_chart(sensor: Sensor, chart: Chart) -> None:
     if not fits:
         raise ValueError(
             f"ekf_slam: the chart {chart.name} does not act on the {landmark.shape[0]}-parameter "
-            f"landmarks of the sensor {sensor.name}"
+            f"landmarks of the sensor {sensor.name}: choose charts.euclidean()"
         )
 
 
@@ -124,16 +124,16 @@ def check_settings(settings: EkfSettings) -> None:
     """Raise ValueError unless sensor, chart, linearizer and covariance form are compatible."""
     sensor, chart, linearize = settings.sensor, settings.chart, settings.linearize
     check_chart(sensor, chart)
-    if linearize.euclidean and (chart.basis is not None or not sensor.of_points):
-        raise ValueError(
-            f"ekf_slam: the linearizer {linearize.name} is for the Euclidean chart and landmarks "
-            f"(x, y), not for the chart {chart.name} and the landmarks of {sensor.name}"
-        )
-    if linearize.euclidean and isinstance(sensor, Suite) and any(p.absolute for p in sensor.parts):
-        raise ValueError(
-            f"ekf_slam: the linearizer {linearize.name} does not support absolute sensors, "
-            f"and the suite {sensor.name} has one"
-        )
+    if linearize.euclidean:
+        unfit = [f"the Euclidean chart, not {chart.name}"] * (chart.basis is not None)
+        unfit += [f"landmarks (x, y), not those of {sensor.name}"] * (not sensor.of_points)
+        if isinstance(sensor, Suite) and any(part.absolute for part in sensor.parts):
+            unfit += [f"a suite without absolute sensors, not {sensor.name}"]
+        if unfit:
+            raise ValueError(
+                f"ekf_slam: the linearizer {linearize.name} needs {', and '.join(unfit)}: choose "
+                "linearize.at_estimate()"
+            )
     check_iterations("ekf_slam", linearize, settings.iterations)
     if sensor.reduced is not None and chart.basis is not None:
         ground = jnp.zeros(len(sensor.landmark))

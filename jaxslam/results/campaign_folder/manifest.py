@@ -31,7 +31,10 @@ def read_manifest(folder: Path) -> Json:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ValueError(f"no campaign to resume: there is no {path}") from error
+        raise ValueError(
+            f"no campaign to resume: there is no {path}: give the folder of an interrupted "
+            "campaign, or begin a new one"
+        ) from error
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}") from error
     except (ValueError, RecursionError) as error:

@@ -16,6 +16,7 @@ from jaxslam.results.page.parts import (
     badge,
     embedded_figure,
     lost_runs,
+    measure_notes,
     measures_table,
     verdict_list,
 )
@@ -85,6 +86,7 @@ same draws.</p>
 <section{' class="broad"' if len(campaign.filters) > _UPRIGHT else ""}>
 <h2>Measures</h2>
 {measures_table(campaign, table)}
+{measure_notes(campaign)}
 {lost_runs(campaign)}
 </section>
 <section>
@@ -124,6 +126,7 @@ def fragment(
 {_figures(figures, draw)}
 <details><summary>All measures</summary>
 {measures_table(campaign, table)}
+{measure_notes(campaign)}
 </details>
 {lost_runs(campaign)}
 </div>
@@ -164,9 +167,9 @@ the pointer over a number for its ends, which stand in brackets where it is lops
 <strong>divergent</strong> when its final position error exceeds
 {campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth.</p>
 <p>The <strong>verdict</strong> goes by the pose NEES and by NIS / dof, averaged over time, one
-number a run each, and their intervals over the runs, so wide that an honest filter is rejected in
-{percentage(1 - LEVEL)} of campaigns. <em>Noticed</em> is what nine such campaigns in ten would
-reject. An asterisk marks a verdict with a reservation:</p>
+number a run each, and their intervals over the runs, so wide that an honest filter of a linear
+problem is rejected in {percentage(1 - LEVEL)} of campaigns. <em>Noticed</em> is what nine such
+campaigns in ten would reject. An asterisk marks a verdict with a reservation:</p>
 <dl class="meanings">
 {meanings}
 </dl>

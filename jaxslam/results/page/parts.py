@@ -8,6 +8,7 @@ from itertools import repeat
 from jaxslam.consistency import DOF, LEVEL, Summary, power_of
 from jaxslam.consistency.verdict import TESTS
 from jaxslam.monte_carlo import Campaign
+from jaxslam.results import meanings
 from jaxslam.results.page.text import (
     breakable,
     cell,
@@ -19,15 +20,15 @@ from jaxslam.results.page.text import (
 from jaxslam.results.plot import Figure, describe
 
 VERDICTS = {
-    "consistent": ("✓", "neither interval excludes honesty, which is no proof of it"),
-    "optimistic": ("▲", "an interval lies above: covariances are claimed too small"),
-    "pessimistic": ("▼", "an interval lies below: covariances are claimed too large"),
-    "diverged": ("✕", "over half of the runs are not finite or divergent"),
-    "incomplete": ("–", "not rejected, but over half of the measurements were dropped"),
-    "undecided": (
-        "?",
-        "fewer than two runs have a NEES, or not even twice the honest one would be rejected",
-    ),
+    word: (sign, meanings.VERDICTS[word])
+    for word, sign in (
+        ("consistent", "✓"),
+        ("optimistic", "▲"),
+        ("pessimistic", "▼"),
+        ("diverged", "✕"),
+        ("incomplete", "–"),
+        ("undecided", "?"),
+    )
 }
 """Each verdict with its sign and its meaning."""
 
@@ -108,7 +109,7 @@ def measures_table(campaign: Campaign, table: Sequence[tuple[str, str, str]]) ->
     for key in dict.fromkeys(key for s in summaries.values() for key in s.counts):
         found = [s.counts.get(key, 0) for s in summaries.values()]
         if key in _ALWAYS or any(found):
-            label = "finite runs" if key == "runs" else key.replace("_", " ")
+            label = "finite runs" if key == "runs" else meanings.count_label(key)
             counts.append(_row(label, "", _cells((f"{n:,}" for n in found), found)))
     groups = (("", body), ("Bands", bands), ("Counts", counts))
     span = len(summaries) + 2
@@ -140,6 +141,14 @@ def _cells(texts: Iterable[str], values: Iterable[float | None] | None = None) -
     """Cells of the table as HTML, with the values by which filters are sorted if there are any."""
     pairs = zip(texts, repeat(None) if values is None else values, strict=False)
     return "".join(f"<td{sortable(value)}>{text}</td>" for text, value in pairs)
+
+
+def measure_notes(campaign: Campaign) -> str:
+    """What must be known of the measures, as HTML."""
+    return "\n".join(
+        f'<p class="note"><strong>{escape(term)}</strong>: {escape(said)}.</p>'
+        for term, said in meanings.notes_on(campaign)
+    )
 
 
 def lost_runs(campaign: Campaign) -> str:

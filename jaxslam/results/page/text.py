@@ -4,6 +4,7 @@ from html import escape
 
 import numpy as np
 
+from jaxslam import consistency
 from jaxslam.consistency import LEVEL, Measure, lopsided
 
 
@@ -54,7 +55,7 @@ def published_note(value: float | None) -> str:
 
 def percentage(share: float, digits: int = 0) -> str:
     """A share as a percentage, with a no-break space."""
-    return f"{100 * share:.{digits}f}\N{NO-BREAK SPACE}%"
+    return consistency.percentage(share, digits).replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def with_noun(number: int, noun: str) -> str:

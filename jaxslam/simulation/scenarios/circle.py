@@ -19,7 +19,7 @@ def circle(steps: int = 2500) -> Scenario:
     arXiv:2002.00878; `published` are its program's figures over 100 runs,
     and empty where the number of steps is not theirs.
     """
-    check_count("steps", steps)
+    check_count("circle: steps", steps)
     v, omega = 0.25, np.deg2rad(1.5)
     radius = v / omega
     around = 2 * np.pi * np.arange(20) / 20

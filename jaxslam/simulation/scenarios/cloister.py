@@ -20,7 +20,7 @@ def cloister(steps: int = 200) -> Scenario:
     The noise is on the robot; `dataclasses.replace(…, noise_on="odometry")` gives the guide's way,
     which disturbs the estimator instead (see ERRATA).
     """
-    check_count("steps", steps)
+    check_count("cloister: steps", steps)
     return Scenario(
         name="cloister",
         motion=increment(np.diag([0.01, 0.02]) ** 2),

@@ -15,7 +15,7 @@ def explore(steps: int = 100) -> Scenario:
     Odometry σ (0.05 m, 1°) a step, ranges and bearings σ (0.1 m, 1°) up to 12 m; landmarks every
     5 m, 4 m to the left and to the right, staggered; P0 = 0. Parameters ours.
     """
-    check_count("steps", steps)
+    check_count("explore: steps", steps)
     along = np.arange(2.5, max(steps, 6) + 5.0, 5.0)
     left = np.stack([along, np.full_like(along, 4.0)], axis=1)
     right = np.stack([along + 2.5, np.full_like(along, -4.0)], axis=1)

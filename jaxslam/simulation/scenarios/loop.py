@@ -56,7 +56,7 @@ def loop_landmarks(map_seed: int) -> np.ndarray:
 
 
 def _loop(name: str, sensor: Sensor, steps: int, map_seed: int) -> Scenario:
-    check_count("steps", steps)
+    check_count(f"{name}: steps", steps)
     landmarks = loop_landmarks(map_seed)
     # The true path does not depend on the draw of the noise, so the fullest scan can be counted.
     heading = TURN * np.arange(steps)

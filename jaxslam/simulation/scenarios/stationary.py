@@ -16,7 +16,7 @@ def stationary(steps: int = 300) -> Scenario:
     that linearizes at each new estimate shrinks it. After Julier & Uhlmann, "A counter example to
     the theory of simultaneous localization and map building", ICRA 2001; the figures are ours.
     """
-    check_count("steps", steps)
+    check_count("stationary: steps", steps)
     return Scenario(
         name="stationary",
         motion=unicycle(np.zeros((2, 2))),

@@ -2,7 +2,8 @@
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
 from jaxslam.protocols import Motion, Sensor
+from jaxslam.validation.models import unfit_signature
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.lengths import LONGEST, MOST_UNKNOWN, Deduced, deduce_lengths
 
@@ -81,6 +83,28 @@ def motion_functions(motion: Motion) -> tuple[Function]:
         Argument("noise", motion.noises, scale=0.1),
     )
     return (Function("step", motion.step, arguments, POSE, motion.jacobians),)
+
+
+def told_signatures(model: Motion | Sensor) -> Motion | Sensor:
+    """The model, with functions that cannot take their arguments replaced by ones that say so."""
+    names = (
+        {"step": "pose, u, w"}
+        if isinstance(model, Motion)
+        else {"observe": "pose, l", "invert": "pose, z, s", "residual": "z, z_hat"}
+    )
+
+    def refusing(why: str) -> Callable[..., jax.Array]:
+        def refuse(*_: object) -> jax.Array:
+            raise ValueError(why)
+
+        return refuse
+
+    wrong: dict[str, Any] = {
+        field: refusing(f"{field} takes ({taken}), got a function of {got}")
+        for field, taken in names.items()
+        if (got := unfit_signature(getattr(model, field), taken.count(",") + 1)) is not None
+    }
+    return replace(model, **wrong) if wrong else model
 
 
 def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
@@ -216,14 +240,27 @@ def _undetermined(name: str, missing: list[str], claimed: bool, deduced: Deduced
         why = f"at most {MOST_UNKNOWN} are deduced"
     which = ", ".join(map(repr, missing))
     return (
-        f"{name}: what is the length of its argument {which}? {why}. Name the entries, each with "
-        f"its unit: {name}_arguments = {example_line(missing)} in the file, or arguments= in Python"
+        f"{name}: the length of its argument {which} is not known: {why}. Name the entries, each "
+        f"with its unit: {example_of(name, dict.fromkeys(missing, 2))}"
     )
 
 
-def example_line(parameters: Sequence[str]) -> str:
-    """What a user may write for `arguments`, as if each argument were a speed and a turn rate."""
-    return "{" + ", ".join(f'"{p}": ("v [m/s]", "omega [rad/s]")' for p in parameters) + "}"
+def example_of(name: str, lengths: Mapping[str, int]) -> str:
+    """Where a user names the entries of a function's arguments, with as many names as entries.
+
+    Two are named as a speed and a turn rate, three as a pose.
+    """
+
+    def names(parameter: str, count: int) -> str:
+        told = {2: ("v [m/s]", "omega [rad/s]"), 3: POSE}.get(count)
+        told = told or tuple(f"{parameter}{k} [unit]" for k in range(count))
+        inside = ", ".join(f'"{one}"' for one in told)
+        return f'"{parameter}": ({inside}{"," * (count == 1)})'
+
+    line = "{" + ", ".join(names(*pair) for pair in lengths.items()) + "}"
+    if name.isidentifier():
+        return f"{name}_arguments = {line} in the file, or arguments= in Python"
+    return f"arguments={line} in Python; in a file define a function, which has a name"
 
 
 def _has_signature(call: Callable[..., object]) -> bool:
