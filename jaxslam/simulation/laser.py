@@ -110,8 +110,15 @@ def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Bea
 
 def scan_world(world: LaserWorld, key: Array) -> LaserHistory:
     """A random history of a world: its path, odometry and scans; traceable, as `simulate` is."""
+    check_world("scan_world", world)
     check_key("scan_world", key)
     return programs.call(_scan_world, (world,), key)
+
+
+def check_world(name: str, world: object) -> None:
+    """Raise ValueError, which begins with a caller's name, unless world is a `LaserWorld`."""
+    if not isinstance(world, LaserWorld):
+        raise ValueError(f"{name}: expected a LaserWorld, got {type(world).__name__}")
 
 
 def _scan_world(world: LaserWorld, key: Array) -> LaserHistory:

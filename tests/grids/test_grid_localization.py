@@ -253,6 +253,13 @@ def test_a_log_of_beams_drops_what_says_nothing():
         (lambda: grids.clusters(np.zeros((3, 2)), np.zeros(3)), "clusters: expected poses"),
         (lambda: motion.odometry_controls(np.zeros(3)), "odometry_controls: expected finite poses"),
         (lambda: consistency.judge_localization(WORLD, of(), 0, KEY), "judge_localization: runs"),
+        (
+            lambda: consistency.judge_localization(WORLD, of(), 1, KEY, every=61),
+            "judge_localization: expected every <= 60 steps, got 61",
+        ),
+        (lambda: consistency.judge_localization(WORLD, 3, 1, KEY), "expected a Filter, got int"),
+        (lambda: consistency.judge_localization(3, of(), 1, KEY), "localization: expected a Laser"),
+        (lambda: scan_world(ROOM, KEY), "scan_world: expected a LaserWorld, got Walls"),
     ],
 )
 def test_bad_input_is_refused(call, reason):
