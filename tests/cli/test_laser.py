@@ -125,6 +125,13 @@ def test_a_log_that_ends_in_a_line_is_refused_with_the_line(log_file, tmp_path, 
     assert not out.exists()
 
 
+def test_a_path_too_short_to_be_scored_is_told(log_file, tmp_path, undrawn):
+    out = tmp_path / "out"
+    assert run(log_file.path, out, "--scans", ":2", "--max-range", "10") == 0
+    score = json.loads((out / "summary.json").read_text())["score"]
+    assert score == "none: the path is shorter than 1 m"
+
+
 def test_options_of_laser_logs_are_of_no_other_data_set(tmp_path, refused):
     run = ["run", "--dataset", "bonn", tmp_path, "--map", "known"]
     refused(run, "--map: only of a laser log (--dataset carmen)")
