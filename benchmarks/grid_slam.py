@@ -203,7 +203,7 @@ def draw(world, truth, log, trace, out):
         ("scans at the odometry's poses", grids.occupancy(counts), odometry),
         ("best of 30 particles", grids.best_map(trace.final), np.asarray(trace.estimate.pose)),
     )
-    figure, panels = panels_of(PAGE, 0.56 * PAGE, 1, 2, share=(True, True))
+    figure, panels = panels_of(PAGE, 0.59 * PAGE, 1, 2, share=(True, True))
     height, width = truth.log_odds.shape
     x, y = np.asarray(truth.origin)[:2]
     extent = (x, x + CELL * width, y, y + CELL * height)

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from jaxslam.cli import fit, models
 from jaxslam.cli.common import INTERRUPTED, as_folders
 from jaxslam.cli.consistency import options as consistency_options
+from jaxslam.cli.laser import options as laser_options
 from jaxslam.cli.optimize import options as optimize_options
 from jaxslam.cli.optimize.command import COST, ERRORS
 from jaxslam.cli.run import options as run_options
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        options = _parser().parse_args(arguments)
+        options = _parser().parse_args(laser_options.joined(arguments))
     except SystemExit as stop:
         return int(stop.code or 0)
     try:

@@ -18,7 +18,7 @@ from jaxslam.math.roots import root_psd
 from jaxslam.protocols import Filter
 from jaxslam.resampling.weights import at_points, weights_of
 from jaxslam.run import run
-from jaxslam.simulation.laser import LaserWorld, scan_world
+from jaxslam.simulation.laser import LaserWorld, check_world, scan_world
 from jaxslam.types import JaxOrNumPy, Log
 from jaxslam.validation.numbers import check_count, check_covariance, check_key
 
@@ -91,10 +91,15 @@ def judge_localization(
         same_log: one history for all runs, which differ in the filter's own draws alone.
         every: scores are computed at each n-th step, from the n-th on.
     Raises:
-        ValueError: a key, a covariance or a number that is none.
+        ValueError: a world, a filter, a key, a covariance or a number that is none.
     """
+    check_world("judge_localization", world)
+    if not isinstance(filter, Filter):
+        raise ValueError(f"judge_localization: expected a Filter, got {type(filter).__name__}")
     check_count("judge_localization: runs", runs)
     check_count("judge_localization: every", every)
+    if every > (steps := len(np.asarray(world.controls))):
+        raise ValueError(f"judge_localization: expected every <= {steps} steps, got {every}")
     check_key("judge_localization", key)
     check_covariance("judge_localization: start_cov", start_cov, 3)
     key_log, key_start, key_filter = jax.random.split(key, 3)

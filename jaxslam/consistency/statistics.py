@@ -72,7 +72,9 @@ def run_statistics(trace: Trace, truth: Truth, sensor: Sensor) -> RunStatistics:
         *w, energy, there = sums.recent
         *w_now, energy_now, there_now = white
         products = [
-            linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True)),
+            linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True))
+            if size
+            else jnp.zeros_like(energy),
             energy * there_now[None],
             there * energy_now[None],
             there * there_now[None],

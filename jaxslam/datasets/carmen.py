@@ -101,11 +101,11 @@ def carmen(path: str | Path, *, max_range: float = 50.0) -> LaserLog:
             dropped["comments" if kind.startswith("#") else f"lines {kind}"] += 1
     if not scans:
         raise file.end_error("expected a line FLASER or ROBOTLASER1, got none")
-    return _log_of(file.path, odometry, scans, max_range, dropped)
+    return _log_of(file, odometry, scans, max_range, dropped)
 
 
 def _log_of(
-    path: Path,
+    file: TextFile,
     odometry: list[list[float]],
     scans: list[_Scan],
     max_range: float,
@@ -134,9 +134,13 @@ def _log_of(
         corrections.append("no ODOM lines: raw odometry is the robot's pose of each scan")
     if backward := int((np.diff(time) < 0).sum()):
         corrections.append(f"scans stamped before their predecessor, kept in order: {backward}")
+    if file.lines[-1].strip():
+        corrections.append(
+            f"the last line, {len(file.lines)}, has no newline: its last number may be cut off"
+        )
     return LaserLog(
-        name=path.name.split(".")[0],
-        source=str(path),
+        name=file.path.name.split(".")[0],
+        source=str(file.path),
         time=time,
         beams=Beams(ranges, angles, valid),
         corrected=_wrapped(np.array([scan.corrected for scan in scans])),

@@ -63,6 +63,8 @@ def segments(
     Raises:
         ValueError: on beams of unlike lengths, numbers out of range, angles that do not increase.
     """
+    if not isinstance(beams, Beams):
+        raise ValueError(f"segments: expected Beams, got {type(beams).__name__}")
     angle, distance = (np.asarray(part, np.float64) for part in (beams.angle, beams.range))
     valid = np.asarray(beams.valid, bool)
     if angle.ndim != 1 or not angle.shape == distance.shape == valid.shape:

@@ -45,11 +45,16 @@ def ray_map(grid: Grid, *, method: str = "surface", skip: bool = True) -> RayMap
         ValueError: a grid that is none, or without a free cell; an unknown method.
     """
     check_grid("ray_map", grid)
-    if method not in METHODS:
-        raise ValueError(f"ray_map: expected a method of {', '.join(METHODS)}, got {method!r}")
+    check_method("ray_map", method)
     if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError("ray_map: the map has no free cell (log-odds below 0)")
     return programs.call(_ray_map, (_SQUARES[method], skip), grid)
+
+
+def check_method(name: str, method: str) -> None:
+    """Raise ValueError unless there is such a method."""
+    if method not in METHODS:
+        raise ValueError(f"{name}: expected a method of {', '.join(METHODS)}, got {method!r}")
 
 
 def _ray_map(squares: PyTree, skip: bool, grid: Grid) -> RayMap:
@@ -125,9 +130,11 @@ def cast(
         angles: (B,) of beams in the frame of the pose [rad].
         max_range: [m].
     Raises:
-        ValueError: shapes, numbers that are not finite, max_range not above 0; outside a trace,
-            a pose off the map.
+        ValueError: a grid that is none, shapes, numbers that are not finite, max_range not above 0;
+            outside a trace, a pose off the map.
     """
+    if not isinstance(grid, Grid | RayMap):
+        raise ValueError(f"cast: expected a Grid or a RayMap, got {type(grid).__name__}")
     pose, angles = jnp.asarray(pose), jnp.asarray(angles)
     _check_rays(pose, angles, max_range)
     if isinstance(grid, Grid):

@@ -1,6 +1,7 @@
 """Maps from scans at known poses: hits and misses of cells, and what follows from their counts."""
 
 import functools
+from numbers import Integral
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from jaxslam.grids.beam_models.beam_model import usable_beams
 from jaxslam.grids.grid import Grid, check_frame, to_cells
 from jaxslam.math import se2
 from jaxslam.types import Beams, JaxOrNumPy
-from jaxslam.validation.numbers import is_concrete
+from jaxslam.validation.numbers import check_mount, is_concrete
 
 
 class Counts(NamedTuple):
@@ -27,7 +28,7 @@ class Counts(NamedTuple):
     outside: Int[JaxOrNumPy, ""]
     """usable beams that say nothing: their origin is off the map"""
     unusable: Int[JaxOrNumPy, ""]
-    """beams that are not valid, of NaN or below 0"""
+    """beams that are not valid, of a NaN, or of a range below 0"""
 
 
 def count(
@@ -55,10 +56,12 @@ def count(
         poses: of the robot. beams: with leading T. max_range: [m].
         mount: (3,) pose of the laser on the robot.
     Raises:
-        ValueError: a frame, poses and beams that do not fit; outside a trace, no usable beam, or a
-            usable pose that is not finite.
+        ValueError: a shape, a frame, a mount, poses and beams that do not fit; outside a trace, no
+            usable beam, or a usable pose that is not finite.
     """
+    check_shape("count", shape)
     check_frame("count", origin, resolution)
+    check_mount("count", mount)
     _check_scans(poses, beams, max_range)
     free = max_range if no_return is None else no_return
     if not 0 <= free <= max_range:
@@ -68,6 +71,14 @@ def count(
     return programs.call(
         _count, (_shape(*shape),), *frame, jnp.asarray(poses), beams, max_range, free, eye
     )
+
+
+def check_shape(name: str, shape: tuple[int, int]) -> None:
+    """Raise ValueError unless the shape (H, W) of a map is two integers of at least 1."""
+    if np.shape(shape) != (2,) or not all(isinstance(n, Integral) and n >= 1 for n in shape):
+        raise ValueError(
+            f"{name}: expected a shape (H, W), integers, of at least one cell, got {shape!r}"
+        )
 
 
 @functools.cache
@@ -91,7 +102,7 @@ def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
         return
     if not np.all(np.isfinite(poses)):
         raise ValueError("count: expected finite poses")
-    if not np.any(np.asarray(beams.valid) & (np.asarray(beams.range) >= 0)):
+    if not np.any(usable_beams(Beams(*map(np.asarray, beams)))):
         raise ValueError("count: no scan has a valid beam")
 
 
@@ -146,7 +157,7 @@ def add_scan(
     usable = usable_beams(scan)
     far = scan.range >= max_range
     length = jnp.where(far, free, jnp.where(usable, scan.range, 0.0))
-    heading = eyes[:, 2:] + scan.angle[None]
+    heading = eyes[:, 2:] + jnp.where(usable, scan.angle, 0.0)[None]
     e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
     ends = to_cells(origin, resolution, eyes[:, None, :2] + length[None, :, None] * e)
     start = to_cells(origin, resolution, eyes[:, :2])
@@ -214,15 +225,20 @@ def occupancy(counts: Counts, *, hit: ArrayLike = 0.7, miss: ArrayLike = 0.4) ->
 
     Raises ValueError unless 0 < miss < ½ < hit < 1.
     """
-    if (
-        is_concrete(hit, miss)
-        and not 0 < float(np.asarray(miss)) < 0.5 < float(np.asarray(hit)) < 1
-    ):
-        raise ValueError(f"occupancy: expected 0 < miss < 0.5 < hit < 1, got {miss!r} and {hit!r}")
+    check_hit_and_miss("occupancy", hit, miss)
     log_hit = jnp.log(hit) - jnp.log1p(-jnp.asarray(hit))
     log_miss = jnp.log(miss) - jnp.log1p(-jnp.asarray(miss))
     log_odds = counts.hits * log_hit + counts.misses * log_miss
     return Grid(log_odds, counts.origin, counts.resolution)
+
+
+def check_hit_and_miss(name: str, hit: ArrayLike, miss: ArrayLike) -> None:
+    """Raise ValueError unless 0 < miss < ½ < hit < 1."""
+    if (
+        is_concrete(hit, miss)
+        and not 0 < float(np.asarray(miss)) < 0.5 < float(np.asarray(hit)) < 1
+    ):
+        raise ValueError(f"{name}: expected 0 < miss < 0.5 < hit < 1, got {miss!r} and {hit!r}")
 
 
 def reflection(counts: Counts, *, prior: ArrayLike = 1.0) -> Grid:

@@ -77,6 +77,9 @@ def write_files(
             now are removed in the end.
     """
     created = [each for each in (folder, *folder.parents) if not each.exists()]
+    for name in files:
+        if (folder / name).is_dir():
+            raise IsADirectoryError(f"{folder / name} cannot be written: it is a folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as hidden:

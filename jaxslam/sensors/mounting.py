@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.math import se2
 from jaxslam.math.arrays import Pose
-from jaxslam.validation.numbers import is_concrete
+from jaxslam.validation.numbers import check_mount, is_concrete
 
 NO_OFFSET = (0.0, 0.0, 0.0)
 
@@ -21,11 +21,7 @@ def mounting(
 
     Raises ValueError unless mount is a finite (3,); a traced mount is checked for its shape alone.
     """
-    if np.shape(mount) != (3,):
-        raise ValueError(f"{name}: expected a mounting pose of shape (3,), got {np.shape(mount)}")
-    if is_concrete(mount) and not np.all(np.isfinite(np.asarray(mount))):
-        raise ValueError(f"{name}: the mounting pose is not finite")
-
+    check_mount(name, mount)
     at_origin = is_concrete(mount) and not np.any(np.asarray(mount))
 
     def sensor_pose(pose: Pose) -> Array:

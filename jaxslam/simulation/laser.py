@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jaxslam import programs
 from jaxslam.math import se2
 from jaxslam.protocols import Motion
-from jaxslam.simulation.walls import Walls, exact_ranges
+from jaxslam.simulation.walls import Walls, exact_ranges, wall_ranges
 from jaxslam.simulation.worlds import drive
 from jaxslam.types import Beams
 from jaxslam.validation.numbers import check_key
@@ -110,8 +110,15 @@ def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Bea
 
 def scan_world(world: LaserWorld, key: Array) -> LaserHistory:
     """A random history of a world: its path, odometry and scans; traceable, as `simulate` is."""
+    check_world("scan_world", world)
     check_key("scan_world", key)
     return programs.call(_scan_world, (world,), key)
+
+
+def check_world(name: str, world: object) -> None:
+    """Raise ValueError, which begins with a caller's name, unless world is a `LaserWorld`."""
+    if not isinstance(world, LaserWorld):
+        raise ValueError(f"{name}: expected a LaserWorld, got {type(world).__name__}")
 
 
 def _scan_world(world: LaserWorld, key: Array) -> LaserHistory:
@@ -144,9 +151,14 @@ def scan_information(
 ) -> Observability:
     """The Fisher information of a scan about the pose, its bound, and the degenerate directions.
 
-    J = (1 - dropout)/σ² Σ g gᵀ over beams below max_range, g the derivative of the exact range by
-    the pose, by automatic differentiation. Lengths are measured in median ranges when eigenvalues
-    are compared; a direction is degenerate below `tolerance` times the largest.
+    J = (1 - dropout)/σ² Σ p g gᵀ over beams and the walls that they meet below max_range, g the
+    derivative of the exact range by the pose, by automatic differentiation, and p the probability
+    that the beam returns from this wall: 1 for the nearest without glass, else the shares that
+    pass all nearer ones, times the share that does not pass this one. That is the expectation over
+    what each beam passes. It is exact where the walls that a beam may return from lie many σ apart,
+    so that the range says which it was; where they do not, J is too large, and the bound still one.
+    Lengths are measured in median ranges when eigenvalues are compared; a direction is degenerate
+    below `tolerance` times the largest.
 
     Censi 2007, "On achievable accuracy for range-finder localization", ICRA.
 
@@ -154,14 +166,22 @@ def scan_information(
     """
     place = np.asarray(pose, np.float64)
     if place.shape != (3,):
-        raise ValueError(f"observability: expected a pose (x, y, θ), got {place.shape}")
-    ranges, slopes = programs.call(_ranges_and_slopes, (laser, walls), place)
-    met = np.asarray(ranges) < laser.max_range * (1 - 1e-6)
+        raise ValueError(f"scan_information: expected a pose (x, y, θ), got {place.shape}")
+    found = programs.call(_ranges_and_slopes, (laser, walls), place)
+    ranges, slopes = (np.asarray(part, np.float64) for part in found)
+    passed = np.zeros(ranges.shape[1])
+    passed[: len(walls.segments)] = 0.0 if walls.glass is None else walls.glass
+    order = np.argsort(ranges, axis=1)
+    reached = np.cumprod(passed[order], axis=1)
+    reached = np.concatenate([np.ones((len(ranges), 1)), reached[:, :-1]], axis=1)
+    share = np.zeros(ranges.shape)
+    np.put_along_axis(share, order, reached * (1 - passed[order]), axis=1)
+    met = (share > 0) & (ranges < laser.max_range * (1 - 1e-6))
     if not met.any():
-        raise ValueError(f"observability: no beam from {place} meets a wall within max_range")
-    g = np.asarray(slopes, np.float64)[met]
-    information = (1 - laser.dropout) / laser.sigma**2 * g.T @ g
-    unit = np.array([1.0, 1.0, 1.0 / float(np.median(np.asarray(ranges)[met]))])
+        raise ValueError(f"scan_information: no beam from {place} meets a wall within max_range")
+    g = slopes[met]
+    information = (1 - laser.dropout) / laser.sigma**2 * (share[met] * g.T) @ g
+    unit = np.array([1.0, 1.0, 1.0 / float(np.median(ranges[met]))])
     values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
     seen = values > tolerance * values[-1]
     inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
@@ -173,8 +193,11 @@ def scan_information(
 
 
 def _ranges_and_slopes(laser: Laser, walls: Walls, pose: Array) -> tuple[Array, Array]:
+    angles = jnp.asarray(laser.angles, pose.dtype)
+
     def ranges(pose: Array) -> Array:
-        return true_ranges(laser, walls, pose)
+        eye = se2.compose(pose, jnp.asarray(laser.mount, pose.dtype))
+        return wall_ranges(walls, eye, angles, laser.max_range)
 
     return ranges(pose), jax.jacfwd(ranges)(pose)
 

@@ -92,10 +92,25 @@ def exact_ranges(
     circle of centre c and radius ρ at r = e·(c - o) ± sqrt(ρ² - |c - o|² + (e·(c - o))²).
     Differentiable by the pose and by the walls, but where a beam passes an edge.
     """
+    ranges = wall_ranges(world, pose, angles, max_range, passes)
+    return jnp.minimum(ranges.min(axis=1), max_range)
+
+
+def wall_ranges(
+    world: Walls,
+    pose: Float[Array, "3"],
+    angles: Float[Array, "B"],
+    max_range: float | Array,
+    passes: Bool[Array, "B K"] | None = None,
+) -> Float[Array, "B N"]:
+    """The range [m] of each beam to each wall as if it were alone, max_range where it is not met.
+
+    N = K + 2 C + 1: the K segments, each circle twice, and max_range. As `exact_ranges`.
+    """
     dtype = jnp.result_type(pose, float)
     heading = pose[2] + angles
     e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)[:, None, :]
-    ranges = [jnp.full((len(angles), 1), max_range, dtype)]
+    ranges = []
     if len(world.segments):
         a = jnp.asarray(world.segments[:, 0], dtype)[None] - pose[None, None, :2]
         along = jnp.asarray(world.segments[:, 1] - world.segments[:, 0], dtype)[None]
@@ -112,7 +127,7 @@ def exact_ranges(
         root = jnp.sqrt(jnp.where(reach > 0, reach, 1.0))
         for r in (ahead - root, ahead + root):
             ranges.append(jnp.where((reach > 0) & (r > 0), r, max_range))
-    return jnp.minimum(jnp.concatenate(ranges, axis=1).min(axis=1), max_range)
+    return jnp.concatenate([*ranges, jnp.full((len(angles), 1), max_range, dtype)], axis=1)
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -60,6 +60,15 @@ def check_positive(name: str, **values: ArrayLike) -> None:
             raise ValueError(f"{name}: expected {what} above 0, got {np.asarray(value)}")
 
 
+def check_mount(name: str, mount: ArrayLike) -> None:
+    """Raise ValueError unless mount is a finite (3,); a tracer is checked for its shape alone."""
+    got = shape_told(mount if is_concrete(mount) else jnp.asarray(mount))
+    if got != "(3,)":
+        raise ValueError(f"{name}: expected a mounting pose of shape (3,), got {got}")
+    if is_concrete(mount) and not np.all(np.isfinite(np.asarray(mount))):
+        raise ValueError(f"{name}: the mounting pose is not finite")
+
+
 def check_count(name: str, value: object) -> None:
     """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:

@@ -110,6 +110,11 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
         (["--map", "known", "--scans", "900:"], "--scans: 900: has none of the 70 scans"),
         (["--map", "known", "--scans", "3:4"], "room.log: none of 1 scans has a valid beam"),
         (["--map", "known", "--figures", "gif"], "--figures: expected formats"),
+        (
+            ["--map", "known", "--max-range", "0.01"],
+            "room.log: no beam returns within 0.01 m (--max-range)",
+        ),
+        (["--localize", "map.yaml", "--scans", "-3:3"], "--scans: -3:3 has none of the 70 scans"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(log_file, tmp_path, refused, options, message):
@@ -124,6 +129,13 @@ def test_a_log_that_ends_in_a_line_is_refused_with_the_line(log_file, tmp_path, 
     run = ["run", "--dataset", "carmen", short, "--out", out, "--map", "known"]
     refused(run, f"short.log:{2 * STEPS + 1}: expected {BEAMS + 11} fields")
     assert not out.exists()
+
+
+def test_a_path_too_short_to_be_scored_is_told(log_file, tmp_path, undrawn):
+    out = tmp_path / "out"
+    assert run(log_file.path, out, "--scans", ":2", "--max-range", "10") == 0
+    score = json.loads((out / "summary.json").read_text())["score"]
+    assert score == "none: the path is shorter than 1 m"
 
 
 def test_options_of_laser_logs_are_of_no_other_data_set(tmp_path, refused):
@@ -168,6 +180,11 @@ def test_a_robot_is_localized_in_a_map_by_odometry_and_scans(log_file, room_map,
         (("", ""), ["--start", "here"], "--start: expected file, global or X,Y,HEADING"),
         (("image: room.pgm", "image: no.pgm"), [], "room.yaml:1: no image"),
         (("resolution: 0.1", "resolution: 0"), [], "room.yaml:3: expected a resolution above 0"),
+        (
+            ("", ""),
+            ["--start", "-60,-.5,90"],
+            "--start: the pose (-60 m, -0.5 m, 90°) is off the map",
+        ),
         (("origin: [-0.5, ", "origin: ["), [], "room.yaml:4: expected origin: [x, y, yaw]"),
         (("negate: 0", "negate: 1"), [], "room.yaml: the map has no free cell"),
     ],

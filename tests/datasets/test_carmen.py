@@ -81,6 +81,11 @@ def test_a_bad_line_is_named(tmp_path, line, why):
         datasets.carmen(path)
 
 
+def test_a_last_line_without_a_newline_is_told(tmp_path):
+    log = datasets.carmen(written(tmp_path / "cut.log", ODOM.format(x=1, t=2), FIRST, end=""))
+    assert log.corrections == ("the last line, 2, has no newline: its last number may be cut off",)
+
+
 def test_a_file_without_scans_and_a_range_below_zero_are_refused(tmp_path):
     path = written(tmp_path / "none.log", ODOM.format(x=1, t=2))
     with pytest.raises(ValueError, match=r"none\.log:1: expected a line FLASER"):

@@ -113,6 +113,11 @@ def test_bad_input_is_refused(change, options, message):
         segments(scan(AROUND)._replace(**change), **({"sigma": 0.1, "max_range": 9} | options))
 
 
+def test_what_is_no_scan_is_refused():
+    with pytest.raises(ValueError, match="segments: expected Beams, got str"):
+        segments("x", sigma=0.1, max_range=9)
+
+
 def test_beams_at_one_point_are_no_line():
     with pytest.raises(ValueError, match="fit_line: expected beams that end at different points"):
         fit_line(np.zeros(4), np.ones(4), SIGMA)

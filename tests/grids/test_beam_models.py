@@ -144,6 +144,29 @@ def test_both_fits_find_the_parameters():
         (lambda m, f: log_likelihood(m, f, np.zeros(3), "scan"), "expected Beams"),
         (lambda m, f: log_likelihood(m, f, np.zeros(3), beams(), every=0), "expected every >= 1"),
         (
+            lambda m, f: log_likelihood(m, f, [0.0, 0.0], beams()),
+            "log_likelihood: expected a pose",
+        ),
+        (
+            lambda m, f: log_likelihood(m, f, np.zeros(3), beams(), exponent=-1.0),
+            "log_likelihood: expected an exponent >= 0",
+        ),
+        (lambda m, f: likelihood_field(max_range=1.0, truncate=-1.0), "expected truncate above 0"),
+        (lambda m, f: likelihood_field(max_range=1.0, mount=(0, 0)), "field: expected a mounting"),
+        (lambda m, f: ray_cast(max_range=1.0, mount=(0, 0, np.nan)), "cast: the mounting pose"),
+        (lambda m, f: ray_cast(max_range=0.0), "ray_cast: expected max_range above 0"),
+        (
+            lambda m, f: ray_cast(Mixture(0.7, 0.1, 0.1, 0.1, 0, 1), max_range=1.0),
+            "ray_cast: expected sigma above 0",
+        ),
+        (
+            lambda m, f: ray_cast(Mixture(0.7, 0.1, 0.1, 0.1, 1, -1), max_range=1.0),
+            "ray_cast: expected rate above 0",
+        ),
+        (lambda m, f: ray_cast(max_range=1.0, method="lut"), "ray_cast: expected a method"),
+        (lambda m, f: fit(np.ones(3), np.ones(3), 0.0), "fit: expected max_range above 0"),
+        (lambda m, f: fit(np.ones(3), -np.ones(3), FAR), "fit: expected finite ranges"),
+        (
             lambda m, f: likelihood_field(0.0, max_range=1.0),
             "likelihood_field: expected sigma above 0, got 0.0",
         ),

@@ -192,6 +192,7 @@ def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(blocks, meth
             r"pose 0, .*, is off the map",
         ),
         (lambda g: grids.cast(g, np.array([0.1, np.nan, 0.0]), ANGLES, 1.0), "pose 0"),
+        (lambda g: grids.cast("x", np.zeros(3), ANGLES, 1.0), "cast: expected a Grid or a RayMap"),
         (lambda g: grids.cast(g, np.zeros(2), ANGLES, 1.0), r"expected poses \(x, y, θ\)"),
         (lambda g: grids.cast(g, np.zeros(3), ANGLES[:0], 1.0), "expected angles of shape"),
         (lambda g: grids.cast(g, np.zeros(3), ANGLES * np.nan, 1.0), "expected finite angles"),

@@ -128,6 +128,22 @@ def test_a_lost_robot_is_found_by_particles_from_anywhere(lost):
     assert not traces[1].info.extra["particles"].injected.any()
 
 
+def test_particles_of_no_weight_from_the_start_are_drawn_anew_until_one_has_some():
+    filter = of(16, least=16)
+    update, predict = jax.jit(filter.update), jax.jit(filter.predict)
+    state = filter.init(np.array([50.0, 50.0, 0.0]), EXACT)
+    scan = Scan(np.column_stack([np.ones(4), np.zeros(4)]), np.full(4, -1), np.zeros(4, bool))
+    nothing = update(state, scan, KEY)[0]
+    assert float(nothing.injection) == 0.0 and not nothing.due  # no beam, no verdict
+    state, info = update(state, scan._replace(valid=np.ones(4, bool)), KEY)
+    assert info.extra["particles"].underflow and float(state.injection) == 1.0
+    state, info = update(
+        predict(state, CONTROLS[0], KEY), scan._replace(valid=np.ones(4, bool)), KEY
+    )
+    found = info.extra["particles"]
+    assert int(found.injected) == 16 and not found.underflow and float(state.injection) == 0.0
+
+
 def test_the_number_is_that_of_the_kld_bound(lost):
     """After a motion that resampled: the first particles that reach the bound of their bins."""
     used = lost[2].info.extra["particles"]
@@ -237,6 +253,13 @@ def test_a_log_of_beams_drops_what_says_nothing():
         (lambda: grids.clusters(np.zeros((3, 2)), np.zeros(3)), "clusters: expected poses"),
         (lambda: motion.odometry_controls(np.zeros(3)), "odometry_controls: expected finite poses"),
         (lambda: consistency.judge_localization(WORLD, of(), 0, KEY), "judge_localization: runs"),
+        (
+            lambda: consistency.judge_localization(WORLD, of(), 1, KEY, every=61),
+            "judge_localization: expected every <= 60 steps, got 61",
+        ),
+        (lambda: consistency.judge_localization(WORLD, 3, 1, KEY), "expected a Filter, got int"),
+        (lambda: consistency.judge_localization(3, of(), 1, KEY), "localization: expected a Laser"),
+        (lambda: scan_world(ROOM, KEY), "scan_world: expected a LaserWorld, got Walls"),
     ],
 )
 def test_bad_input_is_refused(call, reason):

@@ -143,8 +143,24 @@ def test_bad_scans_are_refused(change, reason):
         counted(*change(*scans()))
 
 
+def test_a_beam_of_no_angle_is_unusable():
+    poses, beams = scans()
+    angle, valid = beams.angle.copy(), beams.valid.copy()
+    angle[4, 2:6] = np.nan
+    valid[4, 2:6] = False
+    same = counted(poses, beams._replace(valid=valid))
+    jax.tree.map(np.testing.assert_array_equal, counted(poses, beams._replace(angle=angle)), same)
+    with pytest.raises(ValueError, match="count: no scan has a valid beam"):
+        counted(poses, beams._replace(angle=angle * np.nan))
+
+
 def test_bad_numbers_are_refused():
     poses, beams = scans()
+    for shape in ((0, 5), (5.0, 5), (5,)):
+        with pytest.raises(ValueError, match=r"count: expected a shape \(H, W\)"):
+            grids.count(shape, ORIGIN, 0.1, poses, beams, max_range=1.0)
+    with pytest.raises(ValueError, match="count: expected a mounting pose"):
+        counted(poses, beams, mount=(0.0, 0.0))
     with pytest.raises(ValueError, match="count: expected a resolution above 0"):
         grids.count(SHAPE, ORIGIN, 0.0, poses, beams, max_range=1.0)
     with pytest.raises(ValueError, match="count: expected an origin"):

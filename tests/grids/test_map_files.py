@@ -165,3 +165,7 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path):
         with pytest.raises(ValueError, match=f"write_map: .*{reason}"):
             grids.write_map(tmp_path / "new" / path, wrong, mode=mode)
     assert not (tmp_path / "new").exists()
+    (tmp_path / "b.pgm").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"b\.pgm cannot be written: it is a folder"):
+        grids.write_map(tmp_path / "b.yaml", grid)
+    assert not (tmp_path / "b.yaml").exists()

@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import catalog, filters, motion, run, sensors, simulate, store
+from jaxslam import catalog, filters, grids, motion, run, sensors, simulate, store
 from jaxslam.filters import reporting
+from jaxslam.grids.localization.localize import info_of_beams
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo, work
 from jaxslam.monte_carlo.blocks.block import BlockRunner
 from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
 from jaxslam.monte_carlo.candidates import fitting_block, without_noise
-from jaxslam.types import Status
+from jaxslam.simulation.laser import scan_world
+from jaxslam.simulation.scenarios import square
+from jaxslam.types import Status, Truth
 
 WORLD = worlds.ring()
 EKF = worlds.ekf(WORLD)
@@ -323,6 +326,36 @@ def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
     lost = campaign.filters["always lost"]
     assert lost.verdict == "diverged"
     assert lost.counts["not_finite"] == 10
+
+
+def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_of_beams():
+    """Dead reckoning that says of beams what `grids.localize` does: there is nothing to whiten."""
+    room = square(beams=3)
+
+    def draw(scenario, key):
+        log = scan_world(room, key)
+        nothing = jnp.zeros(len(log.pose), jnp.int32)
+        start = jnp.asarray(room.pose, log.pose.dtype)
+        truth = Truth(log.pose, jnp.zeros((1, 2)), nothing, start)
+        return truth, grids.beam_log(log.control, log.beams)
+
+    world = dataclasses.replace(
+        WORLD,
+        motion=room.motion,
+        landmarks=np.zeros((1, 2)),
+        controls=room.controls,
+        pose=room.pose,
+        draw=draw,
+    )
+    reckoning = filters.dead_reckoning(room.motion, WORLD.sensor)
+
+    def update(joint, scan, key):
+        return joint, info_of_beams(scan, 1, jnp.zeros(()))
+
+    silent = dataclasses.replace(reckoning, update=update)
+    found = worlds.campaign(world, {"silent": silent}, 3).filters["silent"]
+    assert found.counts["fused"] > 0 and found.counts["not_finite"] == 0
+    assert all(np.isfinite(m.value) for m in found.measures.values())
 
 
 def test_a_world_without_noise_does_not_diverge():

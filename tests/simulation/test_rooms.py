@@ -149,6 +149,27 @@ def test_beams_pass_glass_as_often_as_it_says():
     assert not np.any((through & valid)[:, ~on_glass & (exact < 7.9)])
 
 
+def test_the_information_of_a_scan_through_glass_is_that_of_both_walls_by_their_shares():
+    """A pillar of glass in a room, of which two sides let all beams pass, and the third a share."""
+    laser, pose = Laser(np.linspace(-3, 3, 60), dropout=0.1), np.array([1.0, 1.2, 0.4])
+    room, pillar = [[0, 0], [6, 0], [6, 3], [0, 3]], [[3, 1], [3.1, 1], [3.1, 2.5]]
+
+    def seen(*chains, **more):
+        return scan_information(laser, walls(*chains, **more), pose).information
+
+    def through(*shares):
+        return seen(room, pillar, glass={(1, side): share for side, share in enumerate(shares)})
+
+    none, solid, front = seen(room), seen(room, pillar), through(1.0, 1.0, 0.0)
+    np.testing.assert_allclose(through(0.0, 0.0, 0.0), solid, rtol=1e-9)
+    np.testing.assert_allclose(through(1.0, 1.0, 1.0), none, rtol=1e-9)
+    np.testing.assert_allclose(through(1.0, 1.0, 0.3), 0.7 * front + 0.3 * none, rtol=1e-9)
+    world, plain = office(beams=90, glass=1.0), office(beams=90)
+    at = np.array([9.0, 4.1, 0.2])
+    clear = np.diag(scan_information(world.laser, world.walls, at).bound)
+    assert np.all(clear > np.diag(scan_information(plain.laser, plain.walls, at).bound))
+
+
 @pytest.mark.parametrize(
     ("call", "reason"),
     [
@@ -164,7 +185,11 @@ def test_beams_pass_glass_as_often_as_it_says():
         (lambda: rasterize(square().walls, 0.0), "rasterize: expected a resolution"),
         (
             lambda: scan_information(Laser([0.0], max_range=0.1), square().walls, [3, 3, 0]),
-            "no beam from",
+            "scan_information: no beam from",
+        ),
+        (
+            lambda: scan_information(Laser([0.0]), square().walls, [3, 3]),
+            "scan_information: expected a pose",
         ),
     ],
 )

@@ -63,13 +63,19 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> Job:
 def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:
     """The shape (H, W) and the origin of a map that holds all poses and hits.
 
-    Raises ValueError on more than `MOST` cells.
+    Raises ValueError where no beam returns, and on more than `MOST` cells.
     """
     ranges, angles, valid = (np.asarray(part) for part in log.beams)
     pose = log.corrected
     heading = pose[:, 2:] + angles
     ends = pose[:, None, :2] + ranges[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
-    places = np.concatenate([pose[:, :2], ends[valid & (ranges < log.max_range)]])
+    met = valid & (ranges < log.max_range)
+    if not met.any():
+        raise ValueError(
+            f"{log.source}: no beam returns within {log.max_range:g} m (--max-range), so there is "
+            "no map"
+        )
+    places = np.concatenate([pose[:, :2], ends[met]])
     low = resolution * np.floor((places.min(axis=0) - MARGIN) / resolution)
     size = np.ceil((places.max(axis=0) + MARGIN - low) / resolution)
     if not size.prod() <= MOST:

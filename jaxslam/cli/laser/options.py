@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import math
+import re
 
 import numpy as np
 
@@ -28,6 +29,22 @@ ALONE = ("map", "localize", *DEFAULTS)
 
 OTHERS = "filters", "gate", "associate", "check_every", "robot"
 """Options that a laser log does not have."""
+
+
+SIGNED = "--start", "--scans"
+"""Options whose value may begin with a minus sign, and is no single number."""
+
+
+def joined(arguments: list[str]) -> list[str]:
+    """The arguments, with `--start=-6,-10,90` in place of `--start -6,-10,90`, and so of `SIGNED`:
+    argparse takes such a value for an option."""
+    out: list[str] = []
+    for argument in arguments:
+        if out and out[-1] in SIGNED and re.match(r"-[\d.]", argument):
+            out[-1] += f"={argument}"
+        else:
+            out.append(argument)
+    return out
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -53,6 +53,8 @@ def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
         for name, path in paths.items():
             found = [metrics.rpe(log.corrected, path, metres=m) for m in METRES]
             every = np.concatenate([each.translation for each in found])
+            if not len(every):
+                raise ValueError(f"the path is shorter than {METRES[0]:g} m")
             what = "mean relation error to 10 m [m]" + (f", {name}" if name else "")
             out[what] = float(every.mean())
         ate = metrics.ate(log.corrected, solved.poses).translation

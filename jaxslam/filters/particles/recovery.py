@@ -24,6 +24,8 @@ def update_averages(
 ) -> PoseParticles:
     """The state with updated likelihood averages and the injection probability.
 
+    While no scan has left a particle a weight, there is no average, and all are drawn anew.
+
     Args:
         misfit: of each particle: Σ d²/2, or the negative log-likelihood of the scan; a constant
             does not matter, since only the ratio of the averages does.
@@ -41,7 +43,8 @@ def update_averages(
         for before, rate in zip((state.slow, state.fast), settings.rates, strict=True)
     )
     safe = jnp.where(slow > 0, slow, 1.0)
-    injection = jnp.where(slow > 0, jnp.maximum(0.0, 1 - settings.slack * fast / safe), 0.0)
+    # Without an average no particle has a weight, now or before: all are lost.
+    injection = jnp.where(slow > 0, jnp.maximum(0.0, 1 - settings.slack * fast / safe), 1.0)
     some = measured > 0
     return state._replace(
         fast=jnp.where(some, fast, state.fast),

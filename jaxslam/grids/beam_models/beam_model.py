@@ -47,24 +47,31 @@ def log_likelihood(
     an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
     exponent; `jax.vmap` it over poses.
 
-    Raises ValueError on beams that `check_beams` refuses, and on every below 1.
+    Raises ValueError on beams that `check_beams` refuses, a pose that is not (3,), every below 1
+    and an exponent below 0.
     """
     check_beams("log_likelihood", beams)
+    if np.shape(pose) != (3,):
+        raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_told(pose)}")
+    if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
+        raise ValueError(f"log_likelihood: expected an exponent >= 0, got {exponent!r}")
     if every < 1:
         raise ValueError(f"log_likelihood: expected every >= 1, got {every}")
     taken = Beams(*(jnp.asarray(part)[::every] for part in beams))
     usable = usable_beams(taken)
-    clean = Beams(jnp.where(usable, taken.range, 1.0), taken.angle, usable)
+    ranges, angles = jnp.where(usable, taken.range, 1.0), jnp.where(usable, taken.angle, 0.0)
+    clean = Beams(ranges, angles, usable)
     each = model.each(prepared, pose, clean)
     return jnp.asarray(exponent) * jnp.where(usable, each, 0.0).sum()
 
 
-def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "B"]:
-    """Which beams say something: valid ones with a range that is a number and not below 0.
+def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
+    """Which beams say something: valid ones of a finite angle and a range that is not below 0.
 
     An infinite range is that of a beam that met nothing, and is usable.
     """
-    return beams.valid & (beams.range >= 0)
+    angle = beams.angle
+    return beams.valid & (beams.range >= 0) & (angle > -np.inf) & (angle < np.inf)  # NaN is not
 
 
 def check_beams(name: str, beams: object) -> None:

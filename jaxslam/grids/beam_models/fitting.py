@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 from jaxslam import programs
 from jaxslam.grids.beam_models.ray_cast import Mixture, mixture_log_density
+from jaxslam.validation.numbers import check_positive
 
 START = Mixture(0.6, 0.15, 0.1, 0.15, 0.2, 0.5)
 """Where the search begins."""
@@ -33,14 +34,17 @@ def fit(
         neglects the limits [0, max_range] and [0, z*] of the two densities: Thrun, Burgard & Fox
         2005, "Probabilistic robotics", table 6.2. So λ is too large where obstacles are near.
 
-    Raises ValueError on lengths that differ, numbers that are not finite, a z below 0 and no data.
+    Raises ValueError on lengths that differ, numbers that are not finite, a range below 0, no data,
+    and a max_range that is not above 0.
     """
     ranges, stars = np.asarray(z, np.float64), np.asarray(expected, np.float64)
     if ranges.ndim != 1 or ranges.shape != stars.shape or len(ranges) == 0:
         raise ValueError(
             f"fit: expected as many ranges as expected ones, got {ranges.shape} and {stars.shape}"
         )
-    if not (np.all(np.isfinite(ranges)) and np.all(np.isfinite(stars))) or ranges.min() < 0:
+    check_positive("fit", max_range=max_range)
+    both = np.concatenate([ranges, stars])
+    if not np.all(np.isfinite(both)) or both.min() < 0:
         raise ValueError("fit: expected finite ranges, not below 0")
     if method not in ("gradient", "em"):
         raise ValueError(f'fit: expected method "gradient" or "em", got {method!r}')

@@ -13,7 +13,7 @@ from jaxslam.grids.grid import Field, Grid
 from jaxslam.grids.interpolation import interpolate, slope
 from jaxslam.math import se2
 from jaxslam.types import Beams, JaxOrNumPy
-from jaxslam.validation.numbers import check_positive
+from jaxslam.validation.numbers import check_mount, check_positive
 
 
 def likelihood_field(
@@ -41,9 +41,13 @@ def likelihood_field(
         hit, random, maximum: weights, of sum 1.
         truncate: largest distance [m], None for no limit.
         mount: (3,) pose of the laser on the robot.
+    Raises:
+        ValueError: numbers out of range, a mount that is no pose.
     """
     check_positive("likelihood_field", sigma=sigma, max_range=max_range)
     check_weights("likelihood_field", {"hit": hit, "random": random, "maximum": maximum})
+    check_positive("likelihood_field", **({} if truncate is None else {"truncate": truncate}))
+    check_mount("likelihood_field", mount)
 
     def prepare(grid: Grid) -> Field:
         return distance_field(grid, truncate=truncate)

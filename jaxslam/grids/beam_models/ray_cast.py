@@ -11,11 +11,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from jaxslam.grids.beam_models.beam_model import BeamModel
-from jaxslam.grids.cast import RayMap, cast, ray_map
+from jaxslam.grids.cast import RayMap, cast, check_method, ray_map
 from jaxslam.grids.grid import Grid
 from jaxslam.math import se2
 from jaxslam.types import Beams
-from jaxslam.validation.numbers import is_concrete
+from jaxslam.validation.numbers import check_mount, check_positive, is_concrete
 
 
 class Mixture(NamedTuple):
@@ -104,7 +104,12 @@ def ray_cast(
         mixture: parameters, which `fit` learns from data; the four shares have sum 1.
         max_range: [m]. method: of `ray_map`.
         mount: (3,) pose of the laser on the robot.
+    Raises:
+        ValueError: numbers out of range, an unknown method, a mount that is no pose.
     """
+    check_positive("ray_cast", max_range=max_range, sigma=mixture.sigma, rate=mixture.rate)
+    check_method("ray_cast", method)
+    check_mount("ray_cast", mount)
     check_weights("ray_cast", dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
 
     def prepare(grid: Grid) -> RayMap:

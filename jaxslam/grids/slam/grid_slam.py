@@ -24,7 +24,7 @@ from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
 from jaxslam.grids.grid import Grid, check_frame, to_cells
 from jaxslam.grids.localization.beam_log import beams_of
 from jaxslam.grids.localization.localize import info_of_beams
-from jaxslam.grids.mapping import Counts, add_scan, occupancy
+from jaxslam.grids.mapping import Counts, add_scan, check_hit_and_miss, check_shape, occupancy
 from jaxslam.grids.slam.particles import GridParticles, MapInfo, copied_rows, in_place
 from jaxslam.grids.slam.proposal import propose
 from jaxslam.math import se2
@@ -32,6 +32,7 @@ from jaxslam.protocols import Filter, Motion, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import effective_size, normalized
 from jaxslam.types import Beams, Estimate, Info, Scan
+from jaxslam.validation.numbers import check_mount
 
 
 def grid_slam(
@@ -89,7 +90,7 @@ def grid_slam(
         motion: any.
         particles: P, at least 1.
         max_range: of the laser [m]. no_return, mount: as of `count`.
-        candidates: K poses a particle, at least 2. iterations: of the search for a match.
+        candidates: K poses a particle, even. iterations: of the search for a match.
         spread: widths [m], [rad] of the candidates about a match, if the motion is wider.
         exponent: of the likelihood, above 0; beams are not independent. every: each n-th beam
             enters the weight.
@@ -97,22 +98,26 @@ def grid_slam(
         resample: one of `jaxslam.resampling` that returns ancestors.
         threshold: of ESS, as a share of P; 0 never resamples.
     Raises:
-        ValueError: on a frame that is none, a model that is none, and numbers out of range.
+        ValueError: on a frame, a mount or a model that is none, and numbers out of range.
     """
     name = "grid_slam"
+    check_shape(name, shape)
     check_frame(name, origin, resolution)
-    if len(shape) != 2 or min(shape) < 1 or particles * shape[0] * shape[1] >= 2**31:
-        raise ValueError(
-            f"{name}: expected a shape (H, W) of at least one cell, and below 2^31 cells in all "
-            f"{particles} maps, got {shape}"
-        )
+    check_mount(name, mount)
+    check_hit_and_miss(name, hit, miss)
     if not isinstance(model, BeamModel):
         raise ValueError(f"{name}: expected a BeamModel, got {type(model).__name__}")
     validation.check_motion(name, motion)
     for what, count in (("particles", particles), ("every", every), ("iterations", iterations)):
         validation.check_count(f"{name}: {what}", count)
-    if candidates < 2:
-        raise ValueError(f"{name}: expected at least two candidates, got {candidates}")
+    if particles * shape[0] * shape[1] >= 2**31:
+        raise ValueError(
+            f"{name}: expected fewer than 2^31 cells in all {particles} maps, got {shape}"
+        )
+    if candidates < 2 or candidates % 2:
+        raise ValueError(
+            f"{name}: expected an even number of candidates, at least 2, got {candidates}"
+        )
     if proposal not in ("motion", "scan_matched"):
         raise ValueError(f'{name}: expected proposal "motion" or "scan_matched", got {proposal!r}')
     if not (max_range > 0 and 0 <= no_return <= max_range):
@@ -120,11 +125,13 @@ def grid_slam(
             f"{name}: expected max_range above 0 and no_return from 0 to it, got {max_range}, "
             f"{no_return}"
         )
-    if validation.is_concrete(exponent, spread) and not (
-        float(np.asarray(exponent)) > 0 and min(spread) > 0
+    concrete = validation.is_concrete(exponent, spread)
+    if validation.shape_told(spread if concrete else jnp.asarray(spread)) != "(2,)" or (
+        concrete and not (float(np.asarray(exponent)) > 0 and min(spread) > 0)
     ):
         raise ValueError(
-            f"{name}: expected an exponent and a spread above 0, got {exponent!r}, {spread!r}"
+            f"{name}: expected an exponent and a spread of two widths above 0, got {exponent!r}, "
+            f"{spread!r}"
         )
     check_resampling(name, resample, threshold)
     height, width = shape
