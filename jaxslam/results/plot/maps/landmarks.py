@@ -130,6 +130,8 @@ def run_map_figure(
         axes.set_xlabel("x [m]" if lowest else "")
         axes.set_ylabel("y [m]" if i % columns == 0 else "")
     caption(figure, title, every_handle(panels))
+    # The layout of panels of one scale takes two passes; saving makes the second.
+    figure.draw_without_rendering()
     return figure
 
 
