@@ -1,5 +1,7 @@
 """Localization in a grid: one step in NumPy, the KLD count, a robot carried away, bad input."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -142,6 +144,22 @@ def test_particles_of_no_weight_from_the_start_are_drawn_anew_until_one_has_some
     )
     found = info.extra["particles"]
     assert int(found.injected) == 16 and not found.underflow and float(state.injection) == 0.0
+
+
+def test_the_ray_cast_model_keeps_the_robot_on_the_draws_that_both_models_get():
+    """From a pose known roughly, 20 steps: same truths for both, and both stay within 0.15 m."""
+    world = dataclasses.replace(WORLD, controls=CONTROLS[:20])
+    ray_cast = grids.ray_cast(max_range=FAR, method="cells")
+    truths = []
+    for model, count in ((MODEL, 200), (ray_cast, 150)):
+        filter = grids.localize(GRID, model, MOVE, count, exponent=0.2)
+        scores = consistency.judge_localization(
+            world, filter, 2, KEY, start_cov=np.diag([0.1, 0.1, 0.05]) ** 2, every=5
+        )
+        error = np.asarray(scores.pose - scores.truth)[:, 1:]
+        assert np.hypot(error[..., 0], error[..., 1]).max() < 0.15
+        truths.append(np.asarray(scores.truth))
+    np.testing.assert_array_equal(*truths)
 
 
 def test_the_number_is_that_of_the_kld_bound(lost):
