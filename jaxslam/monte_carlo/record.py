@@ -81,8 +81,8 @@ class Campaign:
 
         They are report.html (one page with its figures embedded), consistency.json (verdicts,
         measures and counts), consistency.csv (the averages of every step) and the figures. All of
-        them appear when all are complete, or none. Two figures show run 0 of
-        each filter; they are left out where this process did not compute that run (`first`).
+        them appear when all are complete, or none. Two figures show run 0 of each filter; they are
+        left out where this process did not compute that run (`first`).
 
         Args:
             folder: it is created if needed.

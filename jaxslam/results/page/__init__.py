@@ -168,8 +168,8 @@ the pointer over a number for its ends, which stand in brackets where it is lops
 {campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth.</p>
 <p>The <strong>verdict</strong> goes by the pose NEES and by NIS / dof, averaged over time, one
 number a run each, and their intervals over the runs, so wide that an honest filter of a linear
-problem is rejected in {percentage(1 - LEVEL)} of campaigns. <em>Noticed</em> is what nine such
-campaigns in ten would reject. An asterisk marks a verdict with a reservation:</p>
+problem is rejected in {percentage(1 - LEVEL)} of campaigns. What it has the power to reject, nine
+such campaigns in ten would. An asterisk marks a verdict with a reservation:</p>
 <dl class="meanings">
 {meanings}
 </dl>
