@@ -58,6 +58,7 @@ from benchmarks.results import measured
 from benchmarks.scan_matching.__main__ import measure as measure_matching
 from benchmarks.speed.__main__ import gated
 from benchmarks.speed.__main__ import measure as measure_speed
+from jaxslam.results.plot.style import png
 
 FIGURES = Path(__file__).parent / "figures"
 SOAKED = Path(__file__).parents[1] / ".cache" / "soak"
@@ -141,7 +142,7 @@ def pictured(module: Any, **scale: int) -> list[Metric]:
     """A published experiment: its section is printed, its figure drawn."""
     section, metrics, figure = module.measure(**scale)
     print(section, flush=True)
-    figure.savefig(FIGURES / f"{section.name}.png")
+    (FIGURES / f"{section.name}.png").write_bytes(png(figure))
     return metrics
 
 

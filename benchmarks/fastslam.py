@@ -28,6 +28,7 @@ import numpy as np
 from benchmarks.gate import Metric, report
 from jaxslam import monte_carlo, motion, run, sensors, simulate
 from jaxslam.filters import ekf_slam, fastslam
+from jaxslam.results.plot.style import PAGE, band, caption, curve, panels_of, png
 from jaxslam.simulation.scenarios import webmap
 from jaxslam.simulation.worlds import Scenario
 
@@ -107,26 +108,18 @@ def measure(runs=20, particles=PARTICLES, out=None, steps=None):
 
 def draw(campaign, out):
     """NEES against time, one line a filter."""
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
-    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+    figure, (axes,) = panels_of(PAGE, 3.0, 1)
     seconds = 0.2 * np.arange(1, campaign.steps + 1)
-    shades = plt.get_cmap("viridis")(np.linspace(0.85, 0.0, len(campaign.filters) - 1))
-    colors = ["#d62728", *shades]
-    for (name, summary), color in zip(campaign.filters.items(), colors, strict=True):
-        axes.plot(seconds, summary.curves["nees_pose"], color=color, lw=1.1, label=name)
-    low, high = (campaign.filters["ekf"].curves[f"nees_pose_{end}"][-1] for end in ("low", "high"))
-    axes.axhspan(low, high, color="#bbbbbb", alpha=0.6, lw=0)
-    axes.text(seconds[-1], low, "95 % band of an honest filter ", ha="right", va="top", size=7)
+    for i, (name, summary) in enumerate(campaign.filters.items()):
+        curve(axes, i, seconds, summary.curves["nees_pose"], name)
+    ends = (campaign.filters["ekf"].curves[f"nees_pose_{end}"] for end in ("low", "high"))
+    band(axes, seconds, *ends, "95 % band of an honest filter")
     axes.set_yscale("log")
     axes.set_xlabel("time [s]")
-    axes.set_ylabel(f"pose NEES, mean of {campaign.runs} runs")
-    axes.set_title(f"FastSLAM 2.0 on {campaign.scenario}, {campaign.steps} scans", size=9)
-    axes.legend(frameon=False, ncols=2, loc="upper left", fontsize=8)
-    axes.set_ylim(0.5, axes.get_ylim()[1] * 3)
+    axes.set_ylabel(f"pose NEES, mean of {campaign.runs} runs (dof 3)")
+    caption(figure, f"FastSLAM 2.0 on {campaign.scenario}, {campaign.steps} scans")
     out.parent.mkdir(exist_ok=True)
-    figure.savefig(out, dpi=170)
+    out.write_bytes(png(figure))
 
 
 def ring(steps=200):

@@ -218,7 +218,7 @@ def draw(world, truth, log, trace, out):
     panels[0].set_ylabel("y [m]")
     caption(figure, "")
     out.parent.mkdir(exist_ok=True)
-    figure.savefig(out, dpi=150)
+    out.write_bytes(plot.png(figure))
 
 
 if __name__ == "__main__":

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxslam import sensors
+from jaxslam.results.plot.style import COLUMN, INK, TEXT, caption, look, panels_of, png
 from jaxslam.verify.linearity import sensor_linearity
 
 NEAREST = 1.0
@@ -51,21 +51,17 @@ def main() -> int:
         i = int(np.argmin(np.abs(shares - share)))
         print(f"{shares[i]:18.3f}" + "".join(f"{c[0][i]:18.4f}" for c in curves.values()))
 
-    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
-    figure, axes = plt.subplots(figsize=(5.2, 3.2), layout="constrained")
-    for color, (name, (hessian, sampled)) in zip(
-        ("#c0392b", "#1f5fa8"), curves.items(), strict=True
-    ):
-        axes.loglog(shares, hessian, color=color, label=f"{name}, Hessian")
-        axes.loglog(shares[::4], sampled[::4], "o", ms=3.5, color=color, label=f"{name}, sampled")
-    axes.axhline(1.0, color="0.6", lw=0.8, ls="--")
-    axes.text(
-        shares[0], 0.85, "above: bends farther than it rises", color="0.4", fontsize=8, va="top"
-    )
+    figure, (axes,) = panels_of(COLUMN, 2.6, 1)
+    for i, (name, (hessian, sampled)) in enumerate(curves.items()):
+        line = look(i)
+        axes.loglog(shares, hessian, color=line["color"], ls=line["ls"], label=f"{name}, Hessian")
+        line["ls"] = "none"
+        axes.loglog(shares[::4], sampled[::4], ms=3.6, label=f"{name}, sampled", **line)
+    axes.axhline(1.0, color=INK, lw=0.8)
+    axes.text(shares[0], 0.8, "above: bends farther than it rises", fontsize=TEXT, va="top")
     axes.set_xlabel("baseline / nearest distance")
-    axes.set_ylabel("linearity index of the bearing (3 σ)")
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
-    figure.savefig(options.out, dpi=200)
+    caption(figure, "Linearity index of the bearing (3 σ)")
+    options.out.write_bytes(png(figure))
     print(f"wrote {options.out}")
     return 0
 

@@ -27,6 +27,7 @@ from jaxslam import run, sensors, simulate
 from jaxslam.filters import localization, particle_localization
 from jaxslam.filters.particles.states import region
 from jaxslam.math.stats import chi2_quantile
+from jaxslam.results.plot.style import HUES, INK, PAGE, TEXT, caption, curve, panels_of, png
 from jaxslam.simulation.scenarios import circle
 
 FIGURE = Path(__file__).parent / "figures" / "monte_carlo_localization.png"
@@ -132,37 +133,30 @@ def measure(runs=20, particles=5000, out=None):
 
 def draw(traces, out):
     """Error and particles in use against time: medians over the runs, and 10 % to 90 % of them."""
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
-    figure, (above, below) = plt.subplots(
-        2, 1, figsize=(6.4, 4.6), sharex=True, layout="constrained", height_ratios=[3, 2]
-    )
+    figure, (above, below) = panels_of(PAGE, 3.8, 2, heights=(3, 2))
     seconds = np.arange(1, 2 * HALF + 1)
-    colors = ["#1f77b4", "#999999", "#d62728"]
 
-    def band(axes, values, color, label):
+    def spread(axes, values, i, label):
         low, mid, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
-        axes.fill_between(seconds, low, high, color=color, alpha=0.2, lw=0)
-        axes.plot(seconds, mid, color=color, lw=1.3, label=label)
+        axes.fill_between(seconds, low, high, color=HUES[i], alpha=0.2, lw=0)
+        curve(axes, i, seconds, mid, label)
 
-    for (name, (error, _)), color in zip(traces.items(), colors, strict=True):
-        band(above, np.maximum(error, 1e-3), color, name)
+    for i, (name, (error, _)) in enumerate(traces.items()):
+        spread(above, np.maximum(error, 1e-3), i, name)
     found = traces["particles"][1].extra["particles"]
-    band(below, np.asarray(found.active), colors[0], "particles in use")
+    spread(below, np.asarray(found.active), 0, "particles in use")
     above.set_ylabel("position error [m]")
     below.set_ylabel("particles in use")
     below.set_xlabel("time [s]")
-    runs = len(traces["particles"][0])
-    above.set_title(f"circle, map known: anywhere, then carried away; {runs} runs", size=9)
     for axes in (above, below):
         axes.set_yscale("log")
-        axes.axvline(HALF, color="black", lw=0.8, ls=":")
-    above.text(HALF + 2, above.get_ylim()[1], "carried away", va="top", size=8)
-    above.legend(frameon=False, fontsize=8, loc="lower left", ncols=3)
-    above.set_ylim(above.get_ylim()[0] / 4, None)
+        axes.axvline(HALF, color=INK, lw=0.8)
+    above.text(HALF + 2, above.get_ylim()[1], "carried away", va="top", size=TEXT)
+    runs = len(traces["particles"][0])
+    what = "medians, shaded 10 % to 90 % of the runs"
+    caption(figure, f"circle, map known: anywhere, then carried away; {runs} runs, {what}")
     out.parent.mkdir(exist_ok=True)
-    figure.savefig(out, dpi=170)
+    out.write_bytes(png(figure))
 
 
 if __name__ == "__main__":

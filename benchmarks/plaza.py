@@ -24,6 +24,7 @@ from benchmarks.gate import Metric, alone
 from jaxslam import datasets, metrics
 from jaxslam.filters import delayed_slam
 from jaxslam.filters.delayed.settings import StoredMeasurements
+from jaxslam.results.plot.style import COLORS, FAINT, INK, PAGE, SHADE, caption, panels_of, png
 from jaxslam.types import Status
 
 FIGURE = Path(__file__).parent / "figures" / "plaza1.png"
@@ -113,21 +114,18 @@ def measure(figure=False):
 
 
 def draw(data, path, reckoned, points):
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.5, 6.5), layout="constrained")
-    axes = figure.subplots()
-    axes.plot(*data.true_path[:, :2].T, color="0.75", linewidth=2.5, label="ground truth")
-    axes.plot(*reckoned.T, color="tab:orange", linewidth=0.7, label="odometry alone, aligned")
-    axes.plot(*path.T, color="tab:blue", linewidth=0.9, label="delayed_slam, aligned")
-    axes.plot(*data.landmarks.T, "k^", markersize=11, fillstyle="none", label="beacons, surveyed")
-    axes.plot(*points.T, "x", color="tab:red", markersize=8, mew=2, label="beacons, estimated")
+    figure, (axes,) = panels_of(PAGE, 6.0, 1)
+    blue, red, *_ = COLORS
+    axes.plot(*data.true_path[:, :2].T, color=SHADE, lw=2.5, label="ground truth")
+    axes.plot(*reckoned.T, color=FAINT, lw=0.6, ls="--", label="odometry alone, aligned")
+    axes.plot(*path.T, color=blue, lw=0.9, label="delayed_slam, aligned")
+    axes.plot(*data.landmarks.T, "^", color=INK, ms=9, mfc="none", label="beacons, surveyed")
+    axes.plot(*points.T, "x", color=red, ms=7, mew=1.5, label="beacons, estimated")
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    axes.set_title("Plaza1: range-only SLAM, beacons unknown")
     axes.margins(0.06)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    caption(figure, "Plaza1: SLAM by ranges alone, beacons unknown")
     FIGURE.parent.mkdir(exist_ok=True)
-    figure.savefig(FIGURE, dpi=130)
+    FIGURE.write_bytes(png(figure))
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, alone
 from jaxslam import filters, motion, sensors
+from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, png
 from jaxslam.types import Log, Scan
 
 FIGURE = Path(__file__).parent / "figures" / "scaling.png"
@@ -171,32 +172,18 @@ def measure(out: Path | None = None) -> list[Metric]:
 
 
 def draw(found, powers, out):
-    import matplotlib.pyplot as plt
-
-    from jaxslam.results.plot import COLORS
-
-    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
-    figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
-    marks = "os^Dv"
-    for (name, times), color, mark in zip(found.items(), COLORS, marks, strict=False):
+    figure, (axes,) = panels_of(PAGE, 3.0, 1)
+    for i, (name, times) in enumerate(found.items()):
         power, (low, high) = powers[name]
-        label = f"{name}: $N^{{{power:.2f}}}$ from {low} to {high:,}"
-        axes.loglog(
-            list(times),
-            [1e3 * s for s in times.values()],
-            mark + "-",
-            color=color,
-            ms=4,
-            label=label,
-        )
+        label = f"{name}: N to the power {power:.2f} from {low} to {high:,}"
+        milliseconds = 1e3 * np.array(list(times.values()))
+        curve(axes, i, np.array(list(times)), milliseconds, label)
+    axes.set(xscale="log", yscale="log")
     axes.set_xlabel("landmarks N in the map")
     axes.set_ylabel("time of a step [ms]")
-    axes.set_title(f"One robot, {SEEN} landmarks in view, CPU with two cores, float64", size=9)
-    axes.grid(color="#dddddd", lw=0.5)
-    axes.set_ylim(top=axes.get_ylim()[1] * 12)
-    axes.legend(frameon=False, loc="upper left", fontsize=8)
+    caption(figure, f"One robot, {SEEN} landmarks in view, CPU with two cores, float64")
     out.parent.mkdir(exist_ok=True)
-    figure.savefig(out, dpi=170)
+    out.write_bytes(png(figure))
 
 
 if __name__ == "__main__":

@@ -23,6 +23,16 @@ from benchmarks.real_data import DATA
 from jaxslam import datasets, se2
 from jaxslam.filters import ekf_slam, team_slam
 from jaxslam.metrics import align_map
+from jaxslam.results.plot.style import (
+    HUES,
+    INK,
+    PAGE,
+    caption,
+    every_handle,
+    panels_of,
+    png,
+    titled,
+)
 from jaxslam.team import poses
 from jaxslam.types import Status
 
@@ -99,24 +109,19 @@ def measure(steps=None, out=FIGURE):
 
 
 def draw(data, runs, out):
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (world, spread) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(1, 1.3))
+    figure, (world, spread) = panels_of(PAGE, 3.4, 1, 2, share=(False, False), widths=(1, 1.5))
     final, (paths, covs, there) = runs["three"]
     onto = align_map(final, data.landmarks)[0]
     carry = jax.vmap(partial(se2.from_frame, jnp.asarray(onto)))
-    colours = ["#1b6ca8", "#c8553d", "#4f8a3c"]
+    colours = HUES[:3]
     for b, colour in enumerate(colours):
         path = np.asarray(carry(jnp.asarray(paths[there[:, b], b, :2][::50])))
-        world.plot(*path.T, lw=0.3, color=colour, label=f"robot {b + 1}")
+        world.plot(*path.T, lw=0.3, color=colour)
     points = np.asarray(carry(jnp.asarray(final.points)))
-    world.plot(*np.asarray(data.landmarks).T, "o", mfc="none", mec="k", ms=9, label="survey")
-    world.plot(*points.T, "k+", ms=7, label="map")
-    world.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="three robots, one map")
-    world.legend(fontsize=7, loc="upper left", bbox_to_anchor=(-0.02, -0.12), ncol=3)
+    world.plot(*np.asarray(data.landmarks).T, "o", mfc="none", mec=INK, ms=7, label="survey")
+    world.plot(*points.T, "+", color=INK, ms=6, label="map")
+    world.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    titled(world, "paths and map")
     seconds = data.time[: len(covs)] - data.time[0]
     for name, style in (("three, blind", "--"), ("three", "-")):
         sigma = np.sqrt(np.trace(runs[name][1][1][:, :, :2, :2], axis1=2, axis2=3) / 2)
@@ -126,13 +131,11 @@ def draw(data, runs, out):
             mean = inside[: bins * 1000].reshape(bins, 1000).mean(axis=1)
             label = f"robot {b + 1}" + (", without sightings" if style == "--" else "")
             spread.plot(seconds[: bins * 1000 : 1000], mean, style, color=colour, lw=1, label=label)
-    spread.set(xlabel="time [s]", ylabel="σ of the position [m]", yscale="log")
-    spread.set_title("what each robot's filter claims (means of 1,000 rows)")
-    spread.set_ylim(top=2 * spread.get_ylim()[1])  # room for the legend
-    spread.legend(fontsize=7, ncol=2, loc="upper right")
-    figure.tight_layout()
+    spread.set(xlabel="time [s]", yscale="log")
+    titled(spread, "σ of the position that the filter claims [m], means of 1,000 rows")
+    caption(figure, "Three robots, one map", every_handle((world, spread)))
     out.parent.mkdir(exist_ok=True)
-    figure.savefig(out, dpi=110)
+    out.write_bytes(png(figure))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ and what the plain EKF needs of it is its inconsistency. The figure shows the ma
 
 import argparse
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 import gtsam
@@ -19,13 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gtsam.symbol_shorthand import L, X
-from matplotlib.figure import Figure
 
 import jaxslam
 from benchmarks.gate import Metric, report
 from jaxslam import charts, datasets, metrics, plot
 from jaxslam.datasets import Dataset
 from jaxslam.filters import ekf_slam
+from jaxslam.results.plot.style import INK, PAGE, SHADE, Figure, caption, panels_of, png, titled
 from jaxslam.types import Status
 
 FILTERS = {"EKF": {}, "invariant EKF": {"chart": charts.right_invariant()}}
@@ -161,25 +162,22 @@ def compare(filtered: Solution, batch: Solution) -> dict[str, float]:
 
 def draw(filtered: dict[str, Filtered], batch: Solution) -> Figure:
     """A panel for each filter, with its 3σ ellipses, over the batch."""
-    figure = Figure(figsize=(10.0, 5.3), layout="constrained")
+    figure, panels = panels_of(PAGE, 3.8, 1, len(filtered), share=(True, True))
     blue, red, *_ = plot.COLORS
-    panels = figure.subplots(1, len(filtered), sharex=True, sharey=True)
     for axes, (name, found) in zip(panels, filtered.items(), strict=True):
         path, points = found.solution
-        axes.plot(*batch.path[:, :2].T, color="0.65", lw=1.8, label="path, batch")
+        axes.plot(*batch.path[:, :2].T, color=SHADE, lw=1.8, label="path, batch")
         axes.plot(*path[:, :2].T, color=blue, lw=0.7, label="path, filter")
-        axes.plot(*batch.points.T, "x", color="0.2", ms=4, mew=0.8, label="landmarks, batch")
-        axes.plot(*points.T, ".", color=red, ms=2.5, label="landmarks, filter")
+        axes.plot(*batch.points.T, "x", color=INK, ms=3, mew=0.7, label="landmarks, batch")
+        axes.plot(*points.T, ".", color=red, ms=2, label="landmarks, filter")
         label = "3 σ of the filter"
         for point, cov in zip(points, found.covs, strict=True):
             axes.plot(*plot.ellipse(point, cov, 3.0).T, color=red, lw=0.6, label=label)
             label = "_"
-        axes.set(xlabel="x [m]", aspect="equal", title=name)
+        axes.set(xlabel="x [m]", aspect="equal")
+        titled(axes, name)
     panels[0].set(ylabel="y [m]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize="small"
-    )
+    caption(figure, "")
     return figure
 
 
@@ -206,7 +204,7 @@ def measure(path: str | None = None, out: str | None = None) -> list[Metric]:
     for label, *cells in rows:
         print(f"  {label:15}" + "".join(f"{cell:>15}" for cell in cells))
     if out:
-        draw(filtered, batch.solution).savefig(out, dpi=200)
+        Path(out).write_bytes(png(draw(filtered, batch.solution)))
         print(f"figure: {out}")
     # The measured 3.28, 0.59 and 0.912, and room for another machine's rounding.
     return [

@@ -13,6 +13,7 @@ import numpy as np
 
 from benchmarks.association import closing, clutter, cost, heading, park
 from benchmarks.gate import Metric, report
+from jaxslam.results.plot.style import png
 
 
 def table(title, rows, columns):
@@ -29,7 +30,7 @@ def measure(quick=False, out=None):
     def save(figure, name):
         if out:
             out.mkdir(parents=True, exist_ok=True)
-            figure.savefig(out / f"association_{name}", dpi=160)
+            (out / f"association_{name}").write_bytes(png(figure))
 
     seconds = cost.measure()
     print("\n20 measurements, 200 landmarks, 16 runs together, time a run:")

@@ -9,10 +9,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxslam
-from jaxslam import association, charts, motion, plot, sensors
+from jaxslam import association, charts, motion, sensors
 from jaxslam.consistency.associations import identities
 from jaxslam.filters import ekf_slam
 from jaxslam.filters.map_management.closing import closing
@@ -20,6 +19,7 @@ from jaxslam.filters.map_management.loop_closure import LoopSettings
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
 from jaxslam.math.stats import chi2_quantile
+from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels_of, titled
 from jaxslam.simulation.scenarios import between_ranges
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import Scenario, simulate
@@ -166,20 +166,17 @@ def measure(runs=RUNS, names=None):
 
 def draw(pictures, run=0):
     """One run, a panel a method: the true path, the estimated one, and the final map."""
-    figure = Figure(figsize=(11.0, 3.9), layout="constrained")
-    panels = figure.subplots(1, len(pictures), sharex=True, sharey=True)
-    blue, red, *_ = plot.COLORS
+    figure, panels = panels_of(PAGE, 2.5, 1, len(pictures), share=(True, True))
+    blue, red, *_ = COLORS
     true_map = world().landmarks
     for axes, (name, (path, true, points, alive, _)) in zip(panels, pictures.items(), strict=True):
-        axes.plot(*true[run].T, color="0.6", lw=2.2, label="true path")
-        axes.plot(*true_map.T, "x", color="0.35", ms=4, label="true landmarks")
+        axes.plot(*true[run].T, color=SHADE, lw=2.2, label="true path")
+        axes.plot(*true_map.T, "x", color=INK, ms=2.5, mew=0.6, label="true landmarks")
         axes.plot(*path[run].T, color=blue, lw=0.9, label="estimated path, as it was driven")
-        axes.plot(*points[run][alive[run]].T, ".", color=red, ms=4, label="map at the end")
-        axes.plot(*path[run][-1], "o", mfc="none", color=blue, ms=7, label="end")
-        axes.set(xlabel="x [m]", aspect="equal", title=name)
+        axes.plot(*points[run][alive[run]].T, ".", color=red, ms=3, label="map at the end")
+        axes.plot(*path[run][-1], "o", mfc="none", color=blue, ms=6, label="end")
+        axes.set(xlabel="x [m]", aspect="equal")
+        titled(axes, name)
     panels[0].set(ylabel="y [m]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize="small"
-    )
+    caption(figure, "")
     return figure

@@ -4,14 +4,14 @@ import dataclasses
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
-from jaxslam import association, motion, plot
+from jaxslam import association, motion
 from jaxslam.filters import ekf_slam
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import existence
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.monte_carlo import monte_carlo
+from jaxslam.results.plot.style import INK, PAGE, caption, curve, panels_of, titled
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.spurious import Spurious
 
@@ -66,8 +66,8 @@ def measure(clutter, noise):
 
 def draw(found):
     """found: {(clutter, noise): what measure returned}."""
-    figure = Figure(figsize=(9.6, 5.2), layout="constrained")
-    panels = figure.subplots(2, 3)
+    figure, panels = panels_of(PAGE, 4.2, 2, 3, share=(False, False))
+    lines = panels[:3], panels[3:]
     series = (
         ("clutter [false measurements a scan]", [(c, 1.0) for c in CLUTTER], CLUTTER),
         ("σ of the odometry [times 1 cm, 1.1°]", [(1.0, n) for n in NOISE], NOISE),
@@ -77,14 +77,14 @@ def draw(found):
         ("recall", "recall"),
         ("nees_pose", "pose NEES (honest: 3)"),
     )
-    for line, (label, at, x) in zip(panels, series, strict=True):
+    for line, (label, at, x) in zip(lines, series, strict=True):
         for axes, (row, title) in zip(line, rows, strict=True):
-            for name, color in zip(("known", *METHODS), plot.COLORS, strict=False):
-                values = [found[key][name].get(row, np.nan) for key in at]
-                axes.plot(x, values, ".-", color=color, lw=1.2, ms=5, label=name)
-            axes.set(xlabel=label, ylabel=title)
-            axes.grid(alpha=0.25)
+            for i, name in enumerate(("known", *METHODS)):
+                values = np.array([found[key][name].get(row, np.nan) for key in at])
+                curve(axes, i, np.array(x), values, name)
+            titled(axes, title)
             if row == "nees_pose":
-                axes.axhline(3, color="0.5", lw=0.8, ls="--")
-    panels[0, 0].legend(frameon=False, fontsize="x-small")
+                axes.axhline(3, color=INK, lw=0.8)
+        line[1].set_xlabel(label)
+    caption(figure, "")
     return figure

@@ -10,14 +10,14 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
-from jaxslam import association, plot
+from jaxslam import association
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
 from jaxslam.math.angles import wrap
 from jaxslam.math.roots import root_psd
 from jaxslam.math.stats import chi2_quantile
+from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, titled
 from jaxslam.sensors import range_bearing
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
@@ -74,19 +74,13 @@ def measure():
 
 
 def draw(found):
-    figure = Figure(figsize=(8.4, 3.4), layout="constrained")
-    panels = figure.subplots(1, 2, sharex=True)
-    for (name, (right, wrong, _)), color in zip(found.items(), plot.COLORS, strict=False):
+    figure, panels = panels_of(PAGE, 2.6, 1, 2)
+    for i, (name, (right, wrong, _)) in enumerate(found.items()):
         for axes, share in zip(panels, (right, wrong), strict=True):
-            width = 4.0 if name == "nearest" else 1.2  # maximum_likelihood decides as it does here
-            axes.plot(SIGMAS, 100 * share, ".-", color=color, lw=width, ms=5, label=name)
+            curve(axes, i, np.array(SIGMAS), 100 * share, name)
     for axes, what in zip(panels, ("rightly", "wrongly"), strict=True):
-        axes.set(
-            xlabel="standard deviation of the heading [°]",
-            ylabel=f"measurements associated {what} [%]",
-            ylim=(0, None),
-        )
-        axes.grid(alpha=0.25)
+        axes.set(xlabel="standard deviation of the heading [°]", ylim=(0, None))
+        titled(axes, f"measurements associated {what} [%]")
     panels[0].set(ylim=(0, 103))
-    panels[0].legend(frameon=False, fontsize="small")
+    caption(figure, "")
     return figure

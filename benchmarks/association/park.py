@@ -31,15 +31,15 @@ import gtsam
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxslam
-from jaxslam import association, charts, datasets, motion, plot, sensors
+from jaxslam import association, charts, datasets, motion, sensors
 from jaxslam.calibration import calibrate
 from jaxslam.filters import ekf_slam
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.life import recency
 from jaxslam.math.stats import chi2_quantile
+from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels_of
 from jaxslam.types import Status
 
 CAPACITY, LOCAL, PATIENCE = 200, 16, 30
@@ -240,13 +240,12 @@ def measure():
 
 def draw(maps):
     given, found = maps
-    figure = Figure(figsize=(6.0, 6.4), layout="constrained")
-    axes = figure.subplots()
-    blue, red, *_ = plot.COLORS
-    axes.plot(*given.path[:, :2].T, color="0.65", lw=1.8, label="path, identities given")
+    figure, (axes,) = panels_of(PAGE, 6.6, 1)
+    blue, red, *_ = COLORS
+    axes.plot(*given.path[:, :2].T, color=SHADE, lw=1.8, label="path, identities given")
     axes.plot(*found.path[:, :2].T, color=blue, lw=0.7, label="path, identities ignored")
-    axes.plot(*given.points[given.alive].T, "x", color="0.2", ms=5, label="landmarks, given")
+    axes.plot(*given.points[given.alive].T, "x", color=INK, ms=4, mew=0.8, label="landmarks, given")
     axes.plot(*found.points[found.alive].T, ".", color=red, ms=4, label="landmarks, ignored")
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize="small")
+    caption(figure, "")
     return figure

@@ -10,7 +10,6 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
@@ -18,7 +17,7 @@ from jaxslam.catalog import FILTERS
 from jaxslam.consistency import own_error_of, score
 from jaxslam.consistency.statistics import run_statistics
 from jaxslam.protocols import Filter, Motion, Sensor
-from jaxslam.results.plot import COLORS
+from jaxslam.results.plot.style import INK, PAGE, Figure, caption, curve, panels_of
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import loop, loop_landmarks
 from jaxslam.simulation.worlds import simulate
@@ -177,12 +176,11 @@ def _scaled(model: _Model, noise: float) -> _Model:
 
 def figure(nees: dict[str, np.ndarray]) -> Figure:
     """Cumulative distribution over maps of the average pose NEES."""
-    picture = Figure(figsize=(6.5, 4.0), dpi=150, layout="constrained")
-    axes = picture.subplots()
+    picture, (axes,) = panels_of(PAGE, 3.0, 1)
     for i, (name, values) in enumerate(nees.items()):
         share = (np.arange(len(values)) + 0.5) / len(values)
-        axes.step(np.sort(values), share, where="mid", color=COLORS[i], lw=1.6, label=name)
-    axes.axvline(3.0, color="#333333", lw=0.8, ls="--", label="honest: 3")
+        curve(axes, i, np.sort(values), share, name)
+    axes.axvline(3.0, color=INK, lw=0.8, label="honest: 3")
     axes.set(
         xscale="log",
         xlabel="average pose NEES of a map (dof 3)",
@@ -190,7 +188,5 @@ def figure(nees: dict[str, np.ndarray]) -> Figure:
         ylim=(0, 1),
     )
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.grid(color="#dddddd", lw=0.5)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize="small")
+    caption(picture, "")
     return picture

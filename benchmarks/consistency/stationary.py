@@ -4,14 +4,13 @@ import math
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
 from jaxslam.monte_carlo import Campaign, monte_carlo
 from jaxslam.protocols import Candidate
-from jaxslam.results.plot import COLORS
+from jaxslam.results.plot.style import PAGE, Figure, caption, curve, panels_of
 from jaxslam.simulation.scenarios import stationary
 
 PRIOR = math.radians(5.0)
@@ -57,26 +56,11 @@ def measure(runs: int = 200, seed: int = 0) -> tuple[Section, list[Metric], Figu
 
 def figure(campaign: Campaign) -> Figure:
     """The heading's σ that each filter could claim against the steps; 5° is honest."""
-    picture = Figure(figsize=(6.5, 4.0), dpi=150, layout="constrained")
-    axes = picture.subplots()
+    picture, (axes,) = panels_of(PAGE, 3.0, 1)
     step = np.arange(1, campaign.steps + 1)
     for i, (name, summary) in enumerate(campaign.filters.items()):
         learnt = summary.curves["rotation_information"] * PRIOR**2
-        axes.plot(
-            step,
-            np.rad2deg(PRIOR / np.sqrt(1 + learnt)),
-            color=COLORS[i % len(COLORS)],
-            ls=("-", (0, (4, 4)))[i // len(COLORS)],
-            lw=1.6,
-            label=name,
-        )
-    axes.set(
-        xlabel="step",
-        ylabel="heading σ it could claim [°]",
-        xlim=(0, campaign.steps),
-        ylim=(0, 5.5),
-    )
-    axes.grid(color="#dddddd", lw=0.5)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize="small", ncols=4, loc="lower center")
+        curve(axes, i, step, np.rad2deg(PRIOR / np.sqrt(1 + learnt)), name)
+    axes.set(xlabel="step", xlim=(0, campaign.steps), ylim=(0, 5.5))
+    caption(picture, "Heading σ that each filter could claim [°]; 5 is honest")
     return picture

@@ -2,13 +2,13 @@
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.results.plot import nees_figure
+from jaxslam.results.plot.style import Figure
 from jaxslam.simulation.scenarios import webmap
 
 NAMES = ("ekf", "ideal", "right_invariant")

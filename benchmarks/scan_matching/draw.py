@@ -7,64 +7,66 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.scan_matching.honesty import COVARIANCES, MATCHERS, WORLDS, Row
-from jaxslam.results.plot import COLORS, COLUMN, PAGE
+from jaxslam.results.plot.style import (
+    COLUMN,
+    INK,
+    PAGE,
+    SHADE,
+    caption,
+    curve,
+    look,
+    panels_of,
+    png,
+    titled,
+)
 
-MARKS = ("o", "s", "v", "^", "D")
 LIMITS = 0.1, 1e3
 
 
 def nees(rows: Sequence[Row]) -> Figure:
     """NEES over its degrees of freedom, a panel a world; beyond the axis at its end."""
-    figure = Figure(figsize=(PAGE, 3.0), layout="constrained")
-    axes = figure.subplots(1, len(WORLDS), sharex=True, sharey=True)
+    figure, axes = panels_of(PAGE, 2.8, 1, len(WORLDS), share=(True, True))
     names = list(COVARIANCES)
     for panel, world in zip(axes, WORLDS, strict=True):
         own = [row for row in rows if row.world == world]
-        panel.axvspan(own[0].low, own[0].high, color="#bdbdbd", lw=0)
-        panel.axvline(1.0, color="#333333", lw=0.6)
+        panel.axvspan(own[0].low, own[0].high, color=SHADE, lw=0)
+        panel.axvline(1.0, color=INK, lw=0.6)
         for row in own:
             k = list(MATCHERS).index(row.matcher)
+            line = look(k)
             beyond = not LIMITS[0] < row.nees < LIMITS[1]
             panel.plot(
                 np.clip(row.nees, LIMITS[0] * 1.15, LIMITS[1] / 1.15),
                 names.index(row.way) + 0.16 * (k - 2),
-                MARKS[k],
-                color=COLORS[k],
+                ls="none",
+                marker=line["marker"],
+                color=line["color"],
                 ms=4,
-                mfc="white" if beyond else COLORS[k],
+                mfc="white" if beyond else line["color"],
                 label=row.matcher if row.way == "hessian" else None,
             )
         panel.set(xscale="log", xlim=LIMITS)
-        panel.set_title(world, fontsize=9)
+        titled(panel, world)
         panel.set_yticks(range(len(names)), names)
-        panel.tick_params(labelsize=8)
-        panel.grid(axis="x", color="#dddddd", lw=0.5)
-        for side in ("top", "right"):
-            panel.spines[side].set_visible(False)
+        panel.grid(axis="y", visible=False)
     axes[0].invert_yaxis()
-    figure.supxlabel("NEES over degrees of freedom (1: honest); open marks lie beyond", fontsize=8)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=5, fontsize=8, frameon=False)
+    caption(figure, "NEES over degrees of freedom (1: honest); open marks lie beyond the axis")
     return figure
 
 
 def convergence(errors: dict[str, np.ndarray]) -> Figure:
     """The distance from the limit over iterations."""
-    figure = Figure(figsize=(COLUMN, 2.4), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = panels_of(COLUMN, 2.4, 1)
     for k, (name, error) in enumerate(errors.items()):
         shown = np.where(error > 0, error, np.nan)
         label = {"point_to_point": "ICP", "point_to_line": "PL-ICP"}[name]
-        axes.semilogy(shown, marker=MARKS[k], color=COLORS[k], ms=3, lw=1, label=label)
-    axes.set_xlabel("iteration", fontsize=8)
-    axes.set_ylabel("distance from the limit [m]", fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.grid(color="#dddddd", lw=0.5)
-    axes.legend(fontsize=8, frameon=False)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+        curve(axes, k, np.arange(len(shown)), shown, label)
+    axes.set_yscale("log")
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("distance from the limit [m]")
+    caption(figure, "")
     return figure
 
 
 def save(figure: Figure, name: str) -> None:
-    figure.savefig(Path(__file__).parents[1] / "figures" / f"{name}.png", dpi=200)
+    (Path(__file__).parents[1] / "figures" / f"{name}.png").write_bytes(png(figure))

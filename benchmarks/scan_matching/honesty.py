@@ -17,6 +17,8 @@ from jaxslam.math.stats import chi2_band, chi2_quantile
 WORLDS = ("square", "corridor", "circular_room", "office")
 SIGMA, CELL = 0.03, 0.05
 SAMPLES = 30
+RECOMMENDED = "point_to_line, Cauchy", "implicit"
+"""What the documentation recommends: PL-ICP with the noise through (Censi 2007)."""
 MATCHERS = {
     "point_to_point": matching.point_to_point(),
     "point_to_line": matching.point_to_line(),
@@ -82,7 +84,14 @@ class Error(NamedTuple):
     usable: int
 
 
-def programs():
+class Judged(NamedTuple):
+    """All that is known of some matchers on some draws."""
+
+    rows: list[Row]
+    errors: list[Error]
+
+
+def programs(names):
     """By matcher: (reference, scan, start, key) of many runs -> Match, covariances by name."""
 
     def of(name, matcher):
@@ -101,31 +110,32 @@ def programs():
 
         return jax.jit(lambda rows: jax.lax.map(one, rows))
 
-    return {name: of(name, matcher) for name, matcher in MATCHERS.items()}
+    return {name: of(name, MATCHERS[name]) for name in names}
 
 
-def judged(runs: int, grid_runs: int) -> tuple[list[Row], list[Error]]:
-    """All rows; matchers of grids, which take a distance transform a run, on the first runs."""
-    compiled, rows, errors = programs(), [], []
+def judged(runs: int, seeds: dict[int, tuple[str, ...]]) -> dict[int, Judged]:
+    """By seed of the draws: the matchers that are named for it, in every world."""
+    compiled = programs({name for names in seeds.values() for name in names})
+    return {seed: of_draws(compiled, names, runs, seed) for seed, names in seeds.items()}
+
+
+def of_draws(compiled, names: tuple[str, ...], runs: int, seed: int) -> Judged:
+    rows, errors = [], []
     for world in WORLDS:
-        pairs = drawn(world, runs, sigma=SIGMA)
-        whole = known(pairs)
-        keys = jax.random.split(jax.random.key(9), runs)
-        for name, matcher in MATCHERS.items():
-            count = grid_runs if matcher.of_grid else runs
+        pairs = drawn(world, runs, sigma=SIGMA, seed=seed)
+        told = known(pairs)
+        keys = jax.random.split(jax.random.key(seed + 9), runs)
+        for name in names:
             given = pairs.reference, pairs.scan, pairs.start, keys
-            found, covs = jax.device_get(
-                compiled[name](jax.tree.map(lambda a, count=count: a[:count], given))
-            )
-            error, usable = error_of(found, np.asarray(pairs.truth)[:count])
-            told = Known(*(part[:count] for part in whole))
+            found, covs = jax.device_get(compiled[name](given))
+            error, usable = error_of(found, np.asarray(pairs.truth))
             errors.append(summary(world, name, found, error, usable, told))
             rows += [
                 scored(world, name, way, error[usable], cov[usable], told, usable)
                 for way, cov in covs.items()
             ]
             print(f"{world}, {name}: {errors[-1].statuses}", file=sys.stderr, flush=True)
-    return rows, errors
+    return Judged(rows, errors)
 
 
 def error_of(found: matching.Match, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

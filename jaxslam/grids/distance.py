@@ -62,7 +62,8 @@ def squared_distances(occupied: Bool[JaxOrNumPy, "H W"]) -> Int[Array, "H W"]:
     First d(i, j), to the nearest one in the same column. Then min over k of (j - k)² + d(i, k)²,
     the lower envelope of a parabola for each column k (Felzenszwalb & Huttenlocher 2012, "Distance
     transforms of sampled functions", Theory of Computing 8). Where parabola q goes below parabola p
-    is (h_q - h_p)/(2 (q - p)) with h_k = k² + d(i, k)². All rows are treated together, each with a
+    is (h_q - h_p)/(2 (q - p)) with h_k = k² + d(i, k)²; the first cell from there on is found in
+    integers, exactly in float32 too. All rows are treated together, each with a
     stack of its own; a step of the loop adds a parabola to a row or removes one, so that there are
     at most 2 W steps however unlike the rows are. H² + W² where nothing is occupied.
     """
@@ -85,9 +86,16 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
     """For each place of a row, a column here, the parabola that is lowest there."""
     width, rows = column.shape
     row = jnp.arange(rows, dtype=jnp.int32)
-    real = jnp.result_type(float)
-    k = jnp.arange(width, dtype=real)[:, None]
-    h = (column.astype(real) ** 2 + k**2).reshape(-1)
+    k = jnp.arange(width, dtype=jnp.int32)[:, None]
+    h = (column**2 + k**2).reshape(-1)
+    everywhere = -3  # before all that `first_cell` returns: the first parabola stays
+
+    def first_cell(rise: Array, run: Array) -> Array:
+        """⌈rise/run⌉ by one division of floats, mended; any below 0 and from width on as good."""
+        cell = jnp.ceil(rise.astype(jnp.float32) / run.astype(jnp.float32))
+        cell = jnp.clip(cell, -1, width).astype(jnp.int32)
+        beyond = cell * run - rise
+        return cell + (beyond < 0) - (beyond >= run)
 
     def unfinished(state: tuple[Array, ...]) -> Array:
         return (state[0] < width).any()
@@ -96,7 +104,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         q, top, parabola, begins, last, last_h, last_begins = state
         live = q < width
         new = jnp.minimum(q, width - 1)
-        crossing = (h[new * rows + row] - last_h) / (2.0 * (new - last))
+        crossing = first_cell(h[new * rows + row] - last_h, jnp.where(live, 2 * (new - last), 2))
         remove = live & (crossing <= last_begins)
         add = live & ~remove
         top = top + add - remove
@@ -108,8 +116,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         return q + add, top, parabola, begins, last, h[last * rows + row], last_begins
 
     zeros = jnp.zeros(rows, jnp.int32)
-    everywhere = jnp.full(rows, -jnp.inf, real)
-    begins = jnp.full(width * rows, jnp.inf, real).at[:rows].set(everywhere)
+    begins = jnp.full(width * rows, everywhere, jnp.int32)
     start: tuple[Array, ...] = (
         zeros + 1,
         zeros,
@@ -117,13 +124,13 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         begins,
         zeros,
         h[:rows],
-        everywhere,
+        begins[:rows],
     )
     _, top, parabola, begins, *_ = jax.lax.while_loop(unfinished, step, start)
     # Parabolas stand in the order of their columns, so the last that began is the lowest.
     depth = jnp.arange(width, dtype=jnp.int32)[:, None]
-    first = jnp.where(depth <= top[None, :], begins.reshape(width, rows), jnp.inf)
-    first = jnp.clip(jnp.ceil(first), 0, width).astype(jnp.int32)
+    first = jnp.where(depth <= top[None, :], begins.reshape(width, rows), width)
+    first = jnp.clip(first, 0, width)
     lowest = jnp.zeros((width + 1, rows), jnp.int32)
     lowest = lowest.at[first, row[None, :]].max(parabola.reshape(width, rows))
     return jax.lax.cummax(lowest, axis=0)[:width]

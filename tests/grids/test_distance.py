@@ -6,6 +6,7 @@ import pytest
 from scipy import ndimage
 
 from jaxslam import grids, se2
+from jaxslam.grids.distance import squared_distances
 from jaxslam.grids.grid import Field
 
 
@@ -45,6 +46,12 @@ def test_a_map_without_obstacles_has_a_finite_distance_and_float32_is_close():
     single = jax.tree.map(np.float32, grid_of(np.where(cells, 2.0, -1.0)))
     exact = 0.1 * ndimage.distance_transform_edt(~cells)
     np.testing.assert_allclose(grids.distance_field(single).values, exact, rtol=1e-5, atol=1e-5)
+
+
+def test_squared_distances_are_integers_exact_on_maps_too_long_for_float32(float32_alone):
+    cells = np.random.default_rng(0).random((3, 9000)) < 0.0004
+    exact = ndimage.distance_transform_edt(~cells) ** 2
+    np.testing.assert_array_equal(squared_distances(cells), np.round(exact))
 
 
 def test_the_gradient_of_a_wall_points_away_from_it():

@@ -5,7 +5,6 @@ import re
 import sys
 
 import jax
-import jax.experimental
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -241,11 +240,9 @@ def test_hidden_state_is_found():
 # --- house --------------------------------------------------------------------------------------
 
 
-def test_float64_is_used_and_given_back():
-    home = jax if hasattr(jax, "enable_x64") else jax.experimental  # from jax 0.8, and before
-    with home.enable_x64(False):
-        report = verify_jacobians(observe, outputs=OUTPUTS)
-        assert jnp.zeros(1).dtype == jnp.float32
+def test_float64_is_used_and_given_back(float32_alone):
+    report = verify_jacobians(observe, outputs=OUTPUTS)
+    assert jnp.zeros(1).dtype == jnp.float32
     assert report.findings[0].relative < 1e-12
     assert report.findings[0].differences < 1e-6
 
