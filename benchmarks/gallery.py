@@ -23,7 +23,13 @@ from benchmarks.real_data import DATA
 ROOT = Path(__file__).parents[1]
 SCRIPTS, PICTURES = ROOT / "examples" / "gallery", ROOT / "benchmarks" / "figures" / "gallery"
 PAGE = ROOT / "docs" / "gallery.md"
-FOLDERS = {"bonn": "bonn", "carmen": "carmen", "mrclam": "mrclam1", "mrclam_team": "mrclam1"}
+FOLDERS = {
+    "bonn": "bonn",
+    "carmen": "carmen",
+    "carmen_freiburg": "carmen",
+    "mrclam": "mrclam1",
+    "mrclam_team": "mrclam1",
+}
 """The folder of recorded data that a script takes, by its name."""
 
 COLOURS, DOTS = 64, 110

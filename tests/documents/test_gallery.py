@@ -37,7 +37,7 @@ def test_every_scenario_family_and_data_set_has_a_script():
         kinds[path.parent.name].add(name)
     assert kinds["scenarios"] == set(SCENARIOS)
     assert kinds["filters"] == families()
-    assert kinds["datasets"] == set(datasets.READERS) | {"carmen", "mrclam_team"}
+    assert kinds["datasets"] == set(datasets.READERS) | {"carmen", "carmen_freiburg", "mrclam_team"}
 
 
 def test_the_page_shows_every_script_with_its_picture():

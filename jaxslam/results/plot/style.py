@@ -83,7 +83,17 @@ def describe(figure: Figure) -> str:
 
 
 class _ShownFigure(Figure):
-    """A figure that a notebook shows as it is, whether or not pyplot was imported."""
+    """A figure that a notebook shows as it is, whether or not pyplot was imported.
+
+    Matplotlib leaves room for the labels of a panel of equal scales before the panel has taken its
+    shape, so that labels may lie outside: such a figure is laid out twice.
+    """
+
+    def savefig(self, *args: Any, **options: Any) -> None:
+        """Write the figure, as Matplotlib does it."""
+        if any(axes.get_aspect() != "auto" for axes in self.axes):
+            self.draw_without_rendering()
+        super().savefig(*args, **options)
 
     def _repr_png_(self) -> bytes:
         """The figure as a PNG file, for the screen."""
