@@ -125,6 +125,7 @@ def own_sensor(**other):
     ("field", "wrong", "told"),
     [
         ("observe", lambda pose, at: pose, r"own.observe\(pose \(3,\), l \(2,\)\) to return shape \(2,\), got shape \(3,\)"),
+        ("observe", lambda pose, at: jnp.arange(2), r"own.observe.* to return real numbers, got int"),
         ("observe", lambda pose, at: (at, at), r"to return shape \(2,\), got a tuple"),
         ("residual", lambda z: z, r"expected own.residual to take \(z, z_hat\), got \(z\)"),
         ("noise_cov", lambda z: jnp.ones(2), r"own.noise_cov\(z \(2,\)\) to return shape \(2, 2\)"),
@@ -277,6 +278,10 @@ LOG = Log(np.zeros((3, 3)), Scan(np.zeros((3, 1, 2)), np.zeros((3, 1), int), np.
 SMOOTH = smoothing.smooth(WORLD.motion, WORLD.sensor, 2, np.zeros(3), np.eye(3))
 
 
+def blind(scenario):
+    return filters.dead_reckoning(scenario.motion, scenario.sensor)
+
+
 def run_from(pose, pose_cov=WORLD.pose_cov):
     return jaxslam.run(EKF, LOG, pose, pose_cov, KEY)
 
@@ -308,6 +313,11 @@ def run_from(pose, pose_cov=WORLD.pose_cov):
         (
             lambda: jaxslam.verify_jacobians(np.sin, 3),
             "expected jacobian to be a function, got int",
+        ),
+        (
+            lambda: jaxslam.monte_carlo(WORLD, {"mine": blind}, 2, KEY),
+            r"blind was called with the truth .* has no attribute 'motion'; of a function of the "
+            r"scenario give what it returns, blind\(scenario\)",
         ),
         (lambda: run_from(None), r"^run: expected a pose \(x, y, θ\) of shape \(3,\), got None"),
         (lambda: run_from("a"), r"^run: expected a pose .*, got 'a'"),

@@ -1,16 +1,25 @@
 """Helpers of all commands: look-up by name, options of several, summaries as text."""
 
 import argparse
+import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from jaxslam.results.campaign_files import RESULT
+from jaxslam.results.files import check_writable
 from jaxslam.results.meanings import count_label
 
 _T = TypeVar("_T")
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
+
+SUMMARY = "summary.json"
+"""The file in which `run` and `optimize` say what they did."""
+
+COUNT = "measurements "
+"""Begins the rows of a summary that count what became of measurements."""
 
 OUT = Path("out")
 """Default folder of results."""
@@ -51,6 +60,25 @@ def add_out(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def check_out(folder: Path, own: str) -> None:
+    """Raise before hours of work if the results of a command, as "run", cannot go to a folder.
+
+    OSError where no file can be written to it; ValueError where it holds the results of another
+    command, some of whose files have the same names.
+    """
+    check_writable(folder)
+    for name in (RESULT, SUMMARY):
+        try:
+            command = str(json.loads((folder / name).read_text(encoding="utf-8"))["command"])
+        except (OSError, ValueError, LookupError, TypeError):
+            continue
+        if (other := " ".join(command.split()[:2])) not in ("", f"jaxslam {own}"):
+            raise ValueError(
+                f"--out: {folder} holds the results of {other}: choose another folder for those of "
+                f"jaxslam {own}"
+            )
+
+
 def add_dtype(parser: argparse.ArgumentParser, of: str = "") -> None:
     """Add the option of the floating-point type; `of` completes the help, as " of the filters"."""
     parser.add_argument(
@@ -79,7 +107,7 @@ def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
         [
             row,
             *(
-                _shown(column.get(row, 0 if row.startswith("status: ") else "-"))
+                _shown(column.get(row, 0 if row.startswith(COUNT) else "-"))
                 for column in columns.values()
             ),
         ]

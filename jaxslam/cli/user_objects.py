@@ -18,7 +18,7 @@ from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.verify.errors import describe_error
-from jaxslam.verify.inputs.user_files import import_file, split_target
+from jaxslam.verify.inputs.user_files import import_file, names_in, split_target
 
 _OWN = "; or FILE.py:NAME, one of your own"
 
@@ -49,7 +49,8 @@ class UserObjects:
                 "expected a function of the number of steps"
             )
         if not isinstance(made, Scenario) and callable(made):
-            made = self._call(asked, made, *arguments)
+            told = "the number of steps" if arguments else "nothing"
+            made = self._call(asked, told, made, *arguments)
         if not isinstance(made, Scenario):
             raise ValueError(f"{asked}: expected a Scenario, or a function that returns one")
         check_noise(made)
@@ -95,16 +96,16 @@ class UserObjects:
             self._modules[path] = import_file(path)
         module = self._modules[path]
         if not name:
-            raise ValueError(f"{option}: expected FILE.py:NAME, got {asked}{_names(module)}")
+            raise ValueError(f"{option}: expected FILE.py:NAME, got {asked}{names_in(module)}")
         if not hasattr(module, name):
-            raise ValueError(f"{option}: there is no {name} in {path.name}{_names(module)}")
+            raise ValueError(f"{option}: there is no {name} in {path.name}{names_in(module)}")
         return name, getattr(module, name)
 
     def _own(self, asked: str, scenario: Scenario) -> tuple[str, Candidate]:
         """The name of a user's filter, and the filter for the scenario."""
         name, made = self._find("--filters", asked)
         if not isinstance(made, Filter) and callable(made):
-            made = self._call(asked, made, scenario)
+            made = self._call(asked, "the scenario", made, scenario)
         if not isinstance(made, Filter) and not callable(made):
             raise ValueError(
                 f"{asked}: expected a Filter, or a function of the scenario that returns one"
@@ -112,30 +113,21 @@ class UserObjects:
         check_fits(name, made, scenario)
         return name, made
 
-    def _call(self, asked: str, function: Callable[..., object], *arguments: object) -> object:
-        """What a user's function returns."""
+    def _call(
+        self, asked: str, told: str, function: Callable[..., object], *arguments: object
+    ) -> object:
+        """What a user's function returns; `told` says what it is called with."""
         given = "one argument" if arguments else "no argument"
         try:
             inspect.signature(function).bind(*arguments)
         except TypeError as error:
             raise ValueError(f"{asked} is called with {given}: {error}") from error
-        with self.located_errors():
+        try:
             return function(*arguments)
-
-
-def _names(module: ModuleType) -> str:
-    """The functions, filters and scenarios that a user's file defines, as the end of a message."""
-    found = [
-        name
-        for name, value in vars(module).items()
-        if not name.startswith("_")
-        and not isinstance(value, type)
-        and (
-            isinstance(value, Filter | Scenario)
-            or (callable(value) and getattr(value, "__module__", "") == module.__name__)
-        )
-    ]
-    return f"; it defines: {', '.join(found)}" if found else "; it defines none"
+        except Exception as error:
+            raise ValueError(
+                f"{asked}: called with {told}, it fails: {describe_error(error)}"
+            ) from error
 
 
 def _in_file(asked: str) -> bool:

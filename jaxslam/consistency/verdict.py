@@ -21,7 +21,7 @@ TESTS = {"nees_pose": "pose NEES", "nis_per_dof": "NIS / dof"}
 """The measures that are tested, and their names in messages."""
 
 TOLERANCE = 0.01
-"""An interval that ends so near the honest value, relative to it, counts as reaching it."""
+"""An interval that lies wholly so near the honest value, relative to it, rejects nothing."""
 
 POWER = 0.9
 """The probability with which an effect that is called noticeable is noticed."""
@@ -165,8 +165,8 @@ def _doubts(per_run: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> tup
     if free.size and free.mean() < 3:
         out.append(
             f"unobservable directions {free.mean():.3g} instead of 3: the filter gained "
-            "information on the pose of the map as a whole, which only a sensor of absolute pose "
-            "or position gives"
+            "information on the pose of the map as a whole, which only a sensor of absolute "
+            "position or heading gives; with one, the value of ideal is the honest one"
         )
     return tuple(out)
 

@@ -185,12 +185,24 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
         )
 
 
+def _of_truth(candidate: Callable[[Truth], Estimator | Filter], truth: Truth) -> Estimator | Filter:
+    """What a candidate makes of the truth; ValueError where it fails on it, as one of the world."""
+    try:
+        return candidate(truth)
+    except AttributeError as error:
+        name = getattr(candidate, "__name__", str(candidate))
+        raise ValueError(
+            f"monte_carlo: {name} was called with the truth (poses and landmarks) and fails: "
+            f"{error}; of a function of the scenario give what it returns, {name}(scenario)"
+        ) from error
+
+
 def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tuple[Estimator, Chart]:
     """The estimator that a candidate is, and the chart of its errors.
 
     Its probe is the information in the filter's observability monitor, where it has one.
     """
-    method = candidate if isinstance(candidate, Filter) else candidate(truth)
+    method = candidate if isinstance(candidate, Filter) else _of_truth(candidate, truth)
     if not isinstance(method, Filter):
         return method, euclidean()
 

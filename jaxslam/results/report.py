@@ -50,6 +50,9 @@ ROWS = (
 
 _COLUMNS = 5
 
+_WIDTH = 88
+"""Characters of a line of the notes; the narrowest table has some 80."""
+
 
 def campaign_table(campaign: Campaign) -> str:
     """The campaign as a text table: a column a filter, a row a measure, and notes below.
@@ -63,15 +66,14 @@ def campaign_table(campaign: Campaign) -> str:
     notes = [
         "honest: the average of a consistent filter; NEES is not divided by its dof.",
         f"± or [low, high]: {percentage(LEVEL)} interval over the runs.",
-        "verdict: by two tests, of pose NEES and of NIS / dof, with the one that rejects. Their",
+        "verdict: by two tests, of pose NEES and of NIS / dof, with the one that rejects. Their "
         f"intervals are wider than {percentage(LEVEL)}: together they reject "
         f"{percentage(1 - LEVEL)} of honest filters of a linear problem.",
         *_explained(campaign),
         f"divergent: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the ideal "
         "EKF.",
     ]
-    for term, said in notes_on(campaign):
-        notes += textwrap.wrap(f"{term}: {said}.", 100)
+    notes += [f"{term}: {said}." for term, said in notes_on(campaign)]
     notes += qualified(campaign)
     notes += not_finite(campaign)
     if campaign.dtype == "float32":
@@ -81,14 +83,14 @@ def campaign_table(campaign: Campaign) -> str:
         )
     if campaign.published:
         notes.append(f"published: {campaign.source}")
-    return "\n".join([title, "", text, "", *notes])
+    lines = (line for note in notes for line in textwrap.wrap(note, _WIDTH))
+    return "\n".join([title, "", text, "", *lines])
 
 
 def _explained(campaign: Campaign) -> list[str]:
     """The meanings of the verdicts that this campaign has."""
     found = {summary.verdict for summary in campaign.filters.values()}
-    told = [f"{word}: {meaning}." for word, meaning in VERDICTS.items() if word in found]
-    return [line for one in told for line in textwrap.wrap(one, 100)]
+    return [f"{word}: {meaning}." for word, meaning in VERDICTS.items() if word in found]
 
 
 def qualified(campaign: Campaign) -> list[str]:

@@ -163,6 +163,8 @@ def _check_size(
     if got != shape:
         what = f"a {type(found).__name__}" if got is None else f"shape {_told(got)}"
         raise ValueError(f"{name}: expected {call} to return shape {_told(shape)}, got {what}")
+    if not jnp.issubdtype(getattr(found, "dtype", np.dtype(object)), jnp.floating):
+        raise ValueError(f"{name}: expected {call} to return real numbers, got {found.dtype}")
 
 
 def _told(shape: _Shape) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.verify.derivatives.jacobians import Evaluated, Jacobians
-from jaxslam.verify.inputs.samples import NOMINAL, Samples
+from jaxslam.verify.inputs.samples import LARGE, NOMINAL, Samples
 from jaxslam.verify.record import Finding, WorstState, WrongEntry
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
@@ -129,6 +129,7 @@ def _finding(
     compared = _compare(evaluation, tolerance, float32_tolerance)
     wrong = compared.excess > 1
     often = wrong.sum(axis=0)
+    far = np.array([label == LARGE for label in samples.labels])
 
     def entry(s: int, i: int, j: int) -> WrongEntry:
         in_single = bool(compared.in_float32[s, i, j])
@@ -149,6 +150,7 @@ def _finding(
             state=_state(evaluated, s),
             values=values,
             dissent=_dissent(values, room, near),
+            far_alone=bool(far[wrong[:, i, j]].all()),
         )
 
     nominal = np.array([label in NOMINAL for label in samples.labels])

@@ -52,7 +52,9 @@ def dtype_checks(evaluated: Evaluated) -> Iterator[Check]:
 def motion_checks(motion: Motion, samples: Samples) -> Iterator[Check]:
     """Checks of a motion model: its noise, its heading, and `perturb`."""
     pose, u, w = samples.values
-    yield from _guarded("noise covariance", lambda: _covariances(motion.noise_cov, (pose, u)))
+    yield from _guarded(
+        "noise covariance", lambda: _covariances(motion.noise_cov, (pose, u), w.shape[-1])
+    )
 
     def heading_error() -> str:
         heading = np.asarray(quick_jit(jax.vmap(motion.step))(pose, u, w))[:, 2]
@@ -80,8 +82,19 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
     """Checks of a sensor: noise, residual, and that `invert` is the inverse of `observe`."""
     circle = periods(sensor.measurements)
     z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*seen.values), np.float64)
-    yield from _guarded("noise covariance", lambda: _covariances(sensor.noise_cov, (z,)))
+    yield from _guarded(
+        "noise covariance", lambda: _covariances(sensor.noise_cov, (z,), z.shape[-1])
+    )
     residual = quick_jit(jax.vmap(sensor.residual))
+
+    def residual_size() -> str:
+        got = jax.eval_shape(residual, z, z).shape[1:]
+        return "" if got == z.shape[1:] else f"it returns shape {got}, expected {z.shape[1:]}"
+
+    size = list(_guarded("the residual has the size of z", residual_size))
+    if not all(check.passed for check in size):
+        yield from size
+        return
     other = z[::-1] + np.random.default_rng(0).uniform(-1, 1, z.shape)
     yield from _guarded(
         "the residual is zero at equality",
@@ -191,12 +204,16 @@ def _residual_error(
     return ""
 
 
-def _covariances(noise_cov: Callable[..., jax.Array], arguments: tuple[Values, ...]) -> str:
-    """What is wrong with the noise covariances at some arguments, or ""."""
+def _covariances(
+    noise_cov: Callable[..., jax.Array], arguments: tuple[Values, ...], size: int
+) -> str:
+    """What is wrong with the noise covariances of `size` numbers at some arguments, or ""."""
     covs = np.asarray(quick_jit(jax.vmap(noise_cov))(*arguments))
+    if covs.shape[1:] != (size, size):
+        return f"noise_cov returns shape {covs.shape[1:]}, expected ({size}, {size})"
     for cov in covs:
         try:
-            check_covariance("noise_cov", cov, covs.shape[-1])
+            check_covariance("noise_cov", cov, size)
         except ValueError as error:
             return str(error)
     return ""

@@ -33,6 +33,8 @@ class WrongEntry:
     """the entry at that state, by each method"""
     dissent: tuple[str, ...]
     """the methods that disagree with the others at that state"""
+    far_alone: bool = False
+    """it is wrong at large coordinates alone, as what subtracts them loses digits"""
 
     def lines(self, samples: int) -> Iterator[str]:
         """The entry as lines of text."""
@@ -44,6 +46,8 @@ class WrongEntry:
         yield "  " + ", ".join(f"{how} {value:.12g}" for how, value in self.values.items())
         at = ", ".join(f"{k} = ({', '.join(f'{v:.6g}' for v in x)})" for k, x in self.state.items())
         yield f"  {self.precision}, {self.label}: {at}"
+        if self.far_alone:
+            yield "  right at all other states: what subtracts large coordinates loses digits"
 
 
 class WorstState(TypedDict, total=False):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxslam import cli, store
+from jaxslam.cli.common import check_out
 from jaxslam.monte_carlo import Interrupted
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
@@ -154,7 +155,9 @@ def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, r
     assert cli.main(asked) == 130
     mine = out / "blocks" / "mine"
     mine.write_text("of this campaign")
-    for other in ([], ["--runs", "4", "--again"], ["--seed", "1", "--again"]):
+    others = f"{out} holds another campaign: --seed is 0 there, 1 here: choose another folder"
+    refused([*asked, "--seed", "1", "--again"], others)
+    for other in ([], ["--runs", "4", "--again"]):
         holds = f"{out} holds a finished campaign of 3 runs: --resume {out} prints it"
         refused([*asked, *other], holds, f"--resume {out}", "--out")
     assert mine.exists() and len(begun) == 1
@@ -173,6 +176,19 @@ def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, r
 def test_a_campaign_begun_from_python_is_not_the_commands_to_resume(tmp_path, refused):
     store.create(tmp_path / "blocks")
     refused(["consistency", "--resume", tmp_path], "a campaign that was begun from Python")
+
+
+def test_the_folder_of_another_command_is_left_alone(tmp_path, refused):
+    """Both write map.png."""
+    (tmp_path / "summary.json").write_text('{"command": "jaxslam run --dataset table mine"}')
+    refused([*QUICK, "--out", tmp_path], f"{tmp_path} holds the results of jaxslam run: choose")
+    check_out(tmp_path, "run")
+    (tmp_path / "summary.json").unlink()
+    (tmp_path / "consistency.json").write_text('{"command": ""}')  # saved from Python
+    check_out(tmp_path, "run")
+    (tmp_path / "consistency.json").write_text('{"command": "jaxslam consistency"}')
+    with pytest.raises(ValueError, match=r"--out: .* the results of jaxslam consistency"):
+        check_out(tmp_path, "run")
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, refused):

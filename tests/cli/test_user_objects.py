@@ -86,7 +86,10 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
             ["--filters", "mine.py:number"],
             "mine.py:number: expected a Filter, or a function of the",
         ),
-        (["--filters", "mine.py:wrong"], "mine.py:25: AttributeError: 'Scenario' object has no"),
+        (
+            ["--filters", "mine.py:wrong"],
+            "mine.py:wrong: called with the scenario, it fails: mine.py:25: AttributeError: 'Scen",
+        ),
         (["--filters", "mine.py:of_two"], "mine.py:of_two is called with one argument: missing a"),
         (["--filters", "mine.py:untraceable"], "mine.py:27: NameError: name 'undefined'"),
         (["--filters", "mine.py:blind,mine.py:blind"], "expected each name once, got blind twice"),

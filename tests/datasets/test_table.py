@@ -2,6 +2,7 @@
 
 import gzip
 import re
+from pathlib import Path
 
 import chex
 import numpy as np
@@ -238,6 +239,11 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
     (tmp_path / name).unlink()
     with pytest.raises(ValueError, match=f"{name}: cannot be read: No such file"):
         datasets.table(tmp_path)
+    for wrong, found in ((tmp_path / name, "is not there"), (Path(__file__), "is a file")):
+        with pytest.raises(
+            ValueError, match=rf"{wrong.name} {found}: expected a folder with odome"
+        ):
+            datasets.table(wrong)
 
 
 @pytest.mark.parametrize(

@@ -40,10 +40,12 @@ def test_the_notes_explain_the_gate_the_likelihood_and_the_counts(campaign):
     ekf = campaign.filters["ekf"]
     counts = ekf.counts | {"rejected": 7, "fused": ekf.counts["fused"] - 7}
     gated = dataclasses.replace(ekf, honest_nis=0.9454, counts=counts)
-    text = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf, "b": gated}))
+    told = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf, "b": gated}))
+    assert max(map(len, told.splitlines())) <= 88
+    text = " ".join(told.split())
     assert "gate: a gate drops the largest innovations" in text and "0.945 (b) to 1" in text
     assert "log-likelihood: comparable only between filters that fused the same" in text
-    assert "initialized, measurements that started a landmark" in " ".join(text.split())
+    assert "initialized, measurements that started a landmark" in text
     assert "born" not in text
     alone = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf}))
     assert "gate:" not in alone and "log-likelihood:" not in alone

@@ -52,6 +52,12 @@ BESIDE_JACOBIANS = {
         {"noise_cov": lambda z: jnp.diag(jnp.stack([z[1], z[1] ** 2]))},
         [NOISE],
     ),
+    "covariance of another size": (LASER, {"noise_cov": lambda z: jnp.eye(3)}, [NOISE]),
+    "residual of another size": (
+        LASER,
+        {"residual": lambda z, z_hat: z[0] - z_hat[0]},
+        ["the residual has the size of z"],
+    ),
     "asymmetric covariance": (
         INCREMENT,
         {"noise_cov": lambda pose, u: jnp.array([[1.0, 0.5], [0, 1]])},
@@ -107,6 +113,22 @@ def test_a_fault_of_a_function_is_found(fault):
     model, changes, names = OF_FUNCTIONS[fault]
     found = failed(verify_jacobians(dataclasses.replace(model, **changes)))
     assert set(names) <= set(found) if fault == "dtype" else found == names
+
+
+def test_a_claim_that_loses_digits_far_from_the_origin_is_told_apart():
+    def observe(pose, landmark):
+        return (landmark - pose[:2])[:1] * (1 + pose[2])
+
+    def claim(pose, landmark):
+        turned = 1 + pose[2]
+        one = 3 * (pose[0] + 1 / 3 - pose[0])  # but for rounding
+        by_pose = jnp.stack([-one * turned, 0 * one, landmark[0] - pose[0]])
+        return by_pose[None], jnp.stack([turned, 0 * one])[None]
+
+    entries = {"pose": ("x [m]", "y [m]", "theta [rad]"), "landmark": ("x [m]", "y [m]")}
+    report = verify_jacobians(observe, claim, arguments=entries, outputs=("ahead [m]",))
+    (wrong,) = report.findings[0].wrong_entries
+    assert wrong.far_alone and "right at all other states" in str(report)
 
 
 def test_a_squared_range_is_tried_only_where_it_can_be_measured():

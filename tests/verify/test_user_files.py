@@ -156,7 +156,7 @@ def test_one_of_them_by_name(verify):
         ("import sys\nsys.exit(3)\n", "", "mine.py:2: does not import: SystemExit"),
         ("x = 1\n", "", "mine.py: defines nothing to verify"),
         ("", "", "mine.py: defines nothing to verify"),
-        (GOOD, ":g", "mine.py: there is no g to verify; it defines: "),
+        (GOOD, ":g", "mine.py: there is no g to verify; it defines: f, f_jacobian"),
         (GOOD.replace("f_jacobian", "f_slope"), ":f", "there is no f_jacobian"),
         (UNTOLD, "", "the length of its argument 'u' is not known"),
         (GOOD + "\nf_jacobians = f_jacobian\n", "", "expected f_jacobian or f_jacobians, got both"),

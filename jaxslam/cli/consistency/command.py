@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import jax
 
-from jaxslam.cli.common import INTERRUPTED, OUT
+from jaxslam.cli.common import INTERRUPTED, OUT, check_out
 from jaxslam.cli.consistency.film import write_films
 from jaxslam.cli.consistency.folder import (
     BLOCKS,
@@ -27,7 +27,6 @@ from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
 from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.protocols import Candidate
 from jaxslam.results import campaign_files, run_table, store
-from jaxslam.results.files import check_writable
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Estimate, Truth
 from jaxslam.validation.numbers import check_count
@@ -53,7 +52,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     check_count("--runs", asked.runs)
     if options.block is not None:
         check_count("--block", options.block)
-    check_writable(out)
+    check_out(out, "consistency")
     # What is missing of a campaign of parts is computed as the parts would.
     most = settings.get("devices")
     assert isinstance(most, int | None)

@@ -178,6 +178,11 @@ def _remove_old_blocks(
                 f"--resume {out} continues it, --overwrite replaces it; or choose another folder"
             )
         same = options.again and (there.settings, whole) == (settings, runs)
+        if done and (found := _differences(_flat(there.settings), _flat(settings))):
+            raise ValueError(
+                f"--out: {out} holds another campaign: {found}: choose another folder, or add "
+                "--overwrite to replace it"
+            )
         if done and not same:
             raise ValueError(
                 f"--out: {out} holds a finished campaign of {done} runs: --resume {out} prints it, "

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 
 from jaxslam.cli import films
-from jaxslam.cli.common import summary_table
+from jaxslam.cli.common import SUMMARY, check_out, summary_table
 from jaxslam.cli.laser.job import Job
 from jaxslam.cli.laser.localization import run_localization
 from jaxslam.cli.laser.mapping import run_mapping
@@ -13,7 +13,7 @@ from jaxslam.cli.laser.options import complete, read_log
 from jaxslam.cli.laser.slam import run_slam
 from jaxslam.datasets import LaserLog
 from jaxslam.results.campaign_files import check_figure_formats
-from jaxslam.results.files import check_writable, json_text, versions, write_files
+from jaxslam.results.files import json_text, versions, write_files
 
 
 def run_laser(options: argparse.Namespace, command: str) -> int:
@@ -22,7 +22,7 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
     options = complete(options)
     formats = check_figure_formats("--figures", options.figures.split(","))
     log, left_out = read_log(options)
-    check_writable(options.out)
+    check_out(options.out, "run")
     job = _job_of(options)(log, options)
     figures = job.figures(formats)
     summary: dict[str, object] = {
@@ -39,7 +39,7 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
     }
     print(summary_table({"": summary}))
     files = job.files | figures
-    files["summary.json"] = json_text(summary | {"versions": versions()})
+    files[SUMMARY] = json_text(summary | {"versions": versions()})
     written = write_files(options.out, files, replaces=films.NAMES)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0

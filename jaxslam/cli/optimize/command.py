@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxslam import graphs
 from jaxslam.cli import films
-from jaxslam.cli.common import pick
+from jaxslam.cli.common import SUMMARY, check_out, pick
 from jaxslam.cli.optimize.figures import WORST, as_text, figure_writer, film_writers
 from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.datasets.formats import g2o
@@ -21,7 +21,7 @@ from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
 from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
-from jaxslam.results.files import check_writable, csv_text, json_text, versions, write_files
+from jaxslam.results.files import csv_text, json_text, versions, write_files
 from jaxslam.types import JaxOrNumPy
 
 ERRORS = {
@@ -49,7 +49,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
             "films show the iterations of one"
         )
     loaded = g2o.load(options.path)
-    check_writable(options.out)
+    check_out(options.out, "optimize")
     known = {**of_files(), "relative_pose": relative()}
     factors = {key: known[key] for key in loaded.graph.tables}
     held = graphs.with_gauge(loaded.graph, factors)
@@ -104,7 +104,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     print(_table(summary))
     worst = _worst(found, squared, factors)
     files: dict[str, str | Callable[[Path], object]] = {
-        "summary.json": json_text(
+        SUMMARY: json_text(
             summary | {"worst residuals": worst, "versions": versions()},
         ),
         "poses.csv": _csv(("x", "y", "theta"), found.pose_id, found.poses, found.fixed_pose),

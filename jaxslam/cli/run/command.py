@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam.cli.common import pick, summary_table
+from jaxslam.cli.common import COUNT, SUMMARY, check_out, pick, summary_table
 from jaxslam.cli.films import NAMES as FILMS
 from jaxslam.cli.laser.command import run_laser
 from jaxslam.cli.laser.options import READERS as LASER_LOGS
@@ -26,7 +26,8 @@ from jaxslam.monte_carlo.progress import Progress
 from jaxslam.protocols import Filter
 from jaxslam.results import report
 from jaxslam.results.campaign_files import check_figure_formats
-from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
+from jaxslam.results.files import Json, json_text, versions, write_files
+from jaxslam.results.meanings import count_label
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Status
 
@@ -42,7 +43,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     data = _reader(options.dataset)(options.path, options.robot)
     data = with_options(data, options)
     filters = chosen_filters(data, options.filters or "ekf")
-    check_writable(options.out)
+    check_out(options.out, "run")
     at = film_steps(data) if options.animate else None
     runs = {name: _run(name, filter, data, options, at) for name, filter in filters.items()}
     last = next(iter(runs.values())).result.last
@@ -71,7 +72,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         files[f"trajectory{suffix}.csv"] = report.trajectory_csv(data.time, run.result.path)
         files[f"trajectory{suffix}.tum"] = report.trajectory_tum(data.time, run.result.path)
         files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
-    files["summary.json"] = json_text(summary | {"versions": versions()})
+    files[SUMMARY] = json_text(summary | {"versions": versions()})
     files |= _figure(data, runs, formats)
     if at is not None:
         files |= films(data, {name: run[:2] for name, run in runs.items()}, at)
@@ -215,7 +216,7 @@ def _flat(summary: Json) -> Json:
     status, final = summary["status"], summary["final pose"]
     assert isinstance(status, dict)
     assert isinstance(final, list)
-    counts = {f"status: {name}": count for name, count in status.items() if count}
+    counts = {f"{COUNT}{count_label(name)}": count for name, count in status.items() if count}
     names = ("x [m]", "y [m]", "theta [rad]")
     pose = {f"final {n}": value for n, value in zip(names, final, strict=True)}
     rows = {key: summary[key] for key in summary if key not in ("status", "final pose")}

@@ -14,6 +14,8 @@ from jaxslam.logs.tables import POSE, TAG, TIME
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.types import Log
 
+ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
+
 
 def table(folder: str | Path) -> Dataset:
     """The data set in the CSV files of a folder.
@@ -54,9 +56,12 @@ def table(folder: str | Path) -> Dataset:
             [section] key: …` on settings; and on a measured tag that `landmarks.csv` lacks.
     """
     folder = Path(folder)
+    if not folder.is_dir():
+        found = "is a file" if folder.exists() else "is not there"
+        raise ValueError(f"{folder} {found}: expected a folder with {ODOMETRY} and {MEASUREMENTS}")
     settings = TableSettings(folder / "dataset.toml")
-    odometry_file = CsvTable(folder / "odometry.csv")
-    seen_file = CsvTable(folder / "measurements.csv")
+    odometry_file = CsvTable(folder / ODOMETRY)
+    seen_file = CsvTable(folder / MEASUREMENTS)
     clock = odometry_file.table((TIME,), "the time").columns[TIME]
     interval = float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0
     by_motion = settings.motion(odometry_file.header, abs(interval) or 1.0)

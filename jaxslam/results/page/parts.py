@@ -61,13 +61,15 @@ def badge(verdict: str, summary: Summary | None = None) -> str:
     sign, meaning = VERDICTS.get(verdict, ("·", ""))
     doubts = summary.doubts if summary is not None else ()
     kind = verdict if verdict in VERDICTS else "undecided"
-    if doubts and verdict == "consistent":
-        sign, kind = "✓*", "undecided"
+    if doubts:
+        sign += "*"
+        kind = "undecided" if verdict == "consistent" else kind
     rejected = ", ".join(TESTS[test] for test in (summary.by if summary is not None else ()))
-    title = "; ".join([meaning, *doubts, *[f"by {rejected}"] * bool(rejected)])
+    title = "; ".join([meaning, *doubts])
+    tested = f" ({rejected})" * bool(rejected)
     return (
         f'<span class="badge {kind}" title="{escape(title)}"><span aria-hidden="true">{sign}'
-        f"</span> {escape(verdict)}</span>"
+        f"</span> {escape(verdict)}{escape(tested)}</span>"
     )
 
 

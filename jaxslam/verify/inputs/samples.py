@@ -22,6 +22,8 @@ NEAR = 2.0**-10
 """Distance from the robot to a close landmark [m]; a power of two is exact in float32, too."""
 NOMINAL = ("random", "given")
 """Labels of the states that are not chosen to be difficult."""
+LARGE = "large coordinates"
+"""Label of the states `FAR` from the origin."""
 _SEAM = 1e-9
 
 # One coordinate at a time takes these values while the others are random. Between 0.499 and 0.501
@@ -62,7 +64,7 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
     places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
     if places:
         shift = np.zeros((2, 2)) + [[FAR, -FAR], [-FAR, FAR]]
-        groups.append(("large coordinates", tuple(_shifted(base, places, shift))))
+        groups.append((LARGE, tuple(_shifted(base, places, shift))))
     for k in places[1:]:
         for distance in (NEAR, 2.0**-4):
             close = base[k][:2].copy()
@@ -119,7 +121,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     there = np.array([[FAR, -FAR], [-FAR, FAR]])
     away = pose[:2].copy()
     away[:, :2] += there
-    groups.append(("large coordinates", (away, at(away, away[:, :2] + offset[:2]))))
+    groups.append((LARGE, (away, at(away, away[:, :2] + offset[:2]))))
     observed = _concatenated(groups)
 
     back: list[Group] = [("random", (pose, z, s))]
@@ -133,7 +135,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     back.append(("zero measurement", (pose[few], zero, s[few])))
     if len(mean):
         back.append(("free coordinates zero", (pose[few], z[few], 0 * s[few])))
-    back.append(("large coordinates", (away, z[:2], s[:2])))
+    back.append((LARGE, (away, z[:2], s[:2])))
     return observed, _concatenated(back)
 
 

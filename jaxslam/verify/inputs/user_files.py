@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
 from jaxslam.grids.beam_models import BeamModel
-from jaxslam.protocols import Motion, Sensor
+from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.simulation.worlds import Scenario
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
 from jaxslam.verify.examination import Model
@@ -93,13 +94,7 @@ def load(target: str) -> list[Target]:
                 f"one, or a function with its Jacobian, and there is no {name}{CLAIMS[0]}"
             )
         if not found:
-            names = ", ".join(
-                key
-                for key, value in vars(module).items()
-                if not key.startswith("_") and not isinstance(value, ModuleType)
-            )
-            there = f"; it defines: {names}" if names else ""
-            raise UnusableFile(f"{path.name}: there is no {name} to verify{there}")
+            raise UnusableFile(f"{path.name}: there is no {name} to verify{names_in(module)}")
     if not found:
         raise UnusableFile(
             f"{path.name}: defines nothing to verify: no Motion, no Sensor, no Factor, no function "
@@ -184,6 +179,21 @@ def import_file(path: Path) -> ModuleType:
         sys.path.pop(0)
         del sys.modules[name]
     return module
+
+
+def names_in(module: ModuleType) -> str:
+    """The functions, models, filters and scenarios that a user's file defines, to end a message."""
+    found = [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and not isinstance(value, type)
+        and (
+            isinstance(value, Motion | Sensor | Factor | BeamModel | Filter | Scenario)
+            or (callable(value) and getattr(value, "__module__", "") == module.__name__)
+        )
+    ]
+    return f"; it defines: {', '.join(found)}" if found else "; it defines none"
 
 
 def _target(module: ModuleType, name: str) -> Target | None:
