@@ -1,12 +1,14 @@
 """The command line `jaxslam`; only here are arguments parsed and JAX configured."""
 
 import argparse
+import difflib
 import os
 import platform
 import shlex
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import Any, NoReturn
 
 import jax
 from threadpoolctl import threadpool_limits
@@ -61,9 +63,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that tells an error in one line, and takes no part of an option's name for it."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **{"allow_abbrev": False, **options})
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As that of argparse; what is not known is an error, here where the command is known."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            alike = difflib.get_close_matches(unknown[0], self._option_string_actions, 1)
+            meant = "".join(f" (did you mean {option}?)" for option in alike)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
+        return found, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with what is wrong and where the options are described."""
+        told = f"{self.prog} --help describes the options"
+        self.exit(USAGE_ERROR, f"{self.prog}: {message}; {told}\n")
+
+
 def _parser() -> argparse.ArgumentParser:
     """The parser of the command line; `options.command` is the function to call."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="jaxslam",
         description="2-D landmark SLAM in JAX.",
         epilog="jaxslam COMMAND --help describes the options of a command.",

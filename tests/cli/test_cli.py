@@ -167,8 +167,22 @@ def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, refused, mo
     assert message == f"jaxslam: results cannot be written to {out}: Permission denied\n"
 
 
-def test_no_command_exits_with_2(refused):
-    refused([], "usage")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "jaxslam: the following arguments are required: COMMAND; jaxslam --help describes"),
+        (["consistancy"], "jaxslam: argument COMMAND: invalid choice: 'consistancy' (choose from "),
+        (
+            ["consistency", "--rnus", "3"],
+            "jaxslam consistency: unrecognized arguments: --rnus 3 (did you mean --runs?); "
+            "jaxslam consistency --help describes the options",
+        ),
+        (["consistency", "--run", "3"], "unrecognized arguments: --run 3 (did you mean --runs?)"),
+        (["verify", "--qq"], "jaxslam verify: unrecognized arguments: --qq; jaxslam verify --help"),
+    ],
+)
+def test_what_is_no_command_or_option_is_told_in_a_line(refused, arguments, message):
+    assert refused(arguments, message).count("\n") == 1
 
 
 AS_A_PROGRAM = """
