@@ -12,6 +12,7 @@ there most beams may end where nothing is mapped, so the model has a large share
 JAXSLAM_DATA, by default ../shared/data; logs that are not there are left out.
 """
 
+import sys
 import time
 
 import jax
@@ -84,7 +85,7 @@ def tempering(runs, particles=500, sigma=0.03, seeds=10):
                 f"{found.lost:.0%}",
             ]
         )
-        print(rows[-1], flush=True)
+        print(f"exponent {rows[-1][0]} done", file=sys.stderr, flush=True)
     header = ["exponent", "coverage of the 95 % set", "NEES (3)", "energy score [mm]"]
     header += ["position RMSE [mm]", "median heading error [°]", "spread over seeds", "ESS", "lost"]
     print(f"\noffice, {runs} runs, {particles} particles, σ = {sigma} m, {BEAMS} beams\n")
