@@ -13,6 +13,11 @@ COUNT = 4
 MATCHER = matching.correlative(
     cell=CELL, window=WINDOW, turn_window=TURN_WINDOW, turn=TURN, sigma=SPREAD, block=4
 )
+STRICT = matching.correlative(
+    cell=CELL, window=WINDOW, turn_window=TURN_WINDOW, turn=TURN, sigma=SPREAD,
+    apart=0.15, ambiguous=0.8,
+)  # fmt: skip
+RASTERS = jax.jit(jax.vmap(lambda points: matching.raster(points, CELL, 5.0)))
 REFERENCES, SCANS, TRUTH, STARTS = pairs(COUNT, off=(0.08, 0.08, 0.04), beams=600)
 PRIOR = matching.Prior(STARTS, np.zeros((COUNT, 3, 3)))
 PRIOR.information[2:] = 60 * (np.diag([4.0, 4.0, 1.0]) + 0.5)  # of all points, so that it matters
@@ -21,7 +26,7 @@ PRIOR.information[2:] = 60 * (np.diag([4.0, 4.0, 1.0]) + 0.5)  # of all points, 
 @pytest.fixture(scope="module")
 def found():
     """Grids, what is prepared of them, matches on the lattice, and refined by the field."""
-    grids = jax.jit(jax.vmap(lambda p: matching.raster(p, CELL, 5.0)))(REFERENCES)
+    grids = RASTERS(REFERENCES)
     prepared = jax.jit(lambda g: jax.lax.map(MATCHER.prepare, g))(grids)
     coarse = jax.jit(jax.vmap(MATCHER.match))(prepared, SCANS, STARTS, PRIOR)
     fine = matching.match(matching.field(least_score=0.3), grids, SCANS, coarse.pose)
@@ -87,14 +92,8 @@ def test_what_a_scan_does_not_determine_is_named(name):
         hall.valid[:] = np.abs(hall.position).max(axis=1) < 4.5
     references = stacked([halls[0], round_room(at, 600)])
     scans = stacked([halls[1], round_room(at, 60)])
-    grids = jax.jit(jax.vmap(lambda p: matching.raster(p, CELL, 5.0)))(references)
-    matcher = {
-        "field": matching.field(least_score=0.3),
-        "correlative": matching.correlative(
-            cell=CELL, window=WINDOW, turn_window=TURN_WINDOW, turn=TURN, sigma=SPREAD,
-            apart=0.15, ambiguous=0.8,
-        ),
-    }[name]  # fmt: skip
+    grids = RASTERS(references)
+    matcher = {"field": matching.field(least_score=0.3), "correlative": STRICT}[name]
     start = np.array([[0.1, 0.05, 0.02], [0.0, 0.05, 0.02]])
     found = jax.device_get(matching.match(matcher, grids, scans, start))
     assert list(found.status) == [MatchStatus.DEGENERATE] * 2
@@ -112,3 +111,27 @@ def test_what_a_scan_does_not_determine_is_named(name):
         assert np.all(np.abs(moved) < 0.02)
     off_the_map = matching.match(matcher, grids, scans, start + [[1e3, 1e3, 0.0]])
     assert np.all(off_the_map.status >= MatchStatus.UNLIKE)
+
+
+def test_a_map_with_two_places_that_fit_alike_is_ambiguous():
+    """A room that stands once in a map, and twice in another, as before a loop is closed."""
+    rng = np.random.default_rng(5)
+    at, places = np.array([0.05, 0.05, 0.0]), np.array([[0.0, 0.0], [0.2, 0.2]])
+    rooms = [points_at(at, rng, beams=300) for _ in places]
+    references = [
+        matching.Points(
+            np.concatenate([room.position + place for room, place in zip(rooms, of, strict=True)]),
+            np.concatenate([room.ray for room in rooms]),
+            np.ones(600, bool),
+        )
+        for of in (places[[0, 0]], places)
+    ]
+    scans = stacked([points_at(at, rng)] * 2)
+    start = np.array([[0.1, 0.1, 0.0]] * 2)
+    grids = RASTERS(stacked(references))
+    found = jax.device_get(matching.match(STRICT, grids, scans, start))
+    assert list(found.status) == [MatchStatus.CONVERGED, MatchStatus.AMBIGUOUS]
+    # Of both places it names one.
+    off = np.abs(found.pose[:, None, :2] - places).max(axis=2)
+    assert off[0, 0] < CELL and off[1].min() < CELL
+    assert np.all(np.abs(found.pose[:, 2]) <= TURN)
