@@ -10,6 +10,8 @@ import pytest
 
 from jaxslam import cli, grids
 from jaxslam.cli.laser.mapping import TOGETHER
+from jaxslam.results import plot
+from jaxslam.results.film import encoding
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import is_free, rasterize, walls
@@ -136,6 +138,26 @@ def test_a_path_too_short_to_be_scored_is_told(log_file, tmp_path, undrawn):
     assert run(log_file.path, out, "--scans", ":2", "--max-range", "10") == 0
     score = json.loads((out / "summary.json").read_text())["score"]
     assert score == "none: the path is shorter than 1 m"
+
+
+def test_laser_slam_writes_a_film_of_the_map_growing(
+    log_file, tmp_path, capsys, undrawn, monkeypatch
+):
+    monkeypatch.setattr(encoding, "ffmpeg", lambda: None)
+    scenes, render = [], plot.render
+    monkeypatch.setattr(plot, "render", lambda scene, **more: scenes.append(scene) or render(scene))
+    out = tmp_path / "out"
+    assert run(log_file.path, out, "--scans", ":2", "--max-range", "10", "--animate") == 0
+    assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in capsys.readouterr().out
+    assert (out / "film.gif").read_bytes().startswith(b"GIF")
+    assert "jaxslam-film" in (out / "film.html").read_text()
+    (scene,) = scenes
+    assert scene.title == "room"
+    assert [scene.said(k) for k in range(3)] == [
+        "laser odometry, scan 1 of 2",
+        "laser odometry, scan 2 of 2",
+        "after closing by 0 loops",
+    ]
 
 
 def test_options_of_laser_logs_are_of_no_other_data_set(tmp_path, refused):
