@@ -6,11 +6,9 @@ import jax
 import numpy as np
 
 from benchmarks.gate import Metric
-from jaxslam import filters, laser_slam, run, scenarios, se2, sensors
+from jaxslam import filters, laser_slam, run, scenarios, sensors
 from jaxslam.laser_slam import ScanLog, Settings, covariances
 from jaxslam.math import numpy_poses as poses
-from jaxslam.noise import noise_model
-from jaxslam.protocols import Motion
 from jaxslam.simulation.laser import scan_world
 from jaxslam.types import Log, Scan
 
@@ -41,32 +39,19 @@ def logs(runs: int, beams: int = 90):
         yield true, ScanLog(time, beams_of, poses.compose(start, raw[kept]), 8.0)
 
 
-def _increment(pose, u, w):
-    return se2.compose(se2.compose(pose, u[:3]), u[3:].reshape(3, 3) @ w)
-
-
-INCREMENT = Motion(
-    name="laser_odometry",
-    controls=("x [m]", "y [m]", "θ [rad]", *(f"root {i}{j}" for i in range(3) for j in range(3))),
-    noises=("w_0", "w_1", "w_2"),
-    step=_increment,
-    noise_cov=noise_model("laser_odometry", np.eye(3), 3),
-)
-"""A relative pose with a root L of the covariance of its end, pose ∘ z ∘ L w."""
-EKF = filters.dead_reckoning(INCREMENT, sensors.range_bearing(np.eye(2)))
+EKF = filters.dead_reckoning(laser_slam.match_motion(), sensors.range_bearing(np.eye(2)))
 
 
 def ekf_of(odometry, true):
     """NEES of the keyframes by an EKF that is driven by the increments and their covariances."""
     keys = odometry.keyframe
-    roots = np.linalg.cholesky(odometry.cov[keys[1:]]).reshape(-1, 9)
-    control = np.zeros((len(true) - 1, 12))  # at rest after the last, so that runs are alike
-    control[: len(keys) - 1] = np.concatenate([odometry.z[keys[1:]], roots], axis=1)
+    control = np.zeros((len(true), 9))  # at rest after the last, so that runs are alike
+    control[: len(keys)] = laser_slam.match_controls(odometry)
     none = (len(control), 1)
     scan = Scan(np.zeros((*none, 2)), np.full(none, -1), np.zeros(none, bool))
     trace = run(EKF, Log(control, scan), true[0], np.zeros((3, 3)), jax.random.key(0))
     pose, cov = (
-        np.asarray(part)[: len(keys) - 1] for part in (trace.estimate.pose, trace.estimate.pose_cov)
+        np.asarray(part)[1 : len(keys)] for part in (trace.estimate.pose, trace.estimate.pose_cov)
     )
     error = true[keys[1:]] - pose
     error[:, 2] = poses.wrapped(error[:, 2])
@@ -95,7 +80,7 @@ def path_of(odometry, true):
 
 def measure(runs: int = 10) -> list[Metric]:
     found: dict[str, list[np.ndarray]] = {}
-    chi2, position = [], {}
+    chi2, closures, position = [], [], {}
     for true, log in logs(runs):
         for name, reference in (("scan to scan", 1), ("scan to submap", SETTINGS.reference)):
             settings = dataclasses.replace(SETTINGS, reference=reference)
@@ -116,6 +101,7 @@ def measure(runs: int = 10) -> list[Metric]:
         off = np.hypot(*(solved.poses - true)[:, :2].T)
         position.setdefault("graph with loops", []).append(np.sqrt((off**2).mean()))
         chi2.append(solved.chi2 / max(solved.dof, 1))
+        closures.append(laser_slam.closure_score(solved, true, gap=SETTINGS.loop_gap))
     print("office, NEES (3 is honest)    mean of runs      median of all    RMSE of position [m]")
     metrics = []
     for name, runs_of in found.items():
@@ -126,5 +112,13 @@ def measure(runs: int = 10) -> list[Metric]:
         rmse = "" if name.endswith("match") else f"{np.mean(position[where]):.3f}"
         print(f"{name:28}  {means.mean():7.2f} ± {half:5.2f}  {middle:12.2f}    {rmse:>12}")
         metrics.append(Metric(f"office, NEES, {name}", means.mean(), note="3 is honest"))
-    metrics.append(Metric("office, chi2 / degrees of freedom", np.mean(chi2), note="1 is honest"))
+    kept, correct, revisits = (
+        sum(getattr(each, what) for each in closures) for what in ("kept", "correct", "revisits")
+    )
+    seen = sum(each.recall * each.revisits for each in closures if each.revisits)
+    metrics += [
+        Metric("office, chi2 / degrees of freedom", np.mean(chi2), note="1 is honest"),
+        Metric("office, precision of loops", correct / kept, note=f"of {kept}"),
+        Metric("office, recall of revisits", seen / revisits, note=f"of {revisits}"),
+    ]
     return metrics

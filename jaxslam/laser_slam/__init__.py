@@ -1,5 +1,6 @@
 """Laser SLAM: from the raw odometry and scans of a log to a path, a pose graph and a map."""
 
+from jaxslam.laser_slam.increments import match_controls, match_motion
 from jaxslam.laser_slam.odometry import Odometry, laser_odometry
 from jaxslam.laser_slam.raw_odometry import Steps, steps_of
 from jaxslam.laser_slam.records import LoopOutcome, Loops, ScanLog, Solved
@@ -20,6 +21,8 @@ __all__ = [
     "Steps",
     "closure_score",
     "laser_odometry",
+    "match_controls",
+    "match_motion",
     "scans_of",
     "solve",
     "steps_of",

@@ -3,16 +3,18 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 from ring_of_rooms import FAR, SETTINGS, driven, errors
 
-from jaxslam import laser_slam
+from jaxslam import filters, laser_slam, run, sensors
 from jaxslam.cli import main
-from jaxslam.laser_slam import LoopOutcome
+from jaxslam.laser_slam import LoopOutcome, covariances, scans_of, steps_of
 from jaxslam.laser_slam.mapping import growing_maps
 from jaxslam.results import laser_slam as results
 from jaxslam.results.files import write_files
+from jaxslam.types import Log, Scan
 
 ONCE = dataclasses.replace(SETTINGS, rounds=1)  # and so fewer programs
 
@@ -42,6 +44,29 @@ def test_the_covariances_are_of_the_right_size(drive):
     nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.cov[1:]), error)
     assert 0.02 < nees.mean() < 9
     assert 0.02 < found.chi2 / found.dof < 2
+
+
+def test_a_filter_is_driven_by_the_matches(drive):
+    """It follows laser odometry, and its covariance is that of the chain of matches."""
+    _, log, found = drive
+    of = scans_of(log, SETTINGS), steps_of(log.raw, SETTINGS)
+    odometry = laser_slam.laser_odometry(*of, SETTINGS, log.raw[0])
+    keys = odometry.keyframe
+    control = laser_slam.match_controls(odometry)
+    np.testing.assert_allclose(laser_slam.match_controls(found), control, rtol=1e-6, atol=1e-12)
+    nothing = len(control), 1
+    scan = Scan(np.zeros((*nothing, 2)), np.full(nothing, -1), np.zeros(nothing, bool))
+    ekf = filters.dead_reckoning(laser_slam.match_motion(), sensors.range_bearing(np.eye(2)))
+    start = log.raw[0], np.zeros((3, 3))
+    path = run(ekf, Log(control, scan), *start, jax.random.key(0)).estimate
+    np.testing.assert_allclose(path.pose, odometry.poses[keys], atol=1e-9)
+    cov = np.zeros((3, 3))
+    for row, key in enumerate(keys[1:], 1):
+        cov = covariances.composed_cov(cov, odometry.z[key], odometry.cov[key])
+        expected = covariances.of_coordinates(cov, odometry.poses[key])
+        np.testing.assert_allclose(path.pose_cov[row], expected, rtol=1e-9, atol=1e-15)
+    with pytest.raises(ValueError, match="match_controls: expected Odometry or Solved, got int"):
+        laser_slam.match_controls(1)
 
 
 def test_maps_of_a_film_grow_to_the_whole(drive):
