@@ -72,7 +72,8 @@ def carmen(path: str | Path, *, max_range: float = 50.0) -> LaserLog:
     n beams of FLASER lie 180°/(n - 1) apart if n is odd (361), else 180°/n (180, 360), from -90°
     on. Scans take the odometry of the last ODOM line before them, by the order of lines, since
     stamps may be rounded; where a file has no ODOM lines, the robot's pose of ROBOTLASER1. A range
-    that is NaN or not above 0 is not valid. Other lines are counted in `dropped`.
+    that is NaN or not above 0 is not valid. Such beams and all other lines are counted in
+    `dropped`.
 
     Args:
         path: NAME, or NAME.gz beside it.

@@ -31,7 +31,7 @@ def line(ranges, pose, raw, t):
 
 @pytest.fixture(scope="module")
 def log_file(tmp_path_factory):
-    """A robot in a room with a niche: 70 scans of the beams ahead, of which scan 3 has no valid one."""
+    """A robot in a room with a niche: 70 scans of the beams ahead; scan 3 has no valid one, 4 a NaN."""
     niche = [[0, 0], [6, 0], [6, 4], [7.5, 4], [7.5, 6], [0, 6]]
     room = walls(niche, [[2.6, 2.6], [3.4, 2.6], [3.4, 2.9]])
     world = dataclasses.replace(square(beams=2 * BEAMS), walls=room)
@@ -39,12 +39,13 @@ def log_file(tmp_path_factory):
     ahead = slice(BEAMS // 2, BEAMS // 2 + BEAMS)  # from -90° on, 7.5° apart
     assert np.isclose(log.beams.angle[0, ahead][0], -np.pi / 2)
     ranges = np.where(log.beams.valid, log.beams.range, 0.0)[:STEPS, ahead]
-    ranges[3] = 0.0
+    ranges[3], ranges[4, 5] = 0.0, np.nan
     path = tmp_path_factory.mktemp("log") / "room.log"
     raw = log.pose + [10.0, -3.0, 0.0]
     text = "".join(line(ranges[k], log.pose[k], raw[k], 100 + 0.25 * k) for k in range(STEPS))
     path.write_text("# comment\n" + text)
-    return SimpleNamespace(path=path, pose=log.pose[:STEPS], walls=world.walls)
+    lost = int((~(ranges > 0)).sum())
+    return SimpleNamespace(path=path, pose=log.pose[:STEPS], walls=world.walls, lost=lost)
 
 
 def run(path, out, *options):
@@ -70,7 +71,10 @@ def test_a_map_at_known_poses_is_one_that_ros_reads(log_file, tmp_path, capsys):
     np.testing.assert_allclose(rows[:, 1:4], log_file.pose, atol=1e-7)
     assert len((out / "trajectory.tum").read_text().splitlines()) == STEPS
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["dropped by the reader"]["comments"] == 1
+    assert summary["dropped by the reader"] == {
+        "comments": 1,
+        "beams without a range": log_file.lost,
+    }
     beams = summary["beams"]
     assert sum(beams.values()) == STEPS * BEAMS
     assert beams["without a range, or padding"] >= BEAMS
