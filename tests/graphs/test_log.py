@@ -13,6 +13,7 @@ from reference import graph as plain
 
 from jaxslam import graphs, motion, sensors, simulate
 from jaxslam.graphs import Ending
+from jaxslam.smoothing import batch_map
 from jaxslam.types import Log, Scan
 
 KEY = jax.random.key(0)
@@ -87,7 +88,6 @@ def optimum(log, points, step, sigma_w, start, root=None):
 
 @pytest.mark.parametrize("known", [False, True])
 def test_it_has_the_optimum_of_scipy(known):
-    """That of `batch_map`, which `test_smoothing` holds against SciPy as well."""
     _, log, graph, _, solution = solved(known)
     assert solution.status == Ending.CONVERGED
     assert list(graph.tables) == ["motion", *["prior"] * (not known), "sensor"]
@@ -100,6 +100,52 @@ def test_it_has_the_optimum_of_scipy(known):
     np.testing.assert_allclose(plain.wrap(off[:, 2]), 0, atol=1e-6)
     if known:
         np.testing.assert_array_equal(solution.graph.poses[0], START)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_it_has_the_optimum_of_batch_map(known):
+    here, log, graph, _, solution = solved(known)
+    cov = np.zeros((3, 3)) if known else START_COV
+    trace = batch_map(here.motion, here.sensor, 6, START, cov, tolerance=1e-9)(log, KEY)
+    batch = trace.final
+    assert batch.ending == Ending.CONVERGED
+    np.testing.assert_allclose(solution.chi2, 2 * batch.cost, rtol=1e-8)
+    off = np.asarray(solution.graph.poses) - [batch.start, *trace.estimate.pose]
+    off[:, 2] = plain.wrap(off[:, 2])
+    np.testing.assert_allclose(off, 0, atol=1e-8)
+    assert set(batch.joint.tag.tolist()) == set(graph.point_id.tolist())
+    order = np.searchsorted(graph.point_id, batch.joint.tag)
+    np.testing.assert_allclose(batch.joint.landmarks, solution.graph.points[order], atol=1e-8)
+
+
+def test_derivatives_of_the_optimum_by_the_noises_are_differences():
+    """By Q and R, in factories that the differentiated function calls."""
+    _, log, graph, factors, _ = solved()
+    plan, random = graphs.plan(graph, factors), np.random.default_rng(2)
+    look = random.normal(size=graph.points.shape), random.normal(size=graph.poses.shape)
+    covs, tangents = [], []
+    for sigma in (SIGMA_W, SIGMA_Z):
+        turn = random.normal(size=(len(sigma), len(sigma)))
+        covs.append(np.diag(sigma) ** 2)
+        tangents.append((turn + turn.T) * np.outer(sigma, sigma) / 4)
+
+    def seen(q, r):
+        models = motion.odometry(q), sensors.range_bearing(r)
+        made, by_table = graphs.of_log(log, *models, START, START_COV)
+        found = graphs.optimize(made, by_table, plan=plan, tolerance=1e-16)
+        poses, points = found.graph.poses, found.graph.points
+        return (points * look[0]).sum() + (poses * look[1]).sum() + found.chi2
+
+    both = jax.jit(jax.value_and_grad(seen, (0, 1)))
+    gradient = both(*covs)[1]
+    for k, tangent in enumerate(tangents):
+        ends = []
+        for step in (1e-4, -1e-4):
+            moved = list(covs)
+            moved[k] = covs[k] + step * tangent
+            ends.append(both(*moved)[0])
+        slope = (np.asarray(gradient[k]) * tangent).sum()
+        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-4, rtol=1e-6)
 
 
 def test_a_motion_of_two_noises_is_a_soft_constraint():

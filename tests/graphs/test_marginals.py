@@ -1,7 +1,10 @@
 """Marginal covariances, against the dense inverse."""
 
 import numpy as np
+import small_graphs
 from pose_rings import SIZE, dense, ring
+from reference import graph as plain
+from small_graphs import POINTS, POSES
 
 from jaxslam import graphs
 
@@ -20,3 +23,32 @@ def test_marginals_are_the_blocks_of_the_dense_inverse():
         both = [[cov[a, :, a], cov[a, :, b]], [cov[b, :, a], cov[b, :, b]]]
         np.testing.assert_allclose(joint, np.array(both), atol=1e-9 * scale)
     assert found.singular == -1
+
+
+def test_those_of_points_and_of_poses_with_points_are_too():
+    """With every kind of measurement; J by differences of the sixth order."""
+    graph = small_graphs.drawn(noise=0.1)
+    # A point seen from the pose, one that is not, turned round, two points, a fixed pose.
+    pairs = [[1, POSES + 1], [1, POSES], [POSES + 2, 4], [POSES, POSES + 2], [0, POSES]]
+    residuals, at, _ = plain.whitened(graph)
+    step = 1e-2 * np.eye(len(at))
+    sides = zip((1, 2, 3), (3 / 4, -3 / 20, 1 / 60), strict=True)
+    jacobian = sum(
+        w / 1e-2 * np.array([residuals(at + k * h) - residuals(at - k * h) for h in step]).T
+        for k, w in sides
+    )
+    inverse, free = np.linalg.inv(jacobian.T @ jacobian), 3 * (POSES - 1)
+    # Rows and columns of the fixed pose, and of the third number that a point does not have.
+    place = np.r_[3 : 3 * POSES, (3 * np.arange(POSES, POSES + POINTS)[:, None] + [0, 1]).ravel()]
+    count = POSES + POINTS
+    cov = np.zeros((3 * count, 3 * count))
+    cov[np.ix_(place, place)] = inverse
+    cov = cov.reshape(count, 3, count, 3)
+    found = graphs.marginals(graph, pairs=pairs)
+    atol = 1e-9 * np.abs(inverse).max()
+    for k in range(POINTS):
+        np.testing.assert_allclose(found.points[k], cov[POSES + k, :2, POSES + k, :2], atol=atol)
+    assert np.abs(inverse[:free, free:]).max() > 1e3 * atol
+    for joint, (a, b) in zip(found.pairs, pairs, strict=True):
+        both = [[cov[a, :, a], cov[a, :, b]], [cov[b, :, a], cov[b, :, b]]]
+        np.testing.assert_allclose(joint, np.array(both), atol=atol)
