@@ -86,13 +86,14 @@ def certify(optima: dict[str, Solution]) -> None:
     """Print what is proved of the optima, as `jaxslam optimize` does."""
     print(
         "\nthe lowest optimum of each file, e = pose: is the chordal optimum next to it global?\n"
-        "file                          χ²       chordal χ²  lower by at most  "
+        "file                poses            χ²       chordal χ²  lower by at most  "
         "apart [m]  apart [rad]  certified"
     )
     for name, found in optima.items():
         proof = graphs.certificate(found.graph)
         print(
-            f"{name:18} {float(found.chi2):13.9g}    {float(proof.chi2):13.9g}  "
+            f"{name:18} {len(found.graph.poses):6} {float(found.chi2):13.9g}    "
+            f"{float(proof.chi2):13.9g}  "
             f"{float(proof.gap):16.2g}  {float(proof.position):9.2g}  "
             f"{float(proof.heading):11.2g}  {'yes' if proof.certified else 'no'}",
             flush=True,
