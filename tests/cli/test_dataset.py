@@ -150,7 +150,7 @@ def test_several_filters_side_by_side(tmp_path, capsys):
     printed = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["dead_reckoning", "ekf"] in printed
     assert ["measurements", "unmatched", "6", "0"] in printed
-    assert ["status:", "fused", "0", "4"] in printed
+    assert ["measurements", "fused", "0", "4"] in printed
     assert {path.name for path in out.iterdir()} == {
         "trajectory-dead_reckoning.csv",
         "trajectory-ekf.csv",
