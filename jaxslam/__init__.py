@@ -36,6 +36,7 @@ from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.run import run
 from jaxslam.simulation import scenarios, spurious
+from jaxslam.simulation.recorded import recorded_world
 from jaxslam.simulation.team_world import team_world
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.verify import linearity, verify_jacobians
@@ -64,6 +65,7 @@ __all__ = [
     "monte_carlo",
     "motion",
     "programs",
+    "recorded_world",
     "resampling",
     "run",
     "scenarios",

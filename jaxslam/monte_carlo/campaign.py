@@ -96,10 +96,10 @@ def monte_carlo(
     Returns:
         Campaign.
     Raises:
-        ValueError: on runs, block or workers below 1, no PRNG key, no devices, no filters, a filter
-            that does not fit the scenario, or a noise that is no covariance, before anything is
-            traced; where `keep` holds another campaign, by every difference, or runs beyond those
-            asked for; on a part without a block.
+        ValueError: on runs, block or workers below 1, more runs than are recorded, no PRNG key, no
+            devices, no filters, a filter that does not fit the scenario, or a noise that is no
+            covariance, before anything is traced; where `keep` holds another campaign, by every
+            difference, or runs beyond those asked for; on a part without a block.
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """
@@ -163,6 +163,11 @@ def _check(
         if jax.process_count() > 1:
             raise ValueError("monte_carlo: part: expected none where jax.distributed divides")
     check_record("monte_carlo", "scenario", scenario, Scenario)
+    if scenario.recorded is not None and runs > (most := len(scenario.recorded[0].pose)):
+        raise ValueError(
+            f"monte_carlo: runs: expected at most {most}, the recorded runs of {scenario.name}, "
+            f"got {runs}"
+        )
     check_key("monte_carlo", key)
     if not isinstance(filters, Mapping) or not filters:
         raise ValueError("monte_carlo: expected filters as {name: filter}, at least one")

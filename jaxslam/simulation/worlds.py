@@ -67,6 +67,9 @@ class Scenario:
     draw: Callable[["Scenario", Array], tuple[Truth, Log]] | None = None
     """(scenario, key) -> truth, log: a world of another kind (`team_world`); None for `simulate`'s
     own."""
+    recorded: tuple[Truth, Log] | None = None
+    """with leading axes over R runs: the records that runs 0 to R - 1 of a campaign are, instead of
+    draws (`recorded_world`)."""
     published: dict[str, dict[str, float]] = field(default_factory=dict)
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
     source: str = ""
@@ -104,6 +107,8 @@ class Scenario:
 def simulate(scenario: Scenario, key: Array) -> tuple[Truth, Log]:
     """One random history of a world: the truth, and the log of controls and noisy scans.
 
+    Of a world of recorded runs it is one of them.
+
     Traceable, so `jax.vmap(partial(simulate, scenario))(keys)` draws a batch. Called outside a
     trace it is compiled once for a structure, as `run` is. The filters of a campaign all get the
     same draws.
@@ -113,8 +118,28 @@ def simulate(scenario: Scenario, key: Array) -> tuple[Truth, Log]:
     return programs.call(_simulate, (scenario,), key)
 
 
+def run_keys(key: Array, number: int | Array) -> Array:
+    """The two keys of a campaign's run of that number: of its world, and of its filter."""
+    return jax.random.split(jax.random.fold_in(key, number))
+
+
+def world_of_run(scenario: Scenario, key: Array, number: int | Array) -> tuple[Truth, Log]:
+    """The truth and the log of run `number` of a campaign with that key; traceable."""
+    if scenario.recorded is not None:
+        return _record(scenario.recorded, number)
+    return simulate(scenario, run_keys(key, number)[0])
+
+
+def _record(recorded: tuple[Truth, Log], number: int | Array) -> tuple[Truth, Log]:
+    found: tuple[Truth, Log] = jax.tree.map(lambda leaf: jnp.asarray(leaf)[number], recorded)
+    return found
+
+
 def _simulate(scenario: Scenario, key: Array) -> tuple[Truth, Log]:
     """Draw the start, the path, the scans, and what is spurious in them."""
+    if scenario.recorded is not None:
+        runs = len(scenario.recorded[0].pose)
+        return _record(scenario.recorded, jax.random.randint(key, (), 0, runs))
     if scenario.draw is not None:
         return scenario.draw(scenario, key)
     dtype = jnp.result_type(float)

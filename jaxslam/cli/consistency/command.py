@@ -27,7 +27,7 @@ from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
 from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.protocols import Candidate
 from jaxslam.results import campaign_files, run_table, store
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, run_keys, world_of_run
 from jaxslam.types import Estimate, Truth
 from jaxslam.validation.numbers import check_count
 
@@ -213,8 +213,8 @@ def _run_zero(
     scenario: Scenario, candidate: Candidate, key: jax.Array, dtype: str
 ) -> tuple[Truth, Estimate]:
     """Run 0 of a filter, computed again where another process or an earlier command computed it."""
-    key_world, key_filter = jax.random.split(jax.random.fold_in(key, 0))
-    truth, log = rounded(simulate(scenario, key_world), dtype)
+    truth, log = rounded(world_of_run(scenario, key, 0), dtype)
     method, _ = estimator_of(candidate, truth, scenario)
-    found: tuple[Truth, Estimate] = jax.device_get((truth, method(log, key_filter).estimate))
+    estimate = method(log, run_keys(key, 0)[1]).estimate
+    found: tuple[Truth, Estimate] = jax.device_get((truth, estimate))
     return found

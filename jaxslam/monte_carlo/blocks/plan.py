@@ -43,7 +43,8 @@ class CampaignPlan:
         """Whether the divergence limit comes from the conditional bound of run 0: always where that
         is computed, and in worlds whose Jacobians at the truth are not to be had."""
         world = self.scenario
-        return self.bound or world.draw is not None or world.spurious is not None
+        own = (world.draw, world.recorded, world.spurious)
+        return self.bound or any(part is not None for part in own)
 
 
 class Promises:

@@ -42,7 +42,7 @@ from jaxslam.monte_carlo.blocks.limit import divergence_limit
 from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises, run_numbers
 from jaxslam.monte_carlo.candidates import estimator_of, rounded
 from jaxslam.protocols import Candidate, Sensor
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation.worlds import Scenario, run_keys, world_of_run
 from jaxslam.types import Estimate, Info, Log, Trace, Truth
 
 World = tuple[Truth, Log]
@@ -189,7 +189,7 @@ def draw_worlds(
     scenario: Scenario, dtype: DTypeLike | None, key: Array, which: Int[Array, "B"]
 ) -> World:
     """The truths and logs (B, …) of these runs, floating-point numbers in the dtype."""
-    world: World = jax.vmap(lambda i: simulate(scenario, _keys(key, i)[0]))(which)
+    world: World = jax.vmap(partial(world_of_run, scenario, key))(which)
     return rounded(world, dtype)
 
 
@@ -200,7 +200,7 @@ def drive_filter(
 
     def one(i: Array, truth: Truth, log: Log) -> FilterResults:
         method, chart = estimator_of(candidate, truth, scenario)
-        trace = method(log, _keys(key, i)[1])
+        trace = method(log, run_keys(key, i)[1])
         own = own_error_of(chart, scenario.sensor, trace, truth)
         monitor = monitor_of(trace.final)
         information = None if monitor is None else trace.probe
@@ -228,13 +228,8 @@ def bound_variances(
     """The conditional Cramér-Rao bound of each run: position [m²] and heading [rad²] by step."""
 
     def one(i: Array, truth: Truth, log: Log) -> Array:
-        return jnp.asarray(conditional_bound(scenario, truth, log, _keys(key, i)[1]).pose_cov)
+        return jnp.asarray(conditional_bound(scenario, truth, log, run_keys(key, i)[1]).pose_cov)
 
     cov = jax.vmap(one)(which, *world)
     position = jnp.trace(cov[:, :, :2, :2], axis1=2, axis2=3)
     return {"position": position, "heading": cov[:, :, 2, 2]}
-
-
-def _keys(key: Array, i: Array) -> Array:
-    """The keys of run i: of its world, and of its filter."""
-    return jax.random.split(jax.random.fold_in(key, i))

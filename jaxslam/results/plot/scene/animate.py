@@ -17,7 +17,7 @@ from jaxslam.results.plot.scene.render import render
 from jaxslam.results.plot.scene.run_scene import run_scene
 from jaxslam.results.plot.style import PAGE
 from jaxslam.run import run
-from jaxslam.simulation.worlds import Scenario, simulate, with_positions
+from jaxslam.simulation.worlds import Scenario, run_keys, with_positions, world_of_run
 from jaxslam.types import Log, Trace, Truth
 from jaxslam.validation import check_record
 
@@ -97,8 +97,8 @@ def animate_world(
         options: of `animate`.
     """
     check_record("animate_world", "scenario", scenario, Scenario)
-    of_world, of_filter = jax.random.split(jax.random.fold_in(key, number))
-    truth, log = rounded(simulate(scenario, of_world), dtype)
+    truth, log = rounded(world_of_run(scenario, key, number), dtype)
+    of_filter = run_keys(key, number)[1]
     method = candidate if isinstance(candidate, Filter) else candidate(truth)
     if isinstance(method, Filter):
         trace = run(method, log, scenario.pose, scenario.pose_cov, of_filter, probe=probe)

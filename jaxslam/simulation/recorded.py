@@ -1,0 +1,123 @@
+"""Worlds of runs that were recorded, or simulated by other means, for campaigns."""
+
+from collections.abc import Sequence
+from typing import TypedDict, Unpack
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.sensors.suite import Suite
+from jaxslam.simulation.worlds import Scenario
+from jaxslam.types import Log, Truth
+from jaxslam.validation import check_log, check_record
+from jaxslam.validation.numbers import check_array
+
+
+class RecordedOptions(TypedDict, total=False):
+    """Fields of `Scenario` that a world of recorded runs may have, too."""
+
+    filter_options: EkfOptions
+    published: dict[str, dict[str, float]]
+    source: str
+
+
+def recorded_world(
+    motion: Motion,
+    sensor: Sensor,
+    logs: Sequence[Log],
+    poses: Sequence[ArrayLike],
+    landmarks: ArrayLike,
+    *,
+    name: str = "recorded",
+    pose: ArrayLike = (0.0, 0.0, 0.0),
+    pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    starts: ArrayLike | None = None,
+    origin: ArrayLike | None = None,
+    **options: Unpack[RecordedOptions],
+) -> Scenario:
+    """A `Scenario` of R runs with known truth, in which run i of a campaign is record i.
+
+    So logs of another simulator, of robots under motion capture, or of a front end that is no pure
+    function (laser odometry) are judged as draws are. `simulate` takes one of the records by its
+    key. A campaign of more than R runs is refused.
+
+    Args:
+        motion, sensor: the models that filters and the bound assume of the logs.
+        logs: (R,) each with T rows and M measurement slots; in a row without measurements none is
+            valid.
+        poses: (R, T, 3) true pose at each row [m, m, rad].
+        landmarks: (N, L) true landmarks, of all runs, or (R, N, L); the tag of one is its row.
+        pose, pose_cov: (3,) and (3, 3) what a filter is told of the pose before the first control,
+            of every run: move records that begin elsewhere there.
+        starts: (R, 3) true pose before the first control; default `pose`.
+        origin: (R, T, M) tag of the landmark that each measurement is truly of, -1 of none, where
+            associations are to be scored.
+        options: other fields of `Scenario`, see `RecordedOptions`.
+    Raises:
+        ValueError: on no runs, a log that `run` would refuse (which), runs of different shapes, a
+            tag without a landmark, a truth that is not finite, and as `Scenario` does.
+    """
+    check_record("recorded_world", "motion", motion, Motion)
+    check_record("recorded_world", "sensor", sensor, Sensor)
+    if isinstance(logs, Log) or not isinstance(logs, Sequence) or not logs:
+        raise ValueError(
+            f"recorded_world: expected logs as a list of Log, one a run, got {type(logs).__name__}"
+            + " of none" * (logs == [])
+        )
+    table = np.asarray(landmarks, np.float64)
+    if table.ndim == 2:
+        table = np.broadcast_to(table, (len(logs), *table.shape))
+    for i, log in enumerate(logs):
+        check_record("recorded_world", f"logs[{i}]", log, Log)
+        check_log(
+            f"recorded_world: run {i}",
+            log,
+            control_size=len(motion.controls),
+            measurement_size=len(sensor.measurements),
+            parts=sensor.places if isinstance(sensor, Suite) else (),
+        )
+        if np.shape(log.scan.tag) != np.shape(logs[0].scan.tag):
+            raise ValueError(
+                "recorded_world: expected logs of the same numbers of rows and measurement slots, "
+                f"got {np.shape(logs[0].scan.tag)} in run 0 and {np.shape(log.scan.tag)} in run {i}"
+            )
+    log = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *logs)
+    runs, steps, places = log.scan.tag.shape
+    first = np.broadcast_to(np.asarray(pose, np.float64), (runs, 3)) if starts is None else starts
+    truth = Truth(
+        np.asarray(poses, np.float64),
+        table,
+        np.zeros((runs, steps), np.int32),
+        np.asarray(first, np.float64),
+        None if origin is None else np.asarray(origin),
+    )
+    check_array("recorded_world: poses", truth.pose, (runs, steps, 3))
+    check_array("recorded_world: landmarks", table, (runs, "N", len(sensor.landmark)))
+    check_array("recorded_world: starts", truth.start, (runs, 3))
+    if truth.origin is not None:
+        check_array("recorded_world: origin", truth.origin, (runs, steps, places), np.integer)
+    for what in ("pose", "landmarks", "start"):
+        if not np.isfinite(getattr(truth, what)).all():
+            run = np.argwhere(~np.isfinite(getattr(truth, what)))[0][0]
+            raise ValueError(f"recorded_world: true {what} of run {run}: expected finite numbers")
+    tags = np.where(log.scan.valid, log.scan.tag, -1)
+    if tags.max(initial=-1) >= table.shape[1]:
+        run, row, _ = np.argwhere(tags >= table.shape[1])[0]
+        raise ValueError(
+            f"recorded_world: expected tags below {table.shape[1]}, the number of landmarks, got "
+            f"{tags.max()} (run {run}, row {row})"
+        )
+    return Scenario(
+        name=name,
+        motion=motion,
+        sensor=sensor,
+        landmarks=table[0],
+        controls=log.control[0],
+        pose=pose,
+        pose_cov=pose_cov,
+        recorded=(truth, log),
+        **options,
+    )

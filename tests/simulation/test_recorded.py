@@ -1,0 +1,109 @@
+"""Worlds of recorded runs: a campaign of them is that of the draws they were made of."""
+
+from functools import partial
+
+import chex
+import jax
+import numpy as np
+import pytest
+
+from jaxslam import Scenario, catalog, monte_carlo, motion, recorded_world, sensors, simulate, store
+from jaxslam.types import Log, Scan
+
+KEY = jax.random.key(3)
+DRAWN = Scenario(
+    name="drawn",
+    motion=motion.unicycle(np.diag([0.05, 0.05]) ** 2),
+    sensor=sensors.range_bearing(np.diag([0.1, 0.05]) ** 2),
+    landmarks=((2.0, 1.0), (-1.0, 3.0)),
+    controls=np.tile([0.5, 0.2, 0.1], (6, 1)),
+    pose=(1.0, 0.0, 0.3),
+    pose_cov=np.diag([0.1, 0.1, 0.05]) ** 2,
+)
+
+
+def drawn(runs, key=KEY):
+    """Truths and logs of runs 0 … of a campaign with the key, in NumPy."""
+    keys = [jax.random.split(jax.random.fold_in(key, i))[0] for i in range(runs)]
+    return zip(*(jax.tree.map(np.asarray, simulate(DRAWN, one)) for one in keys), strict=True)
+
+
+def recorded(runs=5, **changed):
+    truths, logs = drawn(runs)
+    given = {
+        "logs": list(logs),
+        "poses": np.stack([truth.pose for truth in truths]),
+        "landmarks": DRAWN.landmarks,
+        "starts": np.stack([truth.start for truth in truths]),
+        "pose": DRAWN.pose,
+        "pose_cov": DRAWN.pose_cov,
+    }
+    return recorded_world(DRAWN.motion, DRAWN.sensor, **(given | changed))
+
+
+def test_a_campaign_of_records_is_that_of_the_draws(tmp_path):
+    """Also with another key, in two parts, and where the last block is not full."""
+    filters = {"ekf": catalog.FILTERS["ekf"](DRAWN)}
+    campaign = partial(monte_carlo, filters=filters, block=4, progress=False)
+    expected = campaign(DRAWN, runs=5, key=KEY).filters["ekf"]
+    world = recorded()
+    for key, keep in ((KEY, None), (jax.random.key(8), store.create(tmp_path / "kept"))):
+        found = campaign(world, runs=5, key=key, keep=keep).filters["ekf"]
+        chex.assert_trees_all_close(found.per_run, expected.per_run, rtol=1e-9)
+    again = campaign(recorded(), runs=5, key=key, keep=store.resume(tmp_path / "kept"))
+    chex.assert_trees_all_equal(again.filters["ekf"].per_run, found.per_run)
+    other = recorded(landmarks=np.add(DRAWN.landmarks, 1e-9))
+    with pytest.raises(ValueError, match="world"):
+        campaign(other, runs=5, key=key, keep=store.resume(tmp_path / "kept"))
+
+
+def test_simulate_takes_one_of_the_records():
+    world = recorded()
+    poses = np.asarray(world.recorded[0].pose)
+    for seed in range(3):
+        truth, log = simulate(world, jax.random.key(seed))
+        (i,) = np.flatnonzero((poses == np.asarray(truth.pose)).all(axis=(1, 2)))
+        chex.assert_trees_all_equal(log.control, world.recorded[1].control[i])
+
+
+def ragged():
+    logs = recorded().recorded[1]
+    rows = [jax.tree.map(lambda leaf, i=i: leaf[i], logs) for i in range(5)]
+    return [*rows[:4], jax.tree.map(lambda leaf: leaf[:-1], rows[4])]
+
+
+def unlike(**fields):
+    """Logs of which the second has other fields."""
+    _, logs = drawn(5)
+    logs = list(logs)
+    scan = logs[1].scan._replace(**fields)
+    return [logs[0], Log(logs[1].control, scan), *logs[2:]]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"logs": []}, "logs as a list of Log, one a run, got list of none"),
+        ({"logs": Log(np.zeros((2, 3)), Scan(*[np.zeros((2, 1))] * 3))}, "logs as a list"),
+        ({"logs": [None]}, r"expected logs\[0\] to be a Log, got NoneType"),
+        ({"logs": ragged()}, r"got \(6, 2\) in run 0 and \(5, 2\) in run 4"),
+        ({"logs": unlike(z=np.full((6, 2, 2), np.nan))}, "run 1: .* is not finite"),
+        ({"logs": unlike(tag=np.tile([0, 2], (6, 1)))}, r"below 2, .* got 2 \(run 1, row 0\)"),
+        ({"poses": np.zeros((5, 4, 3))}, r"poses: expected shape \(5, 6, 3\)"),
+        ({"poses": np.full((5, 6, 3), np.inf)}, "true pose of run 0: expected finite"),
+        ({"landmarks": np.zeros((4, 2, 2))}, r"landmarks: expected shape \(5, N, 2\)"),
+        ({"landmarks": np.zeros((0, 2))}, "tags below 0, the number of landmarks"),
+        ({"starts": np.zeros(3)}, r"starts: expected shape \(5, 3\), got \(3,\)"),
+        ({"pose": (0.0, 0.0)}, r"pose: expected shape \(3,\)"),
+        ({"origin": np.zeros((5, 6, 2))}, "origin: expected integer"),
+    ],
+)
+def test_what_is_no_record_is_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        recorded(**changed)
+
+
+def test_a_campaign_of_more_runs_than_there_are_is_refused():
+    filters = {"ekf": catalog.FILTERS["ekf"](DRAWN)}
+    with pytest.raises(ValueError, match="at most 5, the recorded runs of recorded, got 6"):
+        monte_carlo(recorded(), filters, 6, KEY)
