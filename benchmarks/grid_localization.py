@@ -1,19 +1,24 @@
 """Localization in grids: `python -m benchmarks.grid_localization [--runs 100] [--part logs]`.
 
-Default sizes are meant for a quarter of an hour on two idle cores.
+Default sizes are meant for half an hour on two idle cores.
 
 `office`: the likelihood-field filter on the same draws for each exponent of the likelihood, in a
 map made from another drive: does the 95 % set of its particles cover the truth in 95 % of the
-steps? Then from anywhere. `logs`: the Intel lab and Freiburg's building 101, raw odometry and scans
-against the corrected poses, in a map made from other scans of the same log: of its first half, and
-of every second scan; and from anywhere, in both maps. The second half leaves the map of the first:
-there most beams may end where nothing is mapped, so the model has a large share of random ranges
-(`HALF`), and particles are not drawn anew, which would put them into the mapped part. The folder is
-JAXSLAM_DATA, by default ../shared/data; logs that are not there are left out.
+steps? Then from anywhere. `ray_cast`: the same of the ray-cast model, on the same draws; its
+parameters are learnt by `grids.fit` from the true poses of a third drive. `logs`: the Intel lab and
+Freiburg's building 101, raw odometry and scans against the corrected poses, in a map made from
+other scans of the same log: of its first half, and of every second scan; and from anywhere, in both
+maps. The second half leaves the map of the first: there most beams may end where nothing is mapped,
+so the model has a large share of random ranges (`HALF`), and particles are not drawn anew, which
+would put them into the mapped part. The folder is JAXSLAM_DATA, by default ../shared/data; logs
+that are not there are left out.
 """
 
+import dataclasses
+import os
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +33,7 @@ from jaxslam.simulation import laser, walls
 from jaxslam.simulation.scenarios import office
 
 EXPONENTS = (1.0, 0.5, 0.2, 0.1, 0.05)
+RAY_EXPONENTS = (1.0, 0.2, 0.1, 0.05)
 BEAMS, CELL = 60, 0.05
 START = np.diag([0.1, 0.1, 0.05]) ** 2
 SKIP = 5  # scored steps, of 4 each, until the start is forgotten
@@ -55,12 +61,45 @@ def office_map():
     return single(grids.occupancy(counts))
 
 
-def tempering(runs, particles=500, sigma=0.03, seeds=10):
-    """The table over exponents, from a known start; σ is that of the laser and of half a cell."""
-    world, grid = office(beams=BEAMS), office_map()
+def learnt(grid, world):
+    """The mixture of `grids.fit` for the ranges of a third drive, given those that the map predicts
+    at its true poses."""
+    log, far = laser.scan_world(world, jax.random.key(1001)), world.laser.max_range
+    expected = grids.cast(grids.ray_map(grid), log.pose, world.laser.angles, far)
+    seen = np.asarray(log.beams.valid)
+    return grids.fit(np.asarray(log.beams.range)[seen], np.asarray(expected)[seen], far)
+
+
+def in_single(model):
+    """The model in float32, in half the time; the draws of the world stay in float64."""
+
+    def each(prepared, pose, beams):
+        return model.each(*single_log((prepared, pose, beams))).astype(pose.dtype)
+
+    return dataclasses.replace(model, each=each)
+
+
+def tempering_field(runs, sigma=0.03):
+    """Of the likelihood field; σ is that of the laser and of half a cell."""
+    world = office(beams=BEAMS)
     model = grids.likelihood_field(sigma, max_range=world.laser.max_range)
-    rows, covered = [], []
-    for exponent in EXPONENTS:
+    return tempering("office", world, office_map(), model, f"σ = {sigma} m", EXPONENTS, runs)
+
+
+def tempering_rays(runs):
+    """Of the ray-cast model as it is learnt."""
+    world, grid = office(beams=BEAMS), office_map()
+    mixture = learnt(grid, office())
+    model = in_single(grids.ray_cast(mixture, max_range=world.laser.max_range))
+    told = ", ".join(f"{name} {value:.4f}" for name, value in mixture._asdict().items())
+    return tempering("office, ray_cast", world, grid, model, told, RAY_EXPONENTS, runs)
+
+
+def tempering(name, world, grid, model, settings, exponents, runs, particles=500, seeds=10):
+    """The table over exponents, from a known start."""
+
+    def judged(exponent):
+        """The coverage, and the row of the table."""
         filter = grids.localize(
             grid, model, world.motion, particles, least=particles, exponent=exponent
         )
@@ -71,31 +110,33 @@ def tempering(runs, particles=500, sigma=0.03, seeds=10):
             world, filter, seeds, key, start_cov=0 * START, same_log=True, every=4
         )
         spread = float(np.median(consistency.seed_spread(again)[SKIP:]))
-        covered.append(found.coverage.value)
-        rows.append(
-            [
-                f"{exponent:g}",
-                told(found.coverage),
-                told(found.nees),
-                f"{1e3 * found.energy.value:.1f}",
-                f"{1e3 * found.rmse.value:.1f}" if found.rmse else "-",
-                f"{np.degrees(found.heading):.2f}",
-                f"{spread:.2f}",
-                f"{np.asarray(scores.ess)[:, SKIP:].mean():.0f}",
-                f"{found.lost:.0%}",
-            ]
-        )
-        print(f"exponent {rows[-1][0]} done", file=sys.stderr, flush=True)
+        print(f"{name}, exponent {exponent:g} done", file=sys.stderr, flush=True)
+        return found.coverage.value, [
+            f"{exponent:g}",
+            told(found.coverage),
+            told(found.nees),
+            f"{1e3 * found.energy.value:.1f}",
+            f"{1e3 * found.rmse.value:.1f}" if found.rmse else "-",
+            f"{np.degrees(found.heading):.2f}",
+            f"{spread:.2f}",
+            f"{np.asarray(scores.ess)[:, SKIP:].mean():.0f}",
+            f"{found.lost:.0%}",
+        ]
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        covered, rows = zip(*pool.map(judged, exponents), strict=True)
     header = ["exponent", "coverage of the 95 % set", "NEES (3)", "energy score [mm]"]
     header += ["position RMSE [mm]", "median heading error [°]", "spread over seeds", "ESS", "lost"]
-    print(f"\noffice, {runs} runs, {particles} particles, σ = {sigma} m, {BEAMS} beams\n")
+    print(f"\n{name}, {runs} runs, {particles} particles, {settings}, {BEAMS} beams\n")
     print(table(header, rows), flush=True)
-    honest = honest_exponent(covered)
     gap = [abs(value - 0.95) for value in covered]
     return [
-        Metric("office: coverage without tempering", covered[0]),
-        Metric("office: coverage nearest to 0.95", covered[int(np.argmin(gap))], 0.9, 0.99),
-        Metric("office: exponent whose sets cover 95 %, interpolated", honest),
+        Metric(f"{name}: coverage without tempering", covered[0]),
+        Metric(f"{name}: coverage nearest to 0.95", covered[int(np.argmin(gap))], 0.9, 0.99),
+        Metric(
+            f"{name}: exponent whose sets cover 95 %, interpolated",
+            honest_exponent(covered, exponents),
+        ),
     ]
 
 
@@ -105,9 +146,9 @@ def told(measure):
     return f"{measure.value:.3g} [{measure.low:.3g}, {measure.high:.3g}]"
 
 
-def honest_exponent(covered):
+def honest_exponent(covered, exponents):
     """Where coverage crosses 0.95, linear in the logarithm of the exponent; NaN if it does not."""
-    values, logs = np.array(covered), np.log(EXPONENTS)
+    values, logs = np.array(covered), np.log(exponents)
     for k in range(len(values) - 1):
         low, high = values[k : k + 2]
         if low < 0.95 <= high:
@@ -268,11 +309,13 @@ def found_in(name, half=False, seeds=100, particles=5000, steps=60):
     ]
 
 
-def measure(runs=100, part="office,logs"):
+def measure(runs=100, part="office,ray_cast,logs"):
     """The metrics of the parts named."""
     wanted, metrics = part.split(","), []
     if "office" in wanted:
-        metrics += tempering(runs) + anywhere(runs)
+        metrics += tempering_field(runs) + anywhere(runs)
+    if "ray_cast" in wanted:
+        metrics += tempering_rays(runs)
     if "logs" in wanted:
         for name in LOGS:
             metrics += tracking(name)
@@ -288,6 +331,6 @@ if __name__ == "__main__":
             "grid_localization",
             measure,
             runs={"type": int, "default": 100},
-            part={"default": "office,logs"},
+            part={"default": "office,ray_cast,logs"},
         )
     )

@@ -71,8 +71,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "target",
         metavar="FILE.py[:NAME]",
         nargs="?",
-        help="a file that defines a Motion, a Sensor, a factory of one, or a function f and its "
-        "f_jacobian; NAME: only that one (default: every model of jaxslam)",
+        help="a file that defines a Motion, a Sensor, a factory of one, a graphs.Factor, a "
+        "grids.BeamModel, or a function f and its f_jacobian; NAME: only that one (default: every "
+        "motion model, sensor and beam model of jaxslam)",
     )
     parser.add_argument(
         "--states", type=int, default=24, help="number of random states (default: 24)"

@@ -41,9 +41,10 @@ def _over_batch(size: int, batched: PyTree, *arguments: PyTree) -> tuple[PyTree,
         x if on else jnp.broadcast_to(x, (size, *x.shape))
         for x, on in zip(rays, on_rays, strict=True)
     ]
-    flat = [x.reshape(-1, 2) for x in each]
+    # The rays of one beam from all poses lie together: of poses close together they are as long.
+    flat = [x.swapaxes(0, 1).reshape(-1, 2) for x in each]
     found = march(ahead, corners, *flat, limit)
-    return jax.tree.map(lambda x: x.reshape(size, -1), found), (True, True)
+    return jax.tree.map(lambda x: x.reshape(-1, size).T, found), (True, True)
 
 
 def _march(

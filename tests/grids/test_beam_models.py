@@ -74,6 +74,28 @@ def test_the_likelihood_field_by_hand(room):
     assert float(found(0.25)) == pytest.approx(0.25 * expected)
 
 
+def test_the_ray_cast_model_of_a_laser_off_the_centre_by_hand():
+    """In a room of 5 m by 3 m whose walls are borders between cells: ranges without rounding."""
+    log_odds = np.full((34, 54), 2.0)
+    log_odds[2:-2, 2:-2] = -2.0
+    empty = grids.Grid(log_odds, np.array([-0.2, -0.2, 0.0]), np.float64(0.1))
+    model = ray_cast(MIXTURE, max_range=FAR, mount=(0.3, -0.2, 0.7))
+    prepared, pose = model.prepare(empty), np.array([2.0, 1.2, 0.4])
+    angles = np.delete(np.linspace(-3, 3, 12), 8)  # the ninth ends in a corner, which is rounded
+    c, s = np.cos(0.4), np.sin(0.4)
+    eye = pose[:2] + [0.3 * c + 0.2 * s, 0.3 * s - 0.2 * c]
+    e = np.stack([np.cos(0.4 + 0.7 + angles), np.sin(0.4 + 0.7 + angles)], axis=1)
+    star = ((np.where(e > 0, [5.0, 3.0], 0.0) - eye) / e).min(axis=1)
+    z = star + np.array([0.1, -0.2, -0.05, 0.3, -0.9, 0.05, -1.5, 0.6, -0.1, 0.2, 5.0])
+    hit, short, maximum, random, sigma, rate = MIXTURE
+    normal = stats.truncnorm(-star / sigma, (FAR - star) / sigma, star, sigma).pdf(z)
+    early = stats.truncexpon(star * rate, scale=1 / rate).pdf(z)
+    density = np.where(z < FAR, hit * normal + short * early + random / FAR, maximum)
+    scan = Beams(z, angles, np.ones(11, bool))
+    found = jax.jit(lambda p: log_likelihood(model, prepared, p, scan))(pose)
+    assert float(found) == pytest.approx(np.log(density).sum(), rel=1e-9)
+
+
 @pytest.mark.parametrize("make", [likelihood_field, ray_cast])
 def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(room, make):
     model = make(max_range=FAR)

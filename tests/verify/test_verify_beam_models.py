@@ -1,13 +1,15 @@
 """Beam models under `verify`: both pass, a wrong derivative does not, and a file may define one."""
 
 import dataclasses
+from functools import partial
 
 import jax.numpy as jnp
 import pytest
 
+from jaxslam import cli
 from jaxslam.grids import beam_models
 from jaxslam.verify import build, verify_jacobians
-from jaxslam.verify.inputs.user_files import load
+from jaxslam.verify.inputs.user_files import UnusableFile, load, verify_file
 
 
 @pytest.mark.parametrize("make", beam_models.REGISTRY.values(), ids=beam_models.REGISTRY)
@@ -28,10 +30,19 @@ def test_a_wrong_derivative_by_the_heading_is_found():
     assert "theta" in str(report) and "hand disagrees" in str(report), str(report)
 
 
-def test_a_file_may_define_a_beam_model(tmp_path):
+def test_a_file_may_define_a_beam_model_whose_jacobian_is_held(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text(
-        "from jaxslam.grids import likelihood_field\nmine = likelihood_field(0.2, max_range=40.0)\n",
+        "import dataclasses\nfrom jaxslam.grids import likelihood_field\n"
+        "mine = likelihood_field(0.2, max_range=40.0)\n"
+        "wrong = dataclasses.replace(mine, jacobian=lambda *at: -mine.jacobian(*at))\n",
         encoding="utf-8",
     )
-    assert [target.name for target in load(str(path))] == ["mine"]
+    right, wrong = verify_file(str(path), partial(verify_jacobians, count=4))
+    assert (right.model, right.kind, right.passed) == ("mine", "beam model", True), str(right)
+    assert not wrong.passed
+    assert "hand disagrees" in str(wrong)
+    with pytest.raises(UnusableFile, match=r"expected dataclasses to be .* a BeamModel, or"):
+        load(f"{path}:dataclasses")
+    (target,) = (a for a in cli._parser()._actions if isinstance(a.choices, dict))
+    assert "grids.BeamModel" in target.choices["verify"].format_help()

@@ -90,15 +90,17 @@ def load(target: str) -> list[Target]:
     if name:
         if not found and keys:
             raise UnusableFile(
-                f"{path.name}: expected {name} to be a Motion, a Sensor, a Factor, a factory of "
-                f"one, or a function with its Jacobian, and there is no {name}{CLAIMS[0]}"
+                f"{path.name}: expected {name} to be a Motion, a Sensor, a factory of one, a "
+                "Factor, a BeamModel, or a function with its Jacobian, and there is no "
+                f"{name}{CLAIMS[0]}"
             )
         if not found:
             raise UnusableFile(f"{path.name}: there is no {name} to verify{names_in(module)}")
     if not found:
         raise UnusableFile(
-            f"{path.name}: defines nothing to verify: no Motion, no Sensor, no Factor, no function "
-            "f with an f_jacobian, no factory whose result is annotated as -> Motion or -> Sensor"
+            f"{path.name}: defines nothing to verify: no Motion, no Sensor, no Factor, no "
+            "BeamModel, no function f with an f_jacobian, no factory whose result is annotated as "
+            "-> Motion or -> Sensor"
         )
     return found
 
