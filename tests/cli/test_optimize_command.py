@@ -93,6 +93,20 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
         assert part in printed
 
 
+def test_a_file_of_toro_is_optimized_and_written_as_g2o(tmp_path, capsys, undrawn):
+    graph = small_graphs.only(small(), "relative_pose")
+    none = np.zeros(0, int)
+    graph = graph._replace(points=np.zeros((0, 2)), point_id=none, fixed_point=none > 0)
+    graphs.write(tmp_path / "small.toro", graph)
+    run = ["optimize", str(tmp_path / "small.toro"), "--no-certificate", "--out", str(tmp_path)]
+    assert cli.main(run) == 0
+    assert "optimized.g2o" in capsys.readouterr().out
+    again = graphs.read(tmp_path / "optimized.g2o")
+    assert again.fixed_pose.tolist() == [True] + [False] * 7
+    chi2 = json.loads((tmp_path / "summary.json").read_text())["chi2"]
+    np.testing.assert_allclose(chi2, plain.optimum(graph._replace(fixed_pose=again.fixed_pose))[2])
+
+
 def test_too_few_steps_are_no_success(file, tmp_path, capsys):
     """By the program of the test above: numbers are its arguments."""
     run = ["optimize", str(file), "--iterations", "1", "--out", str(tmp_path)]
