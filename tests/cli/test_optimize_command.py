@@ -10,6 +10,7 @@ import small_graphs
 from reference import graph as plain
 
 from jaxslam import cli, graphs
+from jaxslam.cli.optimize import command
 from jaxslam.results import plot
 
 FILM = SimpleNamespace(
@@ -105,6 +106,13 @@ def test_a_file_of_toro_is_optimized_and_written_as_g2o(tmp_path, capsys, undraw
     assert again.fixed_pose.tolist() == [True] + [False] * 7
     chi2 = json.loads((tmp_path / "summary.json").read_text())["chi2"]
     np.testing.assert_allclose(chi2, plain.optimum(graph._replace(fixed_pose=again.fixed_pose))[2])
+
+
+def test_an_optimum_without_a_proof_says_what_to_try(monkeypatch):
+    proof = SimpleNamespace(certified=False, chi2=2.0, gap=1.0, position=0.1, heading=0.1)
+    monkeypatch.setattr(graphs, "certificate", lambda graph: proof)
+    told = command._certificate(small(), converged=True, plain=True)
+    assert told["certificate"].startswith("not certified: ") and "--start" in told["certificate"]
 
 
 def test_too_few_steps_are_no_success(file, tmp_path, capsys):
