@@ -85,12 +85,17 @@ def gate(metric: Metric) -> str:
     return text if metric.passes else f"{text} (missed)"
 
 
+def recorded() -> dict[str, str]:
+    """The sections of RESULTS.md, by name."""
+    if not FILE.exists():
+        return {}
+    parts = re.split(r"^## (\w+)$", FILE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
 def write(name: str, text: str) -> None:
     """Put a section in its place among the others, in alphabetical order; the rest stays."""
-    sections = {}
-    if FILE.exists():
-        parts = re.split(r"^## (\w+)$", FILE.read_text(encoding="utf-8"), flags=re.MULTILINE)
-        sections = dict(zip(parts[1::2], parts[2::2], strict=True))
+    sections = recorded()
     sections[name] = f"\n\n{text.strip()}\n\n"
     body = "".join(f"## {each}{sections[each]}" for each in sorted(sections))
     written = FILE.with_suffix(".new")

@@ -46,6 +46,9 @@ def share(runs: int, stop_at: int, folder: str) -> None:
 
     import jax
 
+    # A process in the background of a shell ignores interrupts, and would never stop.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
     from jaxslam import catalog, monte_carlo, scenarios, store
     from jaxslam.monte_carlo import Interrupted
 

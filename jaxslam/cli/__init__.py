@@ -123,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
             "optimize",
             help="optimize a pose or landmark graph in a file",
             description="Optimize a graph in a file of g2o or TORO. Prints a table and writes the "
-            "poses, the optimized graph, a summary and a figure. The cost is "
+            "poses, the optimized graph in g2o, a summary and a figure. The cost is "
             f"{COST} {ERRORS['pose'][1]}. The exit status is 1 if the "
             "optimization did not converge, 2 if the file cannot be used.",
         )

@@ -10,6 +10,7 @@ import small_graphs
 from reference import graph as plain
 
 from jaxslam import cli, graphs
+from jaxslam.cli.optimize import command
 from jaxslam.results import plot
 
 FILM = SimpleNamespace(
@@ -91,6 +92,27 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
         "to compile",
     ):
         assert part in printed
+
+
+def test_a_file_of_toro_is_optimized_and_written_as_g2o(tmp_path, capsys, undrawn):
+    graph = small_graphs.only(small(), "relative_pose")
+    none = np.zeros(0, int)
+    graph = graph._replace(points=np.zeros((0, 2)), point_id=none, fixed_point=none > 0)
+    graphs.write(tmp_path / "small.toro", graph)
+    run = ["optimize", str(tmp_path / "small.toro"), "--no-certificate", "--out", str(tmp_path)]
+    assert cli.main(run) == 0
+    assert "optimized.g2o" in capsys.readouterr().out
+    again = graphs.read(tmp_path / "optimized.g2o")
+    assert again.fixed_pose.tolist() == [True] + [False] * 7
+    chi2 = json.loads((tmp_path / "summary.json").read_text())["chi2"]
+    np.testing.assert_allclose(chi2, plain.optimum(graph._replace(fixed_pose=again.fixed_pose))[2])
+
+
+def test_an_optimum_without_a_proof_says_what_to_try(monkeypatch):
+    proof = SimpleNamespace(certified=False, chi2=2.0, gap=1.0, position=0.1, heading=0.1)
+    monkeypatch.setattr(graphs, "certificate", lambda graph: proof)
+    told = command._certificate(small(), converged=True, plain=True)
+    assert told["certificate"].startswith("not certified: ") and "--start" in told["certificate"]
 
 
 def test_too_few_steps_are_no_success(file, tmp_path, capsys):

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+import small_graphs
 from recordings import DATA
 
 from jaxslam import graphs
@@ -96,6 +97,50 @@ def test_the_round_trip_is_exact(tmp_path):
     packed = tmp_path / "packed.g2o.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
     assert_same(graphs.read(packed), graph)
+
+
+@pytest.mark.parametrize("ending", ["toro", "graph"])
+def test_toro_is_written_and_read_to_the_bit(tmp_path, ending):
+    """The graph of a TORO file and that of a g2o file are the same; so are what is written."""
+    random = np.random.default_rng(1)
+    root = random.normal(size=(2, 3, 3))
+    one = graphs.read(wrote(tmp_path, "\n".join(SMALL.split("\n")[1:3] + SMALL.split("\n")[5:6])))
+    information = root @ np.swapaxes(root, 1, 2)
+    table = graphs.Table(
+        np.array([[0, 1], [1, 0]], np.int32),
+        random.normal(size=(2, 3)),
+        (information + np.swapaxes(information, 1, 2)) / 2,
+        np.ones(2, bool),
+    )
+    poses = random.normal(size=(2, 3)) * [[1e5, 1e-7, 1]]
+    graph = one._replace(poses=poses, tables={"relative_pose": table})
+    path, other = tmp_path / f"a.{ending}", tmp_path / "a.g2o"
+    graphs.write(path, graph)
+    graphs.write(other, graph)
+    assert [line.split()[0] for line in path.read_text().splitlines()] == [
+        *("VERTEX2", "VERTEX2", "EDGE2", "EDGE2")
+    ]
+    assert_same(graphs.read(path), graph)
+    assert_same(graphs.read(other), graph)
+    text = path.read_text()
+    graphs.write(path, graphs.read(path))
+    assert path.read_text() == text
+
+
+def test_what_toro_cannot_hold_is_refused(tmp_path):
+    graph = graphs.read(wrote(tmp_path, SMALL))
+    posed = graph._replace(points=graph.points[:0], point_id=graph.point_id[:0])
+    free = posed._replace(fixed_pose=np.zeros(2, bool))
+    for lacking, message in (
+        (graph, "TORO has no line for points, and the graph has 1"),
+        (posed, "TORO has no line for fixed poses, and pose 7 is fixed"),
+        (free, "TORO has no line for table 'relative_position'; it has some for relative_pose"),
+        (small_graphs.only(free, "prior"), "TORO has no line for table 'prior'"),
+        (small_graphs.only(free, "bearing"), "TORO has no line for table 'bearing'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            graphs.write(tmp_path / "out.toro", lacking)
+    assert not (tmp_path / "out.toro").exists()
 
 
 def test_rows_that_are_not_valid_are_not_written(tmp_path):

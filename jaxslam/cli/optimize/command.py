@@ -154,7 +154,7 @@ def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, object
     return {
         "certificate": "the chordal optimum next to it is global"
         if proof.certified
-        else "not certified: another optimum of the chordal cost may be lower",
+        else "not certified: another optimum of the chordal cost may be lower; try another --start",
         "chordal chi2": _finite(proof.chi2),
         "lower by at most": _finite(proof.gap),
         "distance of the two optima [m]": _finite(proof.position),

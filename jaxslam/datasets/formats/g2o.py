@@ -44,6 +44,29 @@ VERTICES = {
 SKIPPED = {"ROBOTLASER1": "laser scans"}
 """Lines that are no part of the graph, and what they are counted as."""
 
+
+class Format(NamedTuple):
+    """The kinds of lines that a graph is written in."""
+
+    name: str
+    vertices: dict[str, str]
+    """of "pose" and "point" """
+    edges: dict[str, str]
+    """by table"""
+    fix: bool
+    """whether a variable can be held"""
+
+
+G2O = Format(
+    "g2o",
+    {"pose": "VERTEX_SE2", "point": "VERTEX_XY"},
+    {edge.table: kind for kind, edge in EDGES.items() if kind != "EDGE2"},
+    fix=True,
+)
+TORO = Format("TORO", {"pose": "VERTEX2"}, {"relative_pose": "EDGE2"}, fix=False)
+ENDINGS = {".toro": TORO, ".graph": TORO}
+"""How the names of files end that are not written as g2o."""
+
 _LARGEST = 2**31 - 1
 
 
@@ -97,41 +120,27 @@ def load(path: str | Path) -> Loaded:
 
 
 def save(path: str | Path, graph: Graph) -> None:
-    """Write a graph as a file of g2o; see `graphs.write`."""
+    """Write a graph as a file of g2o, or TORO by the file's ending; see `graphs.write`."""
     path = Path(path)
-    write_files(path.parent, {path.name: text_of(graph)})
+    text = text_of(graph, ENDINGS.get(path.suffix, G2O))
+    write_files(path.parent, {path.name: text})
 
 
-def text_of(graph: Graph) -> str:
-    """The graph in the format of g2o; raises ValueError as `graphs.write` does."""
+def text_of(graph: Graph, form: Format = G2O) -> str:
+    """The graph in a format; raises ValueError as `graphs.write` does."""
+    _check_writable(graph, form)
     ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
-    if len(both := np.intersect1d(ids["pose"], ids["point"])):
-        raise ValueError(
-            f"graphs.write: {both[0]} is the id of a pose and of a point, which g2o does not allow"
-        )
-    points = np.asarray(graph.points)
-    if len(points) and points.shape[1] != 2:
-        raise ValueError(f"graphs.write: expected points (x, y), got {points.shape[1]} numbers")
-    lines = []
-    for kind, name, values in (
-        ("pose", "VERTEX_SE2", np.asarray(graph.poses)),
-        ("point", "VERTEX_XY", points),
-    ):
-        lines += [_line(name, [one], row) for one, row in zip(ids[kind], values, strict=True)]
-    held = [
-        *ids["pose"][np.asarray(graph.fixed_pose)],
-        *ids["point"][np.asarray(graph.fixed_point)],
+    values = {"pose": np.asarray(graph.poses), "point": np.asarray(graph.points)}
+    held = {"pose": np.asarray(graph.fixed_pose), "point": np.asarray(graph.fixed_point)}
+    lines = [
+        _line(name, [one], row)
+        for kind, name in form.vertices.items()
+        for one, row in zip(ids[kind], values[kind], strict=True)
     ]
-    lines += [f"FIX {one}" for one in held]
-    written = {edge.table: (name, edge) for name, edge in reversed(EDGES.items())}
+    lines += [f"FIX {one}" for kind in form.vertices for one in ids[kind][held[kind]]]
     for key, table in graph.tables.items():
-        base = key.split("/")[0]
-        if base not in written:
-            raise ValueError(
-                f"graphs.write: g2o has no line for table {key!r}; it has some for "
-                f"{', '.join(written)}"
-            )
-        name, edge = written[base]
+        name = form.edges[key.split("/")[0]]
+        edge = EDGES[name]
         valid = np.asarray(table.valid)
         information = np.asarray(table.information)[valid]
         entries = np.stack([information[:, i, j] for i, j in edge.entries], axis=1)
@@ -140,6 +149,35 @@ def text_of(graph: Graph) -> str:
         names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
         lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
     return "\n".join(lines) + "\n"
+
+
+def _check_writable(graph: Graph, form: Format) -> None:
+    """Raise ValueError on what a format has no line for."""
+    if len(both := np.intersect1d(graph.pose_id, graph.point_id)):
+        raise ValueError(
+            f"graphs.write: {both[0]} is the id of a pose and of a point, which {form.name} does "
+            "not allow"
+        )
+    if len(graph.points) and "point" not in form.vertices:
+        raise ValueError(
+            f"graphs.write: {form.name} has no line for points, and the graph has "
+            f"{len(graph.points)}"
+        )
+    if len(graph.points) and graph.points.shape[1] != 2:
+        raise ValueError(
+            f"graphs.write: expected points (x, y), got {graph.points.shape[1]} numbers"
+        )
+    held = np.asarray(graph.pose_id)[np.asarray(graph.fixed_pose)]
+    if len(held) and not form.fix:
+        raise ValueError(
+            f"graphs.write: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
+        )
+    for key in graph.tables:
+        if key.split("/")[0] not in form.edges:
+            raise ValueError(
+                f"graphs.write: {form.name} has no line for table {key!r}; it has some for "
+                f"{', '.join(form.edges)}"
+            )
 
 
 def _line(kind: str, ids: Sequence[int], numbers: np.ndarray) -> str:
