@@ -63,9 +63,10 @@ def recorded_world(
     check_record("recorded_world", "motion", motion, Motion)
     check_record("recorded_world", "sensor", sensor, Sensor)
     if isinstance(logs, Log) or not isinstance(logs, Sequence) or not logs:
+        empty = "an empty " * (isinstance(logs, Sequence) and not logs)
         raise ValueError(
-            f"recorded_world: expected logs as a list of Log, one a run, got {type(logs).__name__}"
-            + " of none" * (logs == [])
+            "recorded_world: expected logs as a list of Log, one a run, got "
+            f"{empty}{type(logs).__name__}"
         )
     table = np.asarray(landmarks, np.float64)
     if table.ndim == 2:

@@ -124,8 +124,17 @@ def run_keys(key: Array, number: int | Array) -> Array:
 
 
 def world_of_run(scenario: Scenario, key: Array, number: int | Array) -> tuple[Truth, Log]:
-    """The truth and the log of run `number` of a campaign with that key; traceable."""
+    """The truth and the log of run `number` of a campaign with that key; traceable.
+
+    Raises ValueError where that run is not among the recorded ones, if the number is concrete.
+    """
     if scenario.recorded is not None:
+        runs = len(scenario.recorded[0].pose)
+        if is_concrete(number) and not 0 <= int(number) < runs:
+            raise ValueError(
+                f"Scenario {scenario.name!r}: expected a run from 0 to {runs - 1}, the recorded "
+                f"ones, got {number}"
+            )
         return _record(scenario.recorded, number)
     return simulate(scenario, run_keys(key, number)[0])
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxslam import Scenario, catalog, monte_carlo, motion, recorded_world, sensors, simulate, store
+from jaxslam.results import plot
 from jaxslam.types import Log, Scan
 
 KEY = jax.random.key(3)
@@ -42,7 +43,7 @@ def recorded(runs=5, **changed):
 
 
 def test_a_campaign_of_records_is_that_of_the_draws(tmp_path):
-    """Also with another key, in two parts, and where the last block is not full."""
+    """Also with another key, kept and resumed, and where the last block is not full."""
     filters = {"ekf": catalog.FILTERS["ekf"](DRAWN)}
     campaign = partial(monte_carlo, filters=filters, block=4, progress=False)
     expected = campaign(DRAWN, runs=5, key=KEY).filters["ekf"]
@@ -83,7 +84,7 @@ def unlike(**fields):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"logs": []}, "logs as a list of Log, one a run, got list of none"),
+        ({"logs": []}, "logs as a list of Log, one a run, got an empty list"),
         ({"logs": Log(np.zeros((2, 3)), Scan(*[np.zeros((2, 1))] * 3))}, "logs as a list"),
         ({"logs": [None]}, r"expected logs\[0\] to be a Log, got NoneType"),
         ({"logs": ragged()}, r"got \(6, 2\) in run 0 and \(5, 2\) in run 4"),
@@ -107,3 +108,6 @@ def test_a_campaign_of_more_runs_than_there_are_is_refused():
     filters = {"ekf": catalog.FILTERS["ekf"](DRAWN)}
     with pytest.raises(ValueError, match="at most 5, the recorded runs of recorded, got 6"):
         monte_carlo(recorded(), filters, 6, KEY)
+    for number in (5, -1):
+        with pytest.raises(ValueError, match=f"from 0 to 4, the recorded ones, got {number}"):
+            plot.animate_world(recorded(), filters["ekf"], KEY, number=number)
