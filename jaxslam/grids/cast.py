@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam import programs
 from jaxslam.grids.distance import squared_distances
@@ -185,24 +185,32 @@ def _cast(
     start = to_cells(grid.origin, grid.resolution, pose[:, :2])
     starts = jnp.broadcast_to(start[:, None, :], direction.shape)
     limit = jnp.asarray(max_range, dtype) / grid.resolution
-    length = _lengths(grid, starts.reshape(-1, 2), direction.reshape(-1, 2), limit)
+    length, _ = _lengths(grid, starts.reshape(-1, 2), direction.reshape(-1, 2), limit)
     return (grid.resolution * jnp.minimum(length, limit)).reshape(shape)
 
 
 @jax.custom_jvp
 def _lengths(
     grid: RayMap, start: Float[Array, "R 2"], direction: Float[Array, "R 2"], limit: Array
-) -> Float[Array, "R"]:
-    """The lengths [cells] of rays from start (x, y) [cells]."""
-    length: Array = _hits(grid, start, direction, limit)[0]
-    return length
+) -> tuple[Float[Array, "R"], Bool[Array, "R"]]:
+    """The lengths [cells] of rays from start (x, y) [cells], and whether something is hit."""
+    if grid.ahead.shape[0] == grid.solid.shape[0] + 2:  # its squares are cells
+        found: tuple[Array, Array] = march(grid.ahead, None, start, direction, limit)
+    else:
+        corners = jnp.pad(grid.solid, 1, mode="edge")
+        found = march(grid.ahead, corners, start + 0.5, direction, limit)
+    return found
 
 
 @_lengths.defjvp
-def _derivative(primals: PyTree, tangents: PyTree) -> tuple[Array, Array]:
-    """-n·(dt + r de)/(n·e), of rays that hit something."""
+def _derivative(primals: PyTree, tangents: PyTree) -> PyTree:
+    """-n·(dt + r de)/(n·e), of rays that hit something.
+
+    The length is that of `_lengths` again, so that a second derivative meets this rule and not the
+    loop of `march`.
+    """
     grid, start, direction, _ = primals
-    length, hit = _hits(*primals)
+    length, hit = _lengths(*primals)
     normal = _slope(grid.solid, start + length[:, None] * direction)
     steep = (normal * direction).sum(axis=-1)
     least = GRAZING * jnp.sqrt((normal * normal).sum(axis=-1))
@@ -210,15 +218,8 @@ def _derivative(primals: PyTree, tangents: PyTree) -> tuple[Array, Array]:
     sure = hit & (steep != 0)
     rate = jnp.where(sure, 1.0 / jnp.where(sure, steep, 1.0), 0.0)
     moved = tangents[1] + length[:, None] * tangents[2]
-    return length, jnp.where(hit, -rate * (normal * moved).sum(axis=-1), tangents[3])
-
-
-def _hits(grid: RayMap, start: Array, direction: Array, limit: Array) -> PyTree:
-    """The lengths, and whether something is hit."""
-    if grid.ahead.shape[0] == grid.solid.shape[0] + 2:  # its squares are cells
-        return march(grid.ahead, None, start, direction, limit)
-    corners = jnp.pad(grid.solid, 1, mode="edge")
-    return march(grid.ahead, corners, start + 0.5, direction, limit)
+    along = jnp.where(hit, -rate * (normal * moved).sum(axis=-1), tangents[3])
+    return (length, hit), (along, np.zeros(hit.shape, jax.dtypes.float0))
 
 
 _AROUND = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])

@@ -66,18 +66,21 @@ def centers(grid: Grid | Field) -> Float[Array, "H W 2"]:
     height, width = grid[0].shape
     y, x = jnp.meshgrid(jnp.arange(height) + 0.5, jnp.arange(width) + 0.5, indexing="ij")
     local = grid.resolution * jnp.stack([x, y], axis=-1)
-    turn = se2.rotation(grid.origin[2])
-    return jnp.einsum("ab,hwb->hwa", turn, local) + grid.origin[None, None, :2]
+    origin = jnp.asarray(grid.origin)
+    return jnp.einsum("ab,hwb->hwa", se2.rotation(origin[2]), local) + origin[None, None, :2]
 
 
 def check_grid(name: str, grid: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless the grid is one.
 
-    Refused are log-odds that are no finite table of at least one cell, an origin that is no pose,
-    and a resolution that is not above 0. Within a trace only shapes are checked.
+    Refused are log-odds that are no finite array of floats of at least one cell, an origin that is
+    no pose, and a resolution that is not above 0. Within a trace only shapes are checked.
     """
     if not isinstance(grid, Grid):
         raise ValueError(f"{name}: expected a Grid, got {type(grid).__name__}")
+    if not hasattr(grid.log_odds, "dtype") or not jnp.issubdtype(grid.log_odds.dtype, np.floating):
+        kind = getattr(grid.log_odds, "dtype", f"a {type(grid.log_odds).__name__}")
+        raise ValueError(f"{name}: expected log-odds in an array of floats, got {kind}")
     if np.ndim(grid.log_odds) != 2 or 0 in np.shape(grid.log_odds):
         raise ValueError(
             f"{name}: expected log-odds of shape (at least 1, at least 1), "

@@ -1,18 +1,26 @@
 """Bilinear interpolation in a field, differentiable by the point."""
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxslam.grids.grid import Field, to_cells
 
 
-def interpolate(field: Field, points: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
-    """The values of a field at points of the world [m], bilinear between centres of cells.
+def interpolate(field: Field, points: ArrayLike) -> Float[Array, "*n"]:
+    """The values of a field at points (..., 2) of the world [m], bilinear between centres of cells.
 
     Off the map, and within half a cell of its border, the value is that of the nearest point of the
     rectangle of centres: continuous everywhere, and the gradient by a point is finite everywhere;
     across the border it is zero. At a line between four centres the gradient is of one side.
+
+    Raises ValueError on what is no field, and on points of a shape other than (..., 2).
     """
+    if not isinstance(field, Field):
+        raise ValueError(f"interpolate: expected a Field, got a {type(field).__name__}")
+    points = jnp.asarray(points)
+    if points.ndim == 0 or points.shape[-1] != 2:
+        raise ValueError(f"interpolate: expected points (x, y), got shape {points.shape}")
     return interpolated(field.values, to_cells(field.origin, field.resolution, points) - 0.5)
 
 

@@ -15,7 +15,10 @@ from jaxslam.grids.beam_models.beam_model import usable_beams
 from jaxslam.grids.grid import Grid, check_frame, to_cells
 from jaxslam.math import se2
 from jaxslam.types import Beams, JaxOrNumPy
-from jaxslam.validation.numbers import check_mount, is_concrete
+from jaxslam.validation.numbers import check_mount, check_positive, is_concrete
+
+FARTHEST = 2.0**29
+"""An end of a beam farther off [cells] counts as this far, lest the number of cells overflow."""
 
 
 class Counts(NamedTuple):
@@ -96,8 +99,7 @@ def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
             f"count: expected a pose (x, y, θ) for each of {shapes[0][0]} scans, got "
             f"{np.shape(poses)}"
         )
-    if not max_range > 0:
-        raise ValueError(f"count: expected max_range above 0, got {max_range}")
+    check_positive("count", max_range=max_range)
     if not is_concrete(beams, poses):
         return
     if not np.all(np.isfinite(poses)):
@@ -183,15 +185,15 @@ def _cross(
 ) -> tuple[Array, Array]:
     """Add one to each cell from start up to, without, that of the end; and the latter's index.
 
-    A beam crosses as many lines of the table as there are between the two cells. base: where the
-    map of each beam begins.
+    A beam crosses as many lines of the table as there are between the two cells; one that leaves
+    the map does not return. base: where the map of each beam begins.
     """
     height, width = shape
     nowhere = misses.shape[0]
     delta = ends - start
     forward = jnp.where(delta >= 0, 1, -1)
     first = jnp.floor(start).astype(jnp.int32)
-    last = jnp.floor(ends).astype(jnp.int32)
+    last = jnp.floor(jnp.clip(ends, -FARTHEST, FARTHEST)).astype(jnp.int32)
     steps = jnp.where(live, jnp.abs(last - first).sum(axis=1), 0)
     slope = jnp.where(delta != 0, 1.0 / jnp.where(delta != 0, delta, 1.0), 0.0)
 
@@ -209,7 +211,8 @@ def _cross(
         crossing = jnp.where(cell == last, jnp.inf, crossing)
         across = crossing[:, 0] < crossing[:, 1]
         move = jnp.stack([across, ~across], axis=1) * forward
-        return misses, jnp.where(going[:, None], cell + move, cell), done + going
+        done = jnp.where(inside, done + going, steps)
+        return misses, jnp.where(going[:, None], cell + move, cell), done
 
     begin: tuple[Array, ...] = (misses, first, jnp.zeros_like(steps))
     misses, *_ = jax.lax.while_loop(unfinished, step, begin)

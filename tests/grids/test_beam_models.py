@@ -123,6 +123,13 @@ def test_the_true_pose_is_the_most_likely_one(room, make):
     assert np.argmax(values) == 0
 
 
+def test_a_pose_may_be_a_list_of_whole_numbers(room):
+    model = likelihood_field(max_range=FAR, mount=(0.3, 0, 0))
+    field = model.prepare(room)
+    found = [log_likelihood(model, field, p, beams()) for p in ([2, 1, 0], np.array([2.0, 1, 0]))]
+    assert float(found[0]) == float(found[1])
+
+
 def drawn(count, seed=0):
     """Ranges of the mixture for ranges expected between 1 and 3.5 m."""
     rng = np.random.default_rng(seed)
@@ -164,7 +171,10 @@ def test_both_fits_find_the_parameters():
             r"as many ranges, angles and masks, got \(24,\), \(5,\), \(24,\)",
         ),
         (lambda m, f: log_likelihood(m, f, np.zeros(3), "scan"), "expected Beams"),
-        (lambda m, f: log_likelihood(m, f, np.zeros(3), beams(), every=0), "expected every >= 1"),
+        (
+            lambda m, f: log_likelihood(m, f, np.zeros(3), beams(), every=0),
+            "every: expected an integer",
+        ),
         (
             lambda m, f: log_likelihood(m, f, [0.0, 0.0], beams()),
             "log_likelihood: expected a pose",
@@ -172,6 +182,10 @@ def test_both_fits_find_the_parameters():
         (
             lambda m, f: log_likelihood(m, f, np.zeros(3), beams(), exponent=-1.0),
             "log_likelihood: expected an exponent >= 0",
+        ),
+        (
+            lambda m, f: log_likelihood(m, grids.Grid(*f), np.zeros(3), beams()),
+            "expected what model.prepare makes of the grid",
         ),
         (lambda m, f: likelihood_field(max_range=1.0, truncate=-1.0), "expected truncate above 0"),
         (lambda m, f: likelihood_field(max_range=1.0, mount=(0, 0)), "field: expected a mounting"),

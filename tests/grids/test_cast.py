@@ -169,6 +169,20 @@ def test_the_derivative_by_the_pose_is_that_of_a_wall(method):
     assert np.mean(error < 0.1) > 0.9
 
 
+def test_the_second_derivative_is_that_of_a_wall_too():
+    """Its trace once went on without end, through the loop of the rays."""
+    log_odds = np.full((20, 30), -2.0)
+    log_odds[:, 29] = 2.0
+    rays = grids.ray_map(grid_of(log_odds))
+    pose, angles = np.array([1.0, 1.0, 0.1]), np.array([0.05, 0.2])
+    second = jax.jit(jax.hessian(lambda p: grids.cast(rays, p, angles, 9.0)))(pose)
+    slope, far = np.tan(0.1 + angles), 1.9 / np.cos(0.1 + angles)  # r = (2.9 - x)/cos φ
+    expected = np.zeros((2, 3, 3))
+    expected[:, 2, 2] = far * (1 + 2 * slope**2)
+    expected[:, 0, 2] = expected[:, 2, 0] = -far / 1.9 * slope
+    np.testing.assert_allclose(second, expected, atol=1e-9)
+
+
 @pytest.mark.parametrize("method", ["cells", "surface"])
 def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(blocks, method):
     grid, at, _, pose = blocks

@@ -154,8 +154,23 @@ def test_a_beam_of_no_angle_is_unusable():
         counted(poses, beams._replace(angle=angle * np.nan))
 
 
+def test_a_beam_ends_where_it_leaves_the_map():
+    """One of 1e9 m crosses 1e10 cells, of which all but a few are off the map."""
+    poses, beams = scans()
+    away = beams._replace(range=np.where(beams.range > 0, 1e9, beams.range))
+    near, far = (
+        grids.count(SHAPE, ORIGIN, CELL, poses, beams, max_range=max_range)
+        for beams, max_range in [(beams._replace(range=away.range * 1e-7), 99.0), (away, 2e9)]
+    )
+    np.testing.assert_array_equal(far.misses, near.misses)
+    assert far.hits.sum() == near.hits.sum() == 0 and far.misses.sum() > 100
+
+
 def test_bad_numbers_are_refused():
     poses, beams = scans()
+    for max_range in (0.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match="count: expected max_range above 0"):
+            grids.count(SHAPE, ORIGIN, CELL, poses, beams, max_range=max_range)
     for shape in ((0, 5), (5.0, 5), (5,)):
         with pytest.raises(ValueError, match=r"count: expected a shape \(H, W\)"):
             grids.count(shape, ORIGIN, 0.1, poses, beams, max_range=1.0)

@@ -109,6 +109,7 @@ def test_the_map_of_turtlebot(tmp_path):
         ("0.05", "fine", 3, "resolution is not a finite number: 'fine'"),
         ("0.05", "nan", 3, "resolution is not a finite number"),
         ("-1.5, 2.0, 0.25", "-1.5, 2.0", 4, "expected origin: [x, y, yaw], got [-1.5, 2.0]"),
+        ("2.0, 0.25]", "2.0, 0.25", 4, "expected origin: [x, y, yaw], got [-1.5, 2.0, 0.25"),
         ("-1.5, 2.0, 0.25", "-1.5, 2.0, inf", 4, "yaw is not a finite number"),
         ("negate: 0", "negate: 2", 5, "expected negate to be 0 or 1"),
         ("negate: 0", "mode: raw\nnegate: 0", 5, "expected mode to be trinary or scale"),
@@ -144,6 +145,13 @@ def test_a_bad_image_is_refused(tmp_path, image, reason):
         grids.read_map(path)
     assert str(caught.value).startswith(f"{tmp_path / 'map.pgm'}: ")
     assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a #1", "b: c", "d's", "#", "two words"])
+def test_a_name_that_yaml_would_misread_is_quoted(tmp_path, name):
+    grid = grids.read_map(made(tmp_path))
+    path, _ = grids.write_map(tmp_path / f"{name}.yaml", grid)
+    same(grids.read_map(path), grid)
 
 
 def test_a_file_that_is_not_there(tmp_path):

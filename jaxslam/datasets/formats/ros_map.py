@@ -73,7 +73,7 @@ def map_files(
         image, levels = _levels(log_odds)
     numbers = ", ".join(repr(float(value)) for value in np.asarray(grid.origin))
     text = (
-        f"image: {stem}.pgm\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
+        f"image: {_scalar(f'{stem}.pgm')}\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
         f"origin: [{numbers}]\nnegate: 0\noccupied_thresh: {occupied}\nfree_thresh: {free}\n"
     )
     data = pgm_bytes(image, levels)
@@ -136,7 +136,7 @@ class Header:
         """The value of a key, without quotes."""
         value = self.found[key][1]
         if len(value) > 1 and value[0] == value[-1] and value[0] in "\"'":
-            value = value[1:-1]
+            value = value[1:-1].replace("''", "'") if value[0] == "'" else value[1:-1]
         if not value:
             raise self.error(key, f"{key} has no value")
         return value
@@ -148,6 +148,8 @@ class Header:
     def numbers(self, key: str, names: tuple[str, ...]) -> list[float]:
         """The value of a key as a list of finite numbers, one a name."""
         line, value = self.found[key]
+        if value.startswith("[") != value.endswith("]"):
+            raise self.file.error(line, f"expected {key}: [{', '.join(names)}], got {value}")
         fields = [field.strip() for field in value.removeprefix("[").removesuffix("]").split(",")]
         try:
             return self.file.numbers(line, fields, names)
@@ -166,9 +168,20 @@ class Header:
         return choices[value]
 
 
+def _scalar(text: str) -> str:
+    """A text as YAML has it: in quotes unless letters, digits and a few signs are all it has."""
+    plain = text[0].isalnum() and all(letter.isalnum() or letter in " ._-/" for letter in text)
+    return text if plain else "'" + text.replace("'", "''") + "'"
+
+
 def _without_comment(text: str) -> str:
-    """A line up to a # that begins it or follows a blank."""
+    """A line up to a # that begins it or follows a blank, outside a value in quotes."""
+    quote = ""
     for at, letter in enumerate(text):
-        if letter == "#" and (at == 0 or text[at - 1].isspace()):
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'" and text[:at].rstrip().endswith((":", "'")):
+            quote = letter
+        elif letter == "#" and (at == 0 or text[at - 1].isspace()):
             return text[:at]
     return text

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.grids.grid import Grid
 from jaxslam.types import Beams, JaxOrNumPy
-from jaxslam.validation.numbers import is_concrete, shape_told
+from jaxslam.validation.numbers import check_count, is_concrete, shape_told
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +33,13 @@ class BeamModel:
 def log_likelihood(
     model: BeamModel,
     prepared: PyTree,
-    pose: Float[Array, "3"],
+    pose: ArrayLike,
     beams: Beams,
     *,
     every: int = 1,
     exponent: ArrayLike = 1.0,
 ) -> Float[Array, ""]:
-    """The log-likelihood of a scan at a pose: exponent · Σ log p(z_k) over its valid beams.
+    """The log-likelihood of a scan at a pose (3,): exponent · Σ log p(z_k) over its valid beams.
 
     Beams that are not valid, of NaN or of a range below 0 add nothing. The beams of a scan are
     taken to be independent given the pose, which they are not: what the map lacks, or a pose
@@ -47,21 +47,25 @@ def log_likelihood(
     an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
     exponent; `jax.vmap` it over poses.
 
-    Raises ValueError on beams that `check_beams` refuses, a pose that is not (3,), every below 1
-    and an exponent below 0.
+    Raises ValueError on beams that `check_beams` refuses, a pose that is not (3,), every below 1,
+    an exponent below 0, and a grid in place of what `model.prepare` makes of it.
     """
     check_beams("log_likelihood", beams)
     if np.shape(pose) != (3,):
         raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_told(pose)}")
     if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
         raise ValueError(f"log_likelihood: expected an exponent >= 0, got {exponent!r}")
-    if every < 1:
-        raise ValueError(f"log_likelihood: expected every >= 1, got {every}")
+    check_count("log_likelihood: every", every)
+    if isinstance(prepared, Grid):
+        raise ValueError(
+            "log_likelihood: expected what model.prepare makes of the grid, got the Grid itself"
+        )
     taken = Beams(*(jnp.asarray(part)[::every] for part in beams))
     usable = usable_beams(taken)
     ranges, angles = jnp.where(usable, taken.range, 1.0), jnp.where(usable, taken.angle, 0.0)
     clean = Beams(ranges, angles, usable)
-    each = model.each(prepared, pose, clean)
+    at = jnp.asarray(pose)
+    each = model.each(prepared, at.astype(jnp.result_type(at, 0.0)), clean)
     return jnp.asarray(exponent) * jnp.where(usable, each, 0.0).sum()
 
 
