@@ -26,7 +26,7 @@ class Job(NamedTuple):
 def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
     """The score by the poses in the file, or why there is none: they were the odometry as well."""
     if np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6):
-        return {"score": "none: the log has no odometry but the poses that would score it"}
+        return {"score": "none: the odometry is equal to the poses that would score it"}
     return score()
 
 
