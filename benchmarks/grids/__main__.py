@@ -94,9 +94,9 @@ def measure() -> list[Metric]:
     metrics = []
     for name, value in json.loads(done.stdout.splitlines()[-1]).items():
         low, high = -np.inf, np.inf
-        if name.startswith("cells, skipping"):
+        if name.startswith(("cells, skipping", "surface")):
             low = 6.0  # of CDDT: Walsh & Karaman 2018, "CDDT: fast approximate 2D ray casting"
-        elif name.startswith("C++ / cells, skipping"):
+        elif name.startswith(("C++ / cells, skipping", "C++ / surface")):
             low = 0.5
         elif name.startswith("mean range"):
             low, high = -1e-3, 1e-3

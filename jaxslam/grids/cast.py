@@ -1,19 +1,19 @@
 """Ranges to the nearest obstacle of a grid along rays."""
 
-import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
 from jaxslam import programs
 from jaxslam.grids.distance import squared_distances
 from jaxslam.grids.grid import Grid, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolated
-from jaxslam.grids.traversal import OFF, STOP, march
+from jaxslam.grids.traversal import MOST, OFF, STOP, march
 from jaxslam.validation.numbers import is_concrete, shape_told
 
 GRAZING = 0.05
@@ -27,9 +27,9 @@ class RayMap(NamedTuple):
 
     solid: Float[Array, "H W"]
     """the share of a cell that is solid less ½: p - ½, and -½ where unknown"""
-    ahead: Float[Array, "H2 W2"]
-    """of each square that rays traverse: how far a ray may go from anywhere in it [squares],
-    `STOP` where it may end, `OFF` in a border off the map"""
+    ahead: UInt8[Array, "H2 W2"]
+    """of each square that rays traverse: how far a ray may go from anywhere in it [quarters of a
+    square], `STOP` where it may end, `OFF` in a border off the map"""
     origin: Float[Array, "3"]
     resolution: Float[Array, ""]
 
@@ -40,7 +40,7 @@ def ray_map(grid: Grid, *, method: str = "surface", skip: bool = True) -> RayMap
     Args:
         method: "surface" or "cells", see `cast`.
         skip: compute the distance field, with which rays cross free space in long steps (sphere
-            tracing). The ranges are the same, bit for bit, but for rays through an exact corner.
+            tracing). The ranges are the same to rounding, but for rays through an exact corner.
     Raises:
         ValueError: a grid that is none, or without a free cell; an unknown method.
     """
@@ -60,17 +60,22 @@ def check_method(name: str, method: str) -> None:
 def _ray_map(squares: PyTree, skip: bool, grid: Grid) -> RayMap:
     solid = jnp.where(grid.known, grid.probability, 0.0) - 0.5
     stops = squares(solid)
+    ahead = jnp.zeros(stops.shape, jnp.uint8)
     if skip:
-        # Beyond the border it is as if all were occupied: no step leads off the map. Between points
-        # of two squares there may be a diagonal less than between their centres. A step is at least
-        # a square long, so that rounding does not keep a ray where it is.
-        away = jnp.sqrt(squared_distances(jnp.pad(stops, 1, constant_values=True)))
-        ahead = away[1:-1, 1:-1].astype(solid.dtype) - math.sqrt(2.0)
-        ahead = jnp.where(ahead >= 1.0, ahead, 0.0)
-    else:
-        ahead = jnp.zeros(stops.shape, solid.dtype)
-    ahead = jnp.pad(jnp.where(stops, STOP, ahead), 1, constant_values=OFF)
+        # Beyond the border it is as if all were occupied: no step leads off the map. The distance
+        # of two squares is that of the centre of one from those around the other.
+        around = _dilated(jnp.pad(stops, 1, constant_values=True))
+        away = jnp.sqrt(squared_distances(around))[1:-1, 1:-1]
+        ahead = jnp.minimum(jnp.floor(4.0 * away), MOST).astype(jnp.uint8)
+    ahead = jnp.pad(jnp.where(stops, jnp.uint8(STOP), ahead), 1, constant_values=OFF)
     return RayMap(solid, ahead, jnp.asarray(grid.origin), jnp.asarray(grid.resolution, solid.dtype))
+
+
+def _dilated(stops: Bool[Array, "H W"]) -> Array:
+    """Whether a square or one of the eight around it stops."""
+    wide = jnp.pad(stops, 1)
+    rows = wide[2:] | wide[1:-1] | wide[:-2]
+    return rows[:, 2:] | rows[:, 1:-1] | rows[:, :-2]
 
 
 def _cells(solid: Float[Array, "H W"]) -> Array:
@@ -178,7 +183,9 @@ def _cast(
 ) -> Float[Array, "*poses B"]:
     shape = (*pose.shape[:-1], len(angles))
     dtype = jnp.result_type(pose, angles, grid.solid, 0.0)
-    grid, pose, angles = jax.tree.map(lambda x: x.astype(dtype), (grid, pose, angles))
+    cast_to = partial(jax.tree.map, lambda x: x.astype(dtype))
+    pose, angles = cast_to((pose, angles))
+    grid = cast_to(grid)._replace(ahead=grid.ahead)
     pose = pose.reshape(-1, 3)
     heading = (pose[:, 2] - grid.origin[2])[:, None] + angles[None, :]
     direction = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)

@@ -1,11 +1,17 @@
 """Rays through a table of squares: every square that a ray crosses, or long steps where it may."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
-STOP, OFF = -1.0, -2.0
+STOP, OFF = 255, 254
 """Squares in which a ray may end, and squares off the map."""
+
+MOST = 253
+"""The longest step, in quarters of a square: steps are bytes, so that more of a map fits into a
+processor's cache."""
 
 CHUNK = 32
 """Rays that a CPU advances together. A loop runs until the longest ray of a chunk ends, so the
@@ -14,7 +20,7 @@ fewer the better; 32 fill its vectors."""
 
 @jax.custom_batching.custom_vmap
 def march(
-    ahead: Float[Array, "H W"],
+    ahead: UInt8[Array, "H W"],
     corners: Float[Array, "H2 W2"] | None,
     start: Float[Array, "R 2"],
     direction: Float[Array, "R 2"],
@@ -22,7 +28,8 @@ def march(
 ) -> tuple[Float[Array, "R"], Bool[Array, "R"]]:
     """The length [squares] of rays up to an obstacle, and whether they meet one within the limit.
 
-    ahead has a border of `OFF` around the squares; start (x, y) counts from the corner of the first
+    ahead: of each square, how far a ray may go from anywhere in it [quarters of a square], or
+    `STOP` or `OFF`; it has a border of `OFF`. start (x, y) counts from the corner of the first
     square within. corners None: a ray ends where it enters a square that is `STOP`. Else it ends in
     such a square where the bilinear interpolation of its four corners is 0, if it is. Rays of a
     batch under `vmap` are as many rays of one call.
@@ -66,104 +73,151 @@ def _march(
     return length.reshape(-1)[:count], hit.reshape(-1)[:count]
 
 
+class _Rays(NamedTuple):
+    """What stays the same along rays."""
+
+    x: Array
+    y: Array
+    """the start, in squares with the border"""
+    dx: Array
+    dy: Array
+    over_x: Array
+    over_y: Array
+    """1/dx and 1/dy, 0 where the ray is along the other axis"""
+    far_x: Array
+    far_y: Array
+    """infinite there: lines of one axis are never crossed, 0 elsewhere"""
+
+
+class _Square(NamedTuple):
+    """Where rays are: the squares (x, y), and the lengths up to them."""
+
+    x: Array
+    y: Array
+    length: Array
+
+
 def _together(
     ahead: Array, corners: Array | None, start: Array, direction: Array, limit: Array
 ) -> tuple[Array, Array]:
     height, width = ahead.shape
-    flat = ahead.reshape(-1)
-    x0, y0, dx, dy = start[:, 0] + 1, start[:, 1] + 1, direction[:, 0], direction[:, 1]
-    right, up = dx > 0, dy > 0
-    # A ray along an axis never crosses lines of the other: its crossing is at infinity.
-    over_x = jnp.where(dx != 0, 1.0 / jnp.where(dx != 0, dx, 1.0), 0.0)
-    over_y = jnp.where(dy != 0, 1.0 / jnp.where(dy != 0, dy, 1.0), 0.0)
-    far_x, far_y = jnp.where(dx != 0, 0.0, jnp.inf), jnp.where(dy != 0, 0.0, jnp.inf)
-
-    def column(x: Array) -> Array:
-        return jnp.clip(jnp.floor(x), 0, width - 1)
-
-    def row(y: Array) -> Array:
-        return jnp.clip(jnp.floor(y), 0, height - 1)
-
-    def unfinished(state: tuple[Array, ...]) -> Array:
-        return state[-1].any()
-
-    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        x, y, length, found, live = state
-        place = y.astype(jnp.int32) * width + x.astype(jnp.int32)
-        here = flat[place]
-        exit_x = (x + right - x0) * over_x + far_x
-        exit_y = (y + up - y0) * over_y + far_y
-        leaves = jnp.minimum(exit_x, exit_y)
-        stop = here == STOP
-        if corners is None:
-            ends = stop
-            end = length
-        else:
-            end, crosses = _surface(corners, x, y, x0, y0, dx, dy, length, leaves)
-            ends = stop & crosses
-        found = found | (live & ends & (end < limit))
-        length_ends = jnp.where(ends, end, length)
-        goes = live & ~ends & (here != OFF) & (leaves < limit)
-        jump = length + here
-        far = (here > 0) & (jump > leaves)
-        after = jnp.where(far, jump, jnp.maximum(leaves, length))
-        first = exit_x < exit_y
-        step_x = jnp.where(first, x + jnp.where(right, 1.0, -1.0), x)
-        step_y = jnp.where(first, y, y + jnp.where(up, 1.0, -1.0))
-        next_x = jnp.where(far, column(x0 + jump * dx), step_x)
-        next_y = jnp.where(far, row(y0 + jump * dy), step_y)
-        return (
-            jnp.where(goes, next_x, x),
-            jnp.where(goes, next_y, y),
-            jnp.where(goes, after, jnp.where(live, length_ends, length)),
-            found,
-            goes,
-        )
-
-    x, y = column(x0), row(y0)
-    inside = (x0 >= 1) & (x0 <= width - 1) & (y0 >= 1) & (y0 <= height - 1)
+    x, y = start[:, 0] + 1, start[:, 1] + 1
+    inside = (x >= 1) & (x <= width - 1) & (y >= 1) & (y <= height - 1)
+    x, y = jnp.where(inside, x, 1.0), jnp.where(inside, y, 1.0)
+    over = jnp.where(direction != 0, 1.0 / jnp.where(direction != 0, direction, 1.0), 0.0)
+    far = jnp.where(direction != 0, 0.0, jnp.inf)
+    rays = _Rays(x, y, *direction.T, *over.T, *far.T)
     # A start on the upper border belongs to the last square.
-    x, y = jnp.minimum(x, width - 2.0), jnp.minimum(y, height - 2.0)
-    zero = jnp.zeros_like(x0)
-    start_state: tuple[Array, ...] = (x, y, zero, jnp.zeros_like(inside), inside)
-    _, _, length, found, _ = jax.lax.while_loop(unfinished, step, start_state)
+    first = _Square(jnp.minimum(x, width - 1.5), jnp.minimum(y, height - 1.5), jnp.zeros_like(x))
+    first = first._replace(x=jnp.floor(first.x), y=jnp.floor(first.y))
+
+    def any_moves(state: tuple[_Square, Array, Array]) -> Array:
+        return state[1].any()
+
+    def free(at: _Square, moving: Array) -> tuple[_Square, Array]:
+        """Move rays up to the next squares that stop; which have come to one."""
+
+        def step(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
+            at, moving, stopped = state
+            here = _taken(ahead, at.x, at.y)
+            crosses = _crossings(rays, at)
+            goes = moving & (here < OFF) & (jnp.minimum(*crosses) < limit)
+            after = _next(rays, at, crosses, here.astype(x.dtype) * 0.25)
+            return _where(goes, after, at), goes, stopped | (moving & (here == STOP))
+
+        waiting = jnp.zeros_like(moving)
+        at, _, stopped = jax.lax.while_loop(
+            lambda state: state[1].any(), step, (at, moving, waiting)
+        )
+        return at, stopped
+
+    if corners is None:
+        at, found = free(first, inside)
+        length = at.length
+    else:
+
+        def through(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
+            """To the next squares that stop, and out of those without the surface."""
+            at, moving, found = state
+            at, stopped = free(at, moving)
+            crosses = _crossings(rays, at)
+            leaves = jnp.minimum(*crosses)
+            meets = _meets(_parabola(corners, rays, at), leaves - at.length)
+            goes = stopped & ~meets & (leaves < limit)
+            after = _next(rays, at, crosses, jnp.zeros_like(leaves))
+            return _where(goes, after, at), goes, found | (stopped & meets)
+
+        begin = first, inside, jnp.zeros_like(inside)
+        at, _, found = jax.lax.while_loop(any_moves, through, begin)
+        length = at.length + _root(_parabola(corners, rays, at))
+    found = found & (length < limit)
     return jnp.where(found, length, limit), found
 
 
-def _surface(
-    corners: Array,
-    x: Array,
-    y: Array,
-    x0: Array,
-    y0: Array,
-    dx: Array,
-    dy: Array,
-    begins: Array,
-    ends: Array,
-) -> tuple[Array, Array]:
-    """Where a ray meets the surface f = 0 in a square, and whether it does there.
+def _taken(table: Array, x: Array, y: Array) -> Array:
+    """The entries (y, x) of a table, which are in it."""
+    place = y.astype(jnp.int32) * table.shape[1] + x.astype(jnp.int32)
+    flat = table.reshape(-1)
+    return flat.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
-    With u, v the coordinates in the square where the ray enters it, and s the length from there,
+
+def _where(goes: Array, after: _Square, at: _Square) -> _Square:
+    return _Square(*(jnp.where(goes, a, b) for a, b in zip(after, at, strict=True)))
+
+
+def _crossings(rays: _Rays, at: _Square) -> tuple[Array, Array]:
+    """The lengths at which rays cross the next line of either axis."""
+    exit_x = (at.x + (rays.dx > 0) - rays.x) * rays.over_x + rays.far_x
+    exit_y = (at.y + (rays.dy > 0) - rays.y) * rays.over_y + rays.far_y
+    return exit_x, exit_y
+
+
+def _next(rays: _Rays, at: _Square, crosses: tuple[Array, Array], ahead: Array) -> _Square:
+    """Where a step leads: as far as is free, where that is beyond the square, else out of it."""
+    exit_x, exit_y = crosses
+    leaves, jump = jnp.minimum(exit_x, exit_y), at.length + ahead
+    far, first = (ahead > 0) & (jump > leaves), exit_x < exit_y
+    step_x = jnp.where(first, at.x + jnp.where(rays.dx > 0, 1.0, -1.0), at.x)
+    step_y = jnp.where(first, at.y, at.y + jnp.where(rays.dy > 0, 1.0, -1.0))
+    return _Square(
+        jnp.where(far, jnp.floor(rays.x + jump * rays.dx), step_x),
+        jnp.where(far, jnp.floor(rays.y + jump * rays.dy), step_y),
+        jnp.where(far, jump, jnp.maximum(leaves, at.length)),
+    )
+
+
+def _parabola(corners: Array, rays: _Rays, at: _Square) -> tuple[Array, Array, Array]:
+    """The interpolation of the corners along rays in their squares, by powers of the length.
+
+    With u, v the coordinates in the square where the ray is now, and s the length from there,
     f = f00 + b u + c v + e u v is (f00 + b u + c v + e u v) + s (b dx + c dy + e (u dy + v dx))
-    + s² e dx dy. A ray that begins in f > 0 ends at once.
+    + s² e dx dy.
     """
-    width = corners.shape[1]
-    at = (y.astype(jnp.int32) - 1) * width + x.astype(jnp.int32) - 1
-    flat = corners.reshape(-1)
-    f00, f10, f01, f11 = flat[at], flat[at + 1], flat[at + width], flat[at + width + 1]
-    u, v = x0 + begins * dx - x, y0 + begins * dy - y
+    x, y = at.x - 1, at.y - 1
+    f00, f10 = _taken(corners, x, y), _taken(corners, x + 1, y)
+    f01, f11 = _taken(corners, x, y + 1), _taken(corners, x + 1, y + 1)
+    u = rays.x + at.length * rays.dx - at.x
+    v = rays.y + at.length * rays.dy - at.y
     b, c, e = f10 - f00, f01 - f00, f00 - f10 - f01 + f11
-    constant = f00 + b * u + c * v + e * u * v
-    linear = b * dx + c * dy + e * (u * dy + v * dx)
-    square = e * dx * dy
-    disc = linear * linear - 4.0 * square * constant
-    half = -0.5 * (linear + jnp.where(linear >= 0, 1.0, -1.0) * jnp.sqrt(jnp.maximum(disc, 0.0)))
-    one = jnp.where(square != 0, half / jnp.where(square != 0, square, 1.0), jnp.inf)
-    two = jnp.where(half != 0, constant / jnp.where(half != 0, half, 1.0), jnp.inf)
-    # Rounding may put a root a little before the square.
-    least = -1e-4
-    one, two = jnp.where(one >= least, one, jnp.inf), jnp.where(two >= least, two, jnp.inf)
-    root = jnp.maximum(jnp.minimum(one, two), 0.0)
-    root = jnp.where(constant > 0, 0.0, root)
-    meets = (constant > 0) | ((disc >= 0) & (begins + root <= ends + 1e-4))
-    return begins + root, meets
+    linear = b * rays.dx + c * rays.dy + e * (u * rays.dy + v * rays.dx)
+    return f00 + b * u + c * v + e * u * v, linear, e * rays.dx * rays.dy
+
+
+def _meets(parabola: tuple[Array, Array, Array], length: Array) -> Array:
+    """Whether a parabola is above 0 at s = 0, at the length, or between."""
+    value, slope, curve = parabola
+    steepest = -2.0 * curve * length
+    between = (curve < 0) & (slope > 0) & (slope < steepest) & (slope**2 >= 4.0 * curve * value)
+    return (value > 0) | (value + length * (slope + length * curve) >= 0) | between
+
+
+def _root(parabola: tuple[Array, Array, Array]) -> Array:
+    """The first s >= 0 at which a parabola is 0; 0 where it begins above."""
+    value, slope, curve = parabola
+    root = jnp.sqrt(jnp.maximum(slope**2 - 4.0 * curve * value, 0.0))
+    half = -0.5 * (slope + jnp.where(slope >= 0, root, -root))
+    one = jnp.where(curve != 0, half / jnp.where(curve != 0, curve, 1.0), jnp.inf)
+    two = jnp.where(half != 0, value / jnp.where(half != 0, half, 1.0), jnp.inf)
+    # Rounding may put a root a little before the start.
+    one, two = (jnp.where(s >= -1e-4, s, jnp.inf) for s in (one, two))
+    return jnp.where(value > 0, 0.0, jnp.maximum(jnp.minimum(one, two), 0.0))
