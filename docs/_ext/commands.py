@@ -35,7 +35,7 @@ ROOT = executed.ROOT
 DATA = Path(os.environ.get("JAXSLAM_DATA", ROOT.parent / "shared" / "data")).absolute()
 RECORD = ROOT / ".cache" / "commands.json"
 """digests of what has passed"""
-LIMIT = 300
+LIMIT = 900
 """seconds that a block may take"""
 BEGINS = {
     "consistency": "jaxslam.cli.consistency.options:",
