@@ -183,7 +183,9 @@ def after_build(app: Any, exception: Exception | None) -> None:
     failed, counted = check([ROOT / "README.md", *pages], RECORD)
     for block, said in failed:
         getLogger(__name__).warning(said, location=f"{block.page}:{block.line}")
-    print("commands:", ", ".join(f"{count} {what}" for what, count in counted.items()))
+    done = [f"{counted.pop(what, 0)} {what}" for what in ("run", "passed before")]
+    why = ", ".join(f"{count} {what}" for what, count in counted.items())
+    print(f"commands: {', '.join(done)}, {counted.total()} not run ({why})")
 
 
 def setup(app: Any) -> dict[str, bool]:
