@@ -35,7 +35,7 @@ check: $(VENV)/.dev
 bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks $(ARGS)
 
-## The documentation, in docs/_build/html; its code is run, its results kept in .cache/. Warnings are errors.
+## The documentation, in docs/_build/html; its code and commands are run, what they gave kept in .cache/. Warnings are errors.
 docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --builder html --jobs auto --fail-on-warning --keep-going --quiet docs docs/_build/html $(ARGS)
 

@@ -74,9 +74,10 @@ def page() -> str:
             name = path.stem
             title = name.replace("_", " ").capitalize() if kind == "filters" else f"`{name}`"
             about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+            argument = f"<!-- run: argument=data/{FOLDERS[name]} -->\n" if name in FOLDERS else ""
             parts.append(
                 f"### {title}\n\n![{about}](../benchmarks/figures/gallery/{name}.png)\n\n"
-                f"```{{literalinclude}} ../examples/gallery/{kind}/{name}.py\n```\n"
+                f"{argument}```{{literalinclude}} ../examples/gallery/{kind}/{name}.py\n```\n"
             )
     return "\n".join(parts)
 

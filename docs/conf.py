@@ -23,6 +23,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "myst_nb",
     "executed",
+    "commands",
     "reference",
 ]
 exclude_patterns = ["_build", "_ext"]

@@ -36,6 +36,7 @@ from jaxslam.simulation.worlds import Scenario
 from jaxslam.smoothing.batch_map import batch_map
 from jaxslam.smoothing.fixed_lag import fixed_lag
 from jaxslam.types import Info, Scan, Truth
+from jaxslam.validation.names import Named
 
 
 def variant(scenario: Scenario, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:
@@ -227,65 +228,77 @@ def in_pieces(filter: Filter, places: int) -> Filter:
     return dataclasses.replace(filter, update=update)
 
 
-FILTERS: dict[str, Callable[..., Candidate]] = {
-    "ekf": variant,
-    "ideal": ideal,
-    "iterated": lambda world, **more: variant(world, iterations=3, **more),
-    "fej": lambda world, **more: variant(world, linearize=first_estimate(), **more),
-    "oc": lambda world, **more: variant(world, linearize=observability(), **more),
-    "right_invariant": lambda world, **more: variant(world, chart=right_invariant(), **more),
-    "left_invariant": lambda world, **more: variant(world, chart=left_invariant(), **more),
-    "robocentric": lambda world, **more: variant(world, chart=robocentric(), **more),
-    "ukf": lambda world, **more: variant(world, linearize=unscented(), **more),
-    "ukf_right": lambda world, **more: variant(
-        world, chart=right_invariant(), linearize=unscented(), **more
-    ),
-    "ukf_left": lambda world, **more: variant(
-        world, chart=left_invariant(), linearize=unscented(), **more
-    ),
-    "square_root": lambda world, **more: variant(world, covariance="square_root", **more),
-}
+FILTERS: Named[Callable[..., Candidate]] = Named(
+    {
+        "ekf": variant,
+        "ideal": ideal,
+        "iterated": lambda world, **more: variant(world, iterations=3, **more),
+        "fej": lambda world, **more: variant(world, linearize=first_estimate(), **more),
+        "oc": lambda world, **more: variant(world, linearize=observability(), **more),
+        "right_invariant": lambda world, **more: variant(world, chart=right_invariant(), **more),
+        "left_invariant": lambda world, **more: variant(world, chart=left_invariant(), **more),
+        "robocentric": lambda world, **more: variant(world, chart=robocentric(), **more),
+        "ukf": lambda world, **more: variant(world, linearize=unscented(), **more),
+        "ukf_right": lambda world, **more: variant(
+            world, chart=right_invariant(), linearize=unscented(), **more
+        ),
+        "ukf_left": lambda world, **more: variant(
+            world, chart=left_invariant(), linearize=unscented(), **more
+        ),
+        "square_root": lambda world, **more: variant(world, covariance="square_root", **more),
+    }
+)
 """By name; each takes a scenario, further options of `ekf_slam`, and `watch` of `variant`, and
 returns what `monte_carlo` runs on it."""
 
-BASELINES: dict[str, Callable[..., Candidate]] = {
-    "dead_reckoning": without_measurements,
-    "localization": in_a_known_map,
-}
+BASELINES: Named[Callable[..., Candidate]] = Named(
+    {
+        "dead_reckoning": without_measurements,
+        "localization": in_a_known_map,
+    }
+)
 """The worst and the best case of a SLAM filter: no measurements, and a known map; as FILTERS."""
 
-PARTICLES: dict[str, Callable[..., Candidate]] = {
-    "fastslam1": lambda world, **more: by_particles(world, "motion", **more),
-    "fastslam2": lambda world, **more: by_particles(world, "measurement", **more),
-    "particle_localization": by_particles_in_a_known_map,
-}
+PARTICLES: Named[Callable[..., Candidate]] = Named(
+    {
+        "fastslam1": lambda world, **more: by_particles(world, "motion", **more),
+        "fastslam2": lambda world, **more: by_particles(world, "measurement", **more),
+        "particle_localization": by_particles_in_a_known_map,
+    }
+)
 """The particle filters; as FILTERS."""
 
-CANONICAL: dict[str, Callable[..., Candidate]] = {
-    "eif_slam": lambda world, **more: in_canonical_form(world, eif_slam, sparse=False, **more),
-    "seif": lambda world, **more: in_canonical_form(world, seif, **more),
-    "eseif": lambda world, **more: in_canonical_form(world, eseif, **more),
-}
+CANONICAL: Named[Callable[..., Candidate]] = Named(
+    {
+        "eif_slam": lambda world, **more: in_canonical_form(world, eif_slam, sparse=False, **more),
+        "seif": lambda world, **more: in_canonical_form(world, seif, **more),
+        "eseif": lambda world, **more: in_canonical_form(world, eseif, **more),
+    }
+)
 """The information filters, exact and sparse; as FILTERS."""
 
-SMOOTHERS: dict[str, Callable[..., Candidate]] = {
-    "fixed_lag": in_a_window,
-    "fixed_lag_fej": lambda world, **more: in_a_window(world, first_estimates=True, **more),
-    "batch_map": in_one_batch,
-}
+SMOOTHERS: Named[Callable[..., Candidate]] = Named(
+    {
+        "fixed_lag": in_a_window,
+        "fixed_lag_fej": lambda world, **more: in_a_window(world, first_estimates=True, **more),
+        "batch_map": in_one_batch,
+    }
+)
 """The fixed-lag smoothers, and the batch solution of the whole log; as FILTERS."""
 
-KINDS: dict[str, tuple[str, ...]] = {
-    "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
-    "consistent Jacobians": ("fej", "oc"),
-    "error coordinates": ("right_invariant", "left_invariant", "robocentric"),
-    "unscented": ("ukf", "ukf_right", "ukf_left"),
-    "smoothing": ("fixed_lag", "fixed_lag_fej", "batch_map"),
-    "information": ("eif_slam", "seif", "eseif"),
-    "particles": ("fastslam1", "fastslam2", "particle_localization"),
-    "baselines": ("dead_reckoning", "localization"),
-}
+KINDS: Named[tuple[str, ...]] = Named(
+    {
+        "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
+        "consistent Jacobians": ("fej", "oc"),
+        "error coordinates": ("right_invariant", "left_invariant", "robocentric"),
+        "unscented": ("ukf", "ukf_right", "ukf_left"),
+        "smoothing": ("fixed_lag", "fixed_lag_fej", "batch_map"),
+        "information": ("eif_slam", "seif", "eseif"),
+        "particles": ("fastslam1", "fastslam2", "particle_localization"),
+        "baselines": ("dead_reckoning", "localization"),
+    }
+)
 """The names by kind of filter; figures of many filters are divided so."""
 
-ALL = FILTERS | SMOOTHERS | CANONICAL | PARTICLES | BASELINES
+ALL = Named(FILTERS | SMOOTHERS | CANONICAL | PARTICLES | BASELINES)
 """All filters, which the command line knows, and runs for `--filters all`."""

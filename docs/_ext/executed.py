@@ -28,18 +28,28 @@ KERNEL = "  name: python3\n"
 
 def digest(page: str) -> str | None:
     """Of what the cells of a page reach; None for a page without cells."""
-    cells = re.findall(r"^```\{code-cell\}[^\n]*\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
-    if not cells:
+    code = code_of(page)
+    if not code:
         return None
-    code = "".join(line for cell in cells for line in cell.splitlines(True) if line[:1] != ":")
     names = named(ast.parse(re.sub(r"^[%!].*$", "", code, flags=re.MULTILINE)))
     files = reached(names | COMMAND if re.search(r"^!jaxslam", code, re.MULTILINE) else names)
     if "examples" in code:
         files |= set((ROOT / "examples").glob("*.py"))
-    hashed = hashlib.sha256()
+    return hashed(files)
+
+
+def code_of(page: str) -> str:
+    """The text of all cells of a page."""
+    cells = re.findall(r"^```\{code-cell\}[^\n]*\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    return "".join(line for cell in cells for line in cell.splitlines(True) if line[:1] != ":")
+
+
+def hashed(files: set[Path], text: str = "") -> str:
+    """A digest of what files do, and of a text."""
+    found = hashlib.sha256(text.encode())
     for path in sorted(files):
-        hashed.update(content(path))
-    return hashed.hexdigest()[:16]
+        found.update(content(path))
+    return found.hexdigest()[:16]
 
 
 def reached(names: frozenset[str]) -> set[Path]:

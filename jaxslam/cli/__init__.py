@@ -1,7 +1,6 @@
 """The command line `jaxslam`; only here are arguments parsed and JAX configured."""
 
 import argparse
-import difflib
 import os
 import platform
 import shlex
@@ -22,6 +21,7 @@ from jaxslam.cli.optimize.command import COST, ERRORS
 from jaxslam.cli.run import options as run_options
 from jaxslam.cli.runtime import cache, devices
 from jaxslam.cli.runtime.compile_clock import CompileClock
+from jaxslam.validation.names import meant
 
 __all__ = ["main"]
 
@@ -73,9 +73,8 @@ class _Parser(argparse.ArgumentParser):
         """As that of argparse; what is not known is an error, here where the command is known."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            alike = difflib.get_close_matches(unknown[0], self._option_string_actions, 1)
-            meant = "".join(f" (did you mean {option}?)" for option in alike)
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
+            asked = meant(unknown[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{asked}")
         return found, unknown
 
     def error(self, message: str) -> NoReturn:

@@ -9,6 +9,7 @@ from typing import TypeVar
 from jaxslam.results.campaign_files import RESULT
 from jaxslam.results.files import check_writable
 from jaxslam.results.meanings import count_label
+from jaxslam.validation.names import meant
 
 _T = TypeVar("_T")
 
@@ -31,8 +32,8 @@ def pick(option: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
     Raises ValueError with the known names and `more`.
     """
     if name not in known:
-        kind = option.removesuffix("s")
-        raise ValueError(f"--{option}: unknown {kind} {name!r}; known: {', '.join(known)}{more}")
+        unknown = f"unknown {option.removesuffix('s')} {name!r}{meant(name, known)}"
+        raise ValueError(f"--{option}: {unknown}; known: {', '.join(known)}{more}")
     return known[name]
 
 

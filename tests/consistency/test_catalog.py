@@ -368,6 +368,22 @@ def test_information_filters_stand_beside_the_family():
 # --- refusals -----------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    "table", ["FILTERS", "BASELINES", "PARTICLES", "CANONICAL", "SMOOTHERS", "KINDS", "ALL"]
+)
+def test_an_unknown_name_is_told_with_the_names_there_are(table):
+    known = getattr(catalog, table)
+    name = next(iter(known))
+    with pytest.raises(KeyError) as told:
+        known[f"{name}f"]
+    assert (
+        str(told.value)
+        == f"expected one of {', '.join(known)}, got '{name}f' (did you mean {name}?)"
+    )
+    assert f"{name}f" not in known
+    assert known.get(f"{name}f") is None
+
+
 @pytest.mark.parametrize("name", ["fej", "oc", "right_invariant", "left_invariant", "robocentric"])
 def test_variants_for_points_refuse_other_landmarks(name):
     with pytest.raises(ValueError, match=r"range_bearing_signature"):

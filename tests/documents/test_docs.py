@@ -1,4 +1,4 @@
-"""The documentation, as far as it is held without building it: `make docs` runs its code."""
+"""The documentation, as far as it is held without building it: `make docs` runs all that it shows."""
 
 import ast
 import contextlib

@@ -1,7 +1,7 @@
 """The gallery shows everything, and its pictures are those of its scripts.
 
-The scripts are run by `python -m benchmarks.gallery`; here one of them is, and the names in the
-others are looked up.
+The scripts are run by `make docs` and `python -m benchmarks.gallery`; here one of them is, and the
+names in the others are looked up.
 """
 
 import ast
