@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxslam import programs
 from jaxslam.grids.grid import Field, Grid, check_grid
 from jaxslam.types import JaxOrNumPy
+from jaxslam.validation.numbers import is_concrete
 
 
 def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None = None) -> Field:
@@ -23,7 +24,7 @@ def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None
         ValueError: a grid that is none, or truncate not above 0.
     """
     check_grid("distance_field", grid)
-    if truncate is not None and not truncate > 0:
+    if truncate is not None and is_concrete(truncate) and not truncate > 0:
         raise ValueError(f"distance_field: expected truncate above 0, got {truncate}")
     largest = jnp.inf if truncate is None else truncate
     return programs.call(_distance_field, (), grid, threshold, largest)

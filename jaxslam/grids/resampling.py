@@ -96,6 +96,5 @@ def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
     one, two = centred(a.probability), centred(other)
     product = (weight * one * one).sum() * (weight * two * two).sum()
     varies = product > 1e-12 * total**2
-    return jnp.where(
-        varies, (weight * one * two).sum() / jnp.sqrt(jnp.where(varies, product, 1.0)), 0.0
-    )
+    found = (weight * one * two).sum() / jnp.sqrt(jnp.where(varies, product, 1.0))
+    return jnp.where(varies, jnp.clip(found, -1.0, 1.0), 0.0)

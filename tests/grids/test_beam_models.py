@@ -214,7 +214,12 @@ def test_both_fits_find_the_parameters():
             lambda m, f: ray_cast(Mixture(1.2, -0.2, 0, 0, 1, 1), max_range=1.0),
             "ray_cast: expected shares",
         ),
-        (lambda m, f: fit(np.ones(3), np.ones(4), FAR), "fit: expected as many ranges"),
+        (lambda m, f: fit(np.ones(3), np.ones(4), FAR), "and as many as expected ones"),
+        (lambda m, f: fit(np.ones(0), np.ones(0), FAR), "fit: expected at least one range"),
+        (
+            lambda m, f: fit(np.ones(3), np.ones(3), FAR, start=Mixture(0, 0, 0, 0, 1, 1)),
+            "fit: start: expected shares",
+        ),
         (lambda m, f: fit(np.ones(3) * np.nan, np.ones(3), FAR), "fit: expected finite ranges"),
         (lambda m, f: fit(np.ones(3), np.ones(3), FAR, method="mcmc"), "fit: expected method"),
     ],

@@ -125,6 +125,10 @@ def test_a_bad_yaml_is_refused_with_its_line(tmp_path, old, new, line, reason):
     recordings.assert_error(path, line, reason, lambda: grids.read_map(path))
 
 
+def test_a_byte_order_mark_is_no_key(tmp_path):
+    assert grids.read_map(made(tmp_path, "\ufeff" + YAML)).resolution == 0.05
+
+
 @pytest.mark.parametrize(
     ("image", "reason"),
     [

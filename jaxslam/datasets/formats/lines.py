@@ -39,7 +39,7 @@ class TextFile:
         self.path, data = read_bytes(path)
         self.comment = comment
         try:
-            self.lines = data.decode("utf-8").split("\n")
+            self.lines = data.decode("utf-8-sig").split("\n")
         except UnicodeDecodeError as problem:
             line = data.count(b"\n", 0, problem.start) + 1
             raise self.error(line, "this is not text") from problem

@@ -53,6 +53,8 @@ def log_likelihood(
     check_beams("log_likelihood", beams)
     if np.shape(pose) != (3,):
         raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_told(pose)}")
+    if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
+        raise ValueError(f"log_likelihood: expected a finite pose, got {pose!r}")
     if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
         raise ValueError(f"log_likelihood: expected an exponent >= 0, got {exponent!r}")
     check_count("log_likelihood: every", every)

@@ -10,11 +10,13 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
 from jaxslam import programs
-from jaxslam.grids.beam_models.ray_cast import Mixture, mixture_log_density
+from jaxslam.grids.beam_models.ray_cast import Mixture, check_weights, mixture_log_density
 from jaxslam.validation.numbers import check_positive
 
 START = Mixture(0.6, 0.15, 0.1, 0.15, 0.2, 0.5)
 """Where the search begins."""
+LEAST = 1e-6
+"""The least σ [m], where ranges are as expected, and length 1/λ."""
 
 
 def fit(
@@ -35,13 +37,16 @@ def fit(
         2005, "Probabilistic robotics", table 6.2. So λ is too large where obstacles are near.
 
     Raises ValueError on lengths that differ, numbers that are not finite, a range below 0, no data,
-    and a max_range that is not above 0.
+    a start that is no mixture, and a max_range that is not above 0.
     """
     ranges, stars = np.asarray(z, np.float64), np.asarray(expected, np.float64)
     if ranges.ndim != 1 or ranges.shape != stars.shape or len(ranges) == 0:
         raise ValueError(
-            f"fit: expected as many ranges as expected ones, got {ranges.shape} and {stars.shape}"
+            "fit: expected at least one range, and as many as expected ones, got "
+            f"{ranges.shape} and {stars.shape}"
         )
+    check_positive("fit: start", sigma=start.sigma, rate=start.rate)
+    check_weights("fit: start", dict(zip(Mixture._fields[:4], start[:4], strict=True)))
     check_positive("fit", max_range=max_range)
     both = np.concatenate([ranges, stars])
     if not np.all(np.isfinite(both)) or both.min() < 0:
@@ -65,7 +70,7 @@ def fit(
 
 
 def _mixture(x: Float[Array, "6"]) -> Mixture:
-    shares, scales = jax.nn.softmax(x[:4]), jnp.exp(x[4:])
+    shares, scales = jax.nn.softmax(x[:4]), LEAST + jnp.exp(x[4:])
     return Mixture(shares[0], shares[1], shares[2], shares[3], scales[0], scales[1])
 
 
@@ -97,5 +102,5 @@ def _em_step(mixture: Mixture, z: np.ndarray, stars: np.ndarray, max_range: floa
     variance = (at * (z - stars) ** 2).sum() / max(at.sum(), 1e-12)
     weights = share.mean(axis=1) / max(share.mean(axis=1).sum(), 1e-12)
     length = (share[1] * z).sum() / max(share[1].sum(), 1e-12)
-    scales = max(np.sqrt(variance), 1e-6), 1 / max(length, 1e-6)
+    scales = max(np.sqrt(variance), LEAST), 1 / max(length, LEAST)
     return Mixture(*(float(value) for value in (*weights, *scales)))

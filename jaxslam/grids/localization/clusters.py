@@ -58,7 +58,7 @@ def clusters(
         raise ValueError(f"clusters: expected bins of three sizes above 0, got {bins!r}")
     used = np.flatnonzero(np.isfinite(weights) & np.isfinite(poses).all(axis=1))
     if len(used) == 0:
-        raise ValueError("clusters: no particle has a positive weight")
+        raise ValueError("clusters: no particle has a finite pose and a positive weight")
     w = np.exp(weights[used] - weights[used].max())
     w = w / w.sum()
     turns = max(int(2 * math.pi / bins[2] + 1e-9), 1)
