@@ -285,13 +285,11 @@ def measure(fit=False, out=FIGURE):
     if out is not None:
         from benchmarks.mrclam.figure import draw
 
-        draw(
-            *(
-                {r: found[r, name, CONSIDERED] for r in robots}
-                for name in ("invariant EKF", "smoother")
-            ),
-            Path(out),
+        filtered, smoothed = (
+            {robot: found[robot, name, CONSIDERED] for robot in robots}
+            for name in ("invariant EKF", "smoother")
         )
+        draw(filtered, smoothed, Path(out))
     return metrics
 
 

@@ -125,10 +125,8 @@ def _together(
             after = _next(rays, at, crosses, here.astype(x.dtype) * 0.25)
             return _where(goes, after, at), goes, stopped | (moving & (here == STOP))
 
-        waiting = jnp.zeros_like(moving)
-        at, _, stopped = jax.lax.while_loop(
-            lambda state: state[1].any(), step, (at, moving, waiting)
-        )
+        begin = at, moving, jnp.zeros_like(moving)
+        at, _, stopped = jax.lax.while_loop(any_moves, step, begin)
         return at, stopped
 
     if corners is None:

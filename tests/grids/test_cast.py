@@ -70,10 +70,17 @@ def test_long_steps_through_free_space_change_no_range(blocks, method):
     np.testing.assert_allclose(skipping, step_by_step, rtol=0, atol=1e-12)
 
 
-def test_rays_end_in_single_precision_too(blocks):
-    """Rounding may leave a ray in a square whose end it has passed."""
-    grid, _, _, pose = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), blocks)
-    angles = jnp.linspace(-3.1, 3.1, 2_000, dtype=jnp.float32)
+def test_rays_end_in_single_precision_too():
+    """Rounding may leave a ray in a square whose end it has passed; it takes many to meet one."""
+    rng = np.random.default_rng(0)
+    log_odds = np.where(rng.random((800, 800)) < 0.01, 4.0, -4.0)
+    free = np.argwhere(log_odds < 0)
+    at = free[rng.integers(len(free), size=100)][:, ::-1] + 0.5
+    pose = np.column_stack([0.05 * at, rng.uniform(-3, 3, 100)])
+    grid = grids.Grid(log_odds, np.zeros(3), np.float64(0.05))
+    grid, pose, angles = jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32), (grid, pose, np.linspace(-3.1, 3.1, 500))
+    )
     step_by_step, skipping = (
         grids.cast(grids.ray_map(grid, method="cells", skip=skip), pose, angles, 20.0)
         for skip in (False, True)

@@ -137,6 +137,7 @@ def test_particles_of_no_weight_from_the_start_are_drawn_anew_until_one_has_some
     scan = Scan(np.column_stack([np.ones(4), np.zeros(4)]), np.full(4, -1), np.zeros(4, bool))
     nothing = update(state, scan, KEY)[0]
     assert float(nothing.injection) == 0.0  # no beam, no verdict
+    np.testing.assert_allclose(nothing.log_weight, state.log_weight, atol=1e-12)
     state, info = update(state, scan._replace(valid=np.ones(4, bool)), KEY)
     assert info.extra["particles"].underflow and float(state.injection) == 1.0
     state, info = update(
