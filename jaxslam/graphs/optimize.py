@@ -19,6 +19,7 @@ from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import chi2_of, data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.plan import Plan, plan_for
+from jaxslam.graphs.solver.rooms import as_before, cut, filled
 from jaxslam.graphs.solver.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
 from jaxslam.validation.numbers import check_count
@@ -49,7 +50,8 @@ def optimize(
         iterations: steps at most.
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
             predicts, and at least by rounding.
-        plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced.
+        plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
+            of about the same size share a compiled program (`solver.rooms`).
     Raises:
         ValueError: on what `check_graph` refuses, and on unknown methods or tables.
     """
@@ -60,9 +62,15 @@ def optimize(
     model = model_of(caller, graph, factors, kernel)
     known = dict(model.factors)
     check_graph(caller, graph, known)
-    plan = plan_for(caller, graph, known, plan)
     limits = np.asarray(iterations), np.asarray(tolerance, float)
-    return programs.call(_optimize, (model, method), graph, plan, *limits)
+    own, fill = graph, plan is None and programs.outside(graph)
+    graph = filled(graph) if fill else graph
+    plan = plan_for(caller, graph, known, plan)
+    found = programs.call(_optimize, (model, method), graph, plan, *limits)
+    if not fill:
+        return found
+    singular = as_before(found.singular, own, graph)
+    return found._replace(graph=cut(found.graph, own), singular=singular)
 
 
 def chi2(

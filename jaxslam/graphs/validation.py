@@ -64,7 +64,7 @@ def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
     pairs = [np.zeros((0, 2), int)]
     held = np.asarray(graph.fixed_pose).copy()
     for key, table in graph.tables.items():
-        counted = table.valid & np.asarray(table.information).any(axis=(1, 2))
+        counted = np.asarray(table.valid) & np.asarray(table.information).any(axis=(1, 2))
         who = variables_in(graph, table._replace(valid=counted), factors[key])
         pairs += [who[:, [0, k]] for k in range(1, who.shape[1])]
         if factors[key].variables == ("pose",):

@@ -13,8 +13,9 @@ is the plain call. Outside, three steps lead to the program, each skipped where 
 So another noise, map or gate of the same shapes costs tracing alone. An integer, and a number that
 `hoisting` leaves in the structure (0, ±1, ±π …), costs one compilation for each value.
 
-The programs least recently used are dropped beyond `ROOM`; `clear` drops all. Concurrent threads
-that need the same program compile it once: the others wait.
+The programs least recently used are dropped beyond `ROOM`, and half of them where they have taken
+half of the memory maps that Linux grants a process: a program has some hundred. `clear` drops all.
+Concurrent threads that need the same program compile it once: the others wait.
 """
 
 import functools
@@ -41,6 +42,9 @@ _T = TypeVar("_T")
 ROOM = 256
 """The number of programs, and of sets of objects that lead to one, in the cache."""
 
+
+FULL = 0.5
+"""The share of the process's memory maps from which on programs are dropped."""
 
 _ALL: "weakref.WeakSet[Kept]" = weakref.WeakSet()
 
@@ -79,6 +83,12 @@ class Kept:
         """Drop the result for a key."""
         with self._lock:
             self._found.pop(key, None)
+
+    def halve(self) -> None:
+        """Drop the half of the results that was used less recently."""
+        with self._lock:
+            for _ in range(len(self._found) // 2):
+                self._found.popitem(last=False)
 
     def clear(self) -> None:
         """Drop all results."""
@@ -224,4 +234,23 @@ def compiled(
     # Unused arguments are not in the text.
     told = tuple(sorted(options.items())) if options else ()
     key = (text, where, lowered.in_tree, str(lowered.in_avals), told)
-    return _BY_TEXT.get(key, lambda: cast(Callable[..., PyTree], lowered.compile(options)))
+
+    def make() -> Callable[..., PyTree]:
+        if _share_of_maps() > FULL:
+            for kept in list(_ALL):
+                kept.halve()
+        return cast(Callable[..., PyTree], lowered.compile(options))
+
+    return _BY_TEXT.get(key, make)
+
+
+def _share_of_maps() -> float:
+    """The number of memory maps of the process, by that which Linux grants it; zero elsewhere.
+
+    Beyond it LLVM cannot allocate memory, and the process ends.
+    """
+    try:
+        with open("/proc/sys/vm/max_map_count") as most, open("/proc/self/maps", "rb") as maps:
+            return sum(1 for _ in maps) / int(most.read())
+    except (OSError, ValueError):
+        return 0.0

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 import small_graphs
+import worlds
 from pose_rings import SIZE, dense, ring, wrap
 from reference import graph as plain
 
@@ -67,6 +68,28 @@ def test_endings():
     assert ended(heading_alone) == (Ending.SINGULAR, 19)
     wrong = dataclasses.replace(factor, residual=uphill, jacobians=None)
     assert ended(graph, factors={"relative_pose": wrong})[0] == Ending.STALLED
+
+
+def test_graphs_of_about_the_same_size_share_their_programs():
+    """Of other poses, loops and pairs; what is found is of the graph's own sizes."""
+
+    table, whole = ring(1).tables["relative_pose"], ring(1)._replace(tables={})
+    rows = np.flatnonzero((table.who < 19).all(axis=1))
+    smaller = jax.tree.map(lambda x: x[:19], whole)
+    smaller.tables["relative_pose"] = jax.tree.map(lambda x: x[rows], table)
+
+    def solved(graph, pairs):
+        found = graphs.optimize(graph)
+        return found, graphs.marginals(found.graph, pairs=pairs)
+
+    solved(ring(), [[3, 4]])
+    with worlds.compilations() as count:
+        found, marginals = solved(smaller, [[2, 7], [1, 18], [3, 3]])
+        assert count() == 0
+    assert jax.tree.map(np.shape, found.graph) == jax.tree.map(np.shape, smaller)
+    assert marginals.poses.shape == (19, 3, 3) and marginals.pairs.shape == (3, 2, 2, 3, 3)
+    _, chi2, information, _ = dense(smaller)
+    np.testing.assert_allclose(found.chi2, chi2, rtol=1e-10)
 
 
 def split(graph):

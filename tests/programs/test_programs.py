@@ -211,6 +211,19 @@ def test_the_least_recently_used_is_dropped():
     assert made == [1, 2, 3, 2]
 
 
+def test_the_older_half_is_dropped_where_memory_maps_run_out(monkeypatch):
+    kept, made = cache.Kept(8), []
+    for name in "abcde":
+        kept.get(name, lambda: 0)
+    monkeypatch.setattr(cache, "_share_of_maps", lambda: 0.6)
+    monkeypatch.setattr(cache, "_ALL", {kept})
+    programs.call(jnp.cosh, (), jnp.zeros(7))
+    for name in "cdeab":
+        kept.get(name, lambda: made.append(0))
+    assert len(made) == 2
+    assert 0 <= cache._share_of_maps() < 1
+
+
 def test_who_comes_second_waits_and_an_error_is_not_kept():
     kept, began, go = cache.Kept(2), threading.Event(), threading.Event()
     made, found = [], []

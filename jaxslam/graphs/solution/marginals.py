@@ -17,8 +17,10 @@ from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import data_of, linearize, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.plan import Plan, plan_for
+from jaxslam.graphs.solver.rooms import LEAST, as_before, as_filled, cut, filled
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
 from jaxslam.graphs.sparse.inverse import selected_inverse
+from jaxslam.graphs.sparse.sweeps import room
 from jaxslam.graphs.validation import check_graph, label
 from jaxslam.validation.numbers import is_concrete
 
@@ -66,8 +68,17 @@ def marginals(
     known = dict(model.factors)
     check_graph(caller, graph, known)
     wanted = np.asarray(pairs, int).reshape(-1, 2)
-    plan = plan_for(caller, graph, known, plan, marginals=True, pairs=wanted)
-    found = programs.call(_marginals, (model,), graph, plan)
+    if plan is None and programs.outside(graph):
+        more = filled(graph)
+        rows = np.zeros((room(len(wanted), LEAST), 2), int)
+        rows[: len(wanted)] = as_filled(wanted, graph, more)
+        new = plan_for(caller, more, known, None, marginals=True, pairs=rows)
+        found = programs.call(_marginals, (model,), more, new)
+        poses, points, pairs = cut(found[:3], (graph.poses, graph.points, wanted))
+        found = Marginals(poses, points, pairs, as_before(found.singular, graph, more))
+    else:
+        plan = plan_for(caller, graph, known, plan, marginals=True, pairs=wanted)
+        found = programs.call(_marginals, (model,), graph, plan)
     if is_concrete(found.singular) and np.ndim(found.singular) == 0 and found.singular >= 0:
         raise ValueError(
             f"{caller}: the measurements do not determine {label(graph, int(found.singular))}"

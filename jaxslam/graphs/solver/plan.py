@@ -13,7 +13,7 @@ from jaxslam.graphs.solver.model import factors_of
 from jaxslam.graphs.sparse.cholesky import CholeskyTables, cholesky_tables
 from jaxslam.graphs.sparse.gathered import Stages, stages
 from jaxslam.graphs.sparse.inverse import InverseTables, inverse_tables
-from jaxslam.graphs.sparse.sweeps import index_table
+from jaxslam.graphs.sparse.sweeps import index_table, room
 from jaxslam.graphs.sparse.symbolic import factor_pattern
 from jaxslam.validation.numbers import is_concrete
 
@@ -34,9 +34,10 @@ class Plan(NamedTuple):
     """from blocks (row, one variable, other variable) of all tables to those of the matrix"""
     gradient: Stages
     """from (row, variable) of all tables to columns"""
-    block_column: Int[Array, "M"]
-    block_row: Int[Array, "M"]
-    on_diagonal: Bool[Array, "M"]
+    block_column: Int[Array, "room"]
+    """of the M blocks of the factor; rows beyond are of no block (`sweeps.room`)"""
+    block_row: Int[Array, "room"]
+    on_diagonal: Bool[Array, "room"]
     cholesky: CholeskyTables
     inverse: InverseTables | None
     """None without `marginals`"""
@@ -57,8 +58,8 @@ def plan(
         plan = graphs.plan(graph)
         jax.vmap(lambda g: graphs.optimize(g, plan=plan))(many)
 
-    Rows that are not valid are in the pattern all the same: which are may differ from graph to
-    graph.
+    Rows that are not valid are in the pattern all the same, since which are may differ from graph
+    to graph; but rows of a variable that is nowhere, as -1, are not.
 
     Args:
         graph: of which only `who` and the numbers of poses and points are read.
@@ -84,16 +85,19 @@ def plan(
         count = np.array([poses if kind == "pose" else points for kind in factors[name].variables])
         lost = ((who[name] < 0) | (who[name] >= count)).any(axis=1)
         bad = lost & np.asarray(its.valid) if is_concrete(its.valid) else lost
-        who[name] = np.where(lost[:, None], 0, who[name])
         if bad.any():
             raise ValueError(
                 f"graphs.plan: row {bad.argmax()} of the table {name!r} is of a variable that is "
                 f"nowhere: {np.asarray(its.who)[bad.argmax()].tolist()}"
             )
+        who[name] = np.where(lost[:, None], 0, who[name])
         shift = np.array([poses * (kind == "point") for kind in factors[name].variables])
-        rows.append(who[name] + shift)
+        rows.append((who[name] + shift, lost))
     joined = [
-        np.stack([r[:, a], r[:, b]]) for r in rows for a in range(r.shape[1]) for b in range(a)
+        np.stack([r[~lost, a], r[~lost, b]])
+        for r, lost in rows
+        for a in range(r.shape[1])
+        for b in range(a)
     ]
     wanted = np.asarray(pairs, int).reshape(-1, 2)
     if ((wanted < 0) | (wanted >= size)).any():
@@ -104,24 +108,26 @@ def plan(
     pattern = factor_pattern(size, first, second)
     cholesky, place = cholesky_tables(pattern)
     order = np.argsort(place[:-1])
-    columns = [pattern.position[r] for r in rows]
-    blocks = []
-    for column in columns:
+    blocks, columns = [], []
+    for its, lost in rows:
+        column = pattern.position[its]
         one, other = np.broadcast_arrays(column[:, :, None], column[:, None, :])
-        lower = one >= other
+        lower = (one >= other) & ~lost[:, None, None]
         target = np.full(one.shape, -1)
         target[lower] = place[pattern.find(one[lower], other[lower])]
         blocks.append(target.ravel())
+        columns.append(np.where(lost[:, None], -1, column).ravel())
     block_column, block_row = pattern.columns[order], pattern.rows[order]
+    width = room(len(order))
     return Plan(
         who={name: index_table(rows) for name, rows in who.items()},
         order=index_table(pattern.order),
         column=index_table(pattern.position),
-        information=stages(np.concatenate(blocks), len(order)),
-        gradient=stages(np.concatenate([column.ravel() for column in columns]), size),
-        block_column=index_table(block_column),
-        block_row=index_table(block_row),
-        on_diagonal=index_table(block_row == block_column),
+        information=stages(np.concatenate(blocks), width),
+        gradient=stages(np.concatenate(columns), size),
+        block_column=index_table(block_column, width),
+        block_row=index_table(block_row, width),
+        on_diagonal=index_table(block_row == block_column, width),
         cholesky=cholesky,
         inverse=inverse_tables(pattern, place, *wanted.T) if marginals else None,
         pairs=index_table(wanted),

@@ -18,11 +18,14 @@ from jaxslam.graphs.sparse.sweeps import (
     Sweep,
     finish,
     index_table,
+    level_table,
     nothing,
     padded,
     places,
+    room,
     subtract_products,
     sweep,
+    table_room,
 )
 from jaxslam.graphs.sparse.symbolic import Ints, Pattern
 from jaxslam.math.linalg import total
@@ -35,7 +38,7 @@ class CholeskyTables(NamedTuple):
     diagonal: Int[Array, "n"]
     """the place of each column's diagonal block"""
     pivots: Int[Array, "levels+1"]
-    """the first chunk of columns of each level"""
+    """the first chunk of columns of each level, and the end of the last"""
     pivot_base: Int[Array, "chunks"]
     """the first column of each chunk"""
     forward: Sweep
@@ -48,7 +51,8 @@ class CholeskyTables(NamedTuple):
 class Factored(NamedTuple):
     """A Cholesky factor L of n columns."""
 
-    blocks: Float[Array, "M+T+1 d d B"]
+    blocks: Float[Array, "places d d B"]
+    """`room(M)` and T + 1 more, which are zero beyond the M of the pattern"""
     inverses: Float[Array, "n+T+1 d d B"]
     """L_jj⁻¹; the last is the identity"""
     regular: Bool[Array, "n B"]
@@ -71,22 +75,23 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
         right.append(blocks[:, other].ravel())
         target.append(pattern.find(rows[left[-1]], rows[right[-1]]))
     sums = Sums(heights[columns], *map(np.concatenate, (target, left, right)))
-    _, place = places(sums)
+    _, place = places(sums, room(len(columns)))
     one = np.append(np.arange(size), nothing(size))
     factor = sweep(sums, place, place, one[np.append(columns, size)])
     # Columns are sorted by height: those of a level lie side by side.
     first = np.searchsorted(heights, np.arange(heights[-1] + 2)).tolist()
     chunks = [range(low, high, TARGETS) for low, high in pairwise(first)]
+    pivot_base = np.concatenate(chunks)
     below = np.flatnonzero(rows > columns)
     downward = Sums(heights, rows[below], below, columns[below])
     upward = Sums(heights[-1] - heights, columns[below], below, rows[below])
-    forward_order, forward_place = places(downward)
-    backward_order, backward_place = places(upward)
+    forward_order, forward_place = places(downward, size)
+    backward_order, backward_place = places(upward, size)
     return CholeskyTables(
         factor,
         diagonal=index_table(place[pattern.first[:-1]]),
-        pivots=index_table(np.cumsum([0, *map(len, chunks)])),
-        pivot_base=index_table(np.concatenate(chunks)),
+        pivots=level_table(np.cumsum([0, *map(len, chunks)]).tolist()),
+        pivot_base=index_table(pivot_base, table_room(len(pivot_base))),
         forward=sweep(downward, place, forward_place, one),
         forward_order=index_table(forward_order),
         backward=sweep(upward, place, backward_place, one),
@@ -113,7 +118,7 @@ def _transposed_on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
     return total(a[:, m] * x[:, m, None] for m in range(a.shape[2]))
 
 
-def factorize(tables: CholeskyTables, blocks: Float[Array, "M d d B"]) -> Factored:
+def factorize(tables: CholeskyTables, blocks: Float[Array, "room d d B"]) -> Factored:
     """The factor of a matrix, from its blocks at their places (lower triangle).
 
     A pivot that rounding may have left of zero, beside the matrix's own diagonal entry, makes its
@@ -149,8 +154,7 @@ def factorize(tables: CholeskyTables, blocks: Float[Array, "M d d B"]) -> Factor
         )
         return finish(tables.factor, i, blocks, inverses, by_transposed), inverses, regular
 
-    levels = len(tables.pivots) - 1
-    state = jax.lax.fori_loop(0, levels, level, (padded(blocks), inverses, regular))
+    state = jax.lax.fori_loop(0, tables.factor.levels, level, (padded(blocks), inverses, regular))
     return Factored(state[0], state[1], state[2][:size])
 
 
@@ -190,6 +194,6 @@ def substitute(
             x = subtract_products(tables_of, i, x, factored.blocks, None, on)  # noqa: B023
             return finish(tables_of, i, x, factored.inverses, lambda x, a: on(a, x))  # noqa: B023
 
-        done = jax.lax.fori_loop(0, len(tables_of.rounds) - 1, level, padded(x[order]))
+        done = jax.lax.fori_loop(0, tables_of.levels, level, padded(x[order]))
         x = jnp.zeros_like(rhs).at[order].set(done[: len(order)], unique_indices=True)
     return x

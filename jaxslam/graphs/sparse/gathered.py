@@ -3,9 +3,11 @@
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxslam.graphs.sparse.sweeps import index_table
+from jaxslam.graphs.sparse.sweeps import index_table, room
 
 TERMS = 4
+LEAST = 2
+"""stages at least, which up to sixteen rows of a target need: fewer would be another program"""
 
 Stages = tuple[Int[Array, "_ terms"], ...]
 
@@ -26,11 +28,13 @@ def stages(target: Int[np.ndarray, "rows"], size: int) -> Stages:
         sums = np.full((groups.sum(), TERMS), absent, np.int32)
         rank = np.arange(len(owner)) - begin[owner]
         sums[group_begin[owner] + rank // TERMS, rank % TERMS] = numbers
-        out.append(index_table(sums))
-        if last:
+        done = last and len(out) + 1 >= LEAST
+        rows = len(sums) if done else room(len(sums))
+        out.append(index_table(sums, rows, absent))
+        if done:
             return tuple(out)
         owner = np.repeat(np.arange(size), groups)
-        numbers, absent = np.arange(len(owner)), len(owner)
+        numbers, absent = np.arange(len(owner)), rows
 
 
 def summed(stages: Stages, rows: Float[Array, "rows *rest"]) -> Float[Array, "size *rest"]:

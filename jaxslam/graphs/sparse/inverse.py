@@ -15,6 +15,7 @@ from jaxslam.graphs.sparse.sweeps import (
     index_table,
     nothing,
     places,
+    room,
     subtract_products,
     sweep,
 )
@@ -56,7 +57,7 @@ def inverse_tables(
     # The diagonal block of a column comes after those below it, of which it is a sum.
     level = 2 * depth[columns] + (rows == columns)
     sums = Sums(level, *map(np.concatenate, (target, left, right, flip)))
-    _, place = places(sums)
+    _, place = places(sums, room(len(columns)))
     end = np.append(columns, nothing(size))
     one, other = pattern.position[first], pattern.position[second]
     pairs = place[pattern.find(np.maximum(one, other), np.minimum(one, other))]
@@ -85,6 +86,5 @@ def selected_inverse(tables: InverseTables, factored: Factored) -> Float[Array, 
         blocks = subtract_products(tables.sweep, i, blocks, None, factored.blocks, by)
         return finish(tables.sweep, i, blocks, factored.inverses, by)
 
-    levels = len(tables.sweep.rounds) - 1
-    out: jax.Array = jax.lax.fori_loop(0, levels, level, start)
+    out: jax.Array = jax.lax.fori_loop(0, tables.sweep.levels, level, start)
     return out

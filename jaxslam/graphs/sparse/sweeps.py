@@ -6,9 +6,12 @@ depend on each other make a level. A level is done in rounds: round r subtracts 
 rK + K - 1 of each target that has so many. The targets of a level are sorted by their number of
 products, so that those of a round are the first of the level and lie side by side in memory: no
 scatter is needed, and the size of the compiled program does not depend on that of the graph.
+
+Tables and arrays are longer than they need be (`room`), so that patterns of about the same size
+share their compiled programs: rows beyond the last level are not visited.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -42,14 +45,15 @@ class Sums(NamedTuple):
 class Sweep(NamedTuple):
     """The tables of a sweep: C chunks of products and F chunks of finished targets."""
 
+    levels: Int[Array, ""]
     rounds: Int[Array, "levels+1"]
-    """the first chunk of products of each level"""
+    """the first chunk of products of each level, and the end of the last"""
     base: Int[Array, "C"]
     """the first place of each chunk"""
     left: Int[Array, "C T K"]
     right: Int[Array, "C T K"]
     ends: Int[Array, "levels+1"]
-    """the first chunk of finished targets of each level"""
+    """the first chunk of finished targets of each level, and the end of the last"""
     end_base: Int[Array, "F"]
     end: Int[Array, "F T"]
     """what a target is finished with"""
@@ -57,19 +61,44 @@ class Sweep(NamedTuple):
     """whether the left factor is transposed"""
 
 
-def index_table(numbers: np.ndarray) -> Array:
-    """A table of integers or flags, on the device."""
+def room(size: int, least: int = 64, parts: int = 8) -> int:
+    """The next size of a coarser series: multiples of `least`, and of the parts of an octave.
+
+    A size of the series is its own room, and so is zero.
+    """
+    step = max(least, (1 << max(size.bit_length() - 1, 0)) // parts)
+    return -(-size // step) * step
+
+
+def table_room(size: int) -> int:
+    """The room of a table, whose rows beyond its size cost memory alone."""
+    return room(size, parts=2)
+
+
+def index_table(numbers: np.ndarray, size: int | None = None, fill: int = 0) -> Array:
+    """A table of integers or flags, on the device; filled up to so many rows."""
     kept = numbers if numbers.dtype == bool else numbers.astype(np.int32)
+    if size is not None:
+        more = [(0, size - len(kept))] + [(0, 0)] * (kept.ndim - 1)
+        kept = np.pad(kept, more, constant_values=fill)
     return jnp.asarray(jax.device_put(kept))
 
 
-def places(sums: Sums) -> tuple[Ints, Ints]:
-    """The target at each place (M,), and the place of each target and of no target (M+1,)."""
+def level_table(ends: Sequence[int]) -> Array:
+    """The end of each level, from 0, as a table."""
+    return index_table(np.array(ends), table_room(len(ends)))
+
+
+def places(sums: Sums, size: int) -> tuple[Ints, Ints]:
+    """The target at each place (M,), and the place of each target and of no target (M+1,).
+
+    size: of the array of targets, at least M.
+    """
     count = np.bincount(sums.target, minlength=len(sums.level))
     order = np.lexsort((-count, sums.level))
     place = np.empty(len(order) + 1, int)
     place[order] = np.arange(len(order))
-    place[-1] = nothing(len(order))
+    place[-1] = nothing(size)
     return order, place
 
 
@@ -90,7 +119,7 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
     finished with, and what leaves a target as it is.
     """
     size = len(sums.level)
-    order, _ = places(sums)
+    order, _ = places(sums, size)
     counts = np.bincount(sums.target, minlength=size)
     begin = (np.cumsum(counts) - counts)[order]
     count = counts[order]
@@ -116,19 +145,22 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
     end_place = np.array(end_base, int)[:, None] + np.arange(TARGETS)
     inside = end_place < np.repeat(first[1:], np.diff(ends))[:, None]
     ending = order[np.minimum(end_place, size - 1)]
+    width = table_room(len(bases))
 
     def factors(numbers: Ints, place: Ints) -> Array:
-        return index_table(place[np.where(real, np.append(numbers, 0)[product], -1)])
+        numbers = np.append(numbers, 0)[product]
+        return index_table(place[np.where(real, numbers, -1)], width, int(place[-1]))
 
     return Sweep(
-        index_table(np.array(rounds)),
-        index_table(bases),
+        index_table(np.array(levels)),
+        level_table(rounds),
+        index_table(bases, width),
         factors(sums.left, left),
         factors(sums.right, right),
-        index_table(np.array(ends)),
-        index_table(np.array(end_base, int)),
-        index_table(end[np.where(inside, ending, -1)]),
-        None if sums.flip is None else index_table(np.append(sums.flip, False)[product]),
+        level_table(ends),
+        index_table(np.array(end_base, int), table_room(len(end_base))),
+        index_table(end[np.where(inside, ending, -1)], table_room(len(end_base)), int(end[-1])),
+        None if sums.flip is None else index_table(np.append(sums.flip, False)[product], width),
     )
 
 
