@@ -1,4 +1,4 @@
-"""jaxslam: pure-functional, differentiable 2-D landmark SLAM.
+"""jaxslam: pure-functional, differentiable 2-D SLAM.
 
 A SLAM method is a record of pure functions (`protocols`). `run` applies it to a log, and
 `monte_carlo` to thousands of simulated worlds. Importing the package does not change the

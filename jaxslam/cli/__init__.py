@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     """The parser of the command line; `options.command` is the function to call."""
     parser = _Parser(
         prog="jaxslam",
-        description="2-D landmark SLAM in JAX.",
+        description="2-D SLAM in JAX: landmark filters and their consistency, graphs, laser maps.",
         epilog="jaxslam COMMAND --help describes the options of a command.",
     )
     parser.add_argument("--version", action="version", version=_versions())

@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -94,10 +94,16 @@ def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more:
     """Add the option of the formats of figures; `more` is said after the default."""
     parser.add_argument(
         "--figures",
-        default="png",
         metavar="FORMATS",
         help=f"formats of figures, of {', '.join(formats)}; comma-separated (default: png{more})",
     )
+
+
+def asked_figures(options: argparse.Namespace, there: Sequence[str] = ()) -> Sequence[str]:
+    """The formats of figures that a command asks for; else those that are there, else PNG."""
+    if options.figures is not None:
+        return list(options.figures.split(","))
+    return there or ("png",)
 
 
 def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:

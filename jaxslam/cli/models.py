@@ -21,6 +21,8 @@ FAILED = 1
 def verify_models(options: argparse.Namespace, command: str) -> int:
     """Verify Jacobians, print and write the findings; returns the exit status, 1 if any fails."""
     began = time.perf_counter()
+    if options.states < 2:
+        raise ValueError(f"--states: expected at least 2, got {options.states}")
     check_writable(options.out)
     verify_one = partial(verify.verify_jacobians, count=options.states, seed=options.seed)
     if options.target is None:

@@ -42,7 +42,8 @@ class UserObjects:
         arguments = () if steps is None else (steps,)
         if not _in_file(asked):
             return pick("scenario", asked, SCENARIOS, _OWN)(*arguments)
-        _, made = self._find("--scenario", asked)
+        _, own = self._find("--scenario", asked)
+        made = own
         if isinstance(made, Scenario) and steps is not None:
             raise ValueError(
                 f"--steps: {asked} is a Scenario, which has {made.steps}; "
@@ -52,7 +53,9 @@ class UserObjects:
             told = "the number of steps" if arguments else "nothing"
             made = self._call(asked, told, made, *arguments)
         if not isinstance(made, Scenario):
-            raise ValueError(f"{asked}: expected a Scenario, or a function that returns one")
+            raise ValueError(
+                f"{asked}: expected a Scenario, or a function that returns one, {_got(own, made)}"
+            )
         check_noise(made)
         return made
 
@@ -98,17 +101,19 @@ class UserObjects:
         if not name:
             raise ValueError(f"{option}: expected FILE.py:NAME, got {asked}{names_in(module)}")
         if not hasattr(module, name):
-            raise ValueError(f"{option}: there is no {name} in {path.name}{names_in(module)}")
+            raise ValueError(f"{option}: there is no {name!r} in {path.name}{names_in(module)}")
         return name, getattr(module, name)
 
     def _own(self, asked: str, scenario: Scenario) -> tuple[str, Candidate]:
         """The name of a user's filter, and the filter for the scenario."""
-        name, made = self._find("--filters", asked)
+        name, own = self._find("--filters", asked)
+        made = own
         if not isinstance(made, Filter) and callable(made):
             made = self._call(asked, "the scenario", made, scenario)
         if not isinstance(made, Filter) and not callable(made):
             raise ValueError(
-                f"{asked}: expected a Filter, or a function of the scenario that returns one"
+                f"{asked}: expected a Filter, or a function of the scenario that returns one, "
+                f"{_got(own, made)}"
             )
         check_fits(name, made, scenario)
         return name, made
@@ -128,6 +133,11 @@ class UserObjects:
             raise ValueError(
                 f"{asked}: called with {told}, it fails: {describe_error(error)}"
             ) from error
+
+
+def _got(own: object, made: object) -> str:
+    """What stands in a file in place of what was expected, or what its function returned."""
+    return f"got {made!r:.60}" if made is own else f"got a function that returned {made!r:.60}"
 
 
 def _in_file(asked: str) -> bool:

@@ -31,7 +31,7 @@ def _of_one_robot(
     reader: Callable[[str | Path], Dataset], path: str | Path, robot: int | None = None
 ) -> Dataset:
     if robot is not None:
-        raise ValueError(f"robot: expected none, since this data set has one robot, got {robot}")
+        raise ValueError(f"--robot: expected none, since this data set has one robot, got {robot}")
     return reader(path)
 
 

@@ -15,9 +15,8 @@ from jaxslam.consistency import (
     Summary,
     lopsided,
     percentage,
-    power_of,
 )
-from jaxslam.consistency.verdict import TESTS
+from jaxslam.consistency.verdict import POWER, TESTS
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.files import csv_text, json_text, versions
 from jaxslam.results.meanings import VERDICTS, count_label, notes_on
@@ -94,17 +93,26 @@ def _explained(campaign: Campaign) -> list[str]:
 
 
 def qualified(campaign: Campaign) -> list[str]:
-    """Sentences on the power of the test of each filter not rejected, and on each verdict's doubts.
+    """Sentences on the power of the tests of the filters not rejected, and on verdicts' doubts.
 
-    Verdicts with doubts have an asterisk in the table.
+    Filters of which the same is said share a sentence. Verdicts with doubts have an asterisk in the
+    table.
     """
-    out = []
+    powers: dict[str, list[str]] = {}
+    doubts: dict[str, list[str]] = {}
     for name, summary in campaign.filters.items():
-        power = power_of(summary.noticed)
-        if power and summary.verdict in ("consistent", "incomplete", "undecided"):
-            out.append(f"{name}: not rejected; {power}")
-        out += [f"{name}*: {doubt}" for doubt in summary.doubts]
-    return out
+        ends = {test: pair for test, pair in summary.noticed.items() if pair != (0.0, np.inf)}
+        if ends and summary.verdict in ("consistent", "incomplete", "undecided"):
+            limits = " and ".join(f"[{low:.3g}, {high:.3g}]" for low, high in ends.values())
+            tests = " and ".join(f"a {TESTS[test]}" for test in ends)
+            powers.setdefault(tests, []).append(f"{name} {limits}")
+        for doubt in summary.doubts:
+            doubts.setdefault(doubt, []).append(name)
+    power = f"not rejected, with {percentage(POWER)} power to reject"
+    return [
+        *(f"{power} {tests} outside: {'; '.join(told)}" for tests, told in powers.items()),
+        *(f"{', '.join(names)}*: {doubt}" for doubt, names in doubts.items()),
+    ]
 
 
 def not_finite(campaign: Campaign) -> list[str]:

@@ -32,7 +32,7 @@ from jaxslam.validation import check_record
 from jaxslam.validation.numbers import check_covariance, check_key, is_concrete
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scenario:
     """A simulated experiment: models, world, controls, and options of the filters under test.
 
@@ -74,6 +74,11 @@ class Scenario:
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
     source: str = ""
     """where the experiment is published."""
+
+    def __repr__(self) -> str:
+        landmarks, steps = np.shape(self.landmarks)[0], np.shape(self.controls)[0]
+        models = f"{self.motion.name}, {self.sensor.name}"
+        return f"Scenario({self.name!r}, {steps} steps, {landmarks} landmarks, {models})"
 
     def __post_init__(self) -> None:
         what = f"Scenario {self.name!r}"

@@ -90,13 +90,18 @@ def check_record(name: str, what: str, value: object, kind: type[_Record]) -> _R
     """The value, if it is such a record; ValueError if not, as on a factory that was not called."""
     if isinstance(value, kind):
         return value
+    what = f"{what} to be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
     if callable(value):
         factory = getattr(value, "__name__", repr(value))
         raise ValueError(
-            f"{name}: expected {what} to be a {kind.__name__}, got the function {factory}: "
-            f"call it, {factory}(…)"
+            f"{name}: expected {what}, got the function {factory}: call it, {factory}(…)"
         )
-    raise ValueError(f"{name}: expected {what} to be a {kind.__name__}, got {type(value).__name__}")
+    fields = getattr(value, "_fields", ())
+    held = next((field for field in fields if isinstance(getattr(value, field), kind)), None)
+    raise ValueError(
+        f"{name}: expected {what}, got {type(value).__name__}"
+        + f"; give its field {held}" * bool(held)
+    )
 
 
 def check_associate(name: str, associate: object) -> None:

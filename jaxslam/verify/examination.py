@@ -17,6 +17,7 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties
 from jaxslam.verify.derivatives.jacobians import Evaluated, evaluate_jacobians
 from jaxslam.verify.errors import describe_error
+from jaxslam.verify.finite import singular_notes
 from jaxslam.verify.inputs import samples
 from jaxslam.verify.inputs.functions import (
     Function,
@@ -35,6 +36,8 @@ class Examined(NamedTuple):
 
     evaluated: tuple[Evaluated, ...]
     checks: tuple[Check, ...]
+    singular: tuple[str, ...]
+    """notes on where a function of places is not finite"""
 
 
 def examine(
@@ -69,7 +72,10 @@ def examine(
             if isinstance(model, Motion | Sensor | BeamModel):
                 checks += properties.dtype_checks(one)
         checks += _model_checks(model, drawn)
-    return Examined(evaluated, tuple(checks))
+        singular: list[str] = []
+        if given is None and not isinstance(model, Motion | Sensor):
+            singular = [note for one in evaluated for note in singular_notes(one)]
+    return Examined(evaluated, tuple(checks), tuple(singular))
 
 
 def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:

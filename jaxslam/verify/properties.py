@@ -1,7 +1,5 @@
 """Checks beside Jacobians: round trips, residuals, noise, purity, finite values, dtypes."""
 
-import contextlib
-import io
 from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
@@ -16,8 +14,8 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.validation.numbers import check_covariance
 from jaxslam.verify.derivatives.differences import modulo_periods
 from jaxslam.verify.derivatives.jacobians import Evaluated
-from jaxslam.verify.derivatives.singular import CURES, singular_operation
-from jaxslam.verify.errors import describe_error, place_of_error
+from jaxslam.verify.errors import describe_error
+from jaxslam.verify.finite import finite_check
 from jaxslam.verify.inputs.functions import Function, at_state, periods, sensor_functions
 from jaxslam.verify.inputs.samples import NOMINAL, Samples
 from jaxslam.verify.record import Check
@@ -35,7 +33,7 @@ def function_checks(evaluated: Evaluated) -> Iterator[Check]:
     if evaluated.values is None:
         return
     function = evaluated.function
-    yield _finite_check(evaluated)
+    yield finite_check(evaluated)
     if any(evaluation.methods for evaluation in evaluated.by_argument):
         yield from _guarded(f"{function.name} is pure", lambda: _pure(function, evaluated))
 
@@ -104,8 +102,9 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
         "the residual is antisymmetric",
         lambda: _deviation(residual(z, other) + residual(other, z), circle),
     )
+    wrapped = ", wrapped on the circle" if np.isfinite(circle).any() else ""
     yield from _guarded(
-        "the residual is a difference, wrapped on the circle",
+        f"the residual is a difference{wrapped}",
         lambda: _residual_error(residual, z, other, circle),
     )
     if not sensor.landmark:
@@ -126,6 +125,9 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
             np.argmax(np.where(np.isnan(off), np.inf, abs(off))), off.shape
         )
         at = at_state(sensor_functions(sensor)[1], [a[row] for a in few])
+        away = abs(off[row, entry]) * size
+        if abs(away - 2 * np.pi) < 1e-6:
+            trouble = "off by 2π (an angle's name ends in [rad])"
         return f"{sensor.measurements[entry]} is {trouble}, at {at}"
 
     yield from _guarded("observe undoes invert, whatever is free", observation_error)
@@ -229,47 +231,6 @@ def _deviation(difference: ArrayLike, circle: Float[np.ndarray, "m"]) -> str:
 def _exactly(difference: ArrayLike) -> str:
     """As `_deviation`, for entries that are not on a circle."""
     return _deviation(difference, np.full(np.shape(difference)[-1], np.inf))
-
-
-def _finite_check(evaluated: Evaluated) -> Check:
-    """The check that values and Jacobians are finite at every state."""
-    function, samples = evaluated.function, evaluated.samples
-    assert evaluated.values is not None
-    parts = {"a value": evaluated.values}
-    for argument, evaluation in zip(function.arguments, evaluated.by_argument, strict=True):
-        for how, jacobian in evaluation.methods.items():
-            parts[f"{how} by {argument.name}"] = jacobian
-        for how, jacobian in evaluation.single.items():
-            parts[f"{how} by {argument.name} in float32"] = jacobian
-    name, count = f"{function.name} and its derivatives are finite", len(samples.labels)
-    for what, part in parts.items():
-        bad = ~np.isfinite(part).all(axis=tuple(range(1, part.ndim)))
-        if bad.any():
-            i = int(np.argmax(bad))
-            state = tuple(a[i] for a in samples.values)
-            hand = function.hand if what.startswith("hand") else None
-            call: Callable[..., object] = hand or function.call
-            kind = singular_operation(call, state)
-            if what != "a value" and hand is None:
-                call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
-            where = _line_of_nan(call, state)
-            at = at_state(function, state)
-            line = f"{where}: " if where else ""
-            often = f"at {int(np.sum(bad))} of {count} states"
-            cure = (f"The cause is {kind}. {CURES[kind][0]}", *CURES[kind][1:]) if kind else ()
-            detail = f"{line}{what} is not finite, {often}; {samples.labels[i]}: {at}"
-            return Check(name, False, detail, cure)
-    return Check(name, True, f"{count} states")
-
-
-def _line_of_nan(call: Callable[..., object], state: tuple[Values, ...]) -> str:
-    """The user's line at which a NaN or an infinity first appears when a function is called."""
-    try:  # JAX prints what it found
-        with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
-            call(*(jnp.asarray(a) for a in state))
-    except (Exception, SystemExit) as error:
-        return place_of_error(error)
-    return ""
 
 
 def _pure(function: Function, evaluated: Evaluated) -> str:

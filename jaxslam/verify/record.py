@@ -131,7 +131,7 @@ class Check:
             yield from _wrapped(line, 6) if number == 0 else [f"        {line}"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Report:
     """The report on one model; `print` shows it, and `passed` is the result."""
 
@@ -143,7 +143,7 @@ class Report:
     """of a model, the median of `linearity_index` over the random states, for standard deviations
     of 0.1 (0.05 of [rad] and [1/m])"""
     notes: tuple[str, ...] = field(default=())
-    """what the user should know although it is no failure"""
+    """what the user should know although it is no failure: text, then lines of code"""
 
     @property
     def passed(self) -> bool:
@@ -172,10 +172,13 @@ class Report:
         if held:
             lines += _wrapped(f"ok    {held}", 2)
         for note in self.notes:
-            lines += _wrapped(f"note  {note}", 2)
+            text, *code = note.split("\n")
+            lines += [*_wrapped(f"note  {text}", 2), *(f"        {line}" for line in code)]
         if self.linearity is not None:
             lines.append(f"  linearity index {self.linearity:.3g}, median (3 σ of 0.1 m, 0.05 rad)")
         return "\n".join(lines)
+
+    __repr__ = __str__
 
     def as_dict(self) -> dict[str, object]:
         """The report as a dictionary for JSON; numbers that are not finite are None."""

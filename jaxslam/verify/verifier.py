@@ -146,8 +146,9 @@ def verify_jacobians(
         ]
     with float64():
         linearity = typical_linearity(model, examined)
-    notes = tuple(note for one in examined.evaluated for note in notes_of(one, kind))
-    return Report(name, kind, tuple(findings), examined.checks, linearity, notes)
+    notes = [note for one in examined.evaluated for note in notes_of(one, kind)]
+    notes += examined.singular
+    return Report(name, kind, tuple(findings), examined.checks, linearity, tuple(notes))
 
 
 def notes_of(evaluated: Evaluated, kind: str) -> Iterator[str]:

@@ -78,7 +78,7 @@ def test_the_version_is_told(capsys):
         (["--filters", "ekf,magic"], "--filters: unknown filter 'magic'"),
         (["--runs", "0"], "--runs: expected an integer >= 1, got 0"),
         (["--runs", "many"], "invalid int"),
-        (["--steps", "0"], "circle: steps: expected an integer >= 1"),
+        (["--steps", "0"], "--steps: expected an integer >= 1"),
         (["--block", "-1"], "--block: expected"),
         (["--seed", "-1"], "seed"),
         (["--dtype", "float16"], "invalid choice"),

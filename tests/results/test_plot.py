@@ -197,7 +197,7 @@ def test_the_band_is_seen_whatever_a_degenerate_covariance_gives(names):
             marks = [mark for mark in beyond(axes) if mark.get_color() == curve.get_color()]
             x = np.concatenate([mark.get_xdata() for mark in marks])
             assert len(x) and (curve.get_ydata()[x.astype(int) - 1] > high).all()
-            assert axes.get_title("right").startswith("▲ to $")
+            assert axes.get_title("right").startswith("↑ to $")
     assert len(extreme) == 3
 
 
@@ -221,7 +221,7 @@ def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
         assert reckoned.get_ydata().max() == 40 * unit
         (marks,) = beyond(axes)
         assert marks.get_color() == reckoned.get_color()
-        assert axes.get_title("right") == f"▲ to {40 * unit}"
+        assert axes.get_title("right") == f"↑ to {40 * unit}"
     # Alone, it does; and so does a filter that is merely worse than another.
     alone = plot.bound_figure(drawn.campaign(["dead_reckoning"])).axes[0]
     assert alone.get_ylim()[1] > 40 and not beyond(alone)
@@ -269,7 +269,7 @@ def test_points_of_cost_stay_off_the_frame(five):
             x, y = axes.transAxes.inverted().transform(axes.transData.transform(point))[0]
             assert 0.05 < x < 0.95
             assert 0.05 < y < 0.95 or (name, key) == ("fastslam1", "nees_pose")
-    assert bottom.get_title("right") == r"▲ to $3\cdot 10^{27}$"
+    assert bottom.get_title("right") == r"↑ to $3\cdot 10^{27}$"
     assert bottom.get_ylim()[1] < 1e3
     assert bottom.get_xlabel() == "time of a step [µs]"
     # A campaign that only read its blocks has timed nothing.

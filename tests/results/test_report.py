@@ -51,6 +51,23 @@ def test_the_notes_explain_the_gate_the_likelihood_and_the_counts(campaign):
     assert "gate:" not in alone and "log-likelihood:" not in alone
 
 
+def test_filters_of_which_the_same_is_said_share_a_sentence(campaign):
+    one = dataclasses.replace(
+        campaign.filters["ekf"],
+        verdict="consistent",
+        noticed={"nees_pose": (1.0, 5.0), "nis_per_dof": (0.9, np.inf)},
+        doubts=("a doubt",),
+    )
+    other = dataclasses.replace(one, noticed={"nees_pose": (0.0, 6.0)})
+    both = dataclasses.replace(campaign, filters={"a": one, "b": one, "c": other})
+    power = "not rejected, with 90 % power to reject a pose NEES"
+    assert report.qualified(both) == [
+        f"{power} and a NIS / dof outside: a [1, 5] and [0.9, inf]; b [1, 5] and [0.9, inf]",
+        f"{power} outside: c [0, 6]",
+        "a, b, c*: a doubt",
+    ]
+
+
 def test_what_a_filter_does_not_estimate_has_no_number():
     """The log-likelihood of dead reckoning, the map of localization."""
     filters = {name: BASELINES[name](WORLD) for name in ("dead_reckoning", "localization")}

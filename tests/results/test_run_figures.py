@@ -10,6 +10,7 @@ import pytest
 from jaxslam import plot
 from jaxslam.results.plot.campaigns.scale import BEYOND
 from jaxslam.results.plot.style import curves_of
+from jaxslam.types import Trace
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 3.0])
@@ -56,7 +57,15 @@ def test_a_map_has_equal_aspect_units_a_start_and_an_end():
     (axes,) = figure.axes
     assert axes.get_aspect() == 1.0
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
-    expected = {"true path", "estimated path", "true landmarks", "3 σ ellipses", "start", "end"}
+    expected = {
+        "true path",
+        "estimated path",
+        "true landmarks",
+        "3 σ ellipses",
+        "3 σ ellipse, pose",
+        "start",
+        "end",
+    }
     assert expected <= set(named(figure)) and len(named(figure)) == len(set(named(figure)))
     for label, at in (("start", 0), ("end", -1)):
         np.testing.assert_array_equal(line(axes, label).get_xydata()[0], estimate.pose[at, :2])
@@ -154,12 +163,24 @@ def test_errors_and_maps_show_every_filter_on_scales_that_dead_reckoning_does_no
     assert rows[0, 0].get_ylim() == rows[1, 0].get_ylim() == pytest.approx((-0.315, 0.315))
     marked = [any(each.get_gid() == BEYOND for each in axes.lines) for axes in rows[:, 0]]
     assert marked == [True, False, False]
-    assert rows[0, 0].get_title("right") == "▼ to −4"
+    assert rows[0, 0].get_title("right") == "↓ to −4"
     maps = plot.run_map_figure(found, title="run 0")
     shown = [axes for axes in maps.axes if axes.axison]
     assert [axes.get_title("left") for axes in shown] == names
     assert len({axes.get_xlim() for axes in shown}) == 1
     assert np.ptp(shown[0].get_xlim()) < 10
+
+
+def test_errors_far_below_the_others_have_a_scale_of_their_own():
+    found = drawn.campaign(["ekf", "fej", "localization"])
+    truth, estimate = found.first["localization"]
+    near = truth.pose + (np.asarray(estimate.pose) - truth.pose) / 100
+    close = estimate._replace(pose=near, pose_cov=np.asarray(estimate.pose_cov) / 100**2)
+    first = found.first | {"localization": (truth, close)}
+    rows = plot.run_errors_figure(dataclasses.replace(found, first=first)).axes
+    common, own = rows[0].get_ylim()[1], rows[6].get_ylim()[1]
+    assert own == pytest.approx(common / 100)
+    assert {label.get_weight() for label in rows[6].get_yticklabels()} == {"bold"}
 
 
 def test_a_run_of_one_filter_has_the_figure_of_one_and_none_is_refused():
@@ -170,3 +191,7 @@ def test_a_run_of_one_filter_has_the_figure_of_one_and_none_is_refused():
     for draw in (plot.run_errors_figure, plot.run_map_figure):
         with pytest.raises(ValueError, match=f"{draw.__name__}: the campaign holds no run 0"):
             draw(nothing)
+        with pytest.raises(ValueError, match="expected the first argument to be a Campaign, got"):
+            draw(found.first["ekf"])
+    with pytest.raises(ValueError, match="to be an Estimate, got Trace; give its field estimate"):
+        plot.map_figure(Trace(found.first["ekf"][1], None, None, None))

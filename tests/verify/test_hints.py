@@ -90,14 +90,14 @@ def test_a_deduced_length_is_noted_and_verified():
 @pytest.mark.parametrize(
     ("function", "claim", "whys"),
     [
-        (lambda u: u, None, ["argument 'u'", "f accepts more than one"]),
+        (lambda u: u, None, ["length of 'u'", "f accepts more than one"]),
         (lambda u: u, lambda u: jnp.eye(len(u)), ["f and its Jacobian accept more than one"]),
         # Only the argument that is not determined is asked for.
-        (lambda a, b: a[0] * b, lambda a, b: (b[:, None], None), ["argument 'b' is"]),
+        (lambda a, b: a[0] * b, lambda a, b: (b[:, None], None), ["length of 'b' is"]),
         (
             lambda a, b: (a * 2).reshape(2) + b[0],
             None,
-            ["argument 'b' is", 'f_arguments = {"b": ("v [m/s]", "omega [rad/s]")}'],
+            ["length of 'b' is", 'f_arguments = {"b": ("v [m/s]", "omega [rad/s]")}'],
         ),
         (lambda u: u.reshape(20), None, ["f fails with 1 to 12 entries", "reshape"]),
         (lambda u: (u, u), None, ["it returns shapes [(12,), (12,)], expected (m,)"]),
@@ -105,7 +105,7 @@ def test_a_deduced_length_is_noted_and_verified():
     ],
 )
 def test_lengths_that_are_not_determined_are_asked_for(function, claim, whys):
-    with pytest.raises(ValueError, match=r"the length of its argument .* is not known") as error:
+    with pytest.raises(ValueError, match=r"the length of .* is not known") as error:
         lengths(function, claim, name="f")
     message = str(error.value)
     assert "\n" not in message
@@ -141,10 +141,11 @@ def bearing(pose, landmark):
 def test_an_output_that_jumps_by_a_turn_is_noted_unless_named():
     report = verify_jacobians(bearing)
     assert report.passed
-    (note,) = report.notes
+    note, _ = report.notes
     assert note.startswith("bearing[1] jumps by 2π at pose = (")
     assert "note  bearing[1] jumps" in str(report)
-    assert not verify_jacobians(bearing, outputs=("x [m]", "bearing [rad]")).notes
+    (note,) = verify_jacobians(bearing, outputs=("x [m]", "bearing [rad]")).notes
+    assert "is not finite with the landmark at the pose" in note
 
 
 def test_only_jumps_by_a_turn_are_noted():
@@ -206,6 +207,24 @@ def test_a_singular_place_comes_with_its_cure():
     assert check.cure[1:] == CURES["a square root of 0"][1:]
     assert "safe = jnp.where(r2 > 0, r2, 1.0)" in str(report)
     assert report.as_dict()["checks"][-2]["cure"]
+
+
+def test_functions_of_places_are_noted_where_these_coincide():
+    """The places are not among the states of the checks, since a claim need not be defined there."""
+
+    def distance(pose, landmark):
+        return jnp.hypot(*(landmark - pose[:2]))[None]
+
+    report = verify_jacobians(distance)
+    (note,) = report.notes
+    assert report.passed
+    assert "derivative by pose and landmark is not finite with the landmark at the pose: " in note
+    assert "a square root of 0" in note
+    assert str(report).endswith("\n        " + CURES["a square root of 0"][-1])
+    safe = verify_jacobians(lambda point: jnp.sqrt(1 + point @ point)[None], name="safe")
+    assert safe.passed and not safe.notes
+    (note,) = verify_jacobians(lambda point: jnp.log(point[:1] ** 2), name="f").notes
+    assert note.count("the value is not finite with the point at the origin: point = (0, 0)") == 1
 
 
 def test_the_cures_cure():

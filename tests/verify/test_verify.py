@@ -261,7 +261,7 @@ def test_the_report_is_json_and_text():
     [
         (
             lambda: verify_jacobians(lambda speed: speed),
-            "the length of its argument 'speed' is not known",
+            "the length of 'speed' is not known",
         ),
         (
             lambda: verify_jacobians(observe, arguments={"landmarks": 2}),

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import jax
 
-from jaxslam.cli.common import INTERRUPTED, OUT, check_out
+from jaxslam.cli.common import INTERRUPTED, OUT, asked_figures, check_out
 from jaxslam.cli.consistency.film import write_films
 from jaxslam.cli.consistency.folder import (
     BLOCKS,
@@ -40,10 +40,14 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
     devices.join_processes(options)
-    formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
+    drawn = [kind for kind in campaign_files.FORMATS if (out / f"nees.{kind}").exists()]
+    wanted = asked_figures(options, drawn if options.resume else ())
+    formats = campaign_files.check_figure_formats("--figures", wanted)
     there = [kind for kind in run_table.FORMATS if (out / f"runs.{kind}").exists()]  # up to date
     asked_for = filter(None, options.table.split(","))
     tables = run_table.check_table_formats("--table", [*asked_for, *there])
+    if asked.steps is not None:
+        check_count("--steps", asked.steps)
     files = UserObjects()
     scenario = files.scenario(asked.scenario, asked.steps)
     filters = files.filters(asked.filters, scenario)

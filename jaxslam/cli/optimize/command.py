@@ -23,6 +23,7 @@ from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import csv_text, json_text, versions, write_files
 from jaxslam.types import JaxOrNumPy
+from jaxslam.validation.numbers import check_count
 
 ERRORS = {
     "pose": (graphs.relative_pose, "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),
@@ -48,6 +49,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
             f"--animate: the kernel {options.kernel} is solved in rounds of many iterations each; "
             "films show the iterations of one"
         )
+    check_count("--iterations", options.iterations)
     loaded = g2o.load(options.path)
     check_out(options.out, "optimize")
     known = {**of_files(), "relative_pose": relative()}

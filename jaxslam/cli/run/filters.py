@@ -55,7 +55,13 @@ def chosen_filters(data: Dataset, asked: str) -> dict[str, Filter]:
         places=data.log.scan.tag.shape[1],
         filter_options=data.filter_options,
     )
-    return {name: _filter(name, pick("filters", name, ALL)(world), data) for name in names}
+    if own := next((name for name in names if ".py" in name), None):
+        raise ValueError(
+            f"--filters: {own}: `jaxslam run` takes filters of the catalog; give your own to "
+            "`jaxslam.run` in Python"
+        )
+    known = {name: ALL[name] for name in ALL if name in NAMES or name in names}
+    return {name: _filter(name, pick("filters", name, known)(world), data) for name in names}
 
 
 def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:

@@ -59,6 +59,12 @@ def table(folder: str | Path) -> Dataset:
     if not folder.is_dir():
         found = "is a file" if folder.exists() else "is not there"
         raise ValueError(f"{folder} {found}: expected a folder with {ODOMETRY} and {MEASUREMENTS}")
+    for name, columns in ((ODOMETRY, "controls of the motion"), (MEASUREMENTS, "measurements")):
+        if not any((folder / file).is_file() for file in (name, f"{name}.gz")):
+            raise ValueError(
+                f"{folder}: expected a file {name}, with columns '{TIME}' and the {columns}, as "
+                "docs/guide/own_data.md shows"
+            )
     settings = TableSettings(folder / "dataset.toml")
     odometry_file = CsvTable(folder / ODOMETRY)
     seen_file = CsvTable(folder / MEASUREMENTS)

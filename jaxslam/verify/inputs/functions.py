@@ -240,7 +240,7 @@ def _undetermined(name: str, missing: list[str], claimed: bool, deduced: Deduced
         why = f"at most {MOST_UNKNOWN} are deduced"
     which = ", ".join(map(repr, missing))
     return (
-        f"{name}: the length of its argument {which} is not known: {why}. Name the entries, each "
+        f"{name}: the length of {which} is not known: {why}. Name the entries, each "
         f"with its unit: {example_of(name, dict.fromkeys(missing, 2))}"
     )
 

@@ -73,6 +73,20 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
     return _concatenated(groups)
 
 
+def coincident(
+    arguments: tuple[Argument, ...], samples: Samples
+) -> Iterable[tuple[str, tuple[np.ndarray, ...]]]:
+    """States where distances vanish, with a label: each place at the origin, or at the first."""
+    state = [table[0].copy() for table in samples.values]
+    places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
+    for k in places:
+        there = [entry.copy() for entry in state]
+        alone = k == places[0]
+        there[k][:2] = 0.0 if alone else state[places[0]][:2]
+        where = "the origin" if alone else f"the {arguments[places[0]].name}"
+        yield f"{arguments[k].name} at {where}", tuple(there)
+
+
 def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
     """Samples (pose, landmark) for `observe`, and (pose, measurement, free) for `invert`.
 

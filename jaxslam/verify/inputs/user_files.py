@@ -91,11 +91,11 @@ def load(target: str) -> list[Target]:
         if not found and keys:
             raise UnusableFile(
                 f"{path.name}: expected {name} to be a Motion, a Sensor, a factory of one, a "
-                "Factor, a BeamModel, or a function with its Jacobian, and there is no "
-                f"{name}{CLAIMS[0]}"
+                f"Factor, a BeamModel, or a function with its Jacobian: define {name}{CLAIMS[0]}, "
+                f"or call jaxslam.verify_jacobians({name}) from Python, which needs none"
             )
         if not found:
-            raise UnusableFile(f"{path.name}: there is no {name} to verify{names_in(module)}")
+            raise UnusableFile(f"{path.name}: there is no {name!r} to verify{names_in(module)}")
     if not found:
         raise UnusableFile(
             f"{path.name}: defines nothing to verify: no Motion, no Sensor, no Factor, no "
@@ -195,7 +195,7 @@ def names_in(module: ModuleType) -> str:
             or (callable(value) and getattr(value, "__module__", "") == module.__name__)
         )
     ]
-    return f"; it defines: {', '.join(found)}" if found else "; it defines none"
+    return f"; it defines: {', '.join(found)}" if found else "; it defines nothing"
 
 
 def _target(module: ModuleType, name: str) -> Target | None:

@@ -21,6 +21,7 @@ from jaxslam.results.plot.style import (
     panels_of,
     plain,
 )
+from jaxslam.validation import check_record
 
 _ERROR, _NEES = "rmse_position", "nees_pose"
 
@@ -45,6 +46,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     five filters are listed, a row each, with columns of time, error and NEES. A NEES over 100 times
     dof is marked at the edge. Filters that were not timed are named only. width [in].
     """
+    check_record("cost_figure", "the first argument", campaign, Campaign)
     times = {name: 1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters}
     if len(times) > TOGETHER:
         return _listed(campaign, times, max(width, PAGE))

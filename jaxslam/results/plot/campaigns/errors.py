@@ -19,6 +19,7 @@ from jaxslam.results.plot.style import (
     titled,
 )
 from jaxslam.types import Estimate, Truth
+from jaxslam.validation import check_record
 
 _SHORT = ("x [m]", "y [m]", "θ [°]")
 """The quantities in a narrow figure."""
@@ -28,10 +29,15 @@ _NARROW = 5.0
 _QUANTITIES = ("x error [m]", "y error [m]", "heading error [°]")
 
 
+_SMALL = 0.1
+"""Errors and bounds below this share of a common scale have a scale of their own."""
+
+
 def errors_figure(
     estimate: Estimate, truth: Truth, *, n_sigma: float = 3.0, title: str = "", width: float = PAGE
 ) -> Figure:
     """Errors of x, y and heading over the steps, with ±n σ of the filter's own covariance."""
+    check_record("errors_figure", "the first argument", estimate, Estimate)
     error, bound = _errors(estimate, truth, n_sigma)
     figure, panels = panels_of(width, 0.55 * width + 1.4, 3)
     for i, (axes, name) in enumerate(zip(panels, _QUANTITIES, strict=True)):
@@ -47,9 +53,11 @@ def run_errors_figure(
 ) -> Figure:
     """Errors of run 0 of every filter of `Campaign.first`, a row each, as `errors_figure`.
 
-    The scales are the same; filters that would set them alone (`bound_figure`) leave the panels at
-    a triangle. Raises ValueError if the campaign has no run 0.
+    The scales are the same, but for panels that would fill less than a tenth of theirs: these have
+    their own, in bold figures. Filters that would set them alone (`bound_figure`) leave the panels
+    at an arrow. Raises ValueError if the campaign has no run 0.
     """
+    check_record("run_errors_figure", "the first argument", campaign, Campaign)
     if not campaign.first:
         raise ValueError("run_errors_figure: the campaign holds no run 0 (Campaign.first is empty)")
     if len(campaign.first) == 1:
@@ -59,25 +67,24 @@ def run_errors_figure(
         n: _errors(estimate, truth, n_sigma) for n, (truth, estimate) in campaign.first.items()
     }
     setters = scale_setters(campaign)
-    tops = [
-        common_top(
-            {
-                name: np.nanmax([np.abs(error[:, i]).max(), bound[:, i].max()])
-                for name, (error, bound) in found.items()
-            },
-            setters,
-        )
-        for i in range(3)
-    ]
-    figure, panels = panels_of(width, 0.8 * len(found) + 0.8, len(found), 3, share=(True, "col"))
-    for i, (axes, top) in enumerate(zip(panels[:3], tops, strict=True)):
+    peaks = {
+        name: np.nanmax([np.abs(error).max(axis=0), bound.max(axis=0)], axis=0)
+        for name, (error, bound) in found.items()
+    }
+    tops = [common_top({name: peak[i] for name, peak in peaks.items()}, setters) for i in range(3)]
+    figure, panels = panels_of(width, 0.8 * len(found) + 0.8, len(found), 3)
+    for i, axes in enumerate(panels[:3]):
         name = _QUANTITIES[i] if width > _NARROW else _SHORT[i]
         titled(axes, f"{name}\n")  # above what `mark_beyond` writes
         if width < _NARROW:
             axes.locator_params(axis="x", nbins=2, min_n_ticks=1)
-        axes.set_ylim(-1.05 * top or -1.0, 1.05 * top or 1.0)
     for j, (name, (error, bound)) in enumerate(found.items()):
         for i, axes in enumerate(panels[3 * j : 3 * j + 3]):
+            own, common = peaks[name][i], tops[i]
+            top = own if 0 < own < _SMALL * common else common
+            axes.set_ylim(-1.05 * top or -1.0, 1.05 * top or 1.0)
+            if top != common:
+                axes.set_yticks([-top, 0.0, top], [f"−{top:.2g}", "0", f"{top:.2g}"], weight="bold")
             _draw(axes, error[:, i], bound[:, i], n_sigma)
             mark_beyond(axes)
         panels[3 * j].set_ylabel(in_lines(name), rotation=0, ha="right", va="center")

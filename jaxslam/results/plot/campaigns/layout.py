@@ -18,6 +18,7 @@ from jaxslam.results.plot.style import (
     plain,
     titled,
 )
+from jaxslam.validation import check_record
 
 TOGETHER = 5
 """largest number of curves in a panel"""
@@ -75,6 +76,7 @@ def sheet(
         only: the filters shown; default all.
         height: of a panel [in] of few filters; default by the width.
     """
+    check_record("plot", "the first argument", campaign, Campaign)
     count = len(quantities)
     numbers = numbers_of(list(campaign.filters))
     groups = kinds_of([name for name in numbers if only is None or name in only])

@@ -9,6 +9,7 @@ from jaxslam.monte_carlo import Campaign
 from jaxslam.results.plot.campaigns.layout import add_legends, head, runs_of, sheet
 from jaxslam.results.plot.campaigns.scale import common_top, mark_beyond, scale_setters
 from jaxslam.results.plot.style import INK, PAGE, RULE, band, curve, plain, step_limits
+from jaxslam.validation import check_record
 
 _NOTHING = 1e-6
 """Information on a heading that counts as none, σ being 1000 rad [1/rad²]."""
@@ -24,7 +25,7 @@ def bound_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """RMSE of position and heading over the steps, with the conditional Cramér-Rao bound if known.
 
     More than five filters are drawn by kind. Filters that fuse no measurement, that diverge, or
-    whose error is over three times the median of the others do not set the scale: triangles at the
+    whose error is over three times the median of the others do not set the scale: marks at the
     edge mark what lies beyond, and the largest value is written above. width [in].
     """
     quantities = {"position": "position RMSE [m]", "heading_deg": "heading RMSE [°]"}
@@ -106,11 +107,15 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         (axes,) = row.panels
         axes.axhline(0.0, color=INK, lw=0.8, zorder=1.5)
         lags = np.arange(1, len(widest) + 1)
-        band(axes, lags, -widest, widest, "95 % band")
-        for place, (name, i) in enumerate(row.names.items()):
+        ends = np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]])
+        wide = np.interp(ends, lags, widest)
+        band(axes, ends, -wide, wide, "95 % band")
+        drawn = [n for n in row.names if np.isfinite(campaign.filters[n].autocorrelation).any()]
+        for name, i in row.names.items():
             values = campaign.filters[name].autocorrelation
             lags = np.arange(1, len(values) + 1)
-            aside = _ASIDE * (place - (len(row.names) - 1) / 2)
+            place = drawn.index(name) if name in drawn else 0
+            aside = _ASIDE * (place - (len(drawn) - 1) / 2)
             curve(axes, i, lags + aside, values, name, absent="no innovations")
         axes.set(xticks=lags, ylim=(-1.1 * extreme, 1.1 * extreme))
     title = f"{head(campaign)}: whiteness of innovations, {runs_of(campaign)}"
@@ -126,6 +131,7 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     the logarithmic axis, each filter at a height of its own. More than five filters are drawn by
     kind. width [in].
     """
+    check_record("gained_figure", "the first argument", campaign, Campaign)
     key, what = "rotation_information", "information [1/rad²]"
     curves = {name: s.curves[key] for name, s in campaign.filters.items() if key in s.curves}
     others = [name for name in campaign.filters if name not in curves]

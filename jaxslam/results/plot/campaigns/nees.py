@@ -20,7 +20,7 @@ def nees_figure(
 
     The band is that of the filter with the most finite runs, the narrowest. More than five filters
     are drawn in a row of panels for each kind of filter (`catalog.KINDS`). The scale ends at 100
-    times dof, or sooner where the band would be too narrow to be seen; triangles at the edge mark
+    times dof, or sooner where the band would be too narrow to be seen; marks at the edge are of
     larger values, and the largest is written above. width [in]: `COLUMN` is that of a paper.
     """
     titles = [f"{block} NEES (dof {DOF[block]})" for block in blocks]

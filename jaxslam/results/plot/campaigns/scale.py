@@ -23,6 +23,9 @@ _POWERS = 6
 BEYOND = "beyond"
 """`gid` of the marks of what lies beyond an axis."""
 
+_NO_MARK = "", " ", "None", "none"
+"""what Matplotlib calls the mark of a line without marks"""
+
 _PLACES = 12
 """number of marks along an edge"""
 
@@ -122,10 +125,10 @@ def power(x: float) -> str:
 
 
 def mark_beyond(axes: Axes) -> None:
-    """Mark what lies beyond the ends of the ordinate, with triangles at the edges.
+    """Mark what lies beyond the ends of the ordinate, with the marks of the curves at the edges.
 
-    Each filter has its own colour and places. The greatest value is written above the panel, the
-    least one only if the axis goes below 0. Call it when the limits are set.
+    Each filter has its own places; a curve without marks has arrows. The greatest value is written
+    above the panel, the least one only if the axis goes below 0. Call it when the limits are set.
     """
     low, high = axes.get_ylim()
     left, right = axes.get_xlim()
@@ -141,7 +144,8 @@ def mark_beyond(axes: Axes) -> None:
             offset = (i + 0.5) / max(len(curves), 1)
             places = np.interp((np.arange(_PLACES) + offset) / _PLACES, [0, 1], [left, right])
         near = np.abs(x[:, None] - places).argmin(axis=0)
-        for out, edge, mark in ((y > high, 1.0, "^"), (y < low, 0.0, "v")):
+        own = str(line.get_marker())
+        for out, edge, arrow in ((y > high, 1.0, "$\u2191$"), (y < low, 0.0, "$\u2193$")):
             if not out.any():
                 continue
             at = np.unique(near[out[near]])
@@ -149,7 +153,8 @@ def mark_beyond(axes: Axes) -> None:
             axes.plot(
                 x[at],
                 np.full(len(at), edge),
-                mark,
+                marker=arrow if own in _NO_MARK else own,
+                linestyle="none",
                 transform=axes.get_xaxis_transform(),
                 color=line.get_color(),
                 mec=INK,
@@ -161,7 +166,7 @@ def mark_beyond(axes: Axes) -> None:
             )
         largest = max(largest, y.max())
         least = min(least, y.min())
-    said = [f"▲ to {power(largest)}"] if largest > high else []
-    said += [f"▼ to −{power(-least)}"] if least < low < 0 else []
+    said = [f"↑ to {power(largest)}"] if largest > high else []
+    said += [f"↓ to −{power(-least)}"] if least < low < 0 else []
     if said:
         axes.set_title(", ".join(said), loc="right", fontsize=7, color=INK)

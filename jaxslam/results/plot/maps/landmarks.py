@@ -26,6 +26,7 @@ from jaxslam.results.plot.style import (
     titled,
 )
 from jaxslam.types import Estimate, Truth
+from jaxslam.validation import check_record
 
 _ARROW = Path([(1.2, 0.0), (-0.6, 0.6), (-0.25, 0.0), (-0.6, -0.6), (1.2, 0.0)])
 
@@ -70,6 +71,7 @@ def map_figure(
 
     Raises ValueError if names are given without true_points.
     """
+    check_record("map_figure", "the first argument", estimate, Estimate)
     if names is not None and true_points is None:
         raise ValueError("map_figure: names are those of true_points, which are missing")
     if truth is not None:
@@ -105,6 +107,7 @@ def run_map_figure(
     The panels show the true map and its surroundings; estimates may leave them. Raises ValueError
     if the campaign has no run 0.
     """
+    check_record("run_map_figure", "the first argument", campaign, Campaign)
     if not campaign.first:
         raise ValueError("run_map_figure: the campaign holds no run 0 (Campaign.first is empty)")
     if len(campaign.first) == 1:
@@ -165,7 +168,7 @@ def _draw_estimate(axes: Axes, estimate: Estimate, n_sigma: float) -> list[np.nd
     here, here_cov = pose[-1:, :2], np.asarray(estimate.pose_cov[-1:])[:, :2, :2]
     refused = 0
     for means, around, color, named in (
-        (here, here_cov, COLORS[0], "_"),
+        (here, here_cov, COLORS[0], f"{n_sigma:g} σ ellipse, pose"),
         (points, covs, COLORS[1], label),
     ):
         contours = ellipses(means, around, n_sigma)
