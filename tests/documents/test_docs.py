@@ -18,9 +18,10 @@ import pytest
 from jaxslam import cli
 
 ROOT = Path(__file__).parents[2]
+OUTSIDE = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "benchmarks/README.md")]
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
-    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    for path in [*OUTSIDE, *sorted((ROOT / "docs").rglob("*.md"))]
     if "_build" not in path.parts
 }
 
@@ -54,6 +55,18 @@ def test_every_block_of_python_is_run():
     """A code cell is run by the build; a plain block would not be."""
     plain = [page for page, text in PAGES.items() if page != "README.md" and "```python" in text]
     assert plain == []
+
+
+def test_a_page_that_shows_a_refusal_fails_without_it():
+    """A `try` in a cell has an `else` that raises."""
+    code_of, trials = executed().code_of, 0
+    for page, text in PAGES.items():
+        code = re.sub(r"^[%!].*$", "", code_of(text), flags=re.MULTILINE)
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.Try):
+                trials += 1
+                assert any(isinstance(each, ast.Raise) for each in node.orelse), page
+    assert trials
 
 
 NUMBER = r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?"
