@@ -23,6 +23,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "myst_nb",
     "executed",
+    "exit_status",
     "commands",
     "reference",
 ]

@@ -11,8 +11,9 @@ the line above says how a block is run, if at all:
     <!-- run: first=cells/guide/own_data.py -->        a Python file that is run before
     <!-- run: argument=data/bonn -->                   the argument of an included file
 
-Commands that name `data/` are left out where there is no such folder. What has passed is run again
-when it, or code that it reaches, has changed (`executed.py`).
+Commands that name `data/` are left out where there is no such folder. A traceback of Python is
+a failure, whatever the exit status. What has passed is run again when it, or code that it reaches,
+has changed (`executed.py`).
 """
 
 import ast
@@ -33,6 +34,8 @@ import executed
 
 ROOT = executed.ROOT
 DATA = Path(os.environ.get("JAXSLAM_DATA", ROOT.parent / "shared" / "data")).absolute()
+OTHERS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "benchmarks/README.md")]
+"""pages outside of docs/"""
 RECORD = ROOT / ".cache" / "commands.json"
 """digests of what has passed"""
 LIMIT = 900
@@ -78,6 +81,8 @@ def groups(page: Path) -> Iterator[list[Block]]:
             script = f"python {name} {argument}".strip()
         else:
             script = "".join(re.findall(r"^\$ ((?:.*\\\n)*.*\n)", body, re.MULTILINE))
+            if not script:
+                raise ValueError(f"{page}:{line}: no line of the block begins with `$ `")
         for word, other in words.items():
             script = re.sub(rf"(?<![\w./-]){re.escape(word)}(?![\w./-])", other, script)
         script = f"python {first}\n{script}" if first else script
@@ -134,7 +139,7 @@ def run(group: list[Block]) -> tuple[Block, str] | None:
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
                 (folder / file).write_text(text, encoding="utf-8")
             done = subprocess.run(
-                ["timeout", str(LIMIT), "bash", "-exc", block.script],
+                ["timeout", str(LIMIT), "bash", "-exo", "pipefail", "-c", block.script],
                 cwd=folder,
                 env=os.environ | {"MPLBACKEND": "Agg", "TMPDIR": name},
                 stdout=subprocess.PIPE,
@@ -144,6 +149,8 @@ def run(group: list[Block]) -> tuple[Block, str] | None:
             )
             if done.returncode != block.status:
                 return block, f"exit status {done.returncode}, not {block.status}\n{done.stdout}"
+            if "Traceback (most recent call last)" in done.stdout:
+                return block, f"a traceback of Python\n{done.stdout}"
     return None
 
 
@@ -174,13 +181,13 @@ def check(pages: list[Path], record: Path) -> tuple[list[tuple[Block, str]], Cou
 
 
 def after_build(app: Any, exception: Exception | None) -> None:
-    """Run the commands of all pages and of the README; one that fails is a warning."""
+    """Run the commands of all pages; one that fails is a warning."""
     from sphinx.util.logging import getLogger  # the suite imports this file without Sphinx
 
     if exception is not None or app.builder.name != "html":
         return
     pages = [Path(app.env.doc2path(page)) for page in sorted(app.env.found_docs)]
-    failed, counted = check([ROOT / "README.md", *pages], RECORD)
+    failed, counted = check([*OTHERS, *pages], RECORD)
     for block, said in failed:
         getLogger(__name__).warning(said, location=f"{block.page}:{block.line}")
     done = [f"{counted.pop(what, 0)} {what}" for what in ("run", "passed before")]

@@ -3,7 +3,8 @@
 What a page printed and drew is kept by its cells and its kernel's description (jupyter-cache). This
 extension adds to that description a digest of the files of the package that the cells reach: those
 that define a name in a cell, those that define a name in these, and so on; for `!jaxslam …` those
-of the command. Docstrings, comments and layout do not count.
+of the command, and the exit statuses that tags say (`exit_status.py`). Docstrings, comments and
+layout do not count.
 """
 
 import ast
@@ -32,10 +33,11 @@ def digest(page: str) -> str | None:
     if not code:
         return None
     names = named(ast.parse(re.sub(r"^[%!].*$", "", code, flags=re.MULTILINE)))
-    files = reached(names | COMMAND if re.search(r"^!jaxslam", code, re.MULTILINE) else names)
+    shell = re.search(r"^!", code, re.MULTILINE)
+    files = reached(names | COMMAND if shell else names)
     if "examples" in code:
         files |= set((ROOT / "examples").glob("*.py"))
-    return hashed(files)
+    return hashed(files, str(re.findall(r"\bexit-\d+", page)) if shell else "")
 
 
 def code_of(page: str) -> str:

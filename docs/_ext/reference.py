@@ -9,6 +9,7 @@ import importlib
 import inspect
 import pkgutil
 import re
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -78,25 +79,30 @@ def modules() -> list[ModuleType]:
 def public_names() -> dict[str, list[Name]]:
     """The public names of each module; a name stands once."""
     walked = modules()
-    listed: dict[int, Name] = {}
+    listed: dict[tuple[int, str], Name] = {}
     pages: dict[str, list[Name]] = {module.__name__: [] for module in walked}
     for module in walked:
         for name in getattr(module, "__all__", []):
             value = getattr(module, name)
-            if not inspect.ismodule(value) and id(value) not in listed:
-                listed[id(value)] = Name(module.__name__, name, kind_of(value))
-                pages[module.__name__].append(listed[id(value)])
+            if not inspect.ismodule(value) and (key := key_of(name, value)) not in listed:
+                listed[key] = Name(module.__name__, name, kind_of(value))
+                pages[module.__name__].append(listed[key])
     for module in walked:
         constants = assigned(module)
         for name, value in vars(module).items():
-            if name.startswith("_") or inspect.ismodule(value) or id(value) in listed:
+            if name.startswith("_") or inspect.ismodule(value) or key_of(name, value) in listed:
                 continue
             kind = kind_of(value)
-            foreign = kind == "data" and inspect.isclass(value)  # `Array`, say, is JAX's
+            foreign = inspect.isclass(value) and kind == "data" and not of_arrays(value)
             own = name in constants if kind == "data" else value.__module__ == module.__name__
             if own and not foreign:
                 pages[module.__name__].append(Name(module.__name__, name, kind))
     return pages
+
+
+def key_of(name: str, value: Any) -> tuple[int, str]:
+    """What two paths to one value share; of plain constants, which equal ones share, the name."""
+    return id(value), name if isinstance(value, int | float | str) else ""
 
 
 def kind_of(value: Any) -> str:
@@ -107,14 +113,18 @@ def kind_of(value: Any) -> str:
     return "function" if is_function and hasattr(value, "__name__") else "data"
 
 
+def of_arrays(value: Any) -> bool:
+    """Whether a value is a type of arrays, as `Float[Array, "3"]`; `Array` alone is JAX's."""
+    return inspect.isclass(value) and value.__module__.startswith("jaxtyping")
+
+
 def assigned(module: ModuleType) -> set[str]:
     """Names of the constants and types that a module itself assigns."""
     names = set()
-    for statement in ast.parse(inspect.getsource(module)).body:
-        if isinstance(statement, ast.Assign):
-            names |= {target.id for target in statement.targets if isinstance(target, ast.Name)}
-        elif isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            names.add(statement.target.id)
+    for node in ast.parse(inspect.getsource(module)).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
+            names |= {each.id for each in ast.walk(target) if isinstance(each, ast.Name)}
     return names
 
 
@@ -152,7 +162,9 @@ def section(module: str, names: list[Name], top: bool) -> str:
     for name in names:
         lines += [f".. auto{name.kind}:: {name.module}::{name.name}"]
         if name.kind == "data":
-            lines += ["   :no-value:"]
+            value = getattr(sys.modules[name.module], name.name)
+            shape = f"annotation: = {value.__name__}" if of_arrays(value) else "no-value:"
+            lines += [f"   :{shape}"]
         lines += [""]
     return "\n".join(lines)
 

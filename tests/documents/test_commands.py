@@ -124,16 +124,41 @@ def test_what_is_run_again_after_a_change_of_the_code(commands):
     assert changed("cli/laser/slam.py") == [False, False]
 
 
-def test_each_block_is_a_directive_or_is_run():
-    """Else it would be read by no one: a block of no language, or of another shell's name."""
-    others = [
-        (page, kind)
-        for page, text in PAGES.items()
-        for kind in re.findall(r"^```(.*)\n(?:.*\n)*?```$", text, re.MULTILINE)
-        if not re.fullmatch(r"console|\{[\w-]+\}.*", kind)
-        and not (page == "README.md" and kind == "python")
-    ]
-    assert others == []
+def test_each_block_is_a_directive_or_is_run(commands):
+    """Else it would be read by no one: a block of no language, or of another shell's name.
+
+    An indented fence, or one of other characters, is refused: no one would find its block.
+    """
+    shown = {("README.md", "python"), ("CONTRIBUTING.md", "text")}
+    for page, text in PAGES.items():
+        kinds = re.findall(r"^```(.*)\n(?:.*\n)*?```$", text, re.MULTILINE)
+        others = {(page, kind) for kind in kinds if not re.match(r"console$|\{[\w-]+\}", kind)}
+        assert others <= shown
+        fences = [line for line in text.split("\n") if re.search(r"```|~~~|^\s*:::", line)]
+        assert [line for line in fences if not re.fullmatch(r"```[^`]*", line)] == [], page
+        assert len(fences) == 2 * len(kinds), page
+        assert all(block.script for group in commands.groups(ROOT / page) for block in group)
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("$ false | cat", "exit status 1, not 0"),
+        ("$ python -c 'int([])' || true", "a traceback of Python"),
+    ],
+)
+def test_a_failure_that_the_exit_status_of_a_line_hides_is_told(commands, tmp_path, script, said):
+    page = tmp_path / "page.md"
+    page.write_text(f"```console\n{script}\n```\n")
+    ((_, told),), _ = commands.check([page], tmp_path / "record.json")
+    assert said in told
+
+
+def test_a_block_without_a_command_is_refused(commands, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# A page\n\n```console\njaxslam verify\n```\n")
+    with pytest.raises(ValueError, match=r"page\.md:3: no line of the block begins with `\$ `"):
+        commands.check([page], tmp_path / "record.json")
 
 
 def test_what_is_marked_exists(commands):
