@@ -21,6 +21,9 @@ GRAZING = 0.05
 
 METHODS = ("surface", "cells")
 
+_ROUNDING = 1e-3
+"""[cells] by which a ray may end off the map."""
+
 
 class RayMap(NamedTuple):
     """A grid prepared for many rays by `ray_map`; `cast` takes it in place of the grid."""
@@ -120,7 +123,13 @@ def cast(
         and a half cells from edges and corners, is wrong by less than half a cell, in the median by
         less than a tenth (`python -m benchmarks.grids`). These are rounded: beside an edge a beam
         may hit or miss wrongly. In a trinary map the line is the border between an
-        occupied and a free cell, with corners cut.
+        occupied and a free cell, with corners cut. In a map of log-odds it passes walls that are
+        weakly occupied beside cells that are surely free: between two such cells that touch by a
+        corner p is below ½. There take "cells", or the trinary map
+        `grid._replace(log_odds=4 * jnp.sign(grid.log_odds))`. In 5 cm maps of building 101 in
+        Freiburg at known poses, the share of beams that go more than 0.5 m too far is 7.7 %
+        ("surface"), 7.2 % (trinary) and 6.2 % ("cells") with `occupancy`, and 18.2 %, 15.6 % and
+        13.0 % with `reflection`, of which a cell that half of the beams pass is free.
 
     The derivative by the pose is that of the range to a straight wall through the hit,
     dr = -n·(dt + r dφ e⊥)/(n·e), with e the direction, φ its angle, dt the shift of the origin, and
@@ -203,10 +212,14 @@ def _lengths(
     """The lengths [cells] of rays from start (x, y) [cells], and whether something is hit."""
     if grid.ahead.shape[0] == grid.solid.shape[0] + 2:  # its squares are cells
         found: tuple[Array, Array] = march(grid.ahead, None, start, direction, limit)
-    else:
-        corners = jnp.pad(grid.solid, 1, mode="edge")
-        found = march(grid.ahead, corners, start + 0.5, direction, limit)
-    return found
+        return found
+    corners = jnp.pad(grid.solid, 1, mode="edge")
+    length, hit = march(grid.ahead, corners, start + 0.5, direction, limit)
+    # The squares reach half a cell beyond the map, which is convex.
+    size = np.array(grid.solid.shape[::-1])[None]
+    for at in (start, start + length[:, None] * direction):
+        hit = hit & ((at >= -_ROUNDING) & (at <= size + _ROUNDING)).all(axis=1)
+    return jnp.where(hit, length, limit), hit
 
 
 @_lengths.defjvp

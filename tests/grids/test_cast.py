@@ -219,6 +219,18 @@ def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(blocks, meth
     assert np.all(slope[-2] == 0)  # off the map
 
 
+def test_what_is_off_the_map_is_not_hit():
+    """The surface beside a free cell of the border would go on beyond the map."""
+    log_odds = np.full((6, 6), -1.0)
+    log_odds[4:, 5] = 1.0
+    rays = grids.ray_map(grid_of(log_odds, resolution=1.0))
+    # One leaves before it is at the wall, y = 4, one after, and one starts off the map.
+    poses = np.array([[5.7, 3.0, np.arctan2(1.2, 0.6)], [5.7, 3.0, 1.3], [6.2, 3.4, np.pi / 2]])
+    found = jax.jit(lambda p: grids.cast(rays, p, np.zeros(1), 20.0))(poses)[:, 0]
+    assert found[0] == found[2] == 20.0
+    np.testing.assert_allclose(found[1], 1 / np.sin(1.3))
+
+
 @pytest.mark.parametrize(
     ("call", "reason"),
     [
