@@ -14,7 +14,7 @@ from jaxslam.grids.distance import squared_distances
 from jaxslam.grids.grid import Grid, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolated
 from jaxslam.grids.traversal import MOST, OFF, STOP, march
-from jaxslam.validation.numbers import is_concrete, shape_told
+from jaxslam.validation.numbers import check_real, is_concrete, shape_told
 
 GRAZING = 0.05
 """Least |cos| of the angle between a ray and the normal of a wall in a derivative."""
@@ -149,6 +149,7 @@ def cast(
     """
     if not isinstance(grid, Grid | RayMap):
         raise ValueError(f"cast: expected a Grid or a RayMap, got {type(grid).__name__}")
+    check_real("cast", pose=pose, angles=angles, max_range=max_range)
     pose, angles = jnp.asarray(pose), jnp.asarray(angles)
     _check_rays(pose, angles, max_range)
     if isinstance(grid, Grid):

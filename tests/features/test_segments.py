@@ -132,6 +132,7 @@ def test_a_bent_wall_is_found_as_often_as_the_docstring_says_and_a_straight_one_
         ({"range": np.ones(3)}, {}, "segments: expected one scan"),
         ({"angle": AROUND[::-1]}, {}, "segments: expected angles that increase"),
         ({}, {"sigma": 0.0}, "segments: expected sigma and max_range above 0"),
+        ({"range": np.full(360, 1e-300)}, {}, "fit_line: expected beams"),
         ({}, {"least": 2}, "segments: .*least of at least 3"),
     ],
 )

@@ -240,6 +240,15 @@ def test_what_is_off_the_map_is_not_hit():
         ),
         (lambda g: grids.cast(g, np.array([0.1, np.nan, 0.0]), ANGLES, 1.0), "pose 0"),
         (lambda g: grids.cast("x", np.zeros(3), ANGLES, 1.0), "cast: expected a Grid or a RayMap"),
+        (
+            lambda g: grids.cast(g, "abc", ANGLES, 1.0),
+            "cast: expected real numbers as pose, got abc",
+        ),
+        (lambda g: grids.cast(g, np.zeros(3), ANGLES, "3"), "cast: .* as max_range, got 3"),
+        (
+            lambda g: grids.cast(g._replace(resolution=None), np.zeros(3), ANGLES, 1.0),
+            "ray_map: expected real numbers as resolution, got None",
+        ),
         (lambda g: grids.cast(g, np.zeros(2), ANGLES, 1.0), r"expected poses \(x, y, θ\)"),
         (lambda g: grids.cast(g, np.zeros(3), ANGLES[:0], 1.0), "expected angles of shape"),
         (lambda g: grids.cast(g, np.zeros(3), ANGLES * np.nan, 1.0), "expected finite angles"),
