@@ -21,9 +21,6 @@ GRAZING = 0.05
 
 METHODS = ("surface", "cells")
 
-_ROUNDING = 1e-3
-"""[cells] by which a ray may end off the map."""
-
 
 class RayMap(NamedTuple):
     """A grid prepared for many rays by `ray_map`; `cast` takes it in place of the grid."""
@@ -213,14 +210,10 @@ def _lengths(
     """The lengths [cells] of rays from start (x, y) [cells], and whether something is hit."""
     if grid.ahead.shape[0] == grid.solid.shape[0] + 2:  # its squares are cells
         found: tuple[Array, Array] = march(grid.ahead, None, start, direction, limit)
-        return found
-    corners = jnp.pad(grid.solid, 1, mode="edge")
-    length, hit = march(grid.ahead, corners, start + 0.5, direction, limit)
-    # The squares reach half a cell beyond the map, which is convex.
-    size = np.array(grid.solid.shape[::-1])[None]
-    for at in (start, start + length[:, None] * direction):
-        hit = hit & ((at >= -_ROUNDING) & (at <= size + _ROUNDING)).all(axis=1)
-    return jnp.where(hit, length, limit), hit
+    else:
+        corners = jnp.pad(grid.solid, 1, mode="edge")
+        found = march(grid.ahead, corners, start + 0.5, direction, limit)
+    return found
 
 
 @_lengths.defjvp
