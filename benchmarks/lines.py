@@ -119,8 +119,21 @@ def judge(name: str, runs: int, every: int) -> tuple[float, float, float]:
     return float(np.mean(of_lines)), float(np.mean(of_pose)), float(np.mean(ratio))
 
 
+def round_walls(beams: int) -> float:
+    """Lines a scan of the circular room, over four runs."""
+    world = scenarios.circular_room(beams=beams)
+    keys = jax.random.split(jax.random.key(0), 4)
+    logs = jax.device_get(jax.jit(jax.vmap(lambda key: laser.scan_world(world, key)))(keys))
+    scans = zip(*(part.reshape(-1, beams) for part in logs.beams), strict=True)
+    options = {"sigma": world.laser.sigma, "max_range": world.laser.max_range}
+    return float(np.mean([len(features.segments(Beams(*scan), **options).line) for scan in scans]))
+
+
 def measure(runs: int = 100, rooms: str = "square,office") -> list[Metric]:
-    metrics = []
+    metrics = [
+        Metric(f"circular_room, {beams} beams: lines a scan", round_walls(beams), high=0.1)
+        for beams in (90, 180, 360, 720)
+    ]
     for name in rooms.split(","):
         line, pose, ratio = judge(name, runs, every=4 if name == "square" else 8)
         metrics += [

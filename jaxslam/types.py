@@ -46,8 +46,8 @@ class Status(IntEnum):
     """Its innovation covariance is not positive definite, so that it cannot be gated; dropped."""
     UNMATCHED = 8
     """Association found it neither of a landmark nor new (between two gates, ambiguous, or of
-    unknown identity where a tag is required), or a robot it concerns has no pose in the map yet;
-    dropped."""
+    unknown identity where a tag is required), a robot it concerns has no pose in the map yet, or it
+    is a beam that entered no weight (`grids.localize`); dropped."""
     SIGHTED = 9
     """Of no landmark yet; kept as a stored measurement (`filters.delayed_slam`)."""
 

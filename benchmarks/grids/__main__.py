@@ -44,7 +44,8 @@ def accuracy() -> list[Metric]:
     """Errors in cells over beams whose exact range changes by less than three cells under a shift
     of one and a half to either side, so none that passes an edge, or more than 63° from the normal
     of a wall; the share of these beams. Gates are for those that end one and a half cells or more
-    from the corners of the room as well, which the grid rounds.
+    from the corners of the room as well, which the grid rounds. Of all beams, with those beside an
+    edge, which the grid may hit or miss wrongly, how many are wrong by more than half a cell.
     """
     metrics = []
     for name, make in ROOMS.items():
@@ -77,12 +78,16 @@ def accuracy() -> list[Metric]:
             rays = grids.ray_map(rasterize(world.walls, CELL, yaw=0.3), method=method)
             found = np.asarray(grids.cast(rays, pose, angles, far))
             error = np.abs(found - middle) / CELL
+            wrong = np.mean(error > 0.5)
             most, median = (0.5, 0.1) if method == "surface" else (np.inf, np.inf)
             what = f"{method}, {name} [cells]"
             metrics += [
                 Metric(f"largest error of a range, {what}", error[plain].max(), high=most),
                 Metric(f"median error of a range, {what}", np.median(error[plain]), high=median),
                 Metric(f"largest error, corners too, {what}", error[steady].max()),
+                Metric(f"median error, all beams, {what}", np.median(error)),
+                Metric(f"largest error, all beams, {what}", error.max()),
+                Metric(f"share of all beams wrong by over half a cell, {method}, {name}", wrong),
             ]
         metrics.append(Metric(f"share of beams counted, {name}", plain.mean()))
     return metrics

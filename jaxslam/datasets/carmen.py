@@ -80,7 +80,7 @@ def carmen(path: str | Path, *, max_range: float = 50.0) -> LaserLog:
         max_range: [m].
     Raises:
         ValueError: with file and line: where a line ends early or has a field that is no number;
-            on a file without scans, and on a max_range that is not above 0.
+            on a file without scans or without beams, and on a max_range that is not above 0.
     """
     if not max_range > 0:
         raise ValueError(f"carmen: expected a max_range above 0, got {max_range}")
@@ -102,6 +102,8 @@ def carmen(path: str | Path, *, max_range: float = 50.0) -> LaserLog:
             dropped["comments" if kind.startswith("#") else f"lines {kind}"] += 1
     if not scans:
         raise file.end_error("expected a line FLASER or ROBOTLASER1, got none")
+    if not any(len(scan.ranges) for scan in scans):
+        raise file.end_error(f"expected scans with beams, got {len(scans)} of 0 beams")
     return _log_of(file, odometry, scans, max_range, dropped)
 
 
@@ -197,11 +199,15 @@ def _expect(file: TextFile, line: int, fields: list[str], count: int) -> None:
 
 def _ranges(file: TextFile, line: int, fields: list[str]) -> Float[np.ndarray, "n"]:
     """Ranges [m], 0 for NaN. Raises ValueError on what is no number."""
+    bad = None
     try:
         values = np.array(fields, float)
     except ValueError:
-        at = next(k for k, field in enumerate(fields) if not _is_number(field))
-        raise file.error(line, f"range {at + 1} is no number: {fields[at]!r}") from None
+        bad = next(k for k, field in enumerate(fields) if not _is_number(field))
+    if "_" in file.lines[line - 1]:  # float() also accepts 1_000
+        bad = next((k for k, field in enumerate(fields) if not _is_number(field)), None)
+    if bad is not None:
+        raise file.error(line, f"range {bad + 1} is no number: {fields[bad]!r}")
     known: np.ndarray = np.nan_to_num(values, nan=0.0, posinf=np.finfo(float).max, neginf=0.0)
     return known
 
@@ -211,7 +217,7 @@ def _is_number(field: str) -> bool:
         float(field)
     except ValueError:
         return False
-    return True
+    return "_" not in field
 
 
 def _wrapped(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -1,5 +1,6 @@
 """Features of laser scans: straight segments, each with its covariance."""
 
-from jaxslam.features.segments import Segments, fit_line, segments
+from jaxslam.features.fits import fit_line
+from jaxslam.features.segments import Segments, segments
 
 __all__ = ["Segments", "fit_line", "segments"]

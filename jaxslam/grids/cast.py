@@ -14,7 +14,7 @@ from jaxslam.grids.distance import squared_distances
 from jaxslam.grids.grid import Grid, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolated
 from jaxslam.grids.traversal import MOST, OFF, STOP, march
-from jaxslam.validation.numbers import is_concrete, shape_told
+from jaxslam.validation.numbers import check_real, is_concrete, shape_told
 
 GRAZING = 0.05
 """Least |cos| of the angle between a ray and the normal of a wall in a derivative."""
@@ -120,7 +120,13 @@ def cast(
         and a half cells from edges and corners, is wrong by less than half a cell, in the median by
         less than a tenth (`python -m benchmarks.grids`). These are rounded: beside an edge a beam
         may hit or miss wrongly. In a trinary map the line is the border between an
-        occupied and a free cell, with corners cut.
+        occupied and a free cell, with corners cut. In a map of log-odds it passes walls that are
+        weakly occupied beside cells that are surely free: between two such cells that touch by a
+        corner p is below ½. There take "cells", or the trinary map
+        `grid._replace(log_odds=4 * jnp.sign(grid.log_odds))`. In 5 cm maps of building 101 in
+        Freiburg at known poses, the share of beams that go more than 0.5 m too far is 7.7 %
+        ("surface"), 7.2 % (trinary) and 6.2 % ("cells") with `occupancy`, and 18.2 %, 15.6 % and
+        13.0 % with `reflection`, of which a cell that half of the beams pass is free.
 
     The derivative by the pose is that of the range to a straight wall through the hit,
     dr = -n·(dt + r dφ e⊥)/(n·e), with e the direction, φ its angle, dt the shift of the origin, and
@@ -140,6 +146,7 @@ def cast(
     """
     if not isinstance(grid, Grid | RayMap):
         raise ValueError(f"cast: expected a Grid or a RayMap, got {type(grid).__name__}")
+    check_real("cast", pose=pose, angles=angles, max_range=max_range)
     pose, angles = jnp.asarray(pose), jnp.asarray(angles)
     _check_rays(pose, angles, max_range)
     if isinstance(grid, Grid):

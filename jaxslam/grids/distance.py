@@ -2,12 +2,13 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam import programs
 from jaxslam.grids.grid import Field, Grid, check_grid
 from jaxslam.types import JaxOrNumPy
-from jaxslam.validation.numbers import is_concrete
+from jaxslam.validation.numbers import check_real, is_concrete
 
 
 def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None = None) -> Field:
@@ -21,9 +22,12 @@ def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None
         threshold: cells with log-odds above it are occupied.
         truncate: largest distance [m], None for no limit.
     Raises:
-        ValueError: a grid that is none, or truncate not above 0.
+        ValueError: a grid that is none, a threshold that is not finite, or truncate not above 0.
     """
     check_grid("distance_field", grid)
+    check_real("distance_field", threshold=threshold)
+    if is_concrete(threshold) and not np.isfinite(threshold):
+        raise ValueError(f"distance_field: expected a finite threshold, got {threshold}")
     if truncate is not None and is_concrete(truncate) and not truncate > 0:
         raise ValueError(f"distance_field: expected truncate above 0, got {truncate}")
     largest = jnp.inf if truncate is None else truncate

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.math import se2
 from jaxslam.types import JaxOrNumPy
-from jaxslam.validation.numbers import is_concrete, shape_told
+from jaxslam.validation.numbers import check_real, is_concrete, shape_told
 
 
 class Grid(NamedTuple):
@@ -93,6 +93,7 @@ def check_grid(name: str, grid: object) -> None:
 
 def check_frame(name: str, origin: ArrayLike, resolution: ArrayLike) -> None:
     """Raise ValueError unless origin is a pose, and resolution a finite number above 0."""
+    check_real(name, origin=origin, resolution=resolution)
     if np.shape(origin) != (3,):
         raise ValueError(
             f"{name}: expected an origin that is a pose (x, y, θ), got {shape_told(origin)}"

@@ -91,6 +91,11 @@ def _shape(height: int, width: int) -> tuple[int, int]:
 
 
 def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
+    if not isinstance(beams, Beams):
+        raise ValueError(f"count: expected Beams, got {type(beams).__name__}")
+    if not all(hasattr(part, "dtype") for part in beams):
+        told = ", ".join(type(part).__name__ for part in beams)
+        raise ValueError(f"count: expected ranges, angles and masks in arrays, got {told}")
     shapes = [np.shape(part) for part in beams]
     if len(set(shapes)) != 1 or len(shapes[0]) != 2:
         raise ValueError(f"count: expected as many ranges, angles and masks (T, B), got {shapes}")

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from jaxslam.grids.grid import Field, Grid, centers, check_grid
 from jaxslam.grids.interpolation import interpolate
 from jaxslam.math import se2
-from jaxslam.validation.numbers import is_concrete
+from jaxslam.validation.numbers import check_real, is_concrete
 
 
 def resample(grid: Grid, resolution: float) -> Grid:
@@ -24,11 +24,13 @@ def resample(grid: Grid, resolution: float) -> Grid:
     check_grid("resample", grid)
     if not is_concrete(resolution, grid.resolution):
         raise ValueError("resample: the resolution sets the shape: expected one outside the trace")
+    check_real("resample", resolution=resolution)
     if not 0 < resolution < np.inf:
         raise ValueError(f"resample: expected a resolution above 0, got {resolution}")
     factor = float(resolution) / float(grid.resolution)
-    up, across = (_overlaps(size, factor) for size in np.shape(grid.log_odds))
-    log_odds = jnp.asarray(up) @ jnp.asarray(grid.log_odds) @ jnp.asarray(across).T
+    log_odds = jnp.asarray(grid.log_odds)
+    up, across = (jnp.asarray(_overlaps(n, factor), log_odds.dtype) for n in log_odds.shape)
+    log_odds = up @ log_odds @ across.T
     return Grid(log_odds, grid.origin, jnp.asarray(resolution, log_odds.dtype))
 
 

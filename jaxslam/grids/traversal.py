@@ -13,6 +13,9 @@ MOST = 253
 """The longest step, in quarters of a square: steps are bytes, so that more of a map fits into a
 processor's cache."""
 
+_ROUNDING = 1e-3
+"""[squares] by which a ray may end off the map."""
+
 CHUNK = 32
 """Rays that a CPU advances together. A loop runs until the longest ray of a chunk ends, so the
 fewer the better; 32 fill its vectors."""
@@ -31,7 +34,8 @@ def march(
     ahead: of each square, how far a ray may go from anywhere in it [quarters of a square], or
     `STOP` or `OFF`; it has a border of `OFF`. start (x, y) counts from the corner of the first
     square within. corners None: a ray ends where it enters a square that is `STOP`. Else it ends in
-    such a square where the bilinear interpolation of its four corners is 0, if it is. Rays of a
+    such a square where the bilinear interpolation of its four corners is 0, if it is, and the outer
+    half of the outermost squares is off the map. Rays of a
     batch under `vmap` are as many rays of one call.
     """
     return _march(ahead, corners, start, direction, limit)
@@ -102,7 +106,13 @@ def _together(
 ) -> tuple[Array, Array]:
     height, width = ahead.shape
     x, y = start[:, 0] + 1, start[:, 1] + 1
-    inside = (x >= 1) & (x <= width - 1) & (y >= 1) & (y <= height - 1)
+    # Squares of corners reach half a square beyond the map: what is hit there is off it.
+    edge = 1.0 if corners is None else 1.5 - _ROUNDING
+
+    def on_map(x: Array, y: Array) -> Array:
+        return (x >= edge) & (x <= width - edge) & (y >= edge) & (y <= height - edge)
+
+    inside = on_map(x, y)
     x, y = jnp.where(inside, x, 1.0), jnp.where(inside, y, 1.0)
     over = jnp.where(direction != 0, 1.0 / jnp.where(direction != 0, direction, 1.0), 0.0)
     far = jnp.where(direction != 0, 0.0, jnp.inf)
@@ -148,6 +158,7 @@ def _together(
         begin = first, inside, jnp.zeros_like(inside)
         at, _, found = jax.lax.while_loop(any_moves, through, begin)
         length = at.length + _root(_parabola(corners, rays, at))
+        found = found & on_map(rays.x + length * rays.dx, rays.y + length * rays.dy)
     found = found & (length < limit)
     return jnp.where(found, length, limit), found
 

@@ -15,7 +15,7 @@ from jaxslam.protocols import Motion
 from jaxslam.simulation.walls import Walls, exact_ranges, wall_ranges
 from jaxslam.simulation.worlds import drive
 from jaxslam.types import Beams
-from jaxslam.validation.numbers import check_key
+from jaxslam.validation.numbers import check_key, check_positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +39,9 @@ class Laser:
             raise ValueError(f"Laser: expected finite angles (at least 1,), got {angles.shape}")
         if mount.shape != (3,) or not np.all(np.isfinite(mount)):
             raise ValueError(f"Laser: expected a mount that is a pose (x, y, θ), got {mount}")
-        if not (self.sigma > 0 and self.max_range > 0 and 0 <= self.dropout <= 1):
-            raise ValueError(
-                "Laser: expected sigma and max_range above 0 and dropout in [0, 1], got "
-                f"{self.sigma}, {self.max_range}, {self.dropout}"
-            )
+        check_positive("Laser", sigma=self.sigma, max_range=self.max_range)
+        if not 0 <= self.dropout <= 1:
+            raise ValueError(f"Laser: expected dropout in [0, 1], got {self.dropout}")
 
 
 @dataclass(frozen=True, eq=False)

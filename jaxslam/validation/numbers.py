@@ -1,6 +1,7 @@
 """Checks of numbers: counts, keys, gates, covariances."""
 
 from numbers import Integral
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -53,8 +54,23 @@ def check_array(
         raise ValueError(f"{name}: expected {kind.__name__} values, got {dtype}")
 
 
+def check_real(name: str, **values: Any) -> None:
+    """Raise ValueError unless values are real numbers or arrays of them; a tracer is accepted."""
+    for what, value in values.items():
+        if not is_concrete(value):
+            continue
+        try:
+            dtype = np.asarray(value).dtype
+        except (TypeError, ValueError):  # a key; rows of unlike lengths
+            dtype = np.dtype(object)
+        if not any(jnp.issubdtype(dtype, kind) for kind in (np.integer, np.floating, np.bool_)):
+            got = value if isinstance(value, str) else shape_told(value)
+            raise ValueError(f"{name}: expected real numbers as {what}, got {got!s}")
+
+
 def check_positive(name: str, **values: ArrayLike) -> None:
     """Raise ValueError unless numbers are above 0 and finite; a tracer is accepted."""
+    check_real(name, **values)
     for what, value in values.items():
         if is_concrete(value) and not (np.shape(value) == () and 0 < np.asarray(value) < np.inf):
             raise ValueError(f"{name}: expected {what} above 0, got {np.asarray(value)}")

@@ -17,6 +17,7 @@ from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import is_free, rasterize, walls
 
 BEAMS, STEPS = 24, TOGETHER + 6
+FIT = "beams of the last 10 scans within 0.3 m of the map's range, share"
 
 
 def line(ranges, pose, raw, t):
@@ -195,8 +196,13 @@ def test_a_robot_is_localized_in_a_map_by_odometry_and_scans(log_file, room_map,
     assert summary["scans left out"]["without a valid beam"] == 1
     assert 0 < summary["particles in use, mean"] <= 500
     assert summary["hypotheses at the end"] >= 1
-    heaviest = summary["weight of the heaviest"]
-    assert summary["localized at the end"].startswith("yes" if heaviest > 0.5 else "no")
+    assert summary["particles agree at the end"] is (summary["weight of the heaviest"] > 0.5)
+    assert summary[FIT] > 0.9
+    assert summary["localized at the end"] == "yes"
+    assert run(log_file.path, tmp_path / "lost", *options, "--start", "5,5,90") == 0
+    summary = json.loads((tmp_path / "lost" / "summary.json").read_text())
+    assert summary["particles agree at the end"] and summary[FIT] < 0.6
+    assert summary["localized at the end"] == "no: less than 75% of the beams fit the map"
 
 
 @pytest.mark.parametrize(

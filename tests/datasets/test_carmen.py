@@ -69,6 +69,7 @@ def test_a_packed_log_without_odometry(tmp_path):
         ("FLASER", "FLASER ends after 1 fields"),
         ("FLASER four 1 2", "number of values is not a whole number"),
         (FLASER.format(t=1).replace("81.91", "1,5"), "range 3 is no number: '1,5'"),
+        (FLASER.format(t=1).replace("81.91", "1_0"), "range 3 is no number: '1_0'"),
         (FLASER.format(t="x"), "logger time is not a finite number"),
         ("ODOM 1 2 3", "expected 9 fields"),
         (ODOM.format(x="nan", t=1), "x is not a finite number"),
@@ -90,6 +91,9 @@ def test_a_file_without_scans_and_a_range_below_zero_are_refused(tmp_path):
     path = written(tmp_path / "none.log", ODOM.format(x=1, t=2))
     with pytest.raises(ValueError, match=r"none\.log:1: expected a line FLASER"):
         datasets.carmen(path)
+    empty = written(tmp_path / "empty.log", "FLASER 0 0 0 0 0 0 0 1 host 1")
+    with pytest.raises(ValueError, match=r"empty\.log:1: expected scans with beams, got 1 of 0"):
+        datasets.carmen(empty)
     with pytest.raises(ValueError, match="max_range above 0"):
         datasets.carmen(path, max_range=0.0)
 

@@ -93,10 +93,37 @@ def test_jumps_divide_and_what_is_no_wall_is_left_out():
     found = segments(beams, sigma=SIGMA, max_range=10)
     assert set(nearest(found)) == {0, 1, 2, 3}
     assert found.left == 348 - found.size.sum()
-    round_room = Beams(np.full(90, 1.0), np.linspace(-3, 3, 90), np.ones(90, bool))
-    assert len(segments(round_room, sigma=1e-3, max_range=10).line) == 0
     none = beams._replace(valid=np.zeros(360, bool))
     assert segments(none, sigma=SIGMA, max_range=10).left == 0
+
+
+@pytest.mark.parametrize(("beams", "scans"), [(90, 60), (180, 60), (360, 30), (720, 30)])
+def test_a_round_room_has_next_to_no_segment(beams, scans):
+    """The circular room of the scenarios; its benchmark has at most 0.04 lines a scan."""
+    rng = np.random.default_rng(beams)
+    angle = np.linspace(-np.pi, np.pi, beams, endpoint=False)
+    e = np.stack([np.cos(angle), np.sin(angle)])
+    count = 0
+    for at in rng.uniform([-1.5, -1.0], [1.5, 1.0], (scans, 2)):
+        exact = -at @ e + np.sqrt(9 - at @ at + (at @ e) ** 2)
+        seen = Beams(exact + SIGMA * rng.normal(size=beams), angle, rng.random(beams) > 0.02)
+        count += len(segments(seen, sigma=SIGMA, max_range=10).line)
+    assert count <= 0.04 * scans + 4 * np.sqrt(0.04 * scans)
+
+
+@pytest.mark.parametrize("beams", [8, 30])
+def test_a_bent_wall_is_found_as_often_as_the_docstring_says_and_a_straight_one_kept(beams):
+    """One segment at 20 m, an arc whose sagitta is so many σ; no neighbour helps."""
+    rng = np.random.default_rng(0)
+    x = np.linspace(-1, 1, beams)
+    angle = np.arctan(x / 20)
+    for sagitta, least, most in ((0, 0, 0.002), (11, 0.5, 1), (17, 0.95, 1)):
+        bend, lost, draws = sagitta / np.sqrt(beams) * SIGMA * x**2, 0, 400
+        for noise in SIGMA * rng.normal(size=(draws, beams)):
+            seen = Beams((20 - bend) / np.cos(angle) + noise, angle, np.ones(beams, bool))
+            lost += not len(segments(seen, sigma=SIGMA, max_range=30, trim=0).line)
+        sigma = np.sqrt(draws * 0.25 if sagitta == 11 else draws * 0.05 if sagitta else 0.8)
+        assert least * draws - 4 * sigma <= lost <= most * draws + 4 * sigma
 
 
 @pytest.mark.parametrize(
@@ -105,6 +132,7 @@ def test_jumps_divide_and_what_is_no_wall_is_left_out():
         ({"range": np.ones(3)}, {}, "segments: expected one scan"),
         ({"angle": AROUND[::-1]}, {}, "segments: expected angles that increase"),
         ({}, {"sigma": 0.0}, "segments: expected sigma and max_range above 0"),
+        ({"range": np.full(360, 1e-300)}, {}, "fit_line: expected beams"),
         ({}, {"least": 2}, "segments: .*least of at least 3"),
     ],
 )
@@ -118,6 +146,16 @@ def test_what_is_no_scan_is_refused():
         segments("x", sigma=0.1, max_range=9)
 
 
-def test_beams_at_one_point_are_no_line():
-    with pytest.raises(ValueError, match="fit_line: expected beams that end at different points"):
-        fit_line(np.zeros(4), np.ones(4), SIGMA)
+@pytest.mark.parametrize(
+    ("angle", "distance", "sigma", "message"),
+    [
+        (np.zeros(4), np.ones(4), SIGMA, "expected beams that end at different points"),
+        (np.zeros(3), np.arange(1.0, 4), SIGMA, "expected beams whose ends are not in line with"),
+        (AROUND[:3], np.full(3, 1e-300), SIGMA, "expected beams whose ends are not in line with"),
+        (AROUND[:3], np.ones(3), 0.0, "expected sigma above 0 .*, got 0.0"),
+        (AROUND[:3], np.array([1, np.nan, 1]), SIGMA, "expected finite angles and ranges"),
+    ],
+)
+def test_beams_that_make_no_line_are_refused(angle, distance, sigma, message):
+    with pytest.raises(ValueError, match=f"fit_line: {message}"):
+        fit_line(angle, distance, sigma)

@@ -130,6 +130,18 @@ def test_a_pose_may_be_a_list_of_whole_numbers(room):
     assert float(found[0]) == float(found[1])
 
 
+def test_a_beam_that_is_not_valid_may_have_any_angle(room):
+    model = likelihood_field(max_range=FAR, mount=(0.3, 0, 0))
+    field, pose, valid = model.prepare(room), np.array([2.0, 1, 0]), beams().valid & True
+    valid[0] = False
+    angle = np.where(valid, beams().angle, np.nan)
+    found = [
+        log_likelihood(model, field, pose, beams()._replace(angle=a, valid=valid))
+        for a in (beams().angle, angle)
+    ]
+    assert float(found[0]) == float(found[1])
+
+
 def drawn(count, seed=0):
     """Ranges of the mixture for ranges expected between 1 and 3.5 m."""
     rng = np.random.default_rng(seed)

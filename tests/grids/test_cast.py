@@ -219,6 +219,18 @@ def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(blocks, meth
     assert np.all(slope[-2] == 0)  # off the map
 
 
+def test_what_is_off_the_map_is_not_hit():
+    """The surface beside a free cell of the border would go on beyond the map."""
+    log_odds = np.full((6, 6), -1.0)
+    log_odds[4:, 5] = 1.0
+    rays = grids.ray_map(grid_of(log_odds, resolution=1.0))
+    # One leaves before it is at the wall, y = 4, one after, and one starts off the map.
+    poses = np.array([[5.7, 3.0, np.arctan2(1.2, 0.6)], [5.7, 3.0, 1.3], [6.2, 3.4, np.pi / 2]])
+    found = jax.jit(lambda p: grids.cast(rays, p, np.zeros(1), 20.0))(poses)[:, 0]
+    assert found[0] == found[2] == 20.0
+    np.testing.assert_allclose(found[1], 1 / np.sin(1.3))
+
+
 @pytest.mark.parametrize(
     ("call", "reason"),
     [
@@ -228,6 +240,15 @@ def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(blocks, meth
         ),
         (lambda g: grids.cast(g, np.array([0.1, np.nan, 0.0]), ANGLES, 1.0), "pose 0"),
         (lambda g: grids.cast("x", np.zeros(3), ANGLES, 1.0), "cast: expected a Grid or a RayMap"),
+        (
+            lambda g: grids.cast(g, "abc", ANGLES, 1.0),
+            "cast: expected real numbers as pose, got abc",
+        ),
+        (lambda g: grids.cast(g, np.zeros(3), ANGLES, "3"), "cast: .* as max_range, got 3"),
+        (
+            lambda g: grids.cast(g._replace(resolution=None), np.zeros(3), ANGLES, 1.0),
+            "ray_map: expected real numbers as resolution, got None",
+        ),
         (lambda g: grids.cast(g, np.zeros(2), ANGLES, 1.0), r"expected poses \(x, y, θ\)"),
         (lambda g: grids.cast(g, np.zeros(3), ANGLES[:0], 1.0), "expected angles of shape"),
         (lambda g: grids.cast(g, np.zeros(3), ANGLES * np.nan, 1.0), "expected finite angles"),

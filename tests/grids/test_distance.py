@@ -101,6 +101,7 @@ def test_resampling_keeps_the_integral_and_the_unknown():
     blocks = log_odds.reshape(4, 2, 6, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(halved.log_odds, blocks, atol=1e-12)
     assert not np.any(np.asarray(halved.known)[:2, :3])
+    assert grids.resample(jax.tree.map(np.float32, grid), 0.2).log_odds.dtype == np.float32
     odd = grids.resample(grid, 0.13)
     assert odd.log_odds.shape == (7, 10)
     np.testing.assert_allclose(odd.log_odds.sum() * 0.13**2, log_odds.sum() * 0.1**2)
@@ -141,6 +142,10 @@ def test_correlation_of_maps():
     ("call", "reason"),
     [
         (lambda g: grids.distance_field(g, truncate=0.0), "distance_field: expected truncate"),
+        (
+            lambda g: grids.distance_field(g, threshold=np.nan),
+            "expected a finite threshold, got nan",
+        ),
         (lambda g: grids.distance_field(3), "distance_field: expected a Grid"),
         (
             lambda g: grids.distance_field(g._replace(log_odds=[[1.0, -1.0]])),

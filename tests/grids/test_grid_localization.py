@@ -140,6 +140,7 @@ def test_particles_of_no_weight_from_the_start_are_drawn_anew_until_one_has_some
     np.testing.assert_allclose(nothing.log_weight, state.log_weight, atol=1e-12)
     state, info = update(state, scan._replace(valid=np.ones(4, bool)), KEY)
     assert info.extra["particles"].underflow and float(state.injection) == 1.0
+    assert np.all(info.status == Status.UNMATCHED)
     state, info = update(
         predict(state, CONTROLS[0], KEY), scan._replace(valid=np.ones(4, bool)), KEY
     )

@@ -134,6 +134,11 @@ def test_a_map_of_a_square_room_is_that_room():
             lambda p, b: (p, b._replace(angle=b.angle[:, :4])),
             "count: expected as many ranges, angles",
         ),
+        (lambda p, b: (p, None), "count: expected Beams, got NoneType"),
+        (
+            lambda p, b: (p, b._replace(range=b.range.tolist())),
+            "count: expected ranges, angles and masks in arrays, got list, ndarray, ndarray",
+        ),
         (lambda p, b: (p, b._replace(valid=b.valid & False)), "count: no scan has a valid beam"),
         (lambda p, b: (p * np.nan, b), "count: expected finite poses"),
     ],

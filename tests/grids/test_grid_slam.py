@@ -13,7 +13,7 @@ from jaxslam.motion import pose_increment
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import rasterize
-from jaxslam.types import Beams
+from jaxslam.types import Beams, Status
 
 
 def test_survivors_stay_and_only_the_dead_are_overwritten():
@@ -145,15 +145,20 @@ def test_a_scan_without_a_valid_beam_changes_no_weight_and_no_map():
     blind = jax.tree.map(lambda leaf: leaf[0], rows.scan)._replace(valid=np.zeros(24, bool))
 
     @jax.jit
-    def step(state, key):
+    def step(state, scan, key):
         ahead = filter.predict(state, np.float32([0.5, 0, 0.25]), key)
-        return filter.update(ahead, blind, key)
+        return filter.update(ahead, scan, key)
 
-    after, info = step(state, jax.random.key(0))
+    after, info = step(state, blind, jax.random.key(0))
     np.testing.assert_allclose(after.log_weight, -np.log(8), rtol=1e-6)
     assert not np.any(after.hits) and not np.any(after.misses)
     assert after.pose.dtype == np.float32 and np.std(after.pose[:, 0]) > 0
     assert not info.extra["particles"].underflow
+    away = state._replace(pose=np.asarray(state.pose) + 50)
+    info = step(away, blind._replace(valid=np.ones(24, bool)), jax.random.key(0))[1]
+    assert info.extra["maps"].outside == 8 and np.all(info.status == Status.UNMATCHED)
+    with pytest.raises(ValueError, match=r"best_map: .* of one run.*jax\.vmap\(grids\.best_map\)"):
+        grids.best_map(jax.tree.map(lambda leaf: np.stack([leaf, leaf]), state))
 
 
 @pytest.mark.parametrize(
@@ -163,11 +168,12 @@ def test_a_scan_without_a_valid_beam_changes_no_weight_and_no_map():
         ({"proposal": "best"}, 'expected proposal "motion" or "scan_matched"'),
         ({"candidates": 1}, "grid_slam: expected an even number of candidates"),
         ({"candidates": 15}, "an even number of candidates, at least 2, got 15"),
-        ({"exponent": 0.0}, "an exponent and a spread of two widths above 0"),
+        ({"exponent": 0.0}, "grid_slam: expected exponent above 0"),
+        ({"exponent": np.inf}, "grid_slam: expected exponent above 0, got inf"),
         ({"spread": (0.1,)}, "a spread of two widths above 0"),
         ({"hit": 0.3}, "grid_slam: expected 0 < miss < 0.5 < hit"),
         ({"mount": (0.0, 0.0)}, "grid_slam: expected a mounting pose"),
-        ({"no_return": 11.0}, "no_return from 0 to it"),
+        ({"no_return": 11.0}, "no_return from 0 to 10.0, got 11.0"),
         ({"threshold": 2.0}, "threshold from 0 to 1"),
         ({"every": 0}, "grid_slam: every"),
     ],
@@ -181,6 +187,8 @@ def test_a_frame_that_is_none_is_refused():
     field = grids.likelihood_field(0.08, max_range=10.0)
     with pytest.raises(ValueError, match="expected a resolution above 0"):
         grids.grid_slam((3, 3), np.zeros(3), 0.0, field, WORLD.motion, 2, max_range=10.0)
+    with pytest.raises(ValueError, match="expected max_range above 0, got inf"):
+        grids.grid_slam((3, 3), np.zeros(3), 0.1, field, WORLD.motion, 2, max_range=np.inf)
     with pytest.raises(ValueError, match="at least one cell"):
         grids.grid_slam((0, 3), np.zeros(3), 0.1, field, WORLD.motion, 2, max_range=10.0)
     with pytest.raises(ValueError, match="expected a BeamModel"):

@@ -350,7 +350,7 @@ def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_
     reckoning = filters.dead_reckoning(room.motion, WORLD.sensor)
 
     def update(joint, scan, key):
-        return joint, info_of_beams(scan, 1, jnp.zeros(()))
+        return joint, info_of_beams(scan, 1, jnp.zeros(()), jnp.asarray(True))
 
     silent = dataclasses.replace(reckoning, update=update)
     found = worlds.campaign(world, {"silent": silent}, 3).filters["silent"]

@@ -53,6 +53,14 @@ NEAR = 0.5
 """Distance from the reference within which the robot counts as found [m]."""
 
 
+LAST, REACH, FIT = 10, 0.3, 0.75
+"""The robot is said to be localized where of the beams of the last scans, so many, at least this
+share has the range that the map predicts, within REACH [m]. On the Intel lab and building 101 in
+Freiburg, in maps of the first half of each log, that share was 0.92 to 0.97 of six runs that ended
+right, 0.66 of a seventh in a part that the map lacks, and of 17 that ended metres off at most 0.44,
+but 0.67 of one in a room like its own."""
+
+
 def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
     """Localize the robot in the map, from raw odometry and scans: likelihood field, KLD, and from
     anywhere recovery.
@@ -99,6 +107,8 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
     cloud, weight = (np.asarray(part)[-1] for part in found.watched)
     groups = grids.clusters(cloud, weight)
     info = found.kept
+    agree = bool(groups.weight[0] > 0.5)
+    fit = share_as_predicted(grid, np.asarray(path.pose)[-LAST:], log)
     summary = {
         "job": "localization",
         "map": str(options.localize),
@@ -112,7 +122,15 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
         ),
         "hypotheses at the end": len(groups.weight),
         "weight of the heaviest": float(groups.weight[0]),
-        "localized at the end": "yes" if groups.weight[0] > 0.5 else "no: hypotheses disagree",
+        "particles agree at the end": agree,
+        f"beams of the last {LAST} scans within {REACH:g} m of the map's range, share": fit,
+        "localized at the end": (
+            "no: hypotheses disagree"
+            if not agree
+            else "yes"
+            if fit >= FIT
+            else f"no: less than {FIT:.0%} of the beams fit the map"
+        ),
         "final pose [m, m, rad]": [float(value) for value in path.pose[-1]],
     } | scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
 
@@ -133,6 +151,17 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
         "trajectory.tum": report.trajectory_tum(log.time, path),
     }
     return Job(summary, files, figures)
+
+
+def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLog) -> float:
+    """Of the beams of the last n scans that met something, the share whose range is within REACH of
+    that of the map at the pose of its scan; 0 without such beams."""
+    scans = jax.tree.map(lambda part: part[-len(poses) :], log.beams)
+    rays = grids.ray_map(grid, method="cells")
+    cast = jax.jit(jax.vmap(lambda pose, angles: grids.cast(rays, pose, angles, log.max_range)))
+    off = np.abs(np.asarray(cast(poses, scans.angle)) - scans.range)
+    met = scans.valid & (scans.range < log.max_range)
+    return float((met & (off < REACH)).sum() / max(met.sum(), 1))
 
 
 def _particle_info(info: Info) -> PyTree:

@@ -83,7 +83,8 @@ def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
 def check_beams(name: str, beams: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless beams are one scan.
 
-    Ranges, angles and masks must be as many, and outside a trace at least one beam must be usable.
+    Ranges, angles and masks must be as many, and outside a trace at least one beam must be usable,
+    and the angles of valid beams finite.
     """
     if not isinstance(beams, Beams):
         raise ValueError(f"{name}: expected Beams, got {type(beams).__name__}")
@@ -93,7 +94,8 @@ def check_beams(name: str, beams: object) -> None:
         raise ValueError(f"{name}: expected as many ranges, angles and masks, got {told}")
     if not is_concrete(beams):
         return
-    if not np.all(np.isfinite(beams.angle)):
-        raise ValueError(f"{name}: expected finite angles")
-    if not np.any(np.asarray(beams.valid) & (np.asarray(beams.range) >= 0)):
+    valid = np.asarray(beams.valid) & (np.asarray(beams.range) >= 0)
+    if not np.all(np.isfinite(np.asarray(beams.angle)[valid])):
+        raise ValueError(f"{name}: expected finite angles of valid beams")
+    if not np.any(valid):
         raise ValueError(f"{name}: the scan of {shapes[0][0]} beams has no valid beam")

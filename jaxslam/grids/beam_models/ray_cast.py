@@ -98,7 +98,8 @@ def ray_cast(
 ) -> BeamModel:
     """The ray-cast model: `mixture_log_density` of each range given that of `grids.cast`.
 
-    Differentiable by the parameters, and by the pose in the sense of `cast`.
+    Differentiable by the parameters, and by the pose in the sense of `cast`. In a map made from
+    scans take `method="cells"`, since "surface" passes walls that are weakly occupied (`cast`).
 
     Args:
         mixture: parameters, which `fit` learns from data; the four shares have sum 1.

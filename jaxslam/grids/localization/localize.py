@@ -79,7 +79,8 @@ def localize(
     `clusters` of `final.pose` and `final.log_weight` finds these. A particle off the map or in an
     occupied cell has weight zero; `blocked` of `info.extra["particles"]`, a `ParticleInfo`, counts
     those in use. A scan without a usable beam tells no more than that. The status of a beam is
-    FUSED if it entered the weights, UNMATCHED if `every` left it out. log_likelihood is
+    FUSED if it entered the weights, UNMATCHED if `every` left it out or the scan left no particle a
+    weight (`underflow`), as where all are off the map. log_likelihood is
     log Σ w p(z | x)^exponent.
 
     Args:
@@ -143,7 +144,7 @@ def localize(
         blocked = blocked & active_mask(state)
         state, found = weigh_particles(state, misfit, fit, beams.valid.sum(), settings)
         found = found._replace(blocked=blocked.sum(dtype=jnp.int32))
-        info = info_of_beams(scan, every, evidence)
+        info = info_of_beams(scan, every, evidence, ~found.underflow)
         return state, with_extra(info, "particles", found)
 
     def no_points(pose: Float[Array, "3"]) -> Float[Array, "0 2"]:
@@ -169,10 +170,15 @@ def _blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
     return ~inside | (jnp.asarray(grid.log_odds > 0)[i, j])
 
 
-def info_of_beams(scan: Scan, every: int, log_likelihood: Float[Array, ""]) -> Info:
-    """The `Info` of a scan: what became of each beam; a beam has no innovation."""
+def info_of_beams(
+    scan: Scan, every: int, log_likelihood: Float[Array, ""], used: Bool[Array, ""]
+) -> Info:
+    """The `Info` of a scan: what became of each beam; a beam has no innovation.
+
+    Each n-th beam is FUSED where the scan was used; all others are UNMATCHED.
+    """
     m = scan.valid.shape[0]
-    taken = jnp.arange(m) % every == 0
+    taken = (jnp.arange(m) % every == 0) & used
     kind = scan.z.dtype
     return info_of(
         status_of(scan.valid, matched=taken, inside=scan.z[:, 0] >= 0),

@@ -7,7 +7,6 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int, PyTree
@@ -32,7 +31,7 @@ from jaxslam.protocols import Filter, Motion, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import effective_size, normalized
 from jaxslam.types import Beams, Estimate, Info, Scan
-from jaxslam.validation.numbers import check_mount
+from jaxslam.validation.numbers import check_mount, check_positive
 
 
 def grid_slam(
@@ -75,8 +74,9 @@ def grid_slam(
 
     `info.extra["particles"]` is a `ParticleInfo`, and `info.extra["maps"]` a `MapInfo`: how many
     maps were copied, and how many particles are off their map, whose scan is not counted. The
-    estimate is `weighted_pose_moments` of the particles, without landmarks;
-    `best_map(trace.final)` is the map.
+    status of a beam is FUSED if it entered the weights, UNMATCHED if `every` left it out, the scan
+    left no particle a weight, or all particles are off their maps. The estimate is
+    `weighted_pose_moments` of the particles, without landmarks; `best_map(trace.final)` is the map.
 
     A step costs P · B · (2 W · iterations + candidates) look-ups and P distance fields of the whole
     map, and the state has 8 P H W bytes: it is meant for a room. The maps are overconfident as all
@@ -120,19 +120,14 @@ def grid_slam(
         )
     if proposal not in ("motion", "scan_matched"):
         raise ValueError(f'{name}: expected proposal "motion" or "scan_matched", got {proposal!r}')
-    if not (max_range > 0 and 0 <= no_return <= max_range):
-        raise ValueError(
-            f"{name}: expected max_range above 0 and no_return from 0 to it, got {max_range}, "
-            f"{no_return}"
-        )
-    concrete = validation.is_concrete(exponent, spread)
+    check_positive(name, max_range=max_range, exponent=exponent)
+    if not 0 <= no_return <= max_range:
+        raise ValueError(f"{name}: expected no_return from 0 to {max_range}, got {no_return}")
+    concrete = validation.is_concrete(spread)
     if validation.shape_told(spread if concrete else jnp.asarray(spread)) != "(2,)" or (
-        concrete and not (float(np.asarray(exponent)) > 0 and min(spread) > 0)
+        concrete and not min(spread) > 0
     ):
-        raise ValueError(
-            f"{name}: expected an exponent and a spread of two widths above 0, got {exponent!r}, "
-            f"{spread!r}"
-        )
+        raise ValueError(f"{name}: expected a spread of two widths above 0, got {spread!r}")
     check_resampling(name, resample, threshold)
     height, width = shape
 
@@ -229,7 +224,8 @@ def grid_slam(
             underflow=~some,
             invalid=(~good).sum(dtype=jnp.int32),
         )
-        info = with_extra(info_of_beams(scan, every, evidence), "particles", found)
+        used = some & ~outside.all()
+        info = with_extra(info_of_beams(scan, every, evidence, used), "particles", found)
         info = with_extra(info, "maps", MapInfo(state.copied, outside.sum(dtype=jnp.int32)))
         state = state._replace(
             pose=pose,

@@ -4,12 +4,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.grids.grid import Grid
 from jaxslam.grids.mapping import Counts, occupancy
+from jaxslam.validation.numbers import shape_told
 
 
 class GridParticles(NamedTuple):
@@ -49,8 +51,15 @@ class MapInfo(NamedTuple):
 def best_map(state: GridParticles, *, hit: ArrayLike = 0.7, miss: ArrayLike = 0.4) -> Grid:
     """The map of the most likely particle, as `occupancy` of its counts.
 
-    Its path is one draw; what the other particles hold is not in it.
+    Its path is one draw; what the other particles hold is not in it. Raises ValueError on the
+    states of a batch, of which `jax.vmap(grids.best_map)` makes a map each.
     """
+    if not isinstance(state, GridParticles) or np.ndim(state.hits) != 3:
+        got = shape_told(state.hits) if isinstance(state, GridParticles) else type(state).__name__
+        raise ValueError(
+            "best_map: expected the GridParticles of one run, with hits (P, H, W), got "
+            f"{got}; a batch takes jax.vmap(grids.best_map)"
+        )
     none = jnp.zeros((), jnp.int32)
     frame = state.origin, state.resolution
     counts = Counts(state.hits[state.best], state.misses[state.best], *frame, none, none)
