@@ -14,8 +14,9 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks.gate import Metric, alone
+from benchmarks.real_data import DATA
 from benchmarks.speed.timing import together
-from jaxslam import grids
+from jaxslam import datasets, grids
 from jaxslam.simulation.scenarios import ROOMS
 from jaxslam.simulation.walls import exact_ranges, rasterize
 
@@ -93,6 +94,43 @@ def accuracy() -> list[Metric]:
     return metrics
 
 
+def passed_walls() -> list[Metric]:
+    """The share of the beams of a log that a map of all its scans predicts over 0.5 m too far."""
+    far, cell = 20.0, 0.05
+    try:
+        log = datasets.carmen(DATA / "carmen" / "freiburg-101-corrected.log", max_range=far)
+    except ValueError as problem:
+        print(f"beams that pass walls: left out: {problem}")
+        return []
+    low, high = log.corrected[:, :2].min(0) - far - 1, log.corrected[:, :2].max(0) + far + 1
+    rows, columns = np.ceil((high - low) / cell)[::-1].astype(int).tolist()
+    counts = grids.count(
+        (rows, columns),
+        np.array([*low, 0.0]),
+        cell,
+        log.corrected,
+        log.beams,
+        max_range=far,
+        no_return=0.0,
+    )
+    every = slice(None, None, 6)
+    ranges, angles, valid = (np.asarray(part)[every] for part in log.beams)
+    hit, metrics = valid & (ranges < far), []
+    for kind, make in (("occupancy", grids.occupancy), ("reflection", grids.reflection)):
+        grid = make(counts)
+        trinary = grid._replace(log_odds=4 * jnp.sign(grid.log_odds))
+        for what, of, method in (
+            ("surface", grid, "surface"),
+            ("surface, trinary", trinary, "surface"),
+            ("cells", grid, "cells"),
+        ):
+            rays = grids.ray_map(of, method=method)
+            found = np.asarray(grids.cast(rays, log.corrected[every], angles[0], far))
+            share = (found - ranges > 0.5)[hit].mean()
+            metrics.append(Metric(f"beams over 0.5 m too far, {kind}, {what}", share))
+    return metrics
+
+
 def measure() -> list[Metric]:
     command = [sys.executable, "-m", "benchmarks.grids.rays"]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
@@ -106,7 +144,7 @@ def measure() -> list[Metric]:
         elif name.startswith("mean range"):
             low, high = -1e-3, 1e-3
         metrics.append(Metric(name, value, low, high))
-    return metrics + accuracy() + distance()
+    return metrics + accuracy() + passed_walls() + distance()
 
 
 if __name__ == "__main__":

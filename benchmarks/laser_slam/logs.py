@@ -84,9 +84,9 @@ def measure(names: tuple[str, ...] = LOGS, draw: bool = True) -> list[Metric]:
         for j in doubtful(solved, log.corrected):
             fits = fit_by_turn(log, j)
             least = min(fits, key=lambda turn: fits[turn])
+            told = f"{fits[0.0]:.3f} m at the file's heading, {fits[least]:.3f} m"
             print(
-                f"{name:12}  scan {j} on scan {j - 1}: median distance {fits[0.0]:.3f} m at the file's "
-                f"heading, {fits[least]:.3f} m turned by {least:.1f} deg"
+                f"{name:12}  scan {j} on {j - 1}: median distance {told} turned by {least:.1f} deg"
             )
         stages = ", ".join(f"{stage} {value:.1f}" for stage, value in solved.seconds.items())
         print(f"{name:12}  seconds: {stages}", flush=True)

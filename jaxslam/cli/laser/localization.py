@@ -55,10 +55,8 @@ NEAR = 0.5
 
 LAST, REACH, FIT = 10, 0.3, 0.75
 """The robot is said to be localized where of the beams of the last scans, so many, at least this
-share has the range that the map predicts, within REACH [m]. On the Intel lab and building 101 in
-Freiburg, in maps of the first half of each log, that share was 0.92 to 0.97 of six runs that ended
-right, 0.66 of a seventh in a part that the map lacks, and of 17 that ended metres off at most 0.44,
-but 0.67 of one in a room like its own."""
+share has the range that the map predicts, within REACH [m]: `benchmarks/NOTES.md` has the runs that
+it was chosen on."""
 
 
 def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
