@@ -18,7 +18,7 @@ def measure(quick: bool = False, part: str | None = None, runs: int | None = Non
     if part in (None, "logs"):
         metrics += logs.measure(("intel",) if quick else logs.LOGS)
     if part in (None, "office"):
-        metrics += office.measure(runs or (3 if quick else 10))
+        metrics += office.measure(runs or (3 if quick else 100))
     return metrics
 
 

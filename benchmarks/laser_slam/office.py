@@ -87,7 +87,7 @@ def path_of(odometry, true):
     return nees(poses.between(odometry.poses[keys[1:]], true[keys[1:]]), cov)
 
 
-def measure(runs: int = 10) -> list[Metric]:
+def measure(runs: int) -> list[Metric]:
     found: dict[str, list[np.ndarray]] = {}
     records: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     chi2, closures, position = [], [], {}

@@ -11,6 +11,7 @@ from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.raw_odometry import Steps
 from jaxslam.laser_slam.reference import (
     BLUR,
+    PEAK,
     gathered,
     on_walls,
     search,
@@ -20,14 +21,19 @@ from jaxslam.laser_slam.reference import (
 )
 from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
-from jaxslam.matching import Match, Matcher, Points, Prior
+from jaxslam.matching import Match, Matcher, MatchStatus, Points, Prior
 from jaxslam.matching.surface import Surface
 from jaxslam.math import numpy_poses as poses
+from jaxslam.math.stats import chi2_quantile
 
 NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0))
 """About raw odometry."""
 FAR = search(1.6, np.deg2rad(60.0), np.deg2rad(2.5))
 """Where that finds little, with raw odometry's covariance times `DOUBT`."""
+LOST = search(2.0, np.deg2rad(100.0), np.deg2rad(2.5), ambiguous=PEAK)
+"""Where raw odometry is no guess, as after a jump: the match must be as good as that of a loop."""
+WIDE = 0.3
+"""[m] standard deviation of raw odometry's position from which on it is none"""
 DOUBT = 16.0
 SURE = 0.6
 """Share of the points on walls below which the wider search is made."""
@@ -66,7 +72,9 @@ def laser_odometry(
     The pose in the frame of the last keyframe minimizes the squared distances of the points from
     the lines of the reference, and the error of raw odometry from the scan before, by their
     covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
-    by `settings.correlation`. Where too few points meet a wall the step is raw odometry alone.
+    by `settings.correlation`. Where too few points meet a wall the step is raw odometry alone; so
+    it is where that is no guess, as after a jump, and the match is worse than that of a loop, or
+    another pose is nearly as good.
     """
     count, width = len(scans.usable), settings.reference
     result = Odometry(
@@ -80,7 +88,7 @@ def laser_odometry(
         residual=np.zeros(count),
     )
     result.poses[0] = first
-    keys = [0]
+    keys, gate = [0], chi2_quantile(settings.consistency, 3)
     z, cov = np.zeros(3), np.zeros((3, 3))  # of the last scan, relative to the last keyframe
     for scan in range(1, count):
         key = keys[-1]
@@ -89,17 +97,26 @@ def laser_odometry(
         of = [one for one in keys[-width:] if scans.usable[one]]
         z, cov = guess, prior
         if scans.usable[scan] and of:
-            fit, seen = _tracked(NEAR, scans, scan, of, result.poses, key, guess, prior, settings)
-            if fit.inliers < SURE:
-                wider = _tracked(
-                    FAR, scans, scan, of, result.poses, key, guess, DOUBT * prior, settings
-                )
-                if wider[0].inliers > fit.inliers + BETTER:
-                    fit, seen = wider
+
+            def tracked(matcher: Matcher, prior: np.ndarray) -> _Tracked:
+                return _tracked(matcher, scans, scan, of, result.poses, key, guess, prior, settings)  # noqa: B023
+
+            least = settings.least_inliers
+            if np.sqrt(prior.diagonal()[:2].max()) > WIDE:
+                found, least = tracked(LOST, prior), max(least, settings.loop_inliers)
+            else:
+                found = tracked(NEAR, prior)
+                if found.match.inliers < SURE:
+                    wider = tracked(FAR, DOUBT * prior)
+                    if wider.match.inliers > found.match.inliers + BETTER:
+                        found = wider
+            fit = found.match
             result.inliers[scan], result.residual[scan] = fit.inliers, fit.residual
-            if fit.inliers >= settings.least_inliers:
+            away = poses.between(guess, np.asarray(fit.pose, np.float64))
+            unlike = fit.inliers < SURE and away @ np.linalg.solve(prior, away) > gate
+            if fit.inliers >= least and not found.ambiguous and not unlike:
                 result.matched[scan] = True
-                z, cov = np.asarray(fit.pose, np.float64), seen
+                z, cov = np.asarray(fit.pose, np.float64), found.cov
         result.base[scan], result.z[scan], result.cov[scan] = key, z, cov
         result.poses[scan] = poses.compose(result.poses[key], z)
         far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > settings.key_turn
@@ -109,6 +126,16 @@ def laser_odometry(
         if progress is not None:
             progress(scan + 1, count)
     return result._replace(keyframe=np.array(keys))
+
+
+class _Tracked(NamedTuple):
+    """A match of a scan with the keyframes before it."""
+
+    match: Match
+    cov: Float[np.ndarray, "3 3"]
+    """of the end of its pose"""
+    ambiguous: bool
+    """whether the search found another pose nearly as good"""
 
 
 def _tracked(
@@ -121,14 +148,14 @@ def _tracked(
     guess: np.ndarray,
     prior: np.ndarray,
     settings: Settings,
-) -> tuple[Match, np.ndarray]:
-    """The match of a scan with keyframes in the frame of the last; its covariance at the end."""
+) -> _Tracked:
+    """The match of a scan with keyframes, in the frame of the last."""
     take = np.array(of + [of[-1]] * (settings.reference - len(of)))
     there = poses.between(path[key], path[take]).astype(np.float32)
     points = taken(scans.points, take)
     again = np.arange(len(take)) < len(of)  # padding repeats a keyframe without points
     wide = covariances.of_coordinates(prior, guess)
-    fit = programs.call(
+    fit, status = programs.call(
         _track,
         (matcher,),
         points._replace(valid=points.valid & again[:, None]),
@@ -142,7 +169,8 @@ def _tracked(
     sigma = max(settings.sigma, float(fit.residual)) ** 2 * settings.correlation
     seen = covariances.semidefinite(np.asarray(fit.information)) / sigma + np.linalg.inv(wide)
     at_end = covariances.at_end(np.linalg.inv(seen), np.asarray(fit.pose, np.float64))
-    return fit, at_end + np.diag(np.square(settings.floor))
+    cov = at_end + np.diag(np.square(settings.floor))
+    return _Tracked(fit, cov, int(status) == MatchStatus.AMBIGUOUS)
 
 
 def _track(
@@ -154,10 +182,12 @@ def _track(
     guess: Array,
     information: Array,
     sigma: Array,
-) -> Match:
-    """By a search and by walls, with a prior of so much information beside points of variance 1."""
+) -> tuple[Match, Array]:
+    """By a search and by walls, with a prior of so much information beside points of variance 1;
+    and the status of the search."""
     reference = gathered(points, surface, there)
     prepared = searched(matcher, reference)
     coarse = Prior(guess, BLUR**2 * information)
     found = matcher.match(prepared, thinned(scan), guess, coarse)
-    return on_walls(reference, scan, found.pose, Prior(guess, sigma**2 * information))
+    near = on_walls(reference, scan, found.pose, Prior(guess, sigma**2 * information))
+    return near, found.status

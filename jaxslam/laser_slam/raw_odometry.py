@@ -19,7 +19,7 @@ class Steps(NamedTuple):
     """longer than can be: the step is zero, and its covariance wide"""
 
 
-WIDE = (1.0, 1.0, 0.5)
+WIDE = (1.0, 1.0, 1.0)
 """Standard deviations [m, m, rad] of a step that raw odometry does not tell."""
 
 

@@ -41,9 +41,14 @@ def check_laser_log(name: str, log: LogOfScans) -> None:
         )
     if np.shape(log.time) != (shape[0],):
         raise ValueError(f"{name}: expected {shape[0]} times, got {np.shape(log.time)}")
-    if not np.all(np.isfinite(log.raw)):
-        scan = int((~np.isfinite(log.raw)).any(axis=1).argmax())
-        raise ValueError(f"{name}: raw odometry of scan {scan} is not finite")
+    lost = np.asarray(log.beams.valid, bool) & ~np.isfinite(log.beams.angle)
+    for what, bad in (
+        ("raw odometry", ~np.isfinite(log.raw).all(axis=1)),
+        ("the time", ~np.isfinite(log.time)),
+        ("the angle of a valid beam", lost.any(axis=1)),
+    ):
+        if bad.any():
+            raise ValueError(f"{name}: {what} of scan {int(bad.argmax())} is not finite")
     if not log.max_range > 0:
         raise ValueError(f"{name}: expected a max_range above 0, got {log.max_range}")
 
@@ -54,7 +59,7 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     nearest = min(settings.max_range, log.max_range * (1 - 1e-6))
     with np.errstate(invalid="ignore"):
         valid = (there > 0) & (ranges > 0) & (ranges < nearest)
-    ranges = np.where(valid, ranges, 0.0)
+    ranges, angles = np.where(valid, ranges, 0.0), np.where(there > 0, angles, 0.0)
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
     points: Any = ranges[..., None].astype(np.float32) * rays, rays, valid
     span = max(2, round(np.deg2rad(2.0) / max(_spacing(angles, there > 0), 1e-3)))

@@ -1,8 +1,13 @@
 """The numbers that laser SLAM is run with."""
 
 from dataclasses import dataclass, fields
+from typing import Any, cast
 
 import numpy as np
+
+from jaxslam.validation.numbers import check_count
+
+_MAY_BE_ZERO = "fewest", "loop_gap", "submap"
 
 
 @dataclass(frozen=True)
@@ -56,22 +61,35 @@ class Settings:
     consistency: float = 0.999
     """probability below which two loops agree"""
     resolution: float = 0.05
-    """side of a cell of the map"""
+    """side of a cell of the map; larger where the map would have more than 4,000 cells a side"""
 
     def __post_init__(self) -> None:
+        caller = "laser_slam.Settings"
         for field in fields(self):
-            value = np.asarray(getattr(self, field.name))
-            if field.name == "appearance":
-                continue
-            if not np.all(np.isfinite(value)) or np.any(value < 0):
-                raise ValueError(f"laser_slam.Settings: {field.name} is {value}")
-        for name in ("max_range", "beams", "sigma", "correlation", "jump", "reference", "rounds"):
-            if not getattr(self, name) > 0:
-                raise ValueError(
-                    f"laser_slam.Settings: expected {name} above 0, got {getattr(self, name)}"
-                )
+            given, default = getattr(self, field.name), cast(Any, field.default)
+            if isinstance(default, bool):
+                if not isinstance(given, bool):
+                    raise ValueError(f"{caller}: {field.name}: expected a bool, got {given!r}")
+            elif isinstance(default, int):
+                if field.name in _MAY_BE_ZERO and given == 0:
+                    continue
+                check_count(f"{caller}: {field.name}", given)
+            else:
+                self._check_numbers(f"{caller}: {field.name}", given, np.shape(default))
+        for name in ("max_range", "sigma", "correlation", "jump", "resolution", "odometry_base"):
+            if not np.all(np.asarray(getattr(self, name)) > 0):
+                raise ValueError(f"{caller}: {name}: expected above 0, got {getattr(self, name)}")
         for name in ("loop_probability", "consistency", "least_inliers", "loop_inliers"):
             if not 0 < getattr(self, name) < 1:
-                raise ValueError(
-                    f"laser_slam.Settings: expected {name} in (0, 1), got {getattr(self, name)}"
-                )
+                raise ValueError(f"{caller}: {name}: expected in (0, 1), got {getattr(self, name)}")
+
+    @staticmethod
+    def _check_numbers(name: str, given: object, shape: tuple[int, ...]) -> None:
+        """Raise ValueError unless these are finite numbers of at least 0, as many as expected."""
+        try:
+            value = np.asarray(given, float)
+        except (TypeError, ValueError):
+            value = np.full(shape, np.nan)
+        if value.shape != shape or not np.all(np.isfinite(value) & (value >= 0)):
+            many = f"{shape[0]} numbers" if shape else "a number"
+            raise ValueError(f"{name}: expected {many} of at least 0, got {given!r}")

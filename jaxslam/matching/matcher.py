@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam import programs
@@ -16,6 +16,8 @@ from jaxslam.grids.grid import Grid, check_grid
 from jaxslam.matching.points import Points
 from jaxslam.matching.prior import Prior
 from jaxslam.validation.numbers import is_concrete, shape_told
+
+_T = TypeVar("_T")
 
 Reference: TypeAlias = Points | Grid
 
@@ -99,16 +101,38 @@ def match(
             arrays for many pairs at once, as `points` and `start` then have.
         start: (3,) where the search begins.
         prior: what is known of the pose; without one only the start is.
+
+    It is computed in the higher precision of reference and points.
+
     Raises:
         ValueError: a reference of another kind, arrays that do not fit each other, numbers that
             are not finite. A scan without points is a status.
     """
     batch = _checked(matcher, reference, points, start)
-    start = jnp.asarray(start)
     if prior is not None:
         _check_prior(prior, batch)
+    dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
+    start = jnp.asarray(start, dtype)
+    reference, points, prior = in_dtype((reference, points, prior), dtype)
     call = _many if batch else _one
     return programs.call(call, (matcher,), reference, points, start, prior)
+
+
+def floats(tree: PyTree) -> list[Array]:
+    """The arrays of a tree that hold real numbers."""
+    leaves = jax.tree.leaves(tree)
+    return [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
+
+
+def in_dtype(tree: _T, dtype: DTypeLike) -> _T:
+    """The tree with its real numbers in one precision; arrays of it stay as they are."""
+
+    def one(leaf: PyTree) -> PyTree:
+        own = jnp.result_type(leaf)
+        other = jnp.issubdtype(own, jnp.floating) and own != dtype
+        return jnp.asarray(leaf, dtype) if other else leaf
+
+    return cast(_T, jax.tree.map(one, tree))
 
 
 def _one(

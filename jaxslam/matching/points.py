@@ -33,8 +33,8 @@ def points(
 ) -> Points:
     """The ends of the beams in the robot's frame, in the order of the beams.
 
-    A beam that is not valid, has no finite range, or a range not between min_range and max_range
-    [m] (both excluded) gives no point: one of max_range met nothing.
+    A beam that is not valid, has no finite angle or range, or a range not between min_range and
+    max_range [m] (both excluded) gives no point: one of max_range met nothing.
 
     Args:
         mount: (3,) pose of the laser on the robot.
@@ -48,9 +48,10 @@ def points(
     check_positive("points", max_range=max_range)
     r = jnp.asarray(beams.range)
     valid = (r > min_range) & (r < jnp.asarray(max_range) * (1 - 1e-6)) & beams.valid
+    valid = valid & jnp.isfinite(beams.angle)
     r = jnp.where(valid, r, 1.0)
     eye = jnp.asarray(mount, r.dtype)
-    heading = eye[2] + beams.angle
+    heading = eye[2] + jnp.where(valid, beams.angle, 0.0)
     ray = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
     return Points(eye[None, :2] + r[:, None] * ray, ray, valid)
 

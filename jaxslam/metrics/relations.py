@@ -62,7 +62,7 @@ def relations(
         raise ValueError("relations: expected exactly one of rows, seconds and metres")
     if (time is None) != (seconds is None):
         raise ValueError("relations: expected the stamps, time=, with seconds= and nowhere else")
-    if rows is not None and rows != int(rows):
+    if rows is not None and not float(rows).is_integer():
         raise ValueError(f"relations: expected a whole number of rows, got {rows}")
     at = travelled(path) if seconds is None else np.asarray(time, np.float64)
     if rows is not None:
@@ -73,8 +73,12 @@ def relations(
         )
     given = next(spacing for spacing in (rows, seconds, metres) if spacing is not None)
     spacings = np.atleast_1d(np.asarray(given, np.float64))
-    if spacings.ndim != 1 or not len(spacings) or not (spacings > 0).all():
-        raise ValueError(f"relations: expected spacings above 0, got {given}")
+    if (
+        spacings.ndim != 1
+        or not len(spacings)
+        or not (np.isfinite(spacings) & (spacings > 0)).all()
+    ):
+        raise ValueError(f"relations: expected finite spacings above 0, got {given}")
     pairs = []
     for spacing in spacings:
         after = np.searchsorted(at, at + spacing - _ROUNDING * min(1.0, spacing))
@@ -124,8 +128,15 @@ def given(
         ValueError: on shapes that do not fit, and on stamps of the path that go back.
     """
     stamps, of = np.asarray(time, np.float64), poses_of("given", pose)
-    if stamps.ndim != 1 or not len(stamps) or not (np.diff(stamps) >= 0).all():
-        raise ValueError(f"given: expected stamps (K,) that do not go back, got {stamps.shape}")
+    if (
+        stamps.ndim != 1
+        or not len(stamps)
+        or not np.isfinite(stamps).all()
+        or not (np.diff(stamps) >= 0).all()
+    ):
+        raise ValueError(
+            f"given: expected finite stamps (K,) that do not go back, got {stamps.shape}"
+        )
     rows, near = [], np.ones(len(of), bool)
     for wanted in (np.asarray(first, np.float64), np.asarray(second, np.float64)):
         if wanted.shape != (len(of),):

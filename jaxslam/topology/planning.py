@@ -96,8 +96,8 @@ def place_weights(
             f"place_weights: expected particles (n, 3) and log-weights (n,), got {table.shape} and "
             f"{logs.shape}"
         )
-    if not np.isfinite(table).all() or np.isnan(logs).any():
-        raise ValueError("place_weights: expected finite poses, and log-weights that are no NaN")
+    if not np.isfinite(table).all() or not (logs < np.inf).all():
+        raise ValueError("place_weights: expected finite poses, and log-weights below infinity")
     if not len(logs) or not np.isfinite(logs.max()):
         raise ValueError("place_weights: expected a particle of weight above 0")
     weight = np.exp(logs - logs.max())

@@ -10,11 +10,12 @@ from ring_of_rooms import FAR, SETTINGS, driven, errors
 
 from jaxslam import filters, laser_slam, run, sensors
 from jaxslam.cli import main
-from jaxslam.laser_slam import LoopOutcome, covariances, scans_of, steps_of
+from jaxslam.laser_slam import LoopOutcome, covariances, laser_odometry, scans_of, steps_of
 from jaxslam.laser_slam.mapping import growing_maps
+from jaxslam.math import numpy_poses as poses
 from jaxslam.results import laser_slam as results
 from jaxslam.results.files import write_files
-from jaxslam.types import Log, Scan
+from jaxslam.types import Beams, Log, Scan
 
 ONCE = dataclasses.replace(SETTINGS, rounds=1)  # and so fewer programs
 
@@ -97,13 +98,13 @@ def test_the_map_is_of_the_walls(drive):
 def test_what_is_wrong_is_counted_and_the_run_goes_on(drive):
     """A scan without points, one of maximum ranges, a jump of odometry, time that runs backward."""
     true, log, _ = drive
-    ranges, valid = log.beams.range.copy(), log.beams.valid.copy()
-    valid[5], ranges[9] = False, FAR
+    ranges, angles, valid = (np.array(part) for part in log.beams)
+    valid[5], ranges[9], angles[5] = False, FAR, np.nan
     ranges[12, :3] = np.nan
     raw, time = log.raw.copy(), log.time.copy()
     raw[20:] += [40.0, -30.0, 0.0]
     time[30] -= 3.0
-    bad = log._replace(time=time, raw=raw, beams=log.beams._replace(range=ranges, valid=valid))
+    bad = log._replace(time=time, raw=raw, beams=Beams(ranges, angles, valid))
     told = []
     found = laser_slam.solve(bad, ONCE, progress=lambda *what: told.append(what))
     counts = found.counts
@@ -114,6 +115,23 @@ def test_what_is_wrong_is_counted_and_the_run_goes_on(drive):
     assert errors(found.poses, true)[0].max() < 0.3
     assert {what[0] for what in told} == {"odometry", "loop closing"}
     assert sum(counts[f"loops {o.name.lower()}"] for o in LoopOutcome) == counts["loops matched"]
+
+
+def test_after_a_jump_a_match_is_right_or_refused(drive):
+    """At each scan of the drive: the step from the one before is unknown, a metre and up to 90°."""
+    true, log, _ = drive
+    every, refused = scans_of(log, SETTINGS), 0
+    for k in range(6, len(true)):
+        at = np.arange(k - 5, k + 1)
+        raw = log.raw[at] + np.where(at == k, 40.0, 0.0)[:, None] * [1, 0, 0]
+        scans = jax.tree.map(lambda part, at=at: np.asarray(part)[at], every)
+        found = laser_odometry(scans, steps_of(raw, SETTINGS), SETTINGS, raw[0])
+        z = poses.between(true[at[found.base[5]]], true[k])
+        off = poses.between(found.z[5], z)
+        assert np.hypot(off[0], off[1]) < 0.2 or not found.matched[5], k
+        assert off @ np.linalg.solve(found.cov[5], off) < 30, k
+        refused += not found.matched[5]
+    assert refused < 4
 
 
 def test_a_log_of_maximum_ranges_is_raw_odometry(drive):
@@ -135,11 +153,23 @@ def test_logs_that_are_none_are_refused(drive):
         ({"max_range": 0.0}, "max_range"),
         ({"beams": log.beams._replace(angle=log.beams.angle[:, :3])}, "angles"),
         ({"beams": log.beams._replace(range=np.zeros((0, 3)))}, "ranges"),
-        ({"raw": log.raw * np.nan}, "scan 0 is not finite"),
+        ({"raw": log.raw * np.nan}, "raw odometry of scan 0 is not finite"),
+        ({"time": np.where(log.time == 3, np.nan, log.time)}, "the time of scan 3 is not finite"),
+        ({"beams": log.beams._replace(angle=log.beams.angle * np.nan)}, "valid beam of scan 0"),
     ):
         with pytest.raises(ValueError, match=message):
             laser_slam.solve(log._replace(**change))
-    for wrong in ({"beams": 0}, {"consistency": 1.5}, {"sigma": -1.0}):
+    for wrong in (
+        {"beams": 0},
+        {"beams": 1.5},
+        {"consistency": 1.5},
+        {"sigma": -1.0},
+        {"floor": (1, 2)},
+        {"odometry_base": (0, 0)},
+        {"resolution": 0},
+        {"candidates": 0},
+        {"appearance": "x"},
+    ):
         with pytest.raises(ValueError, match=f"laser_slam.Settings.*{next(iter(wrong))}"):
             laser_slam.Settings(**wrong)
 

@@ -116,6 +116,19 @@ def test_the_ends_are_near_the_truth_and_lines_nearer(found):
     assert np.all(found["lines", None].residual[:GOOD] < 0.03)
 
 
+def test_numbers_of_other_types_are_those_of_the_scans(found):
+    """A start of integers or of float32, and a prior of float32, beside scans in float64."""
+    one = jax.tree.map(lambda part: part[0], (REFERENCES, SCANS))
+    whole = matching.Prior(np.zeros(3, np.float32), np.zeros((3, 3), np.float32))
+    matcher = matching.point_to_line()
+    ends = [
+        matching.match(matcher, *one, start, prior).pose
+        for start, prior in (([0, 0, 0], whole), (np.zeros(3, np.float32), whole))
+    ]
+    assert ends[0].dtype == np.asarray(one[1].position).dtype
+    np.testing.assert_array_equal(*ends)
+
+
 def test_bad_scans_have_a_status(found):
     for name in ("points", "lines"):
         end = found[name, None]

@@ -50,7 +50,7 @@ def closed(
     index = np.arange(len(keyframe))
     chain = table_of(index[:-1], index[1:], steps, covs)
     total = covariances.along(at, covs)
-    middle = index[:: max(settings.submap_every, 1)]
+    middle = index[:: settings.submap_every]
     usable = scans.usable[keyframe]
     looks = descriptors(
         *(np.asarray(part)[keyframe] for part in (scans.points.position, scans.points.valid))

@@ -63,10 +63,10 @@ class IcpSettings:
                 "IcpSettings: expected reach, scale, gap and tolerance above 0 and trim in (0, 1], "
                 f"got {self.reach}, {self.scale}, {self.gap}, {self.tolerance}, {self.trim}"
             )
-        if self.span < 1 or self.iterations < 1 or not self.lone >= 0:
+        if self.span < 1 or self.iterations < 1 or not (self.lone >= 0 and self.fewest >= 0):
             raise ValueError(
-                "IcpSettings: expected span and iterations >= 1 and lone >= 0, got "
-                f"{self.span}, {self.iterations}, {self.lone}"
+                "IcpSettings: expected span and iterations >= 1, lone and fewest >= 0, got "
+                f"{self.span}, {self.iterations}, {self.lone}, {self.fewest}"
             )
 
 
