@@ -19,16 +19,18 @@ METRES = (1.0, 2.0, 5.0, 10.0)
 """Lengths of path of the relations, of each as many as there are scans."""
 
 
-def doubtful(solved: laser_slam.Solved, reference: np.ndarray) -> list[int]:
-    """The later scans of the loops that were kept and that the reference contradicts, and the scans
-    after these."""
+def off_the_file(
+    solved: laser_slam.Solved, reference: np.ndarray
+) -> list[tuple[int, int, float, float]]:
+    """The loops that were kept and that the file's poses contradict: both scans, [m] and [°]."""
     loops = solved.loops
     kept = loops.outcome == LoopOutcome.KEPT
     first, second = loops.first[kept], loops.second[kept]
     off = poses.between(loops.z[kept], poses.between(reference[first], reference[second]))
-    wrong = (np.hypot(*off[:, :2].T) >= 0.5) | (np.abs(off[:, 2]) >= np.deg2rad(5.0))
-    scans = second[wrong].tolist()
-    return sorted({j for each in scans for j in (each, each + 1) if j < len(reference)})
+    far, turn = np.hypot(*off[:, :2].T), np.rad2deg(off[:, 2])
+    wrong = (far >= 0.5) | (np.abs(turn) >= 5.0)
+    rows = zip(*(part[wrong].tolist() for part in (first, second, far, turn)), strict=True)
+    return list(rows)
 
 
 def fit_by_turn(log: datasets.LaserLog, j: int) -> dict[float, float]:
@@ -81,7 +83,12 @@ def measure(names: tuple[str, ...] = LOGS, draw: bool = True) -> list[Metric]:
         tally = {o.name.lower(): int((solved.loops.outcome == o).sum()) for o in LoopOutcome}
         told = ", ".join(f"{count} {outcome}" for outcome, count in tally.items())
         print(f"{name:12}  loops: {len(solved.loops.outcome)} matched, {told}")
-        for j in doubtful(solved, log.corrected):
+        others = off_the_file(solved, log.corrected)
+        for i, j, off, turn in others:
+            told = f"{off:.2f} m and {abs(turn):.1f} deg off the file"
+            print(f"{name:12}  loop of scans {i} and {j}: {told}")
+        after = {k for _, j, *_ in others for k in (j, j + 1) if k < len(log.corrected)}
+        for j in sorted(after):
             fits = fit_by_turn(log, j)
             least = min(fits, key=lambda turn: fits[turn])
             told = f"{fits[0.0]:.3f} m at the file's heading, {fits[least]:.3f} m"

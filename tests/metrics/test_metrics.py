@@ -174,7 +174,10 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
         (lambda: metrics.relations(SQUARE), "relations: expected exactly one"),
         (lambda: metrics.relations(SQUARE, rows=1, metres=1.0), "relations: expected exactly one"),
         (lambda: metrics.relations(SQUARE, seconds=1.0), "relations: expected the stamps"),
-        (lambda: metrics.relations(SQUARE, metres=0.0), "relations: expected finite spacings above 0"),
+        (
+            lambda: metrics.relations(SQUARE, metres=0.0),
+            "relations: expected finite spacings above 0",
+        ),
         (lambda: metrics.relations(SQUARE, rows=1.5), "relations: expected a whole number"),
         (
             lambda: metrics.relations(SQUARE, seconds=1.0, time=[0, 1, 0.5, 2, 3]),
