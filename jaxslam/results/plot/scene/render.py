@@ -132,10 +132,15 @@ class _Stage:
 
     def __init__(self, scene: Scene, width: float, dpi: float) -> None:
         self._scene = scene
+        height, widths = 0.645 * width, (2.15, 1.0)
+        if scene.beside is None:  # a column for the legend, and as low as the panel is
+            widths = (4.0, 1.0)
+            share = np.ptp(scene.main.ylim) / np.ptp(scene.main.xlim)
+            height = float(np.clip(0.75 * width * share + 0.4, 0.3 * width, 0.75 * width))
         # Both sides even, as MP4 wants them.
-        across, tall = (2 * round(dpi * part / 2) for part in (width, 0.645 * width + _HEAD))
+        across, tall = (2 * round(dpi * part / 2) for part in (width, height + _HEAD))
         size = across / dpi, tall / dpi
-        figure, (main, beside) = panels_of(*size, 1, 2, share=(False, False), widths=(2.15, 1.0))
+        figure, (main, beside) = panels_of(*size, 1, 2, share=(False, False), widths=widths)
         figure.set_dpi(dpi)
         engine = figure.get_layout_engine()
         assert isinstance(engine, ConstrainedLayoutEngine)
