@@ -19,7 +19,7 @@ from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import chi2_of, data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.plan import Plan, plan_for
-from jaxslam.graphs.solver.rooms import as_before, cut, filled
+from jaxslam.graphs.solver.rooms import cut, filled, own_number
 from jaxslam.graphs.solver.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
 from jaxslam.validation.numbers import check_count
@@ -69,7 +69,7 @@ def optimize(
     found = programs.call(_optimize, (model, method), graph, plan, *limits)
     if not fill:
         return found
-    singular = as_before(found.singular, own, graph)
+    singular = own_number(found.singular, own, graph)
     return found._replace(graph=cut(found.graph, own), singular=singular)
 
 

@@ -1,6 +1,7 @@
 """Marginal covariances, against the dense inverse."""
 
 import numpy as np
+import pytest
 import small_graphs
 from pose_rings import SIZE, dense, ring
 from reference import graph as plain
@@ -44,6 +45,8 @@ def test_those_of_points_and_of_poses_with_points_are_too():
     cov = np.zeros((3 * count, 3 * count))
     cov[np.ix_(place, place)] = inverse
     cov = cov.reshape(count, 3, count, 3)
+    with pytest.raises(ValueError, match=f"from 0 to {count - 1}, got"):
+        graphs.marginals(graph, pairs=[[0, count]])  # of the filled graph it is a variable
     found = graphs.marginals(graph, pairs=pairs)
     atol = 1e-9 * np.abs(inverse).max()
     for k in range(POINTS):

@@ -16,8 +16,8 @@ from jaxslam.graphs.solver.batch import in_one_dtype, over_batch
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import data_of, linearize, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
-from jaxslam.graphs.solver.plan import Plan, plan_for
-from jaxslam.graphs.solver.rooms import LEAST, as_before, as_filled, cut, filled
+from jaxslam.graphs.solver.plan import Plan, checked_pairs, plan_for
+from jaxslam.graphs.solver.rooms import LEAST, cut, filled, filled_number, own_number
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
 from jaxslam.graphs.sparse.inverse import selected_inverse
 from jaxslam.graphs.sparse.sweeps import room
@@ -67,15 +67,15 @@ def marginals(
     model = model_of(caller, graph, factors, kernel)
     known = dict(model.factors)
     check_graph(caller, graph, known)
-    wanted = np.asarray(pairs, int).reshape(-1, 2)
+    wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     if plan is None and programs.outside(graph):
         more = filled(graph)
         rows = np.zeros((room(len(wanted), LEAST), 2), int)
-        rows[: len(wanted)] = as_filled(wanted, graph, more)
+        rows[: len(wanted)] = filled_number(wanted, graph, more)
         new = plan_for(caller, more, known, None, marginals=True, pairs=rows)
         found = programs.call(_marginals, (model,), more, new)
         poses, points, pairs = cut(found[:3], (graph.poses, graph.points, wanted))
-        found = Marginals(poses, points, pairs, as_before(found.singular, graph, more))
+        found = Marginals(poses, points, pairs, own_number(found.singular, graph, more))
     else:
         plan = plan_for(caller, graph, known, plan, marginals=True, pairs=wanted)
         found = programs.call(_marginals, (model,), graph, plan)

@@ -99,11 +99,7 @@ def plan(
         for a in range(r.shape[1])
         for b in range(a)
     ]
-    wanted = np.asarray(pairs, int).reshape(-1, 2)
-    if ((wanted < 0) | (wanted >= size)).any():
-        raise ValueError(
-            f"graphs.plan: expected pairs of variables from 0 to {size - 1}, got {wanted.tolist()}"
-        )
+    wanted = checked_pairs("graphs.plan", pairs, size)
     first, second = np.concatenate([wanted.T, *joined], axis=1)
     pattern = factor_pattern(size, first, second)
     cholesky, place = cholesky_tables(pattern)
@@ -132,6 +128,17 @@ def plan(
         inverse=inverse_tables(pattern, place, *wanted.T) if marginals else None,
         pairs=index_table(wanted),
     )
+
+
+def checked_pairs(name: str, pairs: ArrayLike, size: int) -> Int[np.ndarray, "Q 2"]:
+    """Pairs of variables, (Q, 2); raises ValueError, which begins with a caller's name, if one is
+    not among so many."""
+    wanted = np.asarray(pairs, int).reshape(-1, 2)
+    if ((wanted < 0) | (wanted >= size)).any():
+        raise ValueError(
+            f"{name}: expected pairs of variables from 0 to {size - 1}, got {wanted.tolist()}"
+        )
+    return wanted
 
 
 def plan_for(

@@ -46,7 +46,7 @@ def filled(graph: Graph) -> Graph:
     )
 
 
-def as_filled(
+def filled_number(
     variables: Int[np.ndarray, "*shape"], graph: Graph, more: Graph
 ) -> Int[np.ndarray, "*shape"]:
     """The numbers in the filled graph of a graph's variables, points counted on from the poses."""
@@ -54,7 +54,7 @@ def as_filled(
     return np.where(variables >= len(graph.poses), variables + shift, variables)
 
 
-def as_before(variable: jax.Array, graph: Graph, more: Graph) -> jax.Array:
+def own_number(variable: jax.Array, graph: Graph, more: Graph) -> jax.Array:
     """The number of a variable in the graph, by that in the filled one."""
     count, number = len(more.poses), np.asarray(variable)
     return programs.on_device(number - (count - len(graph.poses)) * (number >= count))
