@@ -24,7 +24,6 @@ from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Match, Matcher, MatchStatus, Points, Prior
 from jaxslam.matching.surface import Surface
 from jaxslam.math import numpy_poses as poses
-from jaxslam.math.stats import chi2_quantile
 
 NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0))
 """About raw odometry."""
@@ -88,7 +87,7 @@ def laser_odometry(
         residual=np.zeros(count),
     )
     result.poses[0] = first
-    keys, gate = [0], chi2_quantile(settings.consistency, 3)
+    keys = [0]
     z, cov = np.zeros(3), np.zeros((3, 3))  # of the last scan, relative to the last keyframe
     for scan in range(1, count):
         key = keys[-1]
@@ -112,9 +111,7 @@ def laser_odometry(
                         found = wider
             fit = found.match
             result.inliers[scan], result.residual[scan] = fit.inliers, fit.residual
-            away = poses.between(guess, np.asarray(fit.pose, np.float64))
-            unlike = fit.inliers < SURE and away @ np.linalg.solve(prior, away) > gate
-            if fit.inliers >= least and not found.ambiguous and not unlike:
+            if fit.inliers >= least and not found.ambiguous:
                 result.matched[scan] = True
                 z, cov = np.asarray(fit.pose, np.float64), found.cov
         result.base[scan], result.z[scan], result.cov[scan] = key, z, cov

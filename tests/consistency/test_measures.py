@@ -12,8 +12,9 @@ from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
 from jaxslam import charts, consistency, motion, sensors
 from jaxslam.consistency.nees import block_nees
-from jaxslam.consistency.score import EVENTS
+from jaxslam.consistency.score import EVENTS, _null_space
 from jaxslam.filters.ekf.coordinates.to_points import ToPoints
+from jaxslam.filters.ekf.observability import Monitor
 from jaxslam.filters.map_management.merging import Merged
 from jaxslam.filters.particles.states.moments import weighted_pose_moments
 from jaxslam.filters.particles.states.particle_info import ParticleInfo
@@ -328,3 +329,15 @@ def test_poses_on_a_plane_have_no_nees():
         error = rng.normal(size=(2000, 3))
         regular = block_nees(mean, error, error, cov)["pose"].regular
         assert regular.mean() == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_direction_is_unobservable_below_a_share_of_what_was_measured(dtype):
+    """4e-11 is what sigma points leave on `circle`, 2e-5 what the EKF gains in 120 steps."""
+    gained = np.array([0.0, 4e-11, 2e-5])
+    scale = np.tile(np.array([1e5, 1e5, 4e7]), (3, 1))
+    information = np.zeros((3, 3, 3))
+    information[:, 2, 2] = gained * scale[:, 2]
+    monitor = Monitor(None, information.astype(dtype), scale.astype(dtype), np.ones((3, 3)))
+    _, dimensions = _null_space(monitor, np.zeros((3, 1, 3, 3), dtype))
+    np.testing.assert_array_equal(dimensions, [3, 3, 2])

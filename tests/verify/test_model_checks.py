@@ -214,3 +214,20 @@ def test_a_failed_round_trip_names_entry_and_state():
     checks = {check.name: check for check in properties.sensor_checks(camera, *drawn)}
     assert checks[INVERTED].detail.startswith("bearing [rad] is off by ")
     assert ", at pose = (" in checks[INVERTED].detail
+
+
+def test_a_round_trip_off_by_a_turn_says_that_the_unit_is_missing():
+    def unwrapped(pose, landmark):
+        turn = jnp.where(pose[2] > 0, 2 * jnp.pi, 0.0)
+        return UNMOUNTED.observe(pose, landmark) + jnp.stack([0.0, turn])
+
+    names = "range [m]", "bearing"
+    unnamed = dataclasses.replace(
+        UNMOUNTED, measurements=names, observe=unwrapped, residual=lambda z, other: z - other
+    )
+    drawn = samples.sensor_samples(unnamed, 24, 0)
+    checks = {check.name: check for check in properties.sensor_checks(unnamed, *drawn)}
+    assert checks[INVERTED].detail.startswith(
+        "bearing is off by 2π (an angle's name ends in [rad])"
+    )
+    assert "the residual is a difference" in checks
