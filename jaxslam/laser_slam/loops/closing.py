@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
-from jaxslam.graphs.loops import LOOPS
+from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import graph_of, relative_covs, table_of
 from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_place, near
