@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
-from jaxslam.math.linalg import cholesky, matmul, symmetrize, total
-from jaxslam.math.roots import triangular_root
+from jaxslam.math.linalg import cholesky, matmul, symmetrize, total, triangular_root
 from jaxslam.math.xla import materialize
 
 

@@ -15,7 +15,7 @@ from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.linearize import derivatives
 from jaxslam.linearize.at_truth import at_truth
 from jaxslam.linearize.first_order import with_lever_arm
-from jaxslam.math.roots import root_psd
+from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite

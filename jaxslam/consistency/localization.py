@@ -14,7 +14,7 @@ from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.filters.particles.states.pose_state import PoseParticles
 from jaxslam.grids.localization.beam_log import beam_log
 from jaxslam.math.angles import wrap
-from jaxslam.math.roots import root_psd
+from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Filter
 from jaxslam.resampling.weights import at_points, weights_of
 from jaxslam.run import run

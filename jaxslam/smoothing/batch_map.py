@@ -16,10 +16,10 @@ from jaxslam.smoothing.forward_pass import (
     ForwardPass,
     compiled_once,
     forward_filter,
-    in_one_dtype,
+    log_in_one_dtype,
     run_forward,
 )
-from jaxslam.smoothing.gauss_newton import Iterations, minimize
+from jaxslam.smoothing.gauss_newton import Iterations, optimize_chain
 from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
 from jaxslam.smoothing.problem import Iterate, Problem
 from jaxslam.smoothing.smooth import solution, with_singular
@@ -124,9 +124,9 @@ def batch_map(
 
     def solve(log: Log, key: Array) -> Trace:
         passed = run_forward(filter, log, pose, pose_cov, key)
-        log = in_one_dtype(log)
+        log = log_in_one_dtype(log)
         problem, start, chain = _problem_of(motion, sensor, passed, log, pose, pose_cov)
-        search = minimize(
+        search = optimize_chain(
             motion,
             sensor,
             problem,

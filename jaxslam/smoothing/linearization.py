@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.linearize import derivatives
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.smoothing.chain import Chain, LinearizedStep, Start
@@ -22,12 +22,12 @@ def noise_roots(
 ) -> Float[Array, "T W W"]:
     """The square roots of the motions' noise covariances, at the filter's linearization points."""
     cov = jax.vmap(motion.noise_cov)(passed.before, control)
-    return jax.vmap(roots.root_psd)(cov)
+    return jax.vmap(linalg.root_psd)(cov)
 
 
 def start_of(pose_cov: Float[Array, "3 3"]) -> Start:
     """The start of a chain at the mean of the prior."""
-    return Start(roots.root_psd(pose_cov), jnp.zeros(3, pose_cov.dtype))
+    return Start(linalg.root_psd(pose_cov), jnp.zeros(3, pose_cov.dtype))
 
 
 def chain_of(

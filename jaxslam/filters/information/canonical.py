@@ -25,7 +25,7 @@ from jaxslam.filters.information.settings import InformationSettings
 from jaxslam.filters.information.tag_association import TagAssociation
 from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.linearize import first_order
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.types import Estimate, Info, Scan
@@ -56,7 +56,7 @@ def motion_update(
     rounding. G is zero except for the landmarks that the robot is linked to.
     """
     after, by_pose, noise = first_order.motion_at(motion, pose, u, pose)
-    root = roots.root_psd(noise)
+    root = linalg.root_psd(noise)
     back = linalg.inverse(by_pose)
     phi = omega.at[:3].set(back.T @ omega[:3])
     phi = phi.at[:, :3].set(phi[:, :3] @ back)

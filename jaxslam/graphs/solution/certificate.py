@@ -13,7 +13,7 @@ from jaxslam import programs
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solution.dual import FACTORS, chordal_weights, dual
-from jaxslam.graphs.solver.batch import in_one_dtype, over_batch
+from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
 from jaxslam.graphs.solver.linearized import data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.plan import Plan, plan_for
@@ -119,7 +119,7 @@ def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
 
 
 def _certificate(model: Model, graph: Graph, plan: Plan) -> Certificate:
-    return _batched(model)((plan,), in_one_dtype(graph))
+    return _batched(model)((plan,), graph_in_one_dtype(graph))
 
 
 @functools.lru_cache(maxsize=256)

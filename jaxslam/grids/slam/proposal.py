@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxslam.math import roots
+from jaxslam.math import linalg
 from jaxslam.protocols import Motion
 
 LogDensity = Callable[[Array], Array]
@@ -73,7 +73,7 @@ def propose(
         candidates: K, even. spread: σ [m] and τ [rad].
     """
     size = len(motion.noises)
-    root = roots.root_psd(motion.noise_cov(pose, control))
+    root = linalg.root_psd(motion.noise_cov(pose, control))
 
     def moved(n: Array) -> Array:
         return motion.step(pose, control, root @ n)

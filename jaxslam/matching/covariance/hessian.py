@@ -8,7 +8,7 @@ from jaxslam.matching.covariance.record import (
     MatchedScans,
     curvature,
     inverse_of,
-    of_prior,
+    own_prior_information,
     stated,
 )
 from jaxslam.matching.matcher import Matcher
@@ -29,6 +29,6 @@ def hessian() -> MatchCovariance:
         free = (found.weight > 0).sum() - (3 if found.prior is None else 0)
         least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(free, 1)
         shape = curvature(matcher, prepared, points, found)
-        return least * inverse_of(shape, found.information + of_prior(found))
+        return least * inverse_of(shape, found.information + own_prior_information(found))
 
     return stated("hessian", of)

@@ -55,7 +55,7 @@ def stated(
         found = scans.found
         nothing = jnp.zeros_like(found.information)
         scale = jnp.asarray(1.0 if sigma is None else sigma, nothing.dtype)
-        known = nothing if sigma is None else of_prior(found)
+        known = nothing if sigma is None else own_prior_information(found)
         unknown = scale**2 * inverse_of(known, nothing, sigma=scale)
         return jnp.where(found.status >= MatchStatus.UNLIKE, unknown, of(matcher, scans))
 
@@ -113,7 +113,7 @@ def curvature(matcher: Matcher, prepared: PyTree, points: Points, found: Match) 
     return jnp.asarray(by_pose(found.pose))
 
 
-def of_prior(found: Match) -> Float[Array, "3 3"]:
+def own_prior_information(found: Match) -> Float[Array, "3 3"]:
     """Λ of the prior of a match, zeros without one: σ² Λ is the noise of the cost's slope by it."""
     return prior_information(found.prior, found.information)
 

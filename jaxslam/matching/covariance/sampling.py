@@ -15,7 +15,7 @@ from jaxslam.matching.covariance.record import (
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.validation.numbers import check_count, check_covariance, check_positive
 
@@ -37,7 +37,7 @@ def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
 
     def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, found, start, _ = scans
-        root = roots.root_psd(jnp.asarray(start_cov, start.dtype))
+        root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
         sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
         prepared = matcher.prepare(reference)
         ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off, found.prior).pose)(
@@ -67,7 +67,7 @@ def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> Match
 
     def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, found, start, key = scans
-        root = roots.root_psd(jnp.asarray(start_cov, start.dtype))
+        root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
 
         def one(key: Array) -> Array:
             key_reference, key_scan, key_start, key_prior = jax.random.split(key, 4)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam import slots
 from jaxslam.filters.ekf.coordinates.linear_system import Transition
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.math import linalg, roots, se2
+from jaxslam.math import linalg, se2
 from jaxslam.math.xla import materialize
 from jaxslam.protocols import Basis, Here, Motion
 from jaxslam.slots import Joint, Last
@@ -36,7 +36,7 @@ def propagate(
     if square_root:
         size = joint.cov.shape[0]
         added = moved.lift(size) @ linalg.cholesky(noise)[0]
-        cov = roots.triangular_root(jnp.concatenate([moved.times(joint.cov), added], axis=1))
+        cov = linalg.triangular_root(jnp.concatenate([moved.times(joint.cov), added], axis=1))
     else:
         cov = moved_cov(joint.cov, moved, noise)
     last = joint.last
