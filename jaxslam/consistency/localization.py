@@ -203,7 +203,7 @@ def covering_level(draws: Float[Array, "S 3"], truth: Float[Array, "3"]) -> Floa
 
 
 def energy_score(draws: Float[Array, "S D"], truth: Float[Array, "D"]) -> Float[Array, ""]:
-    """mean |x_i - y| - ½ mean |x_i - x_j| over pairs i ≠ j, less is better.
+    """The energy score mean |x_i - y| - ½ mean |x_i - x_j|, i ≠ j, of particles x; less is better.
 
     Its expectation is least for the true distribution, and for one that knows nothing it is as
     large as the mean error: Gneiting & Raftery 2007, "Strictly proper scoring rules, prediction,

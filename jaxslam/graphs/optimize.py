@@ -79,7 +79,7 @@ def chi2(
     *,
     kernel: Kernel | Mapping[str, Kernel] | None = None,
 ) -> Float[Array, ""]:
-    """χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
+    """The cost χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
     model = model_of("graphs.chi2", graph, factors, kernel)
     return programs.call(_chi2, (model,), graph)
 

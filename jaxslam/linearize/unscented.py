@@ -141,7 +141,7 @@ def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> R
 
 
 def by_variables(slope: Array, root: Array) -> Array:
-    """H with H L = slope (m, n), for a regular lower L (n, n)."""
+    """The Jacobian H with H L = slope (m, n), for a regular lower L (n, n)."""
     return linalg.solve_lower(root.T[::-1, ::-1], slope.T[::-1])[::-1].T
 
 

@@ -214,5 +214,5 @@ def _eliminate_noise(
 
 
 def _solve_upper(factor: Array, rhs: Array) -> Array:
-    """L⁻ᵀ B of lower L."""
+    """The solution L⁻ᵀ B of lower L."""
     return linalg.solve_lower(factor[::-1, ::-1].T, rhs[::-1])[::-1]

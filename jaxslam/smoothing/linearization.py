@@ -56,7 +56,7 @@ def chain_of(
 def _motions(
     motion: Motion, passed: ForwardPass, control: Float[Array, "T U"], roots: Float[Array, "T W W"]
 ) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3 W"], Float[Array, "T 3"]]:
-    """F, G and c of `chain.LinearizedStep` for each motion."""
+    """The matrices F, G and the offset c of `chain.LinearizedStep` for each motion."""
 
     def one(
         before: Array, predicted: Array, corrected: Array, u: Array, root: Array

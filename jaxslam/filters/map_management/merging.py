@@ -149,7 +149,7 @@ def closest_pair(
 
 
 def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Float[Array, ""]:
-    """errorᵀ cov⁻¹ error; infinite where the covariance is not positive definite."""
+    """The squared distance errorᵀ cov⁻¹ error; infinite where cov is not positive definite."""
     terms = gaussian_terms(error, cov)
     return jnp.where(terms.positive, terms.distance, jnp.inf)
 

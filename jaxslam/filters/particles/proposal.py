@@ -145,7 +145,7 @@ def predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
     """The `Prediction` of one particle's map, with landmarks correlated by the pose alone."""
 
     def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
-        """ẑ, H_x and H_l C H_lᵀ of each landmark."""
+        """The prediction ẑ, H_x and H_l C H_lᵀ of each landmark."""
 
         def one(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
             by_pose, by_landmark = derivatives.observe_jacobians(sensor, particle.pose, landmark)

@@ -46,7 +46,7 @@ FACTORS = {
 
 
 def _pose_rows(z: Array) -> list[list[list[Array]]]:
-    """∂r/∂(p, u) of both poses, r = (p_j - p_i - t u_i, u_j - exp(iφ) u_i), (4, 4) each."""
+    """The ∂r/∂(p, u) of both poses, r = (p_j - p_i - t u_i, u_j - exp(iφ) u_i), (4, 4) each."""
     o, i = jnp.zeros_like(z[:, 0]), jnp.ones_like(z[:, 0])
     x, y, c, s = z[:, 0], z[:, 1], jnp.cos(z[:, 2]), jnp.sin(z[:, 2])
     one = [[-i, o, -x, y], [o, -i, -y, -x], [o, o, -c, s], [o, o, -s, -c]]
@@ -54,7 +54,7 @@ def _pose_rows(z: Array) -> list[list[list[Array]]]:
 
 
 def _point_rows(z: Array) -> list[list[list[Array]]]:
-    """∂r/∂(p, u) of a pose and ∂r/∂p of a point, r = p_j - p_i - t u_i."""
+    """The derivatives ∂r/∂(p, u) of a pose and ∂r/∂p of a point, r = p_j - p_i - t u_i."""
     return [rows[:2] for rows in _pose_rows(jnp.concatenate([z, jnp.zeros_like(z[:, :1])], axis=1))]
 
 
@@ -62,7 +62,7 @@ ROWS = {"relative_pose": _pose_rows, "relative_position": _point_rows}
 
 
 def chordal_weights(name: str, information: Float[JaxOrNumPy, "E R R B"]) -> Float[Array, "E S B"]:
-    """τ, τ, κ, κ or τ, τ, as many as chordal residuals; zero for a prior."""
+    """The weights τ, τ, κ, κ or τ, τ of the chordal residuals; zero for a prior."""
     near = 0.5 * (information[:, 0, 0] + information[:, 1, 1])
     if name == "prior":
         return jnp.zeros_like(near)[:, None]

@@ -138,7 +138,7 @@ def _masked(
 
 
 def _turns(graph: Graph, width: int) -> Float[Array, "n d d B"]:
-    """∂(coordinates)/∂(increments) of each variable: R(θ) for the position of a pose."""
+    """The derivative of each variable by its increments: R(θ) for the position of a pose."""
     poses, points, batch = len(graph.poses), len(graph.points), graph.poses.shape[-1]
     unit = jnp.eye(width, dtype=graph.poses.dtype)[None, ..., None]
     every = jnp.broadcast_to(unit, (poses + points, width, width, batch))

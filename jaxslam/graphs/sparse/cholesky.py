@@ -161,7 +161,7 @@ def factorize(tables: CholeskyTables, blocks: Float[Array, "padded d d B"]) -> F
 def _inverse_factor(
     matrix: Float[Array, "T d d B"], least: Float[Array, "T d B"]
 ) -> tuple[Float[Array, "T d d B"], Bool[Array, "T B"]]:
-    """L⁻¹ of L Lᵀ = A, and whether each pivot is above its least; as `linalg.whitener`."""
+    """The inverse factor L⁻¹, as `linalg.whitener`, and whether each pivot is above its least."""
     width = matrix.shape[1]
     zero = jnp.zeros_like(matrix[:, 0, 0])
     factor = [[zero] * width for _ in range(width)]
@@ -183,7 +183,7 @@ def _inverse_factor(
 def substitute(
     tables: CholeskyTables, factored: Factored, rhs: Float[Array, "n d B"]
 ) -> Float[Array, "n d B"]:
-    """A⁻¹ b, by columns."""
+    """The solution A⁻¹ b, by columns of the factor."""
     x = rhs
     for tables_of, order, on in (
         (tables.forward, tables.forward_order, _on_vector),

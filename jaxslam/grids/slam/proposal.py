@@ -16,7 +16,7 @@ LogDensity = Callable[[Array], Array]
 
 
 def climbed(target: LogDensity, start: Float[Array, "W"], iterations: int) -> Float[Array, "W"]:
-    """A local maximum of a function of W numbers, by pattern search.
+    """The place of a local maximum of a function of W numbers, by pattern search.
 
     Steps of ±s along each axis, the best of which is taken; s, at first 1, is halved where none is
     better (Hooke & Jeeves 1961). So no derivative is needed: a likelihood in a grid has many kinks.

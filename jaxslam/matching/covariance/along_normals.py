@@ -21,7 +21,7 @@ from jaxslam.validation.numbers import check_positive
 
 
 def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> MatchCovariance:
-    """A⁻¹ B A⁻¹ with A = Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), and B the noise that reaches Σ w J e.
+    """The covariance A⁻¹ B A⁻¹, A = Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), B the noise of Σ w J e.
 
     A scan that slides along a wall finds other partners, so that the part of a residual along the
     wall says nothing: the second derivative of point-to-point with its pairs kept counts it as

@@ -15,7 +15,7 @@ from jaxslam.matching.matcher import Matcher
 
 
 def hessian() -> MatchCovariance:
-    """s² (∂²E/∂x²)⁻¹ with E = ½ Σ w e² and s² = 2E/(n - 3) of n pairs; 2E/n with a prior.
+    """The covariance s² (∂²E/∂x²)⁻¹, E = ½ Σ w e², s² = 2E/(n - 3) of n pairs; 2E/n with a prior.
 
     Right for independent residuals of one variance that the pairs do not follow. Two scans of
     different density, and pairs that change with the pose, break that.

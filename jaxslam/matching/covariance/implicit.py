@@ -21,7 +21,7 @@ from jaxslam.validation.numbers import check_positive
 
 
 def implicit(sigma: ArrayLike) -> MatchCovariance:
-    """(∂²E/∂x²)⁻¹ (∂²E/∂z∂x) σ² (∂²E/∂z∂x)ᵀ (∂²E/∂x²)⁻¹ with the ranges z of both scans.
+    """The covariance A⁻¹ B σ² Bᵀ A⁻¹, A = ∂²E/∂x², B = ∂²E/∂x∂z, with the ranges z of both scans.
 
     From ∂E/∂x = 0 at the minimum: dx/dz = -(∂²E/∂x²)⁻¹ ∂²E/∂z∂x. The derivatives are those of the
     matcher's cost by automatic differentiation, through the lines that are fitted to the reference;

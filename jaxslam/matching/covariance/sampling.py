@@ -21,7 +21,7 @@ from jaxslam.validation.numbers import check_count, check_covariance, check_posi
 
 
 def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
-    """What six starts around the start lead to, plus `implicit` of the noise of the ranges.
+    """The covariance of what six starts lead to, plus `implicit` of the noise of the ranges.
 
     The starts are start ± √3 L_k, L Lᵀ = start_cov, with weights 1/6 each: Σ (x_k - x̂)(x_k - x̂)ᵀ/6.
     It sees wrong minima and directions that the scans do not determine, where a match stays as far
@@ -95,7 +95,7 @@ def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> Match
 
 
 def _inverse_root(information: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Wᵀ with WᵀW = Λ⁻¹; of a share 1e-6 of the trace along what Λ does not determine."""
+    """The root Wᵀ with WᵀW = Λ⁻¹; of a share 1e-6 of the trace along what Λ does not determine."""
     floor = 1e-6 * jnp.trace(information)
     floor = jnp.where(floor > 0, floor, 1.0) * jnp.eye(3, dtype=information.dtype)
     return linalg.whitener(linalg.symmetrize(information) + floor)[0].T

@@ -106,7 +106,7 @@ def _factor_slope(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Arr
 def solve_lower(
     factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
 ) -> Float[Array, "n *rest"]:
-    """L⁻¹ B for lower L (n, n) and B (n, …), with rows of zeros where a pivot is zero."""
+    """The solution L⁻¹ B for lower L (n, n), B (n, …), with rows of zeros where a pivot is zero."""
     n = factor.shape[-1]
     if n == 0:
         return rhs
@@ -144,7 +144,7 @@ def _substituted(
 def solve_psd(
     matrix: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
 ) -> tuple[Float[Array, "n *rest"], Bool[Array, ""]]:
-    """A⁻¹ B for a positive definite A (n, n) and B (n, …), and whether A was positive definite."""
+    """The solution A⁻¹ B for A (n, n) and B (n, …), and whether A is positive definite."""
     factor, positive = cholesky(matrix)
     reverse = factor[::-1, ::-1].T
     return solve_lower(reverse, solve_lower(factor, rhs)[::-1])[::-1], positive

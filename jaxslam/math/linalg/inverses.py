@@ -82,7 +82,7 @@ def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
 
 
 def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A⁻¹ of a regular (n, n) matrix: by cofactors up to 3×3, which fuses; by LU beyond."""
+    """The inverse of a regular (n, n) matrix: by cofactors up to 3×3, which fuses; by LU beyond."""
     n = matrix.shape[-1]
     a = matrix
     if n == 1:

@@ -32,7 +32,7 @@ def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
 
 
 def gram(a: Float[Array, "k D"], b: Float[Array, "k E"]) -> Float[Array, "D E"]:
-    """Aᵀ B of A (k, D), B (k, E), for small k."""
+    """The product Aᵀ B of A (k, D), B (k, E), for small k."""
     if a.shape[0] > _OUTER_PRODUCTS or a.shape[0] == 0:
         # Not a.T @ b, for which a gradient would store a transposed copy of A.
         return jax.lax.dot_general(a, b, (((0,), (0,)), ((), ())))
@@ -46,7 +46,7 @@ def _outer_products(a: Float[Array, "k D"], b: Float[Array, "k E"]) -> Float[Arr
 
 @jax.custom_jvp
 def self_gram(a: Float[Array, "k D"]) -> Float[Array, "D D"]:
-    """Aᵀ A of A (k, D), k of any size; one product in a gradient, where `gram` takes two."""
+    """The product Aᵀ A of A (k, D) for any k; one product in a gradient, where `gram` takes two."""
     return gram(a, a)
 
 
@@ -57,15 +57,15 @@ def _square_slope(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Arr
 
 
 def gram_both(a: Float[Array, "k D"], b: Float[Array, "k D"]) -> Float[Array, "D D"]:
-    """Aᵀ B + Bᵀ A of A, B (k, D), for small k; symmetric to the bit."""
+    """The sum Aᵀ B + Bᵀ A of A, B (k, D), for small k; symmetric to the bit."""
     return gram(a, b) + gram(b, a)
 
 
 def matmul(a: Float[Array, "n k"], b: Float[Array, "k D"]) -> Float[Array, "n D"]:
-    """A B of A (n, k), B (k, D), for small k."""
+    """The product A B of A (n, k), B (k, D), for small k."""
     return gram(a.T, b)
 
 
 def symmetrize(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
-    """(A + Aᵀ)/2 over the last two axes."""
+    """The symmetric part (A + Aᵀ)/2 over the last two axes."""
     return 0.5 * (matrix + jnp.swapaxes(matrix, -1, -2))

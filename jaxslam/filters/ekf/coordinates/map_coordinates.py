@@ -62,7 +62,7 @@ def estimate_of(
 def cov_of_coordinates(
     joint: Joint, chart: Chart, *, square_root: bool = False
 ) -> Float[Array, "D D"]:
-    """E P Eᵀ (D, D) with E the chart's basis at the estimate, block lower triangular; O(N²)."""
+    """The covariance E P Eᵀ (D, D) of coordinates, E the chart's basis at the estimate; O(N²)."""
     cov = joint.cov @ joint.cov.T if square_root else joint.cov
     if chart.basis is None:
         return cov

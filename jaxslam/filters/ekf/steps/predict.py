@@ -73,7 +73,7 @@ def moved_cov(
     noise: Float[Array, "3 3"] | None,
     shared: tuple[Float[Array, "k D"], Float[Array, "k D"]] | None = None,
 ) -> Float[Array, "D D"]:
-    """A P Aᵀ + G N Gᵀ, each entry of P written once or twice.
+    """The predicted covariance A P Aᵀ + G N Gᵀ, each entry of P written once or twice.
 
     shared: two matrices, of which Sᵀ T + Tᵀ S is added; in another chart than the Euclidean.
     """
