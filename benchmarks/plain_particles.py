@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, alone
 from jaxslam import filters, motion, run, sensors
-from jaxslam.math import gaussians, roots
+from jaxslam.math import gaussians, linalg
 from jaxslam.resampling import systematic
 from jaxslam.simulation.worlds import Scenario, simulate
 
@@ -43,7 +43,7 @@ def plain(log, key, count: int, particles: int):
 
     def place(z, noise):
         """A landmark seen from the origin."""
-        z = z + roots.root_psd(SENSOR.noise_cov(z)) @ noise
+        z = z + linalg.root_psd(SENSOR.noise_cov(z)) @ noise
         return z[0] * jnp.array([jnp.cos(z[1]), jnp.sin(z[1])])
 
     def density(pose, landmark, z):
@@ -51,7 +51,7 @@ def plain(log, key, count: int, particles: int):
         return -0.5 * gaussians.mahalanobis_squared(nu, SENSOR.noise_cov(z))[0]
 
     def moved(pose, u, noise):
-        return MOTION.step(pose, u, roots.root_psd(MOTION.noise_cov(pose, u)) @ noise)
+        return MOTION.step(pose, u, linalg.root_psd(MOTION.noise_cov(pose, u)) @ noise)
 
     key, first = jax.random.split(key)
     noise = jax.random.normal(first, (particles, count, 2))

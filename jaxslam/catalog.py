@@ -5,14 +5,10 @@ A variant is a chart, a linearizer or an option, given in one line; `monte_carlo
 line run them side by side.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Literal, Unpack
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from jaxslam.charts.left_invariant import left_invariant
 from jaxslam.charts.right_invariant import right_invariant
@@ -22,6 +18,7 @@ from jaxslam.filters.ekf.observability import monitored
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.filters.information.eif_slam import eif_slam
 from jaxslam.filters.information.eseif import eseif
+from jaxslam.filters.information.in_pieces import in_pieces
 from jaxslam.filters.information.seif import seif
 from jaxslam.filters.known.dead_reckoning import dead_reckoning
 from jaxslam.filters.known.localization import localization
@@ -35,7 +32,7 @@ from jaxslam.protocols import Candidate, Estimator, Filter
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.smoothing.batch_map import batch_map
 from jaxslam.smoothing.fixed_lag import fixed_lag
-from jaxslam.types import Info, Scan, Truth
+from jaxslam.types import Truth
 from jaxslam.validation.names import Named
 
 
@@ -192,40 +189,6 @@ def in_canonical_form(
 
 LEAST_AREA, LARGEST_AREA = 8, 20
 """active landmarks of the sparse information filters in the catalog"""
-
-
-def in_pieces(filter: Filter, places: int) -> Filter:
-    """The filter applied in turn to pieces of a scan, each of `places` measurement slots.
-
-    Slot i is in piece i mod their number. Numbers that an `Info` has for a whole scan are summed
-    over the pieces, and flags are true where one of a piece is.
-    """
-
-    def update(state: PyTree, scan: Scan, key: jax.Array) -> tuple[PyTree, Info]:
-        m = scan.tag.shape[0]
-        if m <= places:
-            return filter.update(state, scan, key)
-        pieces = -(-m // places)
-
-        def dealt(leaf: jax.Array) -> jax.Array:
-            wide = jnp.pad(leaf, [(0, pieces * places - m), *[(0, 0)] * (leaf.ndim - 1)])
-            return wide.reshape(places, pieces, *leaf.shape[1:]).swapaxes(0, 1)
-
-        def one(state: PyTree, piece: tuple[Scan, jax.Array]) -> tuple[PyTree, Info]:
-            return filter.update(state, *piece)
-
-        each = jax.tree.map(dealt, scan), jax.random.split(key, pieces)
-        state, infos = jax.lax.scan(one, state, each)
-
-        def whole(leaf: jax.Array) -> jax.Array:
-            if leaf.ndim == 1:  # of a scan, not of its measurement slots
-                return leaf.any() if leaf.dtype == bool else leaf.sum()
-            return leaf.swapaxes(0, 1).reshape(places * pieces, *leaf.shape[2:])[:m]
-
-        info: Info = jax.tree.map(whole, infos)
-        return state, info
-
-    return dataclasses.replace(filter, update=update)
 
 
 FILTERS: Named[Callable[..., Candidate]] = Named(

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
-from jaxslam.math.linalg import cholesky, matmul, symmetrize, total
-from jaxslam.math.roots import triangular_root
+from jaxslam.math.linalg import cholesky, matmul, symmetrize, total, triangular_root
 from jaxslam.math.xla import materialize
 
 
@@ -42,7 +41,7 @@ class Joint(NamedTuple):
 
 
 class Last(NamedTuple):
-    """The error δ = (x, y, θ) of the last motion, in the frame it began from."""
+    """The error δ = (x, y, θ) of the robot's last motion, in the frame where it began."""
 
     frame: Float[Array, ""]
     """heading of that frame"""
@@ -201,7 +200,7 @@ def scatter(
 
 
 def _add_blocks(cov: Float[Array, "D D"], blocks: Float[Array, "N L L"]) -> Float[Array, "D D"]:
-    """P with blocks (N, L, L) added on the diagonal of the landmarks."""
+    """The covariance with blocks (N, L, L) added on the diagonal of the landmarks."""
     capacity, size = blocks.shape[:2]
     rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
     return cov.at[rows[:, :, None], rows[:, None, :]].add(blocks)

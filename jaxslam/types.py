@@ -194,16 +194,16 @@ class Info(NamedTuple):
 
     @property
     def overflow(self) -> jax.Array:
-        """() bool: at least one measurement was dropped because the map was full."""
+        """Whether at least one measurement was dropped because the map was full, () bool."""
         return (self.status == Status.OVERFLOW).any(-1)
 
     def tally(self, status: Status) -> jax.Array:
-        """() int: number of measurements with that status in a step; over a whole trace, (T,)."""
+        """The number of measurements with that status: () of a step, (T,) of a whole trace."""
         return (self.status == status).sum(-1)
 
 
 class Trace(NamedTuple):
-    """The result of `run`."""
+    """The result of `run`: the log of a run's estimates, and what the filter says of each step."""
 
     estimate: Estimate
     """with leading T, after each update."""

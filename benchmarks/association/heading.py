@@ -15,7 +15,7 @@ from jaxslam import association
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
 from jaxslam.math.angles import wrap
-from jaxslam.math.roots import root_psd
+from jaxslam.math.linalg import root_psd
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, titled
 from jaxslam.sensors import range_bearing

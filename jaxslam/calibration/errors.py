@@ -40,7 +40,7 @@ def newton_step(observed: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray,
 def observed_information(
     at: Callable[[np.ndarray], LikelihoodPoint], here: LikelihoodPoint, logged: np.ndarray
 ) -> Float[np.ndarray, "P P"]:
-    """-∂²log L/∂q², from central differences of the gradient over part of a standard error."""
+    """The observed information -∂²log L/∂q², from differences of the gradient over part of a σ."""
     rows = []
     for i, scale in enumerate(np.diag(here.spread)):
         h = 0.05 / np.sqrt(scale) if scale > 0 else 1e-3

@@ -191,7 +191,7 @@ def _evaluate(
     logged: Bool[Array, "P"],
     data: tuple[PyTree, ...],
 ) -> tuple[Array, ...]:
-    """log L, its gradient, Σ g gᵀ over the rows, NIS and dof."""
+    """The log-likelihood log L, its gradient, Σ g gᵀ over the rows, NIS and dof."""
 
     def rows(q: Float[Array, "P"]) -> PyTree:
         found = info(jnp.where(logged, jnp.exp(jnp.where(logged, q, 0.0)), q), *data)

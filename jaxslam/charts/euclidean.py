@@ -9,7 +9,7 @@ from jaxslam.protocols import Chart
 
 
 def euclidean() -> Chart:
-    """dx = (x, y, wrap θ) - (x, y, θ)₀ and dl = l - l₀: the error of Solà's EKF-SLAM (22)."""
+    """The chart of plain differences, dx = x - x₀ (θ wrapped), dl = l - l₀: Solà's error (22)."""
 
     def retract(pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark) -> tuple[Pose, Landmark]:
         return _wrap_heading(pose + dx), landmark + dl

@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        options = _parser().parse_args(laser_options.joined(arguments))
+        options = _parser().parse_args(laser_options.with_signed_values(arguments))
     except SystemExit as stop:
         return int(stop.code or 0)
     try:

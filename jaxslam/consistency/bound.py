@@ -15,7 +15,7 @@ from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.linearize import derivatives
 from jaxslam.linearize.at_truth import at_truth
 from jaxslam.linearize.first_order import with_lever_arm
-from jaxslam.math.roots import root_psd
+from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
@@ -232,7 +232,7 @@ def final_covariance(
 def _by_parameters(
     run: RunJacobians, start: Float[np.ndarray, "3 3"], at: Int[np.ndarray, "K"]
 ) -> Iterator[tuple[Float[np.ndarray, "3 P"], Float[np.ndarray, "P P"]]]:
-    """∂x_t/∂p, and the information that the scans until then hold on p, at each step of at."""
+    """The ∂x_t/∂p, and the information of the scans until then on p, at each step of at."""
     steps, _, width = run.by_noise.shape
     count, size = run.landmarks.shape
     map_at = 3 + steps * width
@@ -257,7 +257,7 @@ def _by_parameters(
 
 
 def _whitened(sensor: SensorJacobians) -> list[np.ndarray]:
-    """R^{-1/2} times the Jacobians by pose and landmark; zero where nothing was measured."""
+    """The whitened Jacobians R^{-1/2} H by pose and landmark; zero where nothing was measured."""
     there = sensor.valid[:, :, None, None]
     noise = np.where(there, sensor.noise_cov, np.eye(sensor.noise_cov.shape[2]))
     try:

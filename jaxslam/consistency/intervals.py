@@ -59,12 +59,12 @@ class Spread(NamedTuple):
 
     @property
     def above(self) -> float:
-        """m/μ at the lower end of the interval."""
+        """The ratio m/μ at the lower end of the interval."""
         return max(1 + self.reach - self.error**2 / 2, 1.0)
 
     @property
     def below(self) -> float:
-        """m/μ at its upper end; 0 where it has none."""
+        """The ratio m/μ at its upper end; 0 where it has none."""
         return max(1 - self.reach - self.error**2 / 2, 0.0)
 
     @property

@@ -14,7 +14,7 @@ from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.filters.particles.states.pose_state import PoseParticles
 from jaxslam.grids.localization.beam_log import beam_log
 from jaxslam.math.angles import wrap
-from jaxslam.math.roots import root_psd
+from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Filter
 from jaxslam.resampling.weights import at_points, weights_of
 from jaxslam.run import run
@@ -203,7 +203,7 @@ def covering_level(draws: Float[Array, "S 3"], truth: Float[Array, "3"]) -> Floa
 
 
 def energy_score(draws: Float[Array, "S D"], truth: Float[Array, "D"]) -> Float[Array, ""]:
-    """mean |x_i - y| - ½ mean |x_i - x_j| over pairs i ≠ j, less is better.
+    """The energy score mean |x_i - y| - ½ mean |x_i - x_j|, i ≠ j, of particles x; less is better.
 
     Its expectation is least for the true distribution, and for one that knows nothing it is as
     large as the mean error: Gneiting & Raftery 2007, "Strictly proper scoring rules, prediction,

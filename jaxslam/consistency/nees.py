@@ -31,7 +31,7 @@ class Nees(NamedTuple):
 def pose_error(
     truth: Float[np.ndarray, "*steps 3"], pose: Float[np.ndarray, "*steps 3"]
 ) -> Float[np.ndarray, "*steps 3"]:
-    """truth - estimate, heading wrapped to (-π, π]."""
+    """The error truth - estimate of a pose, heading wrapped to (-π, π]."""
     error = np.asarray(truth, np.float64) - np.asarray(pose, np.float64)
     turn = error[..., 2]
     error[..., 2] = turn - 2 * np.pi * np.ceil((turn - np.pi) / (2 * np.pi))

@@ -174,15 +174,15 @@ class Tally:
         return {name: value.high + value.low for name, value in self._sums.items()}
 
     def pieces(self) -> list[tuple[int, int]]:
-        """(first, runs) of the blocks, in order; blocks that follow each other may be one."""
+        """The pieces (first, runs) that the blocks cover, in order; adjacent blocks may be one."""
         return sorted(self._runs.items())
 
     def numbers(self) -> np.ndarray:
-        """(runs,) the numbers of the runs, in order."""
+        """The numbers of the runs (runs,), in order."""
         return _joined(np.arange(first, first + runs) for first, runs in self.pieces())
 
     def flags(self, name: str) -> np.ndarray:
-        """(runs,) finite or divergent, by run."""
+        """Whether each run is finite, or divergent: flags (runs,)."""
         return self._all(name)
 
     def first(self, name: str) -> np.ndarray:
@@ -190,7 +190,7 @@ class Tally:
         return self._blocks[min(self._blocks)][name]
 
     def measures(self) -> dict[str, np.ndarray]:
-        """(runs,) each run's average, NaN where it has none."""
+        """Each run's average (runs,), NaN where it has none."""
         some = next(iter(self._blocks.values()))
         names = [name.removeprefix("measure/") for name in some if name.startswith("measure/")]
         return {
@@ -217,13 +217,13 @@ def _joined(parts: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def _two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """a + b rounded, and the exact error of that rounding."""
+    """The sum a + b rounded, and the exact error of that rounding."""
     high = a + b
     of_b = high - a
     return high, (a - (high - of_b)) + (b - of_b)
 
 
 def _renormalized(high: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """high + low rounded, and the exact error of that rounding, for |high| >= |low|."""
+    """The sum high + low rounded, and the exact error of that rounding, for |high| >= |low|."""
     out = high + low
     return out, low - (out - high)

@@ -109,7 +109,7 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
 
 
 def _side(found: Spread, low: float, high: float) -> int:
-    """1 where the interval lies above what is honest, -1 below, 0 elsewhere."""
+    """The sign of a rejection: 1 for an interval above what is honest, -1 for one below, else 0."""
     if found.low > high and found.high > high * (1 + TOLERANCE):
         return 1
     return -1 if found.high < low and found.low < low / (1 + TOLERANCE) else 0

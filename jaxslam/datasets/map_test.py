@@ -30,7 +30,7 @@ class MapTest(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """consistent (not rejected), optimistic (covariances too small) or pessimistic."""
+        """The verdict: consistent (not rejected), optimistic (small covariances) or pessimistic."""
         low, high = self.band
         return (
             "optimistic" if self.nees > high else "pessimistic" if self.nees < low else "consistent"

@@ -78,7 +78,7 @@ def misfit_of_parabola(
     sigma: float,
     sigma_angle: float = 0.0,
 ) -> float:
-    """χ² of the residuals of a parabola through the ends of some beams, n - 3 degrees of freedom.
+    """The χ² of the residuals of a parabola through the ends of n beams, n - 3 degrees of freedom.
 
     y = f(x) with x along the line of total least squares. With t its direction and n its normal,
     y - f has to first order the variance (n·e - f' t·e)² σ² + ρ² (t·e + f' n·e)² σ_β².

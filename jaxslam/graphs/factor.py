@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxslam import sensors
+from jaxslam.graphs.solution.chordal import PRIOR, RELATIVE_POSE, RELATIVE_POSITION, Chordal
 from jaxslam.math import se2
 from jaxslam.math.angles import sin_cos, wrap
 from jaxslam.protocols import Motion, Sensor
@@ -37,6 +38,9 @@ class Factor:
     predict: Callable[[Array, Array], Array] | None = None
     """(first variable, z) -> the second of two, where the residual is zero: what `starts` places
     variables with; None where z does not tell it"""
+    chordal: Chordal | None = None
+    """the residual where a heading is cosine and sine, by which `certificate` bounds the cost; None
+    where there is none"""
 
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
@@ -67,7 +71,14 @@ def relative_pose() -> Factor:
         return by_relative @ by_first, by_relative @ by_second
 
     return Factor(
-        "relative_pose", ("pose", "pose"), POSE, POSE, residual, jacobians, predict=se2.compose
+        "relative_pose",
+        ("pose", "pose"),
+        POSE,
+        POSE,
+        residual,
+        jacobians,
+        predict=se2.compose,
+        chordal=RELATIVE_POSE,
     )
 
 
@@ -84,7 +95,15 @@ def relative_pose_log() -> Factor:
         return se2.log(_between(z, _between(first, second)))
 
     poses = ("pose", "pose")
-    return Factor("relative_pose_log", poses, POSE, POSE, residual, predict=se2.compose)
+    return Factor(
+        "relative_pose_log",
+        poses,
+        POSE,
+        POSE,
+        residual,
+        predict=se2.compose,
+        chordal=RELATIVE_POSE,
+    )
 
 
 def prior() -> Factor:
@@ -96,12 +115,12 @@ def prior() -> Factor:
     def jacobians(variables: tuple[Array, ...], z: Array) -> tuple[Array, ...]:
         return (se2.between_jacobians(z, variables[0])[1],)
 
-    return Factor("prior", ("pose",), POSE, POSE, residual, jacobians)
+    return Factor("prior", ("pose",), POSE, POSE, residual, jacobians, chordal=PRIOR)
 
 
 def relative_position() -> Factor:
     """The factor of a point in the frame of a pose: e = z - R(θ)ᵀ(l - t), g2o's `EDGE_SE2_XY`."""
-    return from_sensor(sensors.relative_position(np.eye(2)))
+    return replace(from_sensor(sensors.relative_position(np.eye(2))), chordal=RELATIVE_POSITION)
 
 
 def bearing() -> Factor:

@@ -225,7 +225,7 @@ def _local(
     noise_cov: Float[Array, "W W"],
     slack: Float[Array, ""],
 ) -> Float[Array, "3 3"]:
-    """G Q Gᵀ + s² I in the frame of a pose that the motion led to."""
+    """The noise covariance G Q Gᵀ + s² I of a motion, in the frame of the pose that it led to."""
     turned = jnp.eye(3, dtype=pose.dtype).at[:2, :2].set(se2.rotation(pose[2]))
     local = turned.T @ by_noise
     return local @ noise_cov @ local.T + slack.astype(pose.dtype) ** 2 * jnp.eye(

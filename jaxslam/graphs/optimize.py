@@ -12,14 +12,14 @@ from jaxtyping import Array, Float, PyTree
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.solver.batch import in_one_dtype, over_batch, with_batch
+from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch, with_batch
 from jaxslam.graphs.solver.gnc import graduated
 from jaxslam.graphs.solver.implicit import followed
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import chi2_of, data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
+from jaxslam.graphs.solver.padding import cut, own_number, padded
 from jaxslam.graphs.solver.plan import Plan, plan_for
-from jaxslam.graphs.solver.rooms import cut, filled, own_number
 from jaxslam.graphs.solver.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
 from jaxslam.validation.numbers import check_count
@@ -51,7 +51,7 @@ def optimize(
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
             predicts, and at least by rounding.
         plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
-            of about the same size share a compiled program (`solver.rooms`).
+            of about the same size share a compiled program (`solver.padding`).
     Raises:
         ValueError: on what `check_graph` refuses, and on unknown methods or tables.
     """
@@ -64,7 +64,7 @@ def optimize(
     check_graph(caller, graph, known)
     limits = np.asarray(iterations), np.asarray(tolerance, float)
     own, fill = graph, plan is None and programs.outside(graph)
-    graph = filled(graph) if fill else graph
+    graph = padded(graph) if fill else graph
     plan = plan_for(caller, graph, known, plan)
     found = programs.call(_optimize, (model, method), graph, plan, *limits)
     if not fill:
@@ -79,13 +79,13 @@ def chi2(
     *,
     kernel: Kernel | Mapping[str, Kernel] | None = None,
 ) -> Float[Array, ""]:
-    """χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
+    """The cost χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
     model = model_of("graphs.chi2", graph, factors, kernel)
     return programs.call(_chi2, (model,), graph)
 
 
 def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
-    graph = in_one_dtype(graph)
+    graph = graph_in_one_dtype(graph)
     who = {name: jnp.asarray(table.who) for name, table in graph.tables.items()}
     batch = with_batch(graph)
     none = jnp.arange(len(graph.poses) + len(graph.points))
@@ -95,7 +95,7 @@ def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
 def _optimize(
     model: Model, method: str, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
-    graph = in_one_dtype(graph)
+    graph = graph_in_one_dtype(graph)
     return _solver(model, method)(graph, plan, iterations, tolerance.astype(graph.poses.dtype))
 
 

@@ -216,7 +216,7 @@ def _lengths(
 
 @_lengths.defjvp
 def _derivative(primals: PyTree, tangents: PyTree) -> PyTree:
-    """-n·(dt + r de)/(n·e), of rays that hit something.
+    """The derivative of the range, -n·(dt + r de)/(n·e), of rays that hit something.
 
     The length is that of `_lengths` again, so that a second derivative meets this rule and not the
     loop of `march`.

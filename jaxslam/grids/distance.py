@@ -96,7 +96,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
     everywhere = -3  # before all that `first_cell` returns: the first parabola stays
 
     def first_cell(rise: Array, run: Array) -> Array:
-        """⌈rise/run⌉ by one division of floats, mended; any below 0 and from width on as good."""
+        """The cell ⌈rise/run⌉, by one division of floats, corrected; exact from 0 to width."""
         cell = jnp.ceil(rise.astype(jnp.float32) / run.astype(jnp.float32))
         cell = jnp.clip(cell, -1, width).astype(jnp.int32)
         beyond = cell * run - rise

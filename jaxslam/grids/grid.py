@@ -55,7 +55,7 @@ class Field(NamedTuple):
 def to_cells(
     origin: Float[Array, "3"], resolution: ArrayLike, points: Float[Array, "*n 2"]
 ) -> Float[Array, "*n 2"]:
-    """R(θ)ᵀ(p - t)/resolution: world points [m] as continuous coordinates (x, y) in cells."""
+    """World points p [m] as continuous coordinates (x, y) in cells: R(θ)ᵀ(p - t)/resolution."""
     c, s = jnp.cos(origin[2]), jnp.sin(origin[2])
     dx, dy = points[..., 0] - origin[0], points[..., 1] - origin[1]
     return jnp.stack([c * dx + s * dy, -s * dx + c * dy], axis=-1) / resolution

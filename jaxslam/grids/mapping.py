@@ -1,4 +1,4 @@
-"""Maps from scans at known poses: hits and misses of cells, and what follows from their counts."""
+"""Maps from scans at known poses: hits and misses of each cell, and the log-odds they add to it."""
 
 import functools
 from numbers import Integral

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.validation.numbers import is_concrete
 
@@ -55,7 +55,7 @@ def unscented(alpha: float | None = None) -> Linearizer:
         ground = jnp.zeros(here.joint.landmarks.shape[1], pose.dtype)
         moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
         root = _root(here.cov)
-        root_noise = roots.root_psd(motion.noise_cov(pose, u))
+        root_noise = linalg.root_psd(motion.noise_cov(pose, u))
 
         def f(xi: Array) -> Array:
             start, _ = chart.retract(pose, ground, xi[:3], ground)
@@ -96,7 +96,7 @@ def unscented(alpha: float | None = None) -> Linearizer:
         centre = sensor.invert(pose, z, mean)
         still = jnp.zeros_like(centre)
         root = _root(here.cov)
-        own_roots = [roots.root_psd(sensor.noise_cov(z)), roots.root_psd(cov_s)]
+        own_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
 
         def g(xi: Array) -> Array:
             seen_from, _ = chart.retract(pose, still, xi[:3], still)
@@ -141,7 +141,7 @@ def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> R
 
 
 def by_variables(slope: Array, root: Array) -> Array:
-    """H with H L = slope (m, n), for a regular lower L (n, n)."""
+    """The Jacobian H with H L = slope (m, n), for a regular lower L (n, n)."""
     return linalg.solve_lower(root.T[::-1, ::-1], slope.T[::-1])[::-1].T
 
 

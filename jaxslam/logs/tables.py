@@ -48,7 +48,7 @@ class Columns(NamedTuple, Generic[_Name]):
     """(row, column) -> the place of a cell, with which a message begins"""
 
     def values(self, names: Sequence[str]) -> np.ndarray:
-        """(K, len(names)) some columns side by side."""
+        """Some columns side by side, (K, len(names))."""
         return np.column_stack([self.columns[name] for name in names])
 
 
@@ -62,7 +62,7 @@ class Aligned(NamedTuple, Generic[_Name]):
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """("v", "m/s") of "v [m/s]"; None where there is no unit."""
+    """Name and unit of a column, ("v", "m/s") of "v [m/s]"; None where there is no unit."""
     bare, bracket, unit = name.strip().partition("[")
     return bare.strip(), unit.rstrip("] ").strip() if bracket else None
 
@@ -236,7 +236,7 @@ def _names(given: Tabular) -> tuple[str, ...] | None:
 def _numbers(
     at: Callable[[int, str], str], name: str, column: Sequence[object]
 ) -> Float[np.ndarray, "K"]:
-    """(K,) float64; raises ValueError on anything else than finite numbers."""
+    """The column as float64 (K,); raises ValueError on anything else than finite numbers."""
     for row, value in enumerate(column):
         if (
             not isinstance(value, int | float | np.integer | np.floating)

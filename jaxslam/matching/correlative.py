@@ -109,7 +109,7 @@ def correlative(
         axes = cell_size * se2.rotation(of.field.origin[2])[:, ::-1]  # of a row, of a column
 
         def cells(turn: Array) -> Int[Array, "N 2"]:
-            """(row, column) of the points at the start, turned so."""
+            """The cells (row, column) of the points at the start, turned so."""
             moved = points.position @ se2.rotation(turn).T + start[None, :2]
             at = to_cells(of.field.origin, of.field.resolution, moved)[:, ::-1]
             return jnp.floor(at).astype(jnp.int32) + block
@@ -124,8 +124,9 @@ def correlative(
             return jnp.where(points.valid, of.table.reshape(-1)[flat], 0.0).sum(axis=1) / count
 
         def taken(nodes: Nodes) -> Float[Array, "n"]:
-            """What a prior takes at least within each block: that of the middle is √(eᵀ Λ e), and
-            that of a corner farther in is less by √(uᵀ Λ u) at most."""
+            """The score that a prior takes at least within each block.
+
+            At the middle it is √(eᵀ Λ e); at a corner it is less by √(uᵀ Λ u) at most."""
             if prior is None:
                 return jnp.zeros(len(nodes.turn), start.dtype)
             half = 0.5 * ((1 << nodes.level) - 1).astype(start.dtype)

@@ -170,14 +170,14 @@ def field_residuals(
 def field_cost(
     of: Field, points: Points, pose: Float[Array, "3"], weight: Float[Array, "N"]
 ) -> Float[Array, ""]:
-    """½ Σ w d²."""
+    """The cost ½ Σ w d² of a pose, d the distances of its points from the nearest occupied cell."""
     moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
     d = interpolate(of, moved)
     return 0.5 * (weight * jnp.where(weight > 0, d, 0.0) ** 2).sum()
 
 
 def _robust_cost(rule: Rule, residual: Array, points: Points) -> Float[Array, ""]:
-    """Σ ρ over the valid points, those beyond reach included, so that leaving is no gain."""
+    """The sum of ρ over the valid points, also those beyond reach, so that leaving is no gain."""
     square = residual**2
     if rule.kernel is not None:
         square = rule.scale**2 * rule.kernel.cost(square / rule.scale**2)

@@ -90,7 +90,7 @@ def length_of(points: Points) -> Float[Array, ""]:
 
 
 def information_of(jacobian: Float[Array, "N 3"], weight: Float[Array, "N"]) -> Array:
-    """Σ w J Jᵀ (3, 3)."""
+    """The information Σ w J Jᵀ (3, 3) of weighted rows."""
     return linalg.gram(weight[:, None] * jacobian, jacobian)
 
 
@@ -100,7 +100,7 @@ def information_along(
     arm: Float[Array, "N 2"],
     weight: Float[Array, "N"],
 ) -> Float[Array, "3 3"]:
-    """Σ w J Jᵀ with J = (n, n·∂(R p)/∂θ), arms [m] from the pivot, over lines of normals n.
+    """The information Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), of lines; arms [m] from the pivot.
 
     A normal that is turned by noise of variance τ² has E n̂n̂ᵀ = (1 - τ²) nnᵀ + τ² ttᵀ, t along the
     line, which feigns information along a wall; hence the sum of (1 + τ²) n̂n̂ᵀ - τ² ttᵀ.

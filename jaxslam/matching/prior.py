@@ -18,12 +18,12 @@ class Prior(NamedTuple):
     singular"""
 
     def error(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """e, with the angle in (-π, π]."""
+        """The error e of a pose from the prior's, with the angle in (-π, π]."""
         off = pose - self.pose
         return jnp.concatenate([off[:2], wrap(off[2:])])
 
     def cost(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
-        """½ eᵀ Λ e."""
+        """The cost ½ eᵀ Λ e of a pose by the prior."""
         e = self.error(pose)
         return 0.5 * e @ (self.information @ e)
 
@@ -34,5 +34,5 @@ def prior_cost(prior: Prior | None, pose: Float[Array, "3"]) -> Float[Array, ""]
 
 
 def prior_information(prior: Prior | None, like: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Λ; zeros like another matrix without a prior."""
+    """The information Λ of a prior; zeros like another matrix where there is none."""
     return jnp.zeros_like(like) if prior is None else prior.information

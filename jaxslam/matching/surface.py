@@ -94,7 +94,7 @@ def surface_at(of: Surface, pose: Float[Array, "3"]) -> Surface:
 def surface_information(
     of: Surface, pose: Float[Array, "3"], weight: Float[Array, "M"]
 ) -> Float[Array, "3 3"]:
-    """Σ w J Jᵀ of a scan at a pose, by the lines through its own points (`information_along`)."""
+    """The information Σ w J Jᵀ of a scan at a pose, by the lines through its own points."""
     turn = se2.rotation(pose[2]).T
     arm = jnp.where((weight > 0)[:, None], of.position @ turn, 0.0)
     return information_along(of.normal @ turn, of.tilt, arm, jnp.where(of.straight, weight, 0.0))

@@ -41,26 +41,26 @@ def gaussian_terms(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Gaussi
 
 
 def log_det_of(factor: Float[Array, "n n"]) -> Scalar:
-    """log |L Lᵀ| of a Cholesky factor L; a pivot that is not positive counts as 1."""
+    """The log-determinant log |L Lᵀ| of a Cholesky factor L; pivots not above 0 count as 1."""
     return log_det_of_pivots(jnp.diagonal(factor))
 
 
 def log_det_of_pivots(pivots: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """log |L Lᵀ| by the diagonal of L; of L⁻¹ it is the negative."""
+    """The log-determinant log |L Lᵀ| by the diagonal of L; of L⁻¹ it is the negative."""
     return 2 * jnp.log(jnp.where(pivots > 0, pivots, 1.0)).sum(axis=-1)
 
 
 def log_density(
     distance: Float[Array, "..."], log_det: Float[Array, "..."], size: int
 ) -> Float[Array, "..."]:
-    """log N of errors of `size` entries, by their d² and log |cov|."""
+    """The log-density of errors of `size` entries, by their d² and log |cov|."""
     return -0.5 * (distance + log_det + size * LOG_2PI)
 
 
 def mahalanobis_squared(
     error: Float[Array, "n"], cov: Float[Array, "n n"]
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """eᵀ P⁻¹ e and whether P (n, n) is numerically regular; 0 and False where it is not.
+    """The distance eᵀ P⁻¹ e, and whether P (n, n) is numerically regular; 0 and False if not.
 
     P is scaled by each coordinate's standard deviation, so that the test does not depend on units.
     Regular means that each Cholesky pivot exceeds 100 n·eps, i.e. no direction is known exactly,

@@ -126,7 +126,7 @@ def adjoint(pose: Pose) -> PoseMatrix:
 
 @traced_once
 def to_frame(frame: Pose, point: Point) -> Point:
-    """R(θ)ᵀ(p - t): a world point (2,) in the frame's coordinates (Solà (56))."""
+    """A world point p (2,) in the frame's coordinates, R(θ)ᵀ(p - t) (Solà (56))."""
     c, s = jnp.cos(frame[2]), jnp.sin(frame[2])
     dx, dy = point[0] - frame[0], point[1] - frame[1]
     return jnp.stack([c * dx + s * dy, -s * dx + c * dy])
@@ -142,7 +142,7 @@ def to_frame_jacobians(frame: Pose, point: Point) -> tuple[PointByPose, PointMat
 
 @traced_once
 def from_frame(frame: Pose, point: Point) -> Point:
-    """R(θ) p + t: a point (2,) of the frame in world coordinates (Solà (55))."""
+    """A point p (2,) of the frame in world coordinates, R(θ) p + t (Solà (55))."""
     c, s = jnp.cos(frame[2]), jnp.sin(frame[2])
     return jnp.stack(
         [frame[0] + c * point[0] - s * point[1], frame[1] + s * point[0] + c * point[1]]

@@ -23,7 +23,7 @@ def traced_once(function: _F) -> _F:
 
 
 def no_inline(function: Callable[..., _T], *arguments: PyTree) -> _T:
-    """function(*arguments), compiled as a separate computation that XLA does not inline.
+    """The result of function(*arguments), compiled as a computation that XLA does not inline.
 
     XLA on CPU fuses a cheap producer into each of its consumers and computes it again there: a gain
     of D entries would be computed again for each of the D² entries of the covariance it updates. It
@@ -78,7 +78,7 @@ def _wide_vectors() -> dict[str, int] | None:
 
 
 def quick_jit(function: Callable[..., _T]) -> Callable[..., _T]:
-    """jax.jit(function) for a program that runs only once; see `quick_options`."""
+    """The jitted function, for a program that runs only once; see `quick_options`."""
     options = quick_options(jax.default_backend())
     return cast(Callable[..., _T], jax.jit(function, compiler_options=options))
 
@@ -106,7 +106,7 @@ def _over_batch(_: int, batched: PyTree, flag: jax.Array) -> tuple[jax.Array, bo
 def where_any(
     flag: jax.Array, work: Callable[[_T], _U], otherwise: Callable[[_T], _U], state: _T
 ) -> _U:
-    """work(state) if the flag () is set in any run of the batch, else otherwise(state).
+    """The result of work(state) if the flag is set in any run of a batch, else otherwise(state).
 
     Of a run whose own flag is not set, both must give the same numbers.
     """
@@ -114,7 +114,7 @@ def where_any(
 
 
 def change_where(flag: jax.Array, change: Callable[[_T], _T], state: _T) -> _T:
-    """change(state) of a run whose flag () is set, else exactly the state.
+    """The state changed by change(state) in a run whose flag () is set, else exactly the state.
 
     Computed only where the flag is set in any run of the batch.
     """

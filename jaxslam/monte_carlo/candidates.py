@@ -126,7 +126,7 @@ def _sensors(scenario: Scenario) -> list[Sensor]:
 
 
 def _seen_first(sensor: Sensor, scenario: Scenario) -> jax.Array:
-    """(Z,) the first landmark as measured from the start."""
+    """The first landmark as measured from the start, (Z,)."""
     landmark = _number(scenario.landmarks)[0, : len(sensor.landmark)]
     return programs.call(sensor.observe, (), _number(scenario.pose), landmark)
 

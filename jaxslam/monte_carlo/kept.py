@@ -18,7 +18,7 @@ class Keep(Protocol):
         """Keep runs first … first + runs - 1."""
 
     def blocks(self) -> Iterable[tuple[int, int, Mapping[str, np.ndarray]]]:
-        """(first, runs, arrays) of each block kept."""
+        """The blocks kept, each as (first, runs, arrays)."""
 
 
 def add_kept(

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 
 def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
-    """(first, runs) of the pieces of runs 0 … runs-1 that are not done, in order; each of them lies
+    """The pieces (first, runs) of runs 0 … runs-1 that are not done, in order; each of them lies
     within runs n block … (n + 1) block - 1 for some n.
 
     done: (first, runs) of what is, in any order; may overlap and reach beyond.

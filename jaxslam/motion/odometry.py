@@ -93,7 +93,7 @@ def odometry_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
 
 
 def odometry_control(before: Array, after: Array) -> Array:
-    """The u = (rot1, trans, rot2) of `odometry` that leads from one pose to another: Notes 3.
+    """The control (rot1, trans, rot2) of `odometry` that leads from one pose to another: Notes 3.
 
         rot1  = wrap(atan2(y' - y, x' - x) - θ)
         trans = √((x' - x)² + (y' - y)²)

@@ -123,7 +123,7 @@ class Same:
 
 
 def call(function: Callable[..., _T], objects: tuple[PyTree, ...], *arguments: PyTree) -> _T:
-    """function(*objects, *arguments), computed by a program that is compiled once a structure.
+    """The result of function(*objects, *arguments), by a program that is compiled once a structure.
 
     Within a trace, or where JIT is disabled, the plain call.
 

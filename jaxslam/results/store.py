@@ -94,7 +94,7 @@ class Store:
         return read_block(path, self._digest())
 
     def spans(self) -> list[tuple[int, int]]:
-        """(first, runs) of each block by its name; only `blocks` reads the files."""
+        """The runs (first, runs) of each block by its name; only `blocks` reads the files."""
         named = (runs_of_name(path) for path in self.folder.glob("block-*.npz"))
         return sorted((first, last - first) for first, last in filter(None, named))
 

@@ -102,11 +102,11 @@ def facing(z: Measurement) -> Measurement:
 
 
 def _along(alpha: Array, frame: Pose) -> Array:
-    """n·t, n = (cos α, sin α)."""
+    """The distance n·t along the normal n = (cos α, sin α)."""
     return jnp.cos(alpha) * frame[0] + jnp.sin(alpha) * frame[1]
 
 
 def _normal(alpha: Array, frame: Pose) -> tuple[Array, Array, Array]:
-    """cos α, sin α, and the derivative of n·t by α."""
+    """The normal's cos α, sin α, and the derivative of n·t by α."""
     c, s = jnp.cos(alpha), jnp.sin(alpha)
     return c, s, c * frame[1] - s * frame[0]

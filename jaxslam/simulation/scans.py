@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.math.roots import root_psd
+from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.suite import Part
 from jaxslam.types import Scan

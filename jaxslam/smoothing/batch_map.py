@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.chain.elimination import Chain
-from jaxslam.graphs.chain.gauss_newton import Iterations, minimize
+from jaxslam.graphs.chain.gauss_newton import Iterations, optimize_chain
 from jaxslam.graphs.chain.problem import Iterate, Problem
 from jaxslam.graphs.solver.search import Ending
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
@@ -18,7 +18,7 @@ from jaxslam.smoothing.forward_pass import (
     ForwardPass,
     compiled_once,
     forward_filter,
-    in_one_dtype,
+    log_in_one_dtype,
     run_forward,
 )
 from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
@@ -123,9 +123,9 @@ def batch_map(
 
     def solve(log: Log, key: Array) -> Trace:
         passed = run_forward(filter, log, pose, pose_cov, key)
-        log = in_one_dtype(log)
+        log = log_in_one_dtype(log)
         problem, start, chain = _problem_of(motion, sensor, passed, log, pose, pose_cov)
-        search = minimize(
+        search = optimize_chain(
             motion,
             sensor,
             problem,

@@ -19,7 +19,7 @@ from jaxslam.graphs.chain.window import (
     newest_cov,
     solve_window,
 )
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
@@ -118,7 +118,7 @@ def fixed_lag(
         )
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
         state = finite_or(state._replace(prior=prior), begun(state.joint))
-        root = roots.root_psd(motion.noise_cov(state.joint.pose, u))
+        root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
         steps, at = shift(state.steps, state.at, u, root, joint.pose)
         return WindowState(joint, state.prior, steps, at)
 

@@ -120,7 +120,7 @@ def compiled_once(
     return estimator
 
 
-def in_one_dtype(log: Log) -> Log:
+def log_in_one_dtype(log: Log) -> Log:
     """The log as arrays, controls and measurements in the wider dtype of the two, as in `run`."""
     log = jax.tree.map(jnp.asarray, log)
     dtype = jnp.result_type(log.control, log.scan.z)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.graphs.chain.elimination import Chain, LinearizedStep, Start
 from jaxslam.graphs.chain.rows import Rows, pose_difference, whitened_rows
 from jaxslam.linearize import derivatives
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.smoothing.forward_pass import ForwardPass
 from jaxslam.types import Log, Status
@@ -18,12 +18,12 @@ def noise_roots(
 ) -> Float[Array, "T W W"]:
     """The square roots of the motions' noise covariances, at the filter's linearization points."""
     cov = jax.vmap(motion.noise_cov)(passed.before, control)
-    return jax.vmap(roots.root_psd)(cov)
+    return jax.vmap(linalg.root_psd)(cov)
 
 
 def start_of(pose_cov: Float[Array, "3 3"]) -> Start:
     """The start of a chain at the mean of the prior."""
-    return Start(roots.root_psd(pose_cov), jnp.zeros(3, pose_cov.dtype))
+    return Start(linalg.root_psd(pose_cov), jnp.zeros(3, pose_cov.dtype))
 
 
 def chain_of(
@@ -52,7 +52,7 @@ def chain_of(
 def _motions(
     motion: Motion, passed: ForwardPass, control: Float[Array, "T U"], roots: Float[Array, "T W W"]
 ) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3 W"], Float[Array, "T 3"]]:
-    """F, G and c of `LinearizedStep` for each motion."""
+    """The matrices F, G and the offset c of `LinearizedStep` for each motion."""
 
     def one(
         before: Array, predicted: Array, corrected: Array, u: Array, root: Array

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.graphs.chain.elimination import Chain, Policy, eliminate
-from jaxslam.graphs.chain.marginals import marginals
+from jaxslam.graphs.chain.marginals import chain_marginals
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
@@ -18,7 +18,7 @@ from jaxslam.smoothing.forward_pass import (
     ForwardPass,
     compiled_once,
     forward_filter,
-    in_one_dtype,
+    log_in_one_dtype,
     run_forward,
 )
 from jaxslam.smoothing.linearization import chain_of, noise_roots
@@ -83,7 +83,7 @@ def smooth(
 
     def solve(log: Log, key: Array) -> Trace:
         passed = run_forward(filter, log, pose, pose_cov, key)
-        log = in_one_dtype(log)
+        log = log_in_one_dtype(log)
         mean, cov = (jnp.asarray(given, log.control.dtype) for given in (pose, pose_cov))
         roots = noise_roots(motion, passed, log.control)
         chain, used = chain_of(motion, sensor, passed, log, cov, roots)
@@ -105,7 +105,7 @@ def solution(
     passed: ForwardPass,
 ) -> tuple[Estimate, Smoothed]:
     """The estimates at the optimum of a chain about a path and the map of a joint."""
-    found = marginals(chain, policy)
+    found = chain_marginals(chain, policy)
     poses = path + found.path
     poses = poses.at[:, 2].set(wrap(poses[:, 2]))
     landmarks = jnp.where(joint.alive[:, None], joint.landmarks + policy.landmarks, 0.0)

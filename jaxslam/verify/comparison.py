@@ -237,7 +237,7 @@ def _modes_differ(
 
 
 def _relative(gap: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """gap / scale, with 0/0 = 0."""
+    """The ratio gap / scale, with 0/0 = 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(gap == 0, 0.0, gap / scale)
 

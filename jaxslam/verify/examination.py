@@ -121,7 +121,7 @@ def typical_linearity(model: Model, examined: Examined) -> float | None:
 
 
 def _standard_deviation(entry: str) -> float:
-    """0.05 of an angle or inverse depth, 0.1 of all else."""
+    """The standard deviation of a start: 0.05 of an angle or inverse depth, 0.1 of all else."""
     return 0.05 if entry.endswith(("[rad]", "[1/m]")) else 0.1
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.math.roots import root_psd
+from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.validation.numbers import check_covariance, is_concrete
 
@@ -176,7 +176,7 @@ def _vector(name: str, value: ArrayLike, size: int | None = None) -> Float[Array
 
 
 def _index(bend: Float[Array, "m"], sigmas: float, reach2: Float[Array, "m"]) -> Float[Array, "m"]:
-    """bend / (n_σ √reach²), with 0/0 = 0; inf if only reach is 0 or f is not finite."""
+    """The index bend / (n_σ √reach²), with 0/0 = 0; inf if only reach is 0 or f is not finite."""
     defined = jnp.isfinite(bend) & jnp.isfinite(reach2)
     flat = defined & (reach2 == 0)
     bend, reach2 = jnp.where(defined, bend, 0.0), jnp.where(defined & ~flat, reach2, 1.0)

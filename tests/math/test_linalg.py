@@ -359,7 +359,7 @@ def test_slopes_of_slopes_equal_differences():
 
 
 def test_no_batch_reaches_the_librarys_kernels_on_a_cpu():
-    # There they wait for threads that they hold themselves: see `batched_linalg`.
+    # There they wait for threads that they hold themselves: see `linalg.batched`.
     a, b = random_covariances(20, count=4), np.ones((4, 20, 3))
     slope = jax.grad(lambda a, b: everything(a, b)[0].sum(), (0, 1))
     for f in (everything, slope):

@@ -35,7 +35,7 @@ SIGNED = "--start", "--scans"
 """Options whose value may begin with a minus sign, and is no single number."""
 
 
-def joined(arguments: list[str]) -> list[str]:
+def with_signed_values(arguments: list[str]) -> list[str]:
     """The arguments, with `--start=-6,-10,90` in place of `--start -6,-10,90`, and so of `SIGNED`:
     argparse takes such a value for an option."""
     out: list[str] = []

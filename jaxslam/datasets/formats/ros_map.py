@@ -81,7 +81,7 @@ def map_files(
 
 
 def _log_odds(p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """log p/(1-p) within ±CERTAIN; exactly 0 at ½."""
+    """The log-odds log p/(1-p), within ±CERTAIN; exactly 0 at ½."""
     within = np.clip(p, 0.5 / 255, 1.0 - 0.5 / 255)
     found = np.where(p == 0.5, 0.0, np.log(within) - np.log1p(-within))
     found = np.where(within > p, -CERTAIN, np.where(within < p, CERTAIN, found))

@@ -65,11 +65,11 @@ class RobotCalibration(NamedTuple):
         return np.column_stack([t + self.delay, *self.velocities(v, omega)])
 
     def velocities(self, v: Numbers, omega: Numbers) -> tuple[Numbers, Numbers]:
-        """(v', ω') of the recorded ones."""
+        """The calibrated velocities (v', ω') of recorded ones."""
         return self.forward * v - self.outer * abs(omega), self.turn * omega + self.curvature * v
 
     def range(self, recorded: Numbers, bearing: Numbers) -> Numbers:
-        """r' of the recorded range and bearing."""
+        """The calibrated range r' of a recorded range and bearing."""
         cos = jnp.cos if isinstance(bearing, jax.Array) else np.cos
         return recorded / (self.depth * cos(bearing - self.axis))
 

@@ -7,7 +7,8 @@ import numpy as np
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.datasets.formats.csv_table import CsvTable
 from jaxslam.datasets.formats.lines import stored
-from jaxslam.datasets.table.settings import Parametric, TableSettings
+from jaxslam.datasets.table.models import Parametric
+from jaxslam.datasets.table.settings import TableSettings
 from jaxslam.logs import tables
 from jaxslam.logs.streams import interpolate_poses
 from jaxslam.logs.tables import POSE, TAG, TIME

@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Generic, NamedTuple, NoReturn, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam import motion, sensors
 from jaxslam.datasets.table.association import GATE, METHODS, association_options, is_number
+from jaxslam.datasets.table.models import Parametric, fitting_model, of_no_noise
 from jaxslam.datasets.table.settings_text import line_number
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
@@ -29,23 +30,6 @@ MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
 ROOM = 100
 """Default number of landmarks, where identities are unknown."""
 _FILTER = ("gate", "capacity", "associate", "update", "start", "start_noise")
-_FIRST = ("unicycle", "pose_increment", "range_bearing")
-"""Of models with the same columns, those taken by default."""
-
-
-class Parametric(NamedTuple, Generic[_Model]):
-    """A model by the standard deviations of its noise and its mount, and what the file says."""
-
-    names: tuple[str, ...]
-    deviations: tuple[float, ...]
-    mount: tuple[float, ...] | None
-    """None where the model has none"""
-    make: Callable[[JaxOrNumPy, ArrayLike | None], _Model]
-    """(deviations (W,) an array, mount (3,) or None) -> model"""
-
-    def made(self) -> _Model:
-        """The model that the file describes."""
-        return self.make(np.array(self.deviations), self.mount)
 
 
 class TableSettings:
@@ -88,7 +72,7 @@ class TableSettings:
             interval: the time between its lines [s].
         """
         factory, options = self._model("motion", motion.REGISTRY, given)
-        shell = self._built("motion", factory, options, _of_no_noise)
+        shell = self._built("motion", factory, options, of_no_noise)
         from_poses = odometry_columns(shell.controls, given) == POSE
         with_interval = INTERVAL in shell.controls
 
@@ -123,7 +107,7 @@ class TableSettings:
         mount, has_mount = None, "mount" in inspect.signature(factory).parameters
         if "mount" in options:
             mount = self._numbers("sensor", "mount", options.pop("mount"), POSE)
-        names = self._built("sensor", factory, options, _of_no_noise).measurements
+        names = self._built("sensor", factory, options, of_no_noise).measurements
         deviations = self._noise("sensor", names, MEASUREMENT_NOISE)
         if not all(deviations):
             raise ValueError(f"{self._at('sensor', 'noise')}: expected numbers above 0")
@@ -204,7 +188,9 @@ class TableSettings:
         options: dict[str, object] = dict(self.content.get(section, {}))
         name = options.pop("model", None)
         if name is None:
-            name = self._default(section, "model", _fitting(section, registry, given, self.path))
+            name = self._default(
+                section, "model", fitting_model(section, registry, given, self.path)
+            )
         if not isinstance(name, str) or name not in registry:
             raise ValueError(
                 f"{self._at(section, 'model')}: expected one of {', '.join(registry)}, got {name!r}"
@@ -271,36 +257,3 @@ class TableSettings:
         line = line_number(self._text, section, key)
         where = f"{self.path}:" + (f"{line}: " if line else " ")
         return where + (f"[{section}] " if section else "") + key
-
-
-def _fitting(
-    section: str,
-    registry: Mapping[str, Callable[..., Motion | Sensor]],
-    given: Sequence[str],
-    path: Path,
-) -> str:
-    """The model whose columns are given; of several the one with most, then of `_FIRST`."""
-    bare = {split_unit(name)[0] for name in given}
-    fitting, known = [], []
-    for name, factory in registry.items():
-        model = factory(_of_no_noise)
-        names = (
-            odometry_columns(model.controls, given)
-            if isinstance(model, Motion)
-            else model.measurements
-        )
-        known.append(f"{name} ({', '.join(names)})")
-        if {split_unit(one)[0] for one in names} <= bare:
-            fitting.append((len(names), name in _FIRST, name))
-    if not fitting:
-        raise ValueError(
-            f"{path}: [{section}] model: expected one, since no model has the columns "
-            f"{', '.join(given)}; there are {'; '.join(known)}"
-        )
-    most = max(fitting)[:2]
-    return next(name for *rank, name in fitting if tuple(rank) == most)
-
-
-def _of_no_noise(*_: object) -> NoReturn:
-    """The noise of a model that is made for its names alone, and is never evaluated."""
-    raise AssertionError("a model that was made for its names was evaluated")

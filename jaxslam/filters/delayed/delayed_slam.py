@@ -207,7 +207,7 @@ def _reported(
     new: NewMeasurements,
     outcome: _Outcome,
 ) -> Info:
-    """The `Info` of a scan."""
+    """The `Info` of a scan: what became of each of its measurements."""
     slot, refused = outcome.promoted
     status = status_of(
         scan.valid,

@@ -34,7 +34,7 @@ class PointResiduals(NamedTuple):
     """∂g/∂s"""
 
     def squared_distance(self) -> Float[Array, "p q"]:
-        """g²/var(g), infinite where the variance is not positive."""
+        """The squared distance g²/var(g), infinite where the variance is not positive."""
         positive = self.variance > 0
         ratio = self.value**2 / jnp.where(positive, self.variance, 1.0)
         return jnp.where(positive, ratio, jnp.inf)
@@ -115,6 +115,6 @@ def closer_than(
 
 
 def safe_root(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """√x where x is positive, else 0, with a finite derivative."""
+    """The square root of x where x is positive, else 0, with a finite derivative."""
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)

@@ -168,7 +168,7 @@ def empty_state(
 
 
 def covariance_blocks(joint: Joint) -> Float[Array, "S 3 S 3"]:
-    """P of the table, without the robot, by slots."""
+    """The covariance of the table by slots, without the robot."""
     capacity = joint.alive.shape[0]
     return joint.cov[3:, 3:].reshape(capacity, SIZE, capacity, SIZE)
 

@@ -25,14 +25,14 @@ from jaxslam.filters.information.settings import InformationSettings
 from jaxslam.filters.information.tag_association import TagAssociation
 from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.linearize import first_order
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.types import Estimate, Info, Scan
 
 
 def initial_information(pose_cov: Float[Array, "3 3"], floor: float) -> Float[Array, "3 3"]:
-    """P0⁻¹, or (P0 + floor² I)⁻¹ where P0 is not positive definite."""
+    """The first information P0⁻¹, or (P0 + floor² I)⁻¹ where P0 is not positive definite."""
     eye = jnp.eye(3, dtype=pose_cov.dtype)
     positive = linalg.cholesky(pose_cov)[1]
     safe = jnp.where(positive, pose_cov, pose_cov + floor**2 * eye)
@@ -56,7 +56,7 @@ def motion_update(
     rounding. G is zero except for the landmarks that the robot is linked to.
     """
     after, by_pose, noise = first_order.motion_at(motion, pose, u, pose)
-    root = roots.root_psd(noise)
+    root = linalg.root_psd(noise)
     back = linalg.inverse(by_pose)
     phi = omega.at[:3].set(back.T @ omega[:3])
     phi = phi.at[:, :3].set(phi[:, :3] @ back)
@@ -80,7 +80,7 @@ def measurement_update(
 def mean_error(
     omega: Float[Array, "D D"], residual: Float[Array, "D"], omega_positive: Bool[Array, ""]
 ) -> tuple[Float[Array, "D"], Bool[Array, ""]]:
-    """E[e] = Ω⁻¹ ρ, and whether it could be solved for: Ω is positive definite, as it was before
+    """The mean error Ω⁻¹ ρ, and whether it could be solved for: Ω is positive definite, as before
     the scan (omega_positive). Zero where it could not."""
     error, positive = linalg.solve_psd(omega, residual)
     solved = omega_positive & positive
@@ -125,7 +125,7 @@ def initialize_landmarks(
 
 
 def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """Ω plus √eps of its diagonal, used where rounding made Ω indefinite."""
+    """The matrix Ω plus √eps of its diagonal, used where rounding made Ω indefinite."""
     share = math.sqrt(float(jnp.finfo(omega.dtype).eps))
     load: Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
     return omega + load

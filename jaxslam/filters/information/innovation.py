@@ -100,7 +100,7 @@ def stack_jacobians(
     index: Int[Array, "M"],
     count: int,
 ) -> Float[Array, "MZ D"]:
-    """H of M functions of the pose and of one landmark each, index of `count`; D = 3 + count·L."""
+    """The Jacobian H of M functions of pose and a landmark, index of `count`; D = 3 + count·L."""
     m, rows, size = by_landmark.shape
     at = (index[:, None] == jnp.arange(count)[None, :]).astype(by_landmark.dtype)
     wide = jnp.einsum("mkl,ma->mkal", by_landmark, at).reshape(m, rows, count * size)
@@ -112,7 +112,7 @@ def _densities_in_turn(
     joint_cov: Float[Array, "M Z M Z"],
     fused: Bool[Array, "M"],
 ) -> tuple[Float[Array, "M"], Float[Array, "M"]]:
-    """d² and log-density of each fused innovation given those before it."""
+    """The distance d² and log-density of each fused innovation given those before it."""
     m, size = innovation.shape
     both = fused[:, None, None, None] & fused[None, None, :, None]
     eye = jnp.eye(m * size, dtype=innovation.dtype)

@@ -10,7 +10,7 @@ from jaxslam import slots, validation
 from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
 from jaxslam.filters.map_management.wrapping import joint_of, managed
 from jaxslam.filters.reporting import with_extra
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.math.gaussians import gaussian_terms
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
@@ -149,7 +149,7 @@ def closest_pair(
 
 
 def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Float[Array, ""]:
-    """errorᵀ cov⁻¹ error; infinite where the covariance is not positive definite."""
+    """The squared distance errorᵀ cov⁻¹ error; infinite where cov is not positive definite."""
     terms = gaussian_terms(error, cov)
     return jnp.where(terms.positive, terms.distance, jnp.inf)
 
@@ -182,7 +182,7 @@ def merge_landmarks(
     pose, landmarks = retracted(chart, joint, xi)
     cov = rows - linalg.gram(v, v)
     if square_root:
-        cov = roots.root_psd(cov)
+        cov = linalg.root_psd(cov)
     together = joint.co_observed
     if together is not None:  # the landmark kept takes over the co-observations of both
         with_one = together[i] | (ok & (together[i] | together[j]))

@@ -125,7 +125,7 @@ class PairFrame(NamedTuple):
 
 
 def frame_of_pair(points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"]) -> PairFrame:
-    """T of cluster points a, b = ends and map points j, k = slots.
+    """The transformation T that carries cluster points a, b = ends onto map points j, k = slots.
 
     dθ = v⊥·(δm_k - δm_j)/|m_k - m_j| - v⊥·R(δz_b - δz_a)/|z_b - z_a|, with v the direction of the
     map pair; T z_i moves by it times the arm from the midpoint, turned by 90°.
@@ -180,7 +180,7 @@ def quarter_turned(points: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]
 def mahalanobis_of_pairs(
     error: Float[Array, "*batch 2"], cov: Float[Array, "*batch 2 2"]
 ) -> tuple[Float[Array, "*batch"], Bool[Array, "*batch"]]:
-    """eᵀ P⁻¹ e in closed form, 0 where P is not positive definite, and whether it is."""
+    """The squared distance eᵀ P⁻¹ e in closed form, and whether P is positive definite; else 0."""
     p, q, r = cov[..., 0, 0], cov[..., 1, 1], cov[..., 0, 1]
     det = p * q - r * r
     positive = (p > 0) & (q > 0) & (det > 4 * jnp.finfo(cov.dtype).eps * p * q)
@@ -192,13 +192,13 @@ def mahalanobis_of_pairs(
 def difference_covs(
     a: Float[Array, "M 2 2"], b: Float[Array, "N 2 2"], cross: Float[Array, "M N 2 2"]
 ) -> Float[Array, "M N 2 2"]:
-    """cov(x_i - y_j) of all pairs, by the covariances of x, of y and of x_i with y_j."""
+    """The covariances of x_i - y_j of all pairs, by those of x, of y and of x_i with y_j."""
     return a[:, None] + b[None] - cross - cross.transpose(0, 1, 3, 2)
 
 
 def _length_and_direction(
     delta: Float[Array, "*batch 2"],
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch 2"]]:
-    """|δ|, positive, and δ/|δ|."""
+    """The length |δ|, positive, and the direction δ/|δ|."""
     length = jnp.sqrt((delta**2).sum(axis=-1) + jnp.finfo(delta.dtype).tiny)
     return length, delta / length[..., None]

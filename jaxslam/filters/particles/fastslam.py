@@ -169,7 +169,7 @@ def fastslam(
 def of_each_particle(
     scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: PyTree
 ) -> _T:
-    """step(*of_particle, scan=…, settings=…) of every particle."""
+    """The results of step(*of_particle, scan=…, settings=…) for every particle."""
     return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)
 
 

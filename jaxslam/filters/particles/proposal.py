@@ -16,7 +16,7 @@ from jaxslam.filters.particles.scan_association import ParticleAssociation, part
 from jaxslam.filters.particles.settings import ParticleMapSettings
 from jaxslam.filters.particles.states.slam_state import SlamParticles
 from jaxslam.linearize import derivatives, first_order
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of
 from jaxslam.protocols import Motion, Prediction, Sensor
@@ -30,7 +30,7 @@ def sample_motion(
     normals = jax.random.normal(key, (pose.shape[0], len(motion.noises)), pose.dtype)
 
     def move(pose: Float[Array, "3"], normal: Float[Array, "W"]) -> Float[Array, "3"]:
-        return motion.step(pose, u, roots.root_psd(motion.noise_cov(pose, u)) @ normal)
+        return motion.step(pose, u, linalg.root_psd(motion.noise_cov(pose, u)) @ normal)
 
     return jax.vmap(move)(pose, normals)
 
@@ -145,7 +145,7 @@ def predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
     """The `Prediction` of one particle's map, with landmarks correlated by the pose alone."""
 
     def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
-        """ẑ, H_x and H_l C H_lᵀ of each landmark."""
+        """The prediction ẑ, H_x and H_l C H_lᵀ of each landmark."""
 
         def one(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
             by_pose, by_landmark = derivatives.observe_jacobians(sensor, particle.pose, landmark)

@@ -4,7 +4,7 @@ Poses form a chain and landmarks are static, so the least-squares problem of T p
 landmarks needs no matrix larger than the map's. Backward, the information of later measurements on
 (pose, map) is propagated from pose to pose, and the noise of each motion is eliminated: its optimum
 is an affine function of the pose after the motion and of the map. The map remains at the start.
-Forward, these functions give the path (`marginals`). This is dynamic programming, and among
+Forward, these functions give the path (`chain_marginals`). This is dynamic programming, and among
 smoothers the one of backward information and forward means (Mayne 1966, "A solution of the
 smoothing problem for linear dynamic systems", Automatica 4(2); Fraser & Potter 1969, IEEE TAC
 14(4)).
@@ -214,5 +214,5 @@ def _eliminate_noise(
 
 
 def _solve_upper(factor: Array, rhs: Array) -> Array:
-    """L⁻ᵀ B of lower L."""
+    """The solution L⁻ᵀ B of lower L."""
     return linalg.solve_lower(factor[::-1, ::-1].T, rhs[::-1])[::-1]

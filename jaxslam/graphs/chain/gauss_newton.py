@@ -35,7 +35,7 @@ class Iterations(NamedTuple):
     """EXHAUSTED while the iterations continue"""
 
 
-def minimize(
+def optimize_chain(
     motion: Motion,
     sensor: Sensor,
     problem: Problem,

@@ -10,7 +10,7 @@ from jaxslam.graphs.chain.elimination import Chain, Gain, LinearizedStep, Policy
 from jaxslam.math import linalg
 
 
-class Marginals(NamedTuple):
+class ChainMarginals(NamedTuple):
     """The marginals of the Gaussian of a chain: of each pose, and of the last pose with the map."""
 
     path: Float[Array, "T+1 3"]
@@ -20,7 +20,7 @@ class Marginals(NamedTuple):
     """of the last pose and the map, D = 3 + NL; unit variance at dead slots"""
 
 
-def marginals(chain: Chain, policy: Policy) -> Marginals:
+def chain_marginals(chain: Chain, policy: Policy) -> ChainMarginals:
     """The marginals of a chain, in O(T N) plus one triangular system of 3T columns.
 
     With n standard normal and M = R Rᵀ the matrix of the gain,
@@ -63,7 +63,7 @@ def marginals(chain: Chain, policy: Policy) -> Marginals:
         jnp.concatenate([one[None], more]) for one, more in zip(start, rest, strict=True)
     )
     if wide == 0:
-        return Marginals(path, own, own[-1])
+        return ChainMarginals(path, own, own[-1])
     poses = path.shape[0]
     spread = linalg.solve_lower(policy.map_factor, by_map.reshape(poses * 3, wide).T)
     spread = spread.reshape(wide, poses, 3)
@@ -72,4 +72,4 @@ def marginals(chain: Chain, policy: Policy) -> Marginals:
     of_map = unit.T @ unit
     cross = by_map[-1] @ of_map
     cov = jnp.block([[covs[-1], cross], [cross.T, of_map]])
-    return Marginals(path, covs, cov)
+    return ChainMarginals(path, covs, cov)

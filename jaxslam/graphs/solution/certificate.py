@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.solution.dual import FACTORS, chordal_weights, dual
-from jaxslam.graphs.solver.batch import in_one_dtype, over_batch
+from jaxslam.graphs.solution.chordal import PRIOR
+from jaxslam.graphs.solution.dual import chordal_factor, chordal_weights, dual
+from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
 from jaxslam.graphs.solver.linearized import data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.plan import Plan, plan_for
@@ -77,7 +78,8 @@ def certificate(
     Args:
         graph: usually that of a `Solution`. One pose is held: fixed, or by a prior, which is left
             out.
-        factors: as in `optimize`; each must be a relative pose, a relative position, or a prior.
+        factors: as in `optimize`; each must be a relative pose, a relative position, or a prior
+            (`Factor.chordal`).
         plan: of `plan(graph)`; needed under `jit` and `vmap`.
     Raises:
         ValueError: on other factors, on more poses held than one, and on what `check_graph`
@@ -86,10 +88,10 @@ def certificate(
     caller = "graphs.certificate"
     model = model_of(caller, graph, factors)
     for name, factor in model.factors:
-        if factor.name not in FACTORS:
+        if factor.chordal is None:
             raise ValueError(
                 f"{caller}: the table {name!r} has no chordal cost: its factor is {factor.name}, "
-                f"and there are {', '.join(FACTORS)}"
+                "and relative poses, relative positions and priors have one"
             )
     check_graph(caller, graph, dict(model.factors))
     plan = plan_for(caller, graph, dict(model.factors), plan)
@@ -97,7 +99,7 @@ def certificate(
         # NumPy, since each operation on a new shape would be a program.
         held = np.array(graph.fixed_pose)
         for name, factor in model.factors:
-            if factor.name == "prior":
+            if factor.chordal is PRIOR:
                 held[
                     np.asarray(graph.tables[name].who)[np.asarray(graph.tables[name].valid), 0]
                 ] = True
@@ -113,13 +115,13 @@ def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
     """The poses that are fixed or have a prior."""
     held = jnp.asarray(graph.fixed_pose)
     for name, factor in model.factors:
-        if factor.name == "prior":
+        if factor.chordal is PRIOR:
             held = held.at[plan.who[name][:, 0]].max(graph.tables[name].valid)
     return held
 
 
 def _certificate(model: Model, graph: Graph, plan: Plan) -> Certificate:
-    return _batched(model)((plan,), in_one_dtype(graph))
+    return _batched(model)((plan,), graph_in_one_dtype(graph))
 
 
 @functools.lru_cache(maxsize=256)
@@ -134,10 +136,11 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     tables = {}
     for name, factor in model.factors:
         table = graph.tables[name]
-        weights = chordal_weights(FACTORS[factor.name].name, table.information)
+        assert factor.chordal is not None
+        weights = chordal_weights(factor.chordal, table.information)
         unit = jnp.eye(weights.shape[1], dtype=dtype)[None, ..., None]
         tables[name] = table._replace(information=unit * weights[:, None])
-    chordal = Model(tuple((name, FACTORS[factor.name]) for name, factor in model.factors))
+    chordal = Model(tuple((name, chordal_factor(factor)) for name, factor in model.factors))
     surrogate = graph._replace(tables=tables, fixed_pose=held)
     tolerance = jnp.asarray(1e-13, dtype)
     found = minimize(chordal, "levenberg_marquardt", plan, jnp.asarray(100), tolerance, surrogate)

@@ -1,72 +1,39 @@
 """The dual matrix of a pose graph's chordal cost, and that cost as factors of a graph."""
 
-from collections.abc import Callable
+import functools
+from dataclasses import replace
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.solution.chordal import Chordal
 from jaxslam.graphs.solver.linearized import Data, Variables, variable_numbers
 from jaxslam.graphs.solver.model import Model
 from jaxslam.graphs.solver.plan import Plan
 from jaxslam.graphs.sparse.gathered import summed
-from jaxslam.math import se2
 from jaxslam.math.linalg import total
 from jaxslam.types import JaxOrNumPy
 
 
-def _pose_error(variables: tuple[Array, ...], z: Array) -> Array:
-    e = se2.between(z, se2.between(*variables))
-    return jnp.stack([e[0], e[1], jnp.cos(e[2]) - 1.0, jnp.sin(e[2])])
+@functools.lru_cache(maxsize=256)
+def chordal_factor(factor: Factor) -> Factor:
+    """The factor of the same measurement with chordal residuals, `Factor.chordal`."""
+    assert factor.chordal is not None
+    own = factor.chordal
+    return replace(
+        factor, errors=("",) * own.size, residual=own.residual, jacobians=None, predict=None
+    )
 
 
-def _point_error(variables: tuple[Array, ...], z: Array) -> Array:
-    return se2.to_frame(variables[0], variables[1][:2]) - z
-
-
-def _no_error(variables: tuple[Array, ...], z: Array) -> Array:
-    return jnp.zeros(1, z.dtype)
-
-
-def _chordal(
-    name: str, who: tuple[str, ...], errors: int, residual: Callable[..., Array]
-) -> Factor:
-    return Factor(name, who, (), ("",) * errors, residual)
-
-
-_POSE = _chordal("relative_pose", ("pose", "pose"), 4, _pose_error)
-
-FACTORS = {
-    "relative_pose": _POSE,
-    "relative_pose_log": _POSE,
-    "relative_position": _chordal("relative_position", ("pose", "point"), 2, _point_error),
-    "prior": _chordal("prior", ("pose",), 1, _no_error),
-}
-"""The same measurements with chordal residuals."""
-
-
-def _pose_rows(z: Array) -> list[list[list[Array]]]:
-    """∂r/∂(p, u) of both poses, r = (p_j - p_i - t u_i, u_j - exp(iφ) u_i), (4, 4) each."""
-    o, i = jnp.zeros_like(z[:, 0]), jnp.ones_like(z[:, 0])
-    x, y, c, s = z[:, 0], z[:, 1], jnp.cos(z[:, 2]), jnp.sin(z[:, 2])
-    one = [[-i, o, -x, y], [o, -i, -y, -x], [o, o, -c, s], [o, o, -s, -c]]
-    return [one, [[i, o, o, o], [o, i, o, o], [o, o, i, o], [o, o, o, i]]]
-
-
-def _point_rows(z: Array) -> list[list[list[Array]]]:
-    """∂r/∂(p, u) of a pose and ∂r/∂p of a point, r = p_j - p_i - t u_i."""
-    return [rows[:2] for rows in _pose_rows(jnp.concatenate([z, jnp.zeros_like(z[:, :1])], axis=1))]
-
-
-ROWS = {"relative_pose": _pose_rows, "relative_position": _point_rows}
-
-
-def chordal_weights(name: str, information: Float[JaxOrNumPy, "E R R B"]) -> Float[Array, "E S B"]:
-    """τ, τ, κ, κ or τ, τ, as many as chordal residuals; zero for a prior."""
+def chordal_weights(
+    form: Chordal, information: Float[JaxOrNumPy, "E R R B"]
+) -> Float[Array, "E S B"]:
+    """The weights τ, τ, κ, κ or τ, τ of the chordal residuals; zero for a prior."""
     near = 0.5 * (information[:, 0, 0] + information[:, 1, 1])
-    if name == "prior":
+    if form.rows is None:
         return jnp.zeros_like(near)[:, None]
-    turn = [information[:, 2, 2]] * 2 if name == "relative_pose" else []
+    turn = [information[:, 2, 2]] * (form.size - 2)
     return jnp.stack([near, near, *turn], axis=1)
 
 
@@ -91,11 +58,11 @@ def dual(
     for name, factor in chordal.factors:
         who, valid, k = plan.who[name], data.valid[name], len(factor.variables)
         rows, size = len(who), len(factor.errors)
-        if factor.name not in ROWS:
+        if factor.chordal is None or factor.chordal.rows is None:
             blocks.append(jnp.zeros((rows, 4, 4, batch), dtype))
             gradients.append(jnp.zeros((rows, 4, batch), dtype))
             continue
-        parts = ROWS[factor.name](data.z[name])
+        parts = factor.chordal.rows(data.z[name])
         jacobian = jnp.stack(
             [jnp.stack([jnp.stack(row, axis=1) for row in part], axis=1) for part in parts], axis=2
         )  # (E, S, K, 4, B)

@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.solver.batch import in_one_dtype, over_batch
+from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import data_of, linearize, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
+from jaxslam.graphs.solver.padding import LEAST, cut, own_number, padded, padded_number
 from jaxslam.graphs.solver.plan import Plan, checked_pairs, plan_for
-from jaxslam.graphs.solver.rooms import LEAST, cut, filled, filled_number, own_number
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
 from jaxslam.graphs.sparse.inverse import selected_inverse
-from jaxslam.graphs.sparse.sweeps import room
+from jaxslam.graphs.sparse.sweeps import padded_size
 from jaxslam.graphs.validation import check_graph, label
 from jaxslam.validation.numbers import is_concrete
 
@@ -69,9 +69,9 @@ def marginals(
     check_graph(caller, graph, known)
     wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     if plan is None and programs.outside(graph):
-        more = filled(graph)
-        rows = np.zeros((room(len(wanted), LEAST), 2), int)
-        rows[: len(wanted)] = filled_number(wanted, graph, more)
+        more = padded(graph)
+        rows = np.zeros((padded_size(len(wanted), LEAST), 2), int)
+        rows[: len(wanted)] = padded_number(wanted, graph, more)
         new = plan_for(caller, more, known, None, marginals=True, pairs=rows)
         found = programs.call(_marginals, (model,), more, new)
         poses, points, pairs = cut(found[:3], (graph.poses, graph.points, wanted))
@@ -87,7 +87,7 @@ def marginals(
 
 
 def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:
-    return _batched(model)((plan,), in_one_dtype(graph))
+    return _batched(model)((plan,), graph_in_one_dtype(graph))
 
 
 @functools.lru_cache(maxsize=256)
@@ -138,7 +138,7 @@ def _masked(
 
 
 def _turns(graph: Graph, width: int) -> Float[Array, "n d d B"]:
-    """∂(coordinates)/∂(increments) of each variable: R(θ) for the position of a pose."""
+    """The derivative of each variable by its increments: R(θ) for the position of a pose."""
     poses, points, batch = len(graph.poses), len(graph.points), graph.poses.shape[-1]
     unit = jnp.eye(width, dtype=graph.poses.dtype)[None, ..., None]
     every = jnp.broadcast_to(unit, (poses + points, width, width, batch))

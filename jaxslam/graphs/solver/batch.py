@@ -70,7 +70,7 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
     return single
 
 
-def in_one_dtype(graph: Graph) -> Graph:
+def graph_in_one_dtype(graph: Graph) -> Graph:
     """The graph with its numbers in one precision, the highest of them."""
     numbers = [graph.poses, graph.points]
     numbers += [x for table in graph.tables.values() for x in (table.z, table.information)]

@@ -46,7 +46,7 @@ def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solutio
 def _solved(
     plan: Plan, blocks: Float[Array, "M d d"], rhs: Float[Array, "n d"]
 ) -> Float[Array, "n d"]:
-    """A⁻¹ b, with derivatives by b."""
+    """The solution A⁻¹ b, with derivatives by b."""
 
     def times(x: Float[Array, "n d"]) -> Float[Array, "n d"]:
         below = jnp.einsum("mij,mj->mi", blocks, x[plan.block_column])

@@ -24,7 +24,7 @@ from jaxslam.math.linalg import total
 
 
 class Variables(NamedTuple):
-    """What is estimated."""
+    """The variables that are estimated, poses and points."""
 
     poses: Float[Array, "N 3 B"]
     points: Float[Array, "P L B"]
@@ -74,7 +74,7 @@ def _over_rows(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
 
 
 def squared(information: Float[Array, "E R R B"], e: Float[Array, "E R B"]) -> Float[Array, "E B"]:
-    """s = eᵀ Ω e."""
+    """The squared residual s = eᵀ Ω e of each row."""
     size = e.shape[1]
     return total(e[:, i] * information[:, i, j] * e[:, j] for i in range(size) for j in range(size))
 
@@ -91,7 +91,7 @@ def row_costs(
 def chi2_of(
     model: Model, who: Mapping[str, Array], variables: Variables, data: Data
 ) -> Float[Array, "B"]:
-    """χ²."""
+    """The cost χ² of the graph at some variables."""
     parts = []
     for name, factor in model.factors:
         rows = row_costs(

@@ -13,7 +13,7 @@ from jaxslam.graphs.solver.model import factors_of
 from jaxslam.graphs.sparse.cholesky import CholeskyTables, cholesky_tables
 from jaxslam.graphs.sparse.gathered import Stages, stages
 from jaxslam.graphs.sparse.inverse import InverseTables, inverse_tables
-from jaxslam.graphs.sparse.sweeps import index_table, room
+from jaxslam.graphs.sparse.sweeps import index_table, padded_size
 from jaxslam.graphs.sparse.symbolic import factor_pattern
 from jaxslam.validation.numbers import is_concrete
 
@@ -34,10 +34,10 @@ class Plan(NamedTuple):
     """from blocks (row, one variable, other variable) of all tables to those of the matrix"""
     gradient: Stages
     """from (row, variable) of all tables to columns"""
-    block_column: Int[Array, "room"]
-    """of the M blocks of the factor; rows beyond are of no block (`sweeps.room`)"""
-    block_row: Int[Array, "room"]
-    on_diagonal: Bool[Array, "room"]
+    block_column: Int[Array, "padded"]
+    """of the M blocks of the factor; rows beyond are of no block (`sweeps.padded_size`)"""
+    block_row: Int[Array, "padded"]
+    on_diagonal: Bool[Array, "padded"]
     cholesky: CholeskyTables
     inverse: InverseTables | None
     """None without `marginals`"""
@@ -114,7 +114,7 @@ def plan(
         blocks.append(target.ravel())
         columns.append(np.where(lost[:, None], -1, column).ravel())
     block_column, block_row = pattern.columns[order], pattern.rows[order]
-    width = room(len(order))
+    width = padded_size(len(order))
     return Plan(
         who={name: index_table(rows) for name, rows in who.items()},
         order=index_table(pattern.order),

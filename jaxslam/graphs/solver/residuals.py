@@ -15,7 +15,7 @@ from jaxslam.graphs.solver.model import factors_of
 def squared_residuals(
     graph: Graph, factors: Mapping[str, Factor] | None = None
 ) -> dict[str, Float[Array, "E"]]:
-    """eᵀ Ω e of every row of every table, 0 where a row is not valid; their sum is χ².
+    """The squared residual eᵀ Ω e of every row of every table, 0 where not valid; their sum is χ².
 
     Of a row with R residuals, at the truth and with the right Ω, it is χ² distributed with R
     degrees of freedom. factors: as for `optimize`.

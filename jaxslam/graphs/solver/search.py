@@ -170,7 +170,7 @@ def minimize(
         )
 
     def damping(search: Search, good: Array, ratio: Array) -> Array:
-        """λ after a step: less after good ones, down to none; more after refused ones.
+        """The damping λ after a step: less after good ones, down to none; more after refused ones.
 
         The first good step after a refused one leaves it as it is.
         """

@@ -26,7 +26,7 @@ class Step(NamedTuple):
 
 
 def dot(a: Float[Array, "n d B"], b: Float[Array, "n d B"]) -> Float[Array, "B"]:
-    """Σ a b over all variables."""
+    """The inner product Σ a b over all variables."""
     return (a * b).sum(axis=(0, 1))
 
 
@@ -85,7 +85,7 @@ def dogleg(plan: Plan, system: System, radius: Float[Array, "B"]) -> Step:
 
 
 def _quadratic(plan: Plan, system: System, v: Float[Array, "n d B"]) -> Float[Array, "B"]:
-    """vᵀ H v."""
+    """The quadratic form vᵀ H v."""
     one, other = v[plan.block_row], v[plan.block_column]
     width = v.shape[1]
     terms = total(

@@ -21,11 +21,11 @@ from jaxslam.graphs.sparse.sweeps import (
     level_table,
     nothing,
     padded,
+    padded_size,
+    padded_table_size,
     places,
-    room,
     subtract_products,
     sweep,
-    table_room,
 )
 from jaxslam.graphs.sparse.symbolic import Ints, Pattern
 from jaxslam.math.linalg import total
@@ -52,7 +52,7 @@ class Factored(NamedTuple):
     """A Cholesky factor L of n columns."""
 
     blocks: Float[Array, "places d d B"]
-    """`room(M)` and T + 1 more, which are zero beyond the M of the pattern"""
+    """`padded_size(M)` and T + 1 more, which are zero beyond the M of the pattern"""
     inverses: Float[Array, "n+T+1 d d B"]
     """L_jj⁻¹; the last is the identity"""
     regular: Bool[Array, "n B"]
@@ -75,7 +75,7 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
         right.append(blocks[:, other].ravel())
         target.append(pattern.find(rows[left[-1]], rows[right[-1]]))
     sums = Sums(heights[columns], *map(np.concatenate, (target, left, right)))
-    _, place = places(sums, room(len(columns)))
+    _, place = places(sums, padded_size(len(columns)))
     one = np.append(np.arange(size), nothing(size))
     factor = sweep(sums, place, place, one[np.append(columns, size)])
     # Columns are sorted by height: those of a level lie side by side.
@@ -91,7 +91,7 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
         factor,
         diagonal=index_table(place[pattern.first[:-1]]),
         pivots=level_table(np.cumsum([0, *map(len, chunks)]).tolist()),
-        pivot_base=index_table(pivot_base, table_room(len(pivot_base))),
+        pivot_base=index_table(pivot_base, padded_table_size(len(pivot_base))),
         forward=sweep(downward, place, forward_place, one),
         forward_order=index_table(forward_order),
         backward=sweep(upward, place, backward_place, one),
@@ -118,7 +118,7 @@ def _transposed_on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
     return total(a[:, m] * x[:, m, None] for m in range(a.shape[2]))
 
 
-def factorize(tables: CholeskyTables, blocks: Float[Array, "room d d B"]) -> Factored:
+def factorize(tables: CholeskyTables, blocks: Float[Array, "padded d d B"]) -> Factored:
     """The factor of a matrix, from its blocks at their places (lower triangle).
 
     A pivot that rounding may have left of zero, beside the matrix's own diagonal entry, makes its
@@ -161,7 +161,7 @@ def factorize(tables: CholeskyTables, blocks: Float[Array, "room d d B"]) -> Fac
 def _inverse_factor(
     matrix: Float[Array, "T d d B"], least: Float[Array, "T d B"]
 ) -> tuple[Float[Array, "T d d B"], Bool[Array, "T B"]]:
-    """L⁻¹ of L Lᵀ = A, and whether each pivot is above its least; as `linalg.whitener`."""
+    """The inverse factor L⁻¹, as `linalg.whitener`, and whether each pivot is above its least."""
     width = matrix.shape[1]
     zero = jnp.zeros_like(matrix[:, 0, 0])
     factor = [[zero] * width for _ in range(width)]
@@ -183,7 +183,7 @@ def _inverse_factor(
 def substitute(
     tables: CholeskyTables, factored: Factored, rhs: Float[Array, "n d B"]
 ) -> Float[Array, "n d B"]:
-    """A⁻¹ b, by columns."""
+    """The solution A⁻¹ b, by columns of the factor."""
     x = rhs
     for tables_of, order, on in (
         (tables.forward, tables.forward_order, _on_vector),

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxslam.graphs.sparse.sweeps import index_table, room
+from jaxslam.graphs.sparse.sweeps import index_table, padded_size
 
 TERMS = 4
 LEAST = 2
@@ -29,7 +29,7 @@ def stages(target: Int[np.ndarray, "rows"], size: int) -> Stages:
         rank = np.arange(len(owner)) - begin[owner]
         sums[group_begin[owner] + rank // TERMS, rank % TERMS] = numbers
         done = last and len(out) + 1 >= LEAST
-        rows = len(sums) if done else room(len(sums))
+        rows = len(sums) if done else padded_size(len(sums))
         out.append(index_table(sums, rows, absent))
         if done:
             return tuple(out)

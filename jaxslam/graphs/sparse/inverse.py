@@ -14,8 +14,8 @@ from jaxslam.graphs.sparse.sweeps import (
     finish,
     index_table,
     nothing,
+    padded_size,
     places,
-    room,
     subtract_products,
     sweep,
 )
@@ -57,7 +57,7 @@ def inverse_tables(
     # The diagonal block of a column comes after those below it, of which it is a sum.
     level = 2 * depth[columns] + (rows == columns)
     sums = Sums(level, *map(np.concatenate, (target, left, right, flip)))
-    _, place = places(sums, room(len(columns)))
+    _, place = places(sums, padded_size(len(columns)))
     end = np.append(columns, nothing(size))
     one, other = pattern.position[first], pattern.position[second]
     pairs = place[pattern.find(np.maximum(one, other), np.minimum(one, other))]

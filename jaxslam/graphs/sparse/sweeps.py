@@ -7,7 +7,7 @@ rK + K - 1 of each target that has so many. The targets of a level are sorted by
 products, so that those of a round are the first of the level and lie side by side in memory: no
 scatter is needed, and the size of the compiled program does not depend on that of the graph.
 
-Tables and arrays are longer than they need be (`room`), so that patterns of about the same size
+Tables and arrays are longer than they need be (`padded_size`), so that patterns of about one size
 share their compiled programs: rows beyond the last level are not visited.
 """
 
@@ -61,18 +61,18 @@ class Sweep(NamedTuple):
     """whether the left factor is transposed"""
 
 
-def room(size: int, least: int = 64, parts: int = 8) -> int:
+def padded_size(size: int, least: int = 64, parts: int = 8) -> int:
     """The next size of a coarser series: multiples of `least`, and of the parts of an octave.
 
-    A size of the series is its own room, and so is zero.
+    A size of the series stays as it is, and so does zero.
     """
     step = max(least, (1 << max(size.bit_length() - 1, 0)) // parts)
     return -(-size // step) * step
 
 
-def table_room(size: int) -> int:
-    """The room of a table, whose rows beyond its size cost memory alone."""
-    return room(size, parts=2)
+def padded_table_size(size: int) -> int:
+    """The padded size of a table, whose rows beyond its size cost memory alone."""
+    return padded_size(size, parts=2)
 
 
 def index_table(numbers: np.ndarray, size: int | None = None, fill: int = 0) -> Array:
@@ -86,7 +86,7 @@ def index_table(numbers: np.ndarray, size: int | None = None, fill: int = 0) -> 
 
 def level_table(ends: Sequence[int]) -> Array:
     """The end of each level, from 0, as a table."""
-    return index_table(np.array(ends), table_room(len(ends)))
+    return index_table(np.array(ends), padded_table_size(len(ends)))
 
 
 def places(sums: Sums, size: int) -> tuple[Ints, Ints]:
@@ -145,7 +145,7 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
     end_place = np.array(end_base, int)[:, None] + np.arange(TARGETS)
     inside = end_place < np.repeat(first[1:], np.diff(ends))[:, None]
     ending = order[np.minimum(end_place, size - 1)]
-    width = table_room(len(bases))
+    width = padded_table_size(len(bases))
 
     def factors(numbers: Ints, place: Ints) -> Array:
         numbers = np.append(numbers, 0)[product]
@@ -158,8 +158,10 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
         factors(sums.left, left),
         factors(sums.right, right),
         level_table(ends),
-        index_table(np.array(end_base, int), table_room(len(end_base))),
-        index_table(end[np.where(inside, ending, -1)], table_room(len(end_base)), int(end[-1])),
+        index_table(np.array(end_base, int), padded_table_size(len(end_base))),
+        index_table(
+            end[np.where(inside, ending, -1)], padded_table_size(len(end_base)), int(end[-1])
+        ),
         None if sums.flip is None else index_table(np.append(sums.flip, False)[product], width),
     )
 

@@ -138,7 +138,7 @@ def _least_squares(a: csc_array, b: np.ndarray) -> np.ndarray:
 
 
 def _solve(matrix: csc_array, right: np.ndarray) -> np.ndarray:
-    """matrix⁻¹ right of a sparse positive definite matrix."""
+    """The solution matrix⁻¹ right of a sparse positive definite matrix."""
     if matrix.shape[0] == 0:
         return np.zeros(0)
     try:

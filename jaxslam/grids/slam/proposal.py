@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxslam.math import roots
+from jaxslam.math import linalg
 from jaxslam.protocols import Motion
 
 LogDensity = Callable[[Array], Array]
@@ -16,7 +16,7 @@ LogDensity = Callable[[Array], Array]
 
 
 def climbed(target: LogDensity, start: Float[Array, "W"], iterations: int) -> Float[Array, "W"]:
-    """A local maximum of a function of W numbers, by pattern search.
+    """The place of a local maximum of a function of W numbers, by pattern search.
 
     Steps of ±s along each axis, the best of which is taken; s, at first 1, is halved where none is
     better (Hooke & Jeeves 1961). So no derivative is needed: a likelihood in a grid has many kinks.
@@ -73,7 +73,7 @@ def propose(
         candidates: K, even. spread: σ [m] and τ [rad].
     """
     size = len(motion.noises)
-    root = roots.root_psd(motion.noise_cov(pose, control))
+    root = linalg.root_psd(motion.noise_cov(pose, control))
 
     def moved(n: Array) -> Array:
         return motion.step(pose, control, root @ n)

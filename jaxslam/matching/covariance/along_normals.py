@@ -9,7 +9,7 @@ from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
     inverse_of,
-    of_prior,
+    own_prior_information,
     stated,
 )
 from jaxslam.matching.matcher import Matcher
@@ -21,7 +21,7 @@ from jaxslam.validation.numbers import check_positive
 
 
 def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> MatchCovariance:
-    """A⁻¹ B A⁻¹ with A = Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), and B the noise that reaches Σ w J e.
+    """The covariance A⁻¹ B A⁻¹, A = Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), B the noise of Σ w J e.
 
     A scan that slides along a wall finds other partners, so that the part of a residual along the
     wall says nothing: the second derivative of point-to-point with its pairs kept counts it as
@@ -61,8 +61,8 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
         of_partner = jax.ops.segment_sum(weight[:, None] * jacobian, j, len(reference.valid))
         by_reference = (lines.normal * reference.ray).sum(axis=1)[:, None] * of_partner
         noise = by_scan.T @ by_scan + by_reference.T @ by_reference
-        shape = shape + of_prior(found)
+        shape = shape + own_prior_information(found)
         gain = inverse_of(shape, shape, sigma=sigma)
-        return jnp.asarray(sigma) ** 2 * gain @ (noise + of_prior(found)) @ gain
+        return jnp.asarray(sigma) ** 2 * gain @ (noise + own_prior_information(found)) @ gain
 
     return stated("along_normals", of, sigma)

@@ -8,14 +8,14 @@ from jaxslam.matching.covariance.record import (
     MatchedScans,
     curvature,
     inverse_of,
-    of_prior,
+    own_prior_information,
     stated,
 )
 from jaxslam.matching.matcher import Matcher
 
 
 def hessian() -> MatchCovariance:
-    """s² (∂²E/∂x²)⁻¹ with E = ½ Σ w e² and s² = 2E/(n - 3) of n pairs; 2E/n with a prior.
+    """The covariance s² (∂²E/∂x²)⁻¹, E = ½ Σ w e², s² = 2E/(n - 3) of n pairs; 2E/n with a prior.
 
     Right for independent residuals of one variance that the pairs do not follow. Two scans of
     different density, and pairs that change with the pose, break that.
@@ -29,6 +29,6 @@ def hessian() -> MatchCovariance:
         free = (found.weight > 0).sum() - (3 if found.prior is None else 0)
         least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(free, 1)
         shape = curvature(matcher, prepared, points, found)
-        return least * inverse_of(shape, found.information + of_prior(found))
+        return least * inverse_of(shape, found.information + own_prior_information(found))
 
     return stated("hessian", of)

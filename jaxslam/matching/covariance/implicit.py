@@ -10,7 +10,7 @@ from jaxslam.matching.covariance.record import (
     MatchedScans,
     curvature,
     inverse_of,
-    of_prior,
+    own_prior_information,
     range_count,
     stated,
     with_ranges,
@@ -21,7 +21,7 @@ from jaxslam.validation.numbers import check_positive
 
 
 def implicit(sigma: ArrayLike) -> MatchCovariance:
-    """(∂²E/∂x²)⁻¹ (∂²E/∂z∂x) σ² (∂²E/∂z∂x)ᵀ (∂²E/∂x²)⁻¹ with the ranges z of both scans.
+    """The covariance A⁻¹ B σ² Bᵀ A⁻¹, A = ∂²E/∂x², B = ∂²E/∂x∂z, with the ranges z of both scans.
 
     From ∂E/∂x = 0 at the minimum: dx/dz = -(∂²E/∂x²)⁻¹ ∂²E/∂z∂x. The derivatives are those of the
     matcher's cost by automatic differentiation, through the lines that are fitted to the reference;
@@ -54,8 +54,8 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
         zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)
         by_ranges = jnp.concatenate(jax.jacrev(slope, argnums=(0, 1))(*zeros), axis=1)
         shape = curvature(matcher, prepared, points, found)
-        gain = inverse_of(shape, found.information + of_prior(found), sigma=sigma)
-        noise = by_ranges @ by_ranges.T + of_prior(found)
+        gain = inverse_of(shape, found.information + own_prior_information(found), sigma=sigma)
+        noise = by_ranges @ by_ranges.T + own_prior_information(found)
         return jnp.asarray(sigma) ** 2 * gain @ noise @ gain.T
 
     return stated("implicit", of, sigma)

@@ -11,7 +11,7 @@ from jaxslam.matching.covariance.record import (
     MatchedScans,
     curvature,
     inverse_of,
-    of_prior,
+    own_prior_information,
     stated,
 )
 from jaxslam.matching.matcher import Matcher
@@ -53,7 +53,9 @@ def lattice(
         bound = jnp.diag(jnp.asarray(prior, dtype))
         variance = jnp.asarray(sigma) ** 2
         shape = curvature(matcher, prepared, points, found) / variance + bound
-        peak = inverse_of(shape, (found.information + of_prior(found)) / variance + bound)
+        peak = inverse_of(
+            shape, (found.information + own_prior_information(found)) / variance + bound
+        )
         root = linalg.cholesky(peak)[0]
         offset = jnp.asarray(grid, dtype) @ root.T
 

@@ -55,7 +55,7 @@ def stated(
         found = scans.found
         nothing = jnp.zeros_like(found.information)
         scale = jnp.asarray(1.0 if sigma is None else sigma, nothing.dtype)
-        known = nothing if sigma is None else of_prior(found)
+        known = nothing if sigma is None else own_prior_information(found)
         unknown = scale**2 * inverse_of(known, nothing, sigma=scale)
         return jnp.where(found.status >= MatchStatus.UNLIKE, unknown, of(matcher, scans))
 
@@ -108,13 +108,13 @@ def inverse_of(
 
 
 def curvature(matcher: Matcher, prepared: PyTree, points: Points, found: Match) -> Array:
-    """∂²E/∂x² (3, 3) of the matcher's cost at the pose, pairs and weights kept."""
+    """The curvature ∂²E/∂x² (3, 3) of the matcher's cost at the pose, pairs and weights kept."""
     by_pose = jax.hessian(lambda pose: matcher.cost(prepared, points, pose, found))
     return jnp.asarray(by_pose(found.pose))
 
 
-def of_prior(found: Match) -> Float[Array, "3 3"]:
-    """Λ of the prior of a match, zeros without one: σ² Λ is the noise of the cost's slope by it."""
+def own_prior_information(found: Match) -> Float[Array, "3 3"]:
+    """The information Λ of a match's prior, or zeros; σ² Λ is its noise in the cost's slope."""
     return prior_information(found.prior, found.information)
 
 

@@ -15,13 +15,13 @@ from jaxslam.matching.covariance.record import (
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.validation.numbers import check_count, check_covariance, check_positive
 
 
 def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
-    """What six starts around the start lead to, plus `implicit` of the noise of the ranges.
+    """The covariance of what six starts lead to, plus `implicit` of the noise of the ranges.
 
     The starts are start ± √3 L_k, L Lᵀ = start_cov, with weights 1/6 each: Σ (x_k - x̂)(x_k - x̂)ᵀ/6.
     It sees wrong minima and directions that the scans do not determine, where a match stays as far
@@ -37,7 +37,7 @@ def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:
 
     def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, found, start, _ = scans
-        root = roots.root_psd(jnp.asarray(start_cov, start.dtype))
+        root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
         sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
         prepared = matcher.prepare(reference)
         ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off, found.prior).pose)(
@@ -67,7 +67,7 @@ def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> Match
 
     def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, found, start, key = scans
-        root = roots.root_psd(jnp.asarray(start_cov, start.dtype))
+        root = linalg.root_psd(jnp.asarray(start_cov, start.dtype))
 
         def one(key: Array) -> Array:
             key_reference, key_scan, key_start, key_prior = jax.random.split(key, 4)
@@ -95,7 +95,7 @@ def sampling(sigma: ArrayLike, start_cov: ArrayLike, samples: int = 30) -> Match
 
 
 def _inverse_root(information: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Wᵀ with WᵀW = Λ⁻¹; of a share 1e-6 of the trace along what Λ does not determine."""
+    """The root Wᵀ with WᵀW = Λ⁻¹; of a share 1e-6 of the trace along what Λ does not determine."""
     floor = 1e-6 * jnp.trace(information)
     floor = jnp.where(floor > 0, floor, 1.0) * jnp.eye(3, dtype=information.dtype)
     return linalg.whitener(linalg.symmetrize(information) + floor)[0].T

@@ -14,7 +14,7 @@ _NEWTON = 12
 
 
 class Quadratic(NamedTuple):
-    """tᵀ A t + 2 tᵀ B r + rᵀ D r - 2 aᵀ t - 2 dᵀ r of a shift t and r = (cos θ, sin θ)."""
+    """A cost tᵀ A t + 2 tᵀ B r + rᵀ D r - 2 aᵀ t - 2 dᵀ r of a shift t and r = (cos θ, sin θ)."""
 
     shift: Float[Array, "2 2"]
     """A"""
@@ -36,7 +36,7 @@ def added(first: Quadratic, second: Quadratic) -> Quadratic:
 def of_points(
     source: Float[Array, "N 2"], target: Float[Array, "N 2"], weight: Float[Array, "N"]
 ) -> Quadratic:
-    """Σ w |R s + t - q|²."""
+    """The cost Σ w |R s + t - q|² of pairs of points."""
     weighted = weight[:, None] * source
     x, y = weighted.sum(axis=0)
     eye = jnp.eye(2, dtype=source.dtype)
@@ -58,7 +58,7 @@ def of_lines(
     normal: Float[Array, "N 2"],
     weight: Float[Array, "N"],
 ) -> Quadratic:
-    """Σ w (n·(R s + t - q))².
+    """The cost Σ w (n·(R s + t - q))² of points and lines.
 
     The residual is linear in (t, r): n·t + a·r - b, a = (n·s, n × s) as n_x s_x + n_y s_y and
     n_y s_x - n_x s_y, b = n·q.
@@ -77,7 +77,7 @@ def of_lines(
 
 
 def of_prior(prior: Prior, pose: Float[Array, "3"], middle: Float[Array, "2"]) -> Quadratic:
-    """eᵀ Λ e of the error after a motion (t, r) about a middle of a pose (p, θ).
+    """The cost eᵀ Λ e of the error after a motion (t, r) about a middle of a pose (p, θ).
 
     e = (R (p - m) + t + m - p₀, (θ - θ₀) cos δ + sin δ), δ the motion's angle. The last equals
     θ + δ - θ₀ and has its slope where δ = 0, so that the minimum is exact where a pose stays.

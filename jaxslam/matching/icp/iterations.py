@@ -85,7 +85,7 @@ class PairedPoints(NamedTuple):
 
 
 class Metric(NamedTuple):
-    """What an ICP minimizes."""
+    """The cost that an ICP minimizes: its residuals, its pairs and its quadratic form."""
 
     residual: Callable[[Surface, Array, Array], Array]
     """(surface, moved points, partners) -> (N,) [m]"""
@@ -184,7 +184,7 @@ def about(information: Float[Array, "3 3"], arm: Float[Array, "2"]) -> Float[Arr
 def _information(
     of: Surface, at: PairedPoints, pivot: Float[Array, "2"], lone: float
 ) -> Float[Array, "3 3"]:
-    """Σ w J Jᵀ turned about the pivot: of the lines of partners, and of those that have none."""
+    """The information Σ w J Jᵀ about the pivot, of partners with a line and of those without."""
     j, arm = at.partner, at.moved - pivot[None]
     straight = of.straight[j]
     by_lines = information_along(of.normal[j], of.tilt[j], arm, jnp.where(straight, at.weight, 0.0))

@@ -19,8 +19,9 @@ def divergence_limit(
     world: tuple[Truth, Log],
     bound: Mapping[str, Float[np.ndarray, "B T"]] | None = None,
 ) -> Float[np.ndarray, ""]:
-    """5 σ [m] of the ideal spread of run 0's last position, or, in a world without noise, what
-    rounding can do.
+    """The limit of divergence: 5 σ [m] of the ideal spread of run 0's last position.
+
+    In a world without noise it is what rounding can do.
 
     Args:
         which, world: of the block whose first run is run 0, on the devices.

@@ -35,7 +35,7 @@ class CampaignPlan:
 
     @property
     def wide(self) -> int:
-        """B, the runs of a block: those of all devices."""
+        """The number B of runs of a block, those of all devices."""
         return self.block * len(self.devices)
 
     @property

@@ -114,7 +114,7 @@ class _Compiling(NamedTuple):
             self._statistics(*before, world)
 
     def limit(self, world: World) -> Future[Program]:
-        """Start what the divergence limit comes from; the promise of it."""
+        """Start the program of the divergence limit; returns its future."""
         plan, promises = self.plan, self.promises
         if plan.limit_by_bound:
             bound = partial(bound_variances, plan.scenario)

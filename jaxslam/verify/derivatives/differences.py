@@ -37,7 +37,7 @@ def quotients(
     periods: Float[np.ndarray, "m"],
     halvings: int = _HALVINGS,
 ) -> Quotient:
-    """∂f/∂argument at S states: central differences with Richardson's extrapolation.
+    """The derivative ∂f/∂argument at S states: central differences with Richardson's extrapolation.
 
     Steps h = ¼, ⅛, … are extrapolated to h → 0 (orders 2, 4, …, as in Ridders 1982); of all entries
     of the tableau the one with the least estimated error is kept. The estimate is the change from
@@ -113,7 +113,7 @@ def modulo_periods(
 def complex_step(
     function: Batch, arguments: tuple[Values, ...], which: int, step: float = 1e-30
 ) -> Float[np.ndarray, "S m n"]:
-    """∂f/∂argument as Im f(x + ih)/h, without cancellation (Squire & Trapp 1998).
+    """The derivative ∂f/∂argument as Im f(x + ih)/h, without cancellation (Squire & Trapp 1998).
 
     Right only for a function that is analytic and takes complex numbers.
     """

@@ -7,6 +7,7 @@ import pytest
 
 from jaxslam import catalog, scenarios
 from jaxslam.charts import euclidean
+from jaxslam.filters.information.in_pieces import in_pieces
 from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Filter
 from jaxslam.types import Scan
@@ -33,7 +34,7 @@ def test_a_scan_in_pieces_loses_and_moves_nothing():
         info = nothing_of(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
         return state + jnp.where(scan.valid, scan.z[:, 0], 0.0).sum(), info
 
-    seen = catalog.in_pieces(
+    seen = in_pieces(
         Filter("toy", 3, 2, lambda p, c: p[0], lambda s, u, k: s, update, lambda s: s, euclidean()),
         3,
     )

@@ -103,11 +103,11 @@ class LinearizedSteps:
     """(S, scan, key) -> S, info, system."""
 
     def predict(self, state: PyTree, u: Array, key: Array) -> PyTree:
-        """`Filter.predict`."""
+        """The prediction step, as `Filter.predict`."""
         return self.predict_linearized(state, u, key)[0]
 
     def update(self, state: PyTree, scan: Scan, key: Array) -> tuple[PyTree, Info]:
-        """`Filter.update`."""
+        """The update with a scan, as `Filter.update`."""
         return self.update_linearized(state, scan, key)[:2]
 
 

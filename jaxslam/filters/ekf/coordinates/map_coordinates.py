@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxslam.filters.ekf.coordinates.linear_system import Transition
 from jaxslam.filters.ekf.coordinates.to_points import seen_as
 from jaxslam.filters.ekf.steps.predict import moved_cov
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate
@@ -62,7 +62,7 @@ def estimate_of(
 def cov_of_coordinates(
     joint: Joint, chart: Chart, *, square_root: bool = False
 ) -> Float[Array, "D D"]:
-    """E P Eᵀ (D, D) with E the chart's basis at the estimate, block lower triangular; O(N²)."""
+    """The covariance E P Eᵀ (D, D) of coordinates, E the chart's basis at the estimate; O(N²)."""
     cov = joint.cov @ joint.cov.T if square_root else joint.cov
     if chart.basis is None:
         return cov
@@ -90,7 +90,7 @@ def with_cov_of_coordinates(
             landmark = jnp.where(alive, landmark, jnp.eye(cross.shape[1], dtype=cov.dtype)[None])
         cross = jnp.where(alive, cross, 0.0)
         cov = moved_cov(cov, Transition(undo, cross, landmark, undo, None), None)
-    return joint._replace(cov=roots.root_psd(cov) if square_root else cov)
+    return joint._replace(cov=linalg.root_psd(cov) if square_root else cov)
 
 
 def retracted(

@@ -26,7 +26,7 @@ def lever_of_motion(joint: Joint, chart: Chart) -> Float[Array, "D 3"]:
 
 
 def lever_by(moved: Transition, frame: Float[Array, ""]) -> Float[Array, "D 3"]:
-    """g, from a transition to the current chart and the heading before the last motion."""
+    """The Jacobian g, by a transition to the current chart and the heading before the motion."""
     assert moved.cross_noise is not None
     size = 3 + moved.cross_noise[..., 0].size
     return linalg.matmul(moved.lift(size), out_of(frame))

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
 from jaxslam.filters.ekf.coordinates.linear_system import Transition
-from jaxslam.math import linalg, roots
+from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Sensor
 from jaxslam.slots import Joint
@@ -82,7 +82,7 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
     )
     unit = jnp.diag(padding.astype(points.dtype))
     if square_root:
-        cov = roots.triangular_root(jnp.concatenate([turned(joint.cov), unit], axis=1))
+        cov = linalg.triangular_root(jnp.concatenate([turned(joint.cov), unit], axis=1))
     else:
         cov = linalg.symmetrize(turned(turned(joint.cov).T)) + unit
     # Exactly the same for a run that gets here only because of another run of the batch.

@@ -229,7 +229,7 @@ def _split_rows(
 def _project(
     rows: Float[Array, "m Z C"], view: View, joint: Joint, settings: EkfSettings
 ) -> tuple[Float[Array, "m Z D"], Float[Array, "m Z D"]]:
-    """H X and H P of a square-root filter; else H P twice."""
+    """The products H X and H P of a square-root filter; else H P twice."""
     hp = hx = no_inline(seen_rows, rows, view.robot, view.own)
     if settings.square_root:
         m, size_z = rows.shape[:2]
@@ -282,7 +282,7 @@ def _report(
 def seen_rows(
     rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], own: Float[Array, "m L D"]
 ) -> Float[Array, "m Z D"]:
-    """H P from the blocks of H, first by rows, and P of the robot and the landmarks seen."""
+    """The product H P from the blocks of H, by rows, and P of the robot and the landmarks seen."""
     terms = [rows[:, :, k, None] * robot[None, None, k] for k in range(3)]
     terms += [rows[:, :, 3 + k, None] * own[:, None, k] for k in range(own.shape[1])]
     return linalg.total(terms)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam import slots
 from jaxslam.filters.ekf.coordinates.linear_system import Transition
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.math import linalg, roots, se2
+from jaxslam.math import linalg, se2
 from jaxslam.math.xla import materialize
 from jaxslam.protocols import Basis, Here, Motion
 from jaxslam.slots import Joint, Last
@@ -36,7 +36,7 @@ def propagate(
     if square_root:
         size = joint.cov.shape[0]
         added = moved.lift(size) @ linalg.cholesky(noise)[0]
-        cov = roots.triangular_root(jnp.concatenate([moved.times(joint.cov), added], axis=1))
+        cov = linalg.triangular_root(jnp.concatenate([moved.times(joint.cov), added], axis=1))
     else:
         cov = moved_cov(joint.cov, moved, noise)
     last = joint.last
@@ -73,7 +73,7 @@ def moved_cov(
     noise: Float[Array, "3 3"] | None,
     shared: tuple[Float[Array, "k D"], Float[Array, "k D"]] | None = None,
 ) -> Float[Array, "D D"]:
-    """A P Aᵀ + G N Gᵀ, each entry of P written once or twice.
+    """The predicted covariance A P Aᵀ + G N Gᵀ, each entry of P written once or twice.
 
     shared: two matrices, of which Sᵀ T + Tᵀ S is added; in another chart than the Euclidean.
     """

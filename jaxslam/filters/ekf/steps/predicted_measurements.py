@@ -21,7 +21,7 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
     def jacobians() -> tuple[
         Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z L"], Float[Array, "N Z Z"]
     ]:
-        """ẑ, H by errors of pose and landmark, H P Hᵀ of each alone."""
+        """The predicted ẑ, H by errors of pose and landmark, and H P Hᵀ, of each landmark alone."""
         every = jnp.arange(capacity)
         robot, cross, own = materialize(_blocks(joint, square_root))
         top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
@@ -63,7 +63,7 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
 def _blocks(
     joint: Joint, square_root: bool
 ) -> tuple[Float[Array, "3 3"], Float[Array, "N 3 L"], Float[Array, "N L L"]]:
-    """P of the robot, of it with each landmark, and of each landmark."""
+    """The blocks of P: of the robot, of it with each landmark, and of each landmark."""
     capacity, size = joint.landmarks.shape
     if square_root:
         robot, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size, -1)
@@ -104,7 +104,7 @@ def projected_cov(
     slot: Int[Array, "m"],
     capacity: int,
 ) -> Float[Array, "m Z m Z"]:
-    """H P Hᵀ of H P: only the robot's and the seen landmarks' columns."""
+    """The covariance H P Hᵀ of predicted measurements, from the columns of H P that H meets."""
     m, size_z, size_l = by_landmark.shape
     own = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
     if size_l == 0:

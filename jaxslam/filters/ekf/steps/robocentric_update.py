@@ -46,12 +46,14 @@ class Composition(NamedTuple):
     """g"""
 
     def times(self, rows: Float[Array, "E k"]) -> Float[Array, "D k"]:
-        """[T g] times rows, E = D + 3."""
+        """The product of [T g] with rows, E = D + 3."""
         return self.moved.times(rows[:-3]) + linalg.matmul(self.lever, rows[-3:])
 
 
 def separate_motion(joint: Joint, chart: Chart, columns: int) -> MapAndMotion:
-    """x = e - g δ: cov(x) = P - g C - (g C)ᵀ + g Q gᵀ, C = cov(δ, e), Q = cov(δ).
+    """The state x = e - g δ without the last motion: cov(x) = P - g C - (g C)ᵀ + g Q gᵀ.
+
+    C = cov(δ, e) and Q = cov(δ).
 
     columns: of the P of (x, δ), D + 3 or more; what is beyond is zero.
     """

@@ -83,7 +83,7 @@ def turns_of(sensor: Sensor, settings: EkfSettings) -> list[SensorTurn]:
 
 
 def turn_of(part: Part, size: int, settings: EkfSettings) -> SensorTurn:
-    """The turn of one sensor of a suite, for landmarks of `size` numbers."""
+    """The part of a scan's update that is one sensor's, for landmarks of `size` numbers."""
     sensor = on_ground(part.sensor, size)
     return SensorTurn(
         part.places, dataclasses.replace(settings, sensor=sensor, absolute=part.absolute)

@@ -59,7 +59,7 @@ def correct(
 def _corrected_cov(
     cov: Float[Array, "D D"], found: Innovation, form: Covariance
 ) -> Float[Array, "D D"]:
-    """P, or its root X, after the correction."""
+    """The covariance P, or its root X, after the correction."""
     v, factor, noise = found.v, found.factor, found.noise
     m, size_z = noise.shape[:2]
     if form == "plain":
@@ -111,7 +111,7 @@ def _joseph(
     factor: Float[Array, "K K"],
     v: Float[Array, "K D"],
 ) -> Float[Array, "D D"]:
-    """(I - KH) P (I - KH)ᵀ + K R Kᵀ from H P, in O(D²): the left factor first, then the right."""
+    """Joseph's form (I - KH) P (I - KH)ᵀ + K R Kᵀ from H P, in O(D²): left factor, then right."""
     rows = hp.shape[0]
     gain = linalg.solve_lower(factor[::-1, ::-1].T, v[::-1])[::-1].T
     noise = noise.reshape(rows, rows)

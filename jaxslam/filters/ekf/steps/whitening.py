@@ -53,7 +53,7 @@ def whiten(
     hp: Float[Array, "K D"],
     nu: Float[Array, "m Z"],
 ) -> tuple[Float[Array, "K D"], Float[Array, "K"]]:
-    """V = L⁻¹ H P and L⁻¹ ν, zero for measurements that are not fused."""
+    """The whitened rows V = L⁻¹ H P and innovations L⁻¹ ν, zero for what is not fused."""
     if len(fuse) == 1:
         inverse = jnp.where((fuse & factored.regular)[:, None, None], factored.inverse, 0.0)
         return no_inline(_multiplied, inverse, hp, nu)
@@ -65,7 +65,7 @@ def whiten(
 def _solved(
     factor: Float[Array, "KK"], hp: Float[Array, "K D"], nu: Float[Array, "K"]
 ) -> tuple[Float[Array, "K D"], Float[Array, "K"]]:
-    """L⁻¹ H P and L⁻¹ ν by substitution."""
+    """The whitened L⁻¹ H P and L⁻¹ ν by substitution."""
     factor = factor.reshape(len(nu), len(nu))
     both = linalg.solve_lower(factor, jnp.concatenate([hp, nu[:, None]], axis=1))
     return both[:, :-1], both[:, -1]
@@ -74,7 +74,7 @@ def _solved(
 def _multiplied(
     inverse: Float[Array, "1 Z Z"], hp: Float[Array, "Z D"], nu: Float[Array, "1 Z"]
 ) -> tuple[Float[Array, "Z D"], Float[Array, "Z"]]:
-    """L⁻¹ H P and L⁻¹ ν of one measurement, by L⁻¹."""
+    """The whitened L⁻¹ H P and L⁻¹ ν of one measurement, by L⁻¹."""
     return whitened_by(inverse, hp[None])[0], whitened_by(inverse, nu[:, :, None]).reshape(-1)
 
 
@@ -82,6 +82,6 @@ def _multiplied(
 def whitened_by(
     inverse: Float[Array, "m Z Z"], rhs: Float[Array, "m Z k"]
 ) -> Float[Array, "m Z k"]:
-    """L⁻¹ B of each measurement."""
+    """The whitened rows L⁻¹ B of each measurement."""
     each = range(inverse.shape[1])
     return linalg.total(inverse[:, :, k, None] * rhs[:, k, None] for k in each)

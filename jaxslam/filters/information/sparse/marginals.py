@@ -19,7 +19,7 @@ from jaxslam.math import linalg
 
 
 def local_information(state: SparseState, slot: Int[Array, "B"]) -> Float[Array, "D D"]:
-    """Ω of the robot and the landmarks of these slots, D = 3 + 2B; N for none, no slot twice."""
+    """The information Ω of the robot and these slots, D = 3 + 2B; N for none, no slot twice."""
     n, count = state.alive.shape[0], slot.shape[0]
     present = slot < n
     rows = state.neighbours.at[slot].get(mode="fill", fill_value=n)
@@ -43,7 +43,7 @@ def local_information(state: SparseState, slot: Int[Array, "B"]) -> Float[Array,
 
 
 def blanket_cov(state: SparseState, slot: Int[Array, ""]) -> Float[Array, "5 5"]:
-    """P of the robot and the landmark of a slot, given all landmarks outside their Markov blankets.
+    """The covariance of the robot and a slot, given all landmarks outside their Markov blankets.
 
     The blankets are the active landmarks and those of the landmark's list: a matrix of 3 + 2(1 + A
     + K) is factored, whatever N.
@@ -58,7 +58,7 @@ def blanket_cov(state: SparseState, slot: Int[Array, ""]) -> Float[Array, "5 5"]
 
 
 def blanket_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Array, "N 2 2"]]:
-    """P of the robot and of each landmark, given all landmarks outside their Markov blankets."""
+    """Covariances of the robot and of each landmark, given all outside their Markov blankets."""
     omega = state.omega
     eye = jnp.eye(omega.shape[0], 3, dtype=omega.dtype)
     pose_cov = linalg.symmetrize(linalg.solve_psd(omega, eye)[0][:3])
@@ -67,7 +67,7 @@ def blanket_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Ar
 
 
 def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Array, "N 2 2"]]:
-    """P of the robot and of each landmark by inverting the whole Ω, O(N³)."""
+    """Covariances of the robot and of each landmark by inverting the whole Ω, O(N³)."""
     count = state.alive.shape[0]
     omega = local_information(state, jnp.arange(count, dtype=jnp.int32))
     cov = linalg.inverse_psd(omega)
@@ -77,7 +77,7 @@ def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Arra
 
 
 def whole_information(state: SparseState) -> scipy.sparse.csc_array:
-    """Ω of robot and all N landmarks, (3 + 2N, 3 + 2N); not traceable."""
+    """The whole Ω (3 + 2N, 3 + 2N), of robot and all N landmarks; not traceable."""
     active = np.asarray(state.active)
     n, index = len(state.alive), np.flatnonzero(active < len(state.alive))
     slot, passive = active[index], np.setdiff1d(np.arange(n), active)

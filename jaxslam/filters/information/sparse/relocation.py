@@ -101,7 +101,7 @@ def runs_out(
 def marginalize_pose(
     omega: Float[Array, "D D"], residual: Float[Array, "D"]
 ) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
-    """Ω and ρ after the robot's pose is marginalized out, its rows then zero."""
+    """The information Ω and ρ after the robot's pose is marginalized out, its rows then zero."""
     factor = linalg.cholesky(omega[:3, :3])[0]
     half = linalg.solve_lower(factor, omega[:3])
     rest = jnp.arange(len(residual)) >= 3

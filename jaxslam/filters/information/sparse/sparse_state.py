@@ -97,7 +97,7 @@ def active_means(state: SparseState) -> Float[Array, "A 2"]:
 
 
 def active_residual(state: SparseState) -> Float[Array, "D"]:
-    """ρ of the robot and the active landmarks."""
+    """The information residual ρ of the robot and the active landmarks."""
     own = state.landmark_residual.at[state.active].get(mode="fill", fill_value=0)
     return jnp.concatenate([state.pose_residual, own.reshape(-1)])
 

@@ -73,7 +73,7 @@ def cut_robot_links(state: SparseState, leaving: Bool[Array, "A"]) -> SparseStat
 def psd_completion(
     link: Float[Array, "2 2"],
 ) -> tuple[Float[Array, "2 2"], Float[Array, "2 2"]]:
-    """(B Bᵀ)^½ and (Bᵀ B)^½ of a link B: the least U, V with [[U, B], [Bᵀ, V]] ⪰ 0.
+    """The least U, V with [[U, B], [Bᵀ, V]] ⪰ 0 for a link B: (B Bᵀ)^½ and (Bᵀ B)^½.
 
     The square root of a 2×2 matrix M is (M + √|M| I)/√(tr M + 2 √|M|), and √|B Bᵀ| = |det B|.
     """

@@ -95,7 +95,7 @@ def run_errors_figure(
 
 
 def _errors(estimate: Estimate, truth: Truth, n_sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """(T, 3) truth minus estimate, and n σ, in metres and degrees."""
+    """The errors (T, 3), truth minus estimate, and n σ, in metres and degrees."""
     error = np.asarray(truth.pose) - np.asarray(estimate.pose)
     error[:, 2] = np.mod(error[:, 2] + np.pi, 2 * np.pi) - np.pi
     variance = np.diagonal(np.asarray(estimate.pose_cov), axis1=1, axis2=2)

@@ -43,7 +43,7 @@ _solve = _one_by_one_on_cpu(partial(jax.scipy.linalg.solve_triangular, lower=Tru
 
 
 def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
-    """L⁻¹ B of a regular lower L (n, n) and B (n, k)."""
+    """The solution L⁻¹ B of a regular lower L (n, n) and B (n, k)."""
 
     def solve(_: PyTree, b: jax.Array) -> jax.Array:
         return _solve(factor, b)
@@ -60,7 +60,7 @@ def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
 
 @jax.custom_jvp
 def inverse(matrix: jax.Array) -> jax.Array:
-    """A⁻¹ of a regular (n, n) matrix."""
+    """The inverse of a regular (n, n) matrix."""
     one = jax.custom_batching.sequential_vmap(lambda matrix: jnp.linalg.inv(matrix))
     return jnp.asarray(one(matrix))
 

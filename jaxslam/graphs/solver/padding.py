@@ -1,4 +1,4 @@
-"""Graphs filled up to sizes that recur, so that graphs of about one size share their programs.
+"""Graphs padded to sizes that recur, so that graphs of about one size share their programs.
 
 A program is compiled for the sizes of its arrays. Those of a graph are the numbers of poses, points
 and rows, which differ from log to log and from round to round of loop closing.
@@ -12,7 +12,7 @@ from jaxtyping import Int, PyTree
 
 from jaxslam import programs
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.graphs.sparse.sweeps import room
+from jaxslam.graphs.sparse.sweeps import padded_size
 
 _T = TypeVar("_T")
 
@@ -20,7 +20,7 @@ LEAST = 16
 """The step of the sizes of small graphs."""
 
 
-def filled(graph: Graph) -> Graph:
+def padded(graph: Graph) -> Graph:
     """The graph with more poses and points, which are fixed, and rows, which are not valid.
 
     For concrete graphs: its arrays are NumPy's. The rows are of variable -1, which is nowhere, so
@@ -29,7 +29,7 @@ def filled(graph: Graph) -> Graph:
 
     def more(x: PyTree, value: float = 0) -> np.ndarray:
         x = np.asarray(x)
-        rows = [(0, room(len(x), LEAST) - len(x))] + [(0, 0)] * (x.ndim - 1)
+        rows = [(0, padded_size(len(x), LEAST) - len(x))] + [(0, 0)] * (x.ndim - 1)
         return np.pad(x, rows, constant_values=value)
 
     return Graph(
@@ -46,16 +46,16 @@ def filled(graph: Graph) -> Graph:
     )
 
 
-def filled_number(
+def padded_number(
     variables: Int[np.ndarray, "*shape"], graph: Graph, more: Graph
 ) -> Int[np.ndarray, "*shape"]:
-    """The numbers in the filled graph of a graph's variables, points counted on from the poses."""
+    """The numbers in the padded graph of a graph's variables, points counted on from the poses."""
     shift = len(more.poses) - len(graph.poses)
     return np.where(variables >= len(graph.poses), variables + shift, variables)
 
 
 def own_number(variable: jax.Array, graph: Graph, more: Graph) -> jax.Array:
-    """The number of a variable in the graph, by that in the filled one."""
+    """The number of a variable in the graph, by that in the padded one."""
     count, number = len(more.poses), np.asarray(variable)
     return programs.on_device(number - (count - len(graph.poses)) * (number >= count))
 

@@ -46,7 +46,7 @@ def test_those_of_points_and_of_poses_with_points_are_too():
     cov[np.ix_(place, place)] = inverse
     cov = cov.reshape(count, 3, count, 3)
     with pytest.raises(ValueError, match=f"from 0 to {count - 1}, got"):
-        graphs.marginals(graph, pairs=[[0, count]])  # of the filled graph it is a variable
+        graphs.marginals(graph, pairs=[[0, count]])  # of the padded graph it is a variable
     found = graphs.marginals(graph, pairs=pairs)
     atol = 1e-9 * np.abs(inverse).max()
     for k in range(POINTS):

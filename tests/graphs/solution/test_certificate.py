@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pose_rings import SIZE, ring
 
-from jaxslam import graphs
+from jaxslam import graphs, sensors
 
 WEIGHTS = np.array([40.0, 40.0, 300.0])
 
@@ -95,4 +95,23 @@ def test_a_factor_without_a_chordal_cost_is_refused():
                 fixed_point=np.ones(1, bool),
                 point_id=np.zeros(1, int),
             )
+        )
+
+
+def test_a_sensor_of_the_same_name_on_a_mount_is_refused():
+    """Its residual is another one than that of a relative position from the robot's own place."""
+    graph = isotropic()
+    seen = graphs.Table(
+        np.zeros((1, 2), np.int32), np.zeros((1, 2)), np.eye(2)[None], np.ones(1, bool)
+    )
+    mounted = graphs.from_sensor(sensors.relative_position(np.eye(2), mount=[1.0, 0.0, 0.5]))
+    with pytest.raises(ValueError, match="'seen' has no chordal cost: its factor is relative_pos"):
+        graphs.certificate(
+            graph._replace(
+                tables={**graph.tables, "seen": seen},
+                points=np.ones((1, 2)),
+                fixed_point=np.ones(1, bool),
+                point_id=np.zeros(1, int),
+            ),
+            {"relative_pose": graphs.relative_pose(), "seen": mounted},
         )

@@ -1,0 +1,75 @@
+"""Writer of pose and landmark graphs: g2o, and TORO by the ending of the file's name."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxslam.datasets.formats.g2o.kinds import EDGES, ENDINGS, G2O, Format
+from jaxslam.graphs.graph import Graph
+from jaxslam.results.files import write_files
+
+
+def save(path: str | Path, graph: Graph) -> None:
+    """Write a graph as a file of g2o, or TORO by the file's ending; see `graphs.write`."""
+    path = Path(path)
+    text = text_of(graph, ENDINGS.get(path.suffix, G2O))
+    write_files(path.parent, {path.name: text})
+
+
+def text_of(graph: Graph, form: Format = G2O) -> str:
+    """The graph in a format; raises ValueError as `graphs.write` does."""
+    _check_writable(graph, form)
+    ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
+    values = {"pose": np.asarray(graph.poses), "point": np.asarray(graph.points)}
+    held = {"pose": np.asarray(graph.fixed_pose), "point": np.asarray(graph.fixed_point)}
+    lines = [
+        _line(name, [one], row)
+        for kind, name in form.vertices.items()
+        for one, row in zip(ids[kind], values[kind], strict=True)
+    ]
+    lines += [f"FIX {one}" for kind in form.vertices for one in ids[kind][held[kind]]]
+    for key, table in graph.tables.items():
+        name = form.edges[key.split("/")[0]]
+        edge = EDGES[name]
+        valid = np.asarray(table.valid)
+        information = np.asarray(table.information)[valid]
+        entries = np.stack([information[:, i, j] for i, j in edge.entries], axis=1)
+        numbers = np.concatenate([np.asarray(table.z)[valid], entries], axis=1)
+        who = np.asarray(table.who)[valid]
+        names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
+        lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def _check_writable(graph: Graph, form: Format) -> None:
+    """Raise ValueError on what a format has no line for."""
+    if len(both := np.intersect1d(graph.pose_id, graph.point_id)):
+        raise ValueError(
+            f"graphs.write: {both[0]} is the id of a pose and of a point, which {form.name} does "
+            "not allow"
+        )
+    if len(graph.points) and "point" not in form.vertices:
+        raise ValueError(
+            f"graphs.write: {form.name} has no line for points, and the graph has "
+            f"{len(graph.points)}"
+        )
+    if len(graph.points) and graph.points.shape[1] != 2:
+        raise ValueError(
+            f"graphs.write: expected points (x, y), got {graph.points.shape[1]} numbers"
+        )
+    held = np.asarray(graph.pose_id)[np.asarray(graph.fixed_pose)]
+    if len(held) and not form.fix:
+        raise ValueError(
+            f"graphs.write: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
+        )
+    for key in graph.tables:
+        if key.split("/")[0] not in form.edges:
+            raise ValueError(
+                f"graphs.write: {form.name} has no line for table {key!r}; it has some for "
+                f"{', '.join(form.edges)}"
+            )
+
+
+def _line(kind: str, ids: Sequence[int], numbers: np.ndarray) -> str:
+    return " ".join([kind, *map(str, ids), *map(repr, np.asarray(numbers, float).tolist())])
