@@ -18,9 +18,8 @@ from jaxslam.graphs.factor import (
     relative_position,
 )
 from jaxslam.graphs.files import read, write
-from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.graph import Graph, Table, with_loops_apart
 from jaxslam.graphs.log import of_log
-from jaxslam.graphs.loops import with_loops_apart
 from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.solution.certificate import Certificate, certificate
 from jaxslam.graphs.solution.marginals import Marginals, marginals

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
-from jaxslam.graphs.loops import LOOPS
+from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.math import numpy_poses as poses
 

@@ -38,6 +38,10 @@ SURE = 0.6
 """Share of the points on walls below which the wider search is made."""
 BETTER = 0.1
 """By how much more its share has to be."""
+GATE = 30.66
+"""χ² of three degrees of freedom at 1 - 1e-6: a match farther from raw odometry is in doubt."""
+WRONG = 0.1
+"""Probability that a match in doubt is of another place."""
 
 
 class Odometry(NamedTuple):
@@ -49,10 +53,14 @@ class Odometry(NamedTuple):
     z: Float[np.ndarray, "K 3"]
     """the scan's pose in the frame of its base"""
     cov: Float[np.ndarray, "K 3 3"]
-    """of the end of z"""
+    """of the end of z, wider where a match is in doubt"""
+    cov_if_right: Float[np.ndarray, "K 3 3"]
+    """the same as if no match were in doubt"""
     keyframe: Int[np.ndarray, "N"]
     matched: Bool[np.ndarray, "K"]
     """false where z is raw odometry alone"""
+    doubted: Bool[np.ndarray, "K"]
+    """matched, but far from raw odometry, or with few points on walls"""
     inliers: Float[np.ndarray, "K"]
     """share of the points on walls, 0 where none were matched"""
     residual: Float[np.ndarray, "K"]
@@ -74,6 +82,11 @@ def laser_odometry(
     by `settings.correlation`. Where too few points meet a wall the step is raw odometry alone; so
     it is where that is no guess, as after a jump, and the match is worse than that of a loop, or
     another pose is nearly as good.
+
+    A match is in doubt that has few points on walls, or that raw odometry contradicts: it may be of
+    another place that looks the same. It stays, and is taken to be wrong with probability p = 0.1:
+    its covariance is about that of the mixture with raw odometry, C + p (P + e eᵀ), where e leads
+    from one to the other. So are those of the scans after it until the next keyframe.
     """
     count, width = len(scans.usable), settings.reference
     result = Odometry(
@@ -81,20 +94,24 @@ def laser_odometry(
         base=np.zeros(count, int),
         z=np.zeros((count, 3)),
         cov=np.zeros((count, 3, 3)),
+        cov_if_right=np.zeros((count, 3, 3)),
         keyframe=np.zeros(0, int),
         matched=np.zeros(count, bool),
+        doubted=np.zeros(count, bool),
         inliers=np.zeros(count),
         residual=np.zeros(count),
     )
     result.poses[0] = first
     keys = [0]
-    z, cov = np.zeros(3), np.zeros((3, 3))  # of the last scan, relative to the last keyframe
+    # Of the last scan, relative to the last keyframe; doubt is what is added to its covariance.
+    z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     for scan in range(1, count):
         key = keys[-1]
         guess = poses.compose(z, steps.step[scan])
         prior = covariances.composed_cov(cov, steps.step[scan], steps.cov[scan])
         of = [one for one in keys[-width:] if scans.usable[one]]
-        z, cov = guess, prior
+        before, z, cov = z, guess, prior
+        doubted = False
         if scans.usable[scan] and of:
 
             def tracked(matcher: Matcher, prior: np.ndarray) -> _Tracked:
@@ -114,15 +131,32 @@ def laser_odometry(
             if fit.inliers >= least and not found.ambiguous:
                 result.matched[scan] = True
                 z, cov = np.asarray(fit.pose, np.float64), found.cov
-        result.base[scan], result.z[scan], result.cov[scan] = key, z, cov
+                off = poses.between(guess, z)
+                contradicted = off @ np.linalg.solve(prior, off) > GATE
+                doubted = bool(contradicted or fit.inliers < SURE)
+        doubt = covariances.moved(doubt, poses.between(before, z))
+        if doubted:
+            doubt = _doubt(prior, poses.between(z, guess))
+        result.doubted[scan] = doubted
+        result.base[scan], result.z[scan] = key, z
+        result.cov[scan], result.cov_if_right[scan] = cov + doubt, cov
         result.poses[scan] = poses.compose(result.poses[key], z)
         far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > settings.key_turn
         if far and scans.usable[scan]:
             keys.append(scan)
-            z, cov = np.zeros(3), np.zeros((3, 3))
+            z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
         if progress is not None:
             progress(scan + 1, count)
     return result._replace(keyframe=np.array(keys))
+
+
+def _doubt(prior: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """What is added to the covariance of a match that may be wrong: p (P + e eᵀ).
+
+    off: e, the mean of raw odometry seen from the match.
+    """
+    at_match = covariances.propagated(covariances.turns(off[2]), prior)
+    return WRONG * (at_match + np.outer(off, off))
 
 
 class _Tracked(NamedTuple):

@@ -4,7 +4,7 @@ from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.graphs import Graph
 from jaxslam.grids import Grid
@@ -89,6 +89,8 @@ class Solved(NamedTuple):
     """of every scan, by raw odometry"""
     cov: Float[np.ndarray, "K 3 3"]
     """of (x, y, θ) of `poses`, relative to the first"""
+    doubted: Bool[np.ndarray, "K"]
+    """scans whose match is in doubt (`laser_odometry`)"""
     keyframe: Int[np.ndarray, "N"]
     """scans that are poses of the graph"""
     graph: Graph

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.graphs.chain.elimination import Chain
+from jaxslam.graphs.chain.gauss_newton import Iterations, optimize_chain
+from jaxslam.graphs.chain.problem import Iterate, Problem
 from jaxslam.graphs.solver.search import Ending
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
-from jaxslam.smoothing.chain import Chain
 from jaxslam.smoothing.forward_pass import (
     ForwardPass,
     compiled_once,
@@ -19,9 +21,7 @@ from jaxslam.smoothing.forward_pass import (
     log_in_one_dtype,
     run_forward,
 )
-from jaxslam.smoothing.gauss_newton import Iterations, optimize_chain
 from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
-from jaxslam.smoothing.problem import Iterate, Problem
 from jaxslam.smoothing.smooth import solution, with_singular
 from jaxslam.types import Estimate, Info, Log, Trace
 from jaxslam.validation.numbers import check_count, is_concrete
@@ -76,7 +76,7 @@ def batch_map(
 
     over x_0, w_1 … w_T and the landmarks, which have no prior. EKF-SLAM gives the initial path; its
     smoother (`smooth`) is the first step. Each further step linearizes the models along the newest
-    path and solves for all unknowns (`chain.eliminate`): a Gauss-Newton step is a smoother, and
+    path and solves for all unknowns (`eliminate`): a Gauss-Newton step is a smoother, and
     iterating the smoother is Gauss-Newton (Bell 1994, "The iterated Kalman smoother as a
     Gauss-Newton method", SIAM J. Optimization 4(3)). A step is shortened until the cost falls
     (Armijo). P0 and Q may be singular; O(T N²) a step.
@@ -88,11 +88,10 @@ def batch_map(
     with, except those of a singular R, whose status becomes `Status.SINGULAR`. Where Q depends on
     the pose, it is evaluated once at the filter's path.
 
-    The graph of the log (`graphs.of_log`) has the same optimum where the noises of a motion are
-    three and not singular. It does not stand in for this one: its sparse plan needs to know on the
-    host which landmark each measurement is of, and in a campaign the association of the run says
-    it; its unknowns are poses, between which a motion of two noises, or of singular Q, has no
-    finite information.
+    It is the graph of the log (`graphs.of_log`) with another solution: where the noises of a motion
+    are three and not singular, `graphs.optimize` has the same optimum. Here (`graphs.chain`) a
+    motion is a constraint, and the run itself says which landmark each measurement is of; the
+    sparse plan of `graphs.optimize` has to know that on the host.
 
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`. The sensor must determine its

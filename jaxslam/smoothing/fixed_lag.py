@@ -9,11 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam import validation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.math import linalg
-from jaxslam.protocols import Associate, Filter, Motion, Sensor
-from jaxslam.sensors.suite import Suite
-from jaxslam.slots import Joint
-from jaxslam.smoothing.window import (
+from jaxslam.graphs.chain.window import (
     WindowIterate,
     WindowPrior,
     WindowSteps,
@@ -23,6 +19,10 @@ from jaxslam.smoothing.window import (
     newest_cov,
     solve_window,
 )
+from jaxslam.math import linalg
+from jaxslam.protocols import Associate, Filter, Motion, Sensor
+from jaxslam.sensors.suite import Suite
+from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan, Status
 from jaxslam.validation.numbers import check_count
 

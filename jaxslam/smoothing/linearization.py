@@ -4,17 +4,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.graphs.chain.elimination import Chain, LinearizedStep, Start
+from jaxslam.graphs.chain.rows import Rows, pose_difference, whitened_rows
 from jaxslam.linearize import derivatives
 from jaxslam.math import linalg
-from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.smoothing.chain import Chain, LinearizedStep, Start
 from jaxslam.smoothing.forward_pass import ForwardPass
 from jaxslam.types import Log, Status
-
-Rows = tuple[Array, Array, Array, Array]
-"""A (Z, 3), B (Z, L) and b (Z,) of a measurement, as in `chain.LinearizedStep`, in units of its
-noise; and () bool, whether the covariance of that noise is positive definite."""
 
 
 def noise_roots(
@@ -56,7 +52,7 @@ def chain_of(
 def _motions(
     motion: Motion, passed: ForwardPass, control: Float[Array, "T U"], roots: Float[Array, "T W W"]
 ) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3 W"], Float[Array, "T 3"]]:
-    """The matrices F, G and the offset c of `chain.LinearizedStep` for each motion."""
+    """The matrices F, G and the offset c of `LinearizedStep` for each motion."""
 
     def one(
         before: Array, predicted: Array, corrected: Array, u: Array, root: Array
@@ -107,17 +103,6 @@ def _measurements(
     return slot, *jax.vmap(over_slots)(z, slot, fused, new, at)
 
 
-def whitened_rows(
-    sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, "3"], landmark: Float[Array, "L"]
-) -> Rows:
-    """The rows of a measurement: R^{-1/2} times H_pose, H_l and z ⊖ h."""
-    by_pose, by_landmark = derivatives.observe_jacobians(sensor, pose, landmark)
-    innovation = sensor.residual(z, sensor.observe(pose, landmark))
-    factor, positive = linalg.cholesky(sensor.noise_cov(z))
-    a, b, r = (linalg.solve_lower(factor, part) for part in (by_pose, by_landmark, innovation))
-    return a, b, r, positive
-
-
 def _new_landmark_rows(sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, "3"]) -> Rows:
     """The rows of a new landmark: C^{-1/2} times -G_pose, I and 0, C = G_z R G_zᵀ + G_s S G_sᵀ."""
     size = len(sensor.landmark)
@@ -128,9 +113,3 @@ def _new_landmark_rows(sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, 
     a = linalg.solve_lower(factor, -by_pose)
     b = linalg.solve_lower(factor, jnp.eye(size, dtype=z.dtype))
     return a, b, jnp.zeros(size, z.dtype), positive
-
-
-def pose_difference(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The difference a - b of two poses by coordinates, with the angle wrapped."""
-    off = a - b
-    return off.at[2].set(wrap(off[2]))

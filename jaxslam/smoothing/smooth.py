@@ -9,10 +9,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
+from jaxslam.graphs.chain.elimination import Chain, Policy, eliminate
+from jaxslam.graphs.chain.marginals import chain_marginals
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Associate, Estimator, Motion, Sensor
 from jaxslam.slots import Joint
-from jaxslam.smoothing.chain import Chain, Policy, eliminate
 from jaxslam.smoothing.forward_pass import (
     ForwardPass,
     compiled_once,
@@ -21,7 +22,6 @@ from jaxslam.smoothing.forward_pass import (
     run_forward,
 )
 from jaxslam.smoothing.linearization import chain_of, noise_roots
-from jaxslam.smoothing.marginals import chain_marginals
 from jaxslam.types import Estimate, Info, Log, Status, Trace
 
 
@@ -57,7 +57,7 @@ def smooth(
     scans. The recursion of Rauch, Tung & Striebel 1965 ("Maximum likelihood estimates of linear
     dynamic systems", AIAA Journal 3(8)) would store T covariances of the map and invert each, where
     landmarks may not be initialized yet and the noise of a motion may be singular;
-    `chain.eliminate` gives the same numbers from the Jacobians alone, O(T N²). A landmark has no
+    `eliminate` gives the same numbers from the Jacobians alone, O(T N²). A landmark has no
     prior: its initialization is a measurement of it.
 
     What it returns maps (log, key) to a `Trace`: estimates with leading T, the poses smoothed and

@@ -134,6 +134,45 @@ def test_after_a_jump_a_match_is_right_or_refused(drive):
     assert refused < 4
 
 
+def test_a_match_with_another_place_is_in_doubt(drive):
+    """At each scan of the drive: it is that of 17 scans later, of a corridor that looks alike."""
+    true, log, _ = drive
+    every, matched, wrong, doubted = scans_of(log, SETTINGS), 0, 0, 0
+    for k in range(6, len(true)):
+        at = np.arange(k - 5, k + 1)
+        seen = np.append(at[:-1], (k + 17) % len(true))
+        scans = jax.tree.map(lambda part, seen=seen: np.asarray(part)[seen], every)
+        steps = steps_of(log.raw[at], SETTINGS)
+        found = laser_odometry(scans, steps, SETTINGS, log.raw[k - 5])
+        z = poses.between(true[at[found.base[5]]], true[k])
+        off = poses.between(found.z[5], z)
+        matched += found.matched[5]
+        doubted += found.doubted[5]
+        wrong += off @ np.linalg.solve(found.cov[5], off) > 30
+        narrow = found.cov[5] - found.cov_if_right[5]
+        assert np.any(narrow) == found.doubted[5] and np.linalg.eigvalsh(narrow).min() > -1e-12
+    # A place within the error of raw odometry that looks the same cannot be told from this one.
+    assert matched > 25 and matched - doubted < 5 and wrong < 3
+
+
+def test_a_scan_of_another_place_does_not_move_the_path(drive):
+    """Its pose is wrong, by its covariance; the other poses and the loops are right."""
+    true, log, _ = drive
+    odd = 30
+    seen = np.where(np.arange(len(true)) == odd, odd + 17 - len(true), np.arange(len(true)))
+    beams = jax.tree.map(lambda part: np.asarray(part)[seen], log.beams)
+    found = laser_slam.solve(log._replace(beams=beams), SETTINGS)
+    position, _ = errors(found.poses, true)
+    error = found.poses[1:] - true[1:]
+    error[:, 2] = poses.wrapped(error[:, 2])
+    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.cov[1:]), error)
+    assert position[odd] > 0.5 and np.delete(position, odd).max() < 0.1
+    assert nees.max() < 30 and np.delete(nees, odd - 1).max() < 10
+    assert found.doubted[odd]
+    assert found.counts["scans whose match is in doubt"] == found.doubted.sum() < 4
+    assert laser_slam.closure_score(found, true).precision == 1.0
+
+
 def test_a_log_of_maximum_ranges_is_raw_odometry(drive):
     _, log, _ = drive
     short = laser_slam.ScanLog(*(part[:3] for part in (log.time, log.time, log.raw)), FAR)

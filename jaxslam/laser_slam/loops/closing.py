@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam import graphs
-from jaxslam.graphs import Graph
-from jaxslam.graphs.loops import LOOPS
+from jaxslam.graphs import Graph, Table
+from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import graph_of, relative_covs, table_of
 from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_place, near
@@ -46,12 +46,12 @@ def closed(
     """
     keyframe = odometry.keyframe
     at = odometry.poses[keyframe]
-    steps, covs = odometry.z[keyframe[1:]], odometry.cov[keyframe[1:]]
+    steps, covs = odometry.z[keyframe[1:]], odometry.cov_if_right[keyframe[1:]]
     index = np.arange(len(keyframe))
     chain = table_of(index[:-1], index[1:], steps, covs)
     total = covariances.along(at, covs)
     middle = index[:: settings.submap_every]
-    usable = scans.usable[keyframe]
+    usable = scans.usable[keyframe] & ~odometry.doubted[keyframe]
     looks = descriptors(
         *(np.asarray(part)[keyframe] for part in (scans.points.position, scans.points.valid))
     )
@@ -91,20 +91,32 @@ def closed(
         graph = graph_of(path, keyframe, chain, edges)
         if kept.any():
             graph = _host(graphs.optimize(graph, kernel={LOOPS: graphs.cauchy()}).graph)
-    return _final(graph, loops, kept, keyframe, settings)
+    doubtful = table_of(index[:-1], index[1:], steps, odometry.cov[keyframe[1:]])
+    return _final(graph, doubtful, loops, kept, keyframe, settings)
 
 
 def _final(
-    graph: Graph, loops: Loops, kept: np.ndarray, keyframe: np.ndarray, settings: Settings
+    graph: Graph,
+    chain: Table,
+    loops: Loops,
+    kept: np.ndarray,
+    keyframe: np.ndarray,
+    settings: Settings,
 ) -> Closed:
-    """The optimum without a kernel, of the loops that the graph does not contradict."""
+    """The optimum without a kernel, of the loops that the graph does not contradict.
+
+    chain: of the matches with the covariances of those in doubt, which takes the place of that
+    which loops were sought with.
+    """
+    tables = {**graph.tables, "relative_pose": chain}
     if kept.any():
         square = np.asarray(graphs.squared_residuals(graph)[LOOPS])
         doubted = square > chi2_quantile(settings.consistency, 3)
         loops.outcome[np.flatnonzero(kept)[doubted]] = LoopOutcome.DOUBTED
-        table = graph.tables[LOOPS]
-        tables = graph.tables | {LOOPS: table._replace(valid=~doubted)}
-        graph = _host(graphs.optimize(graph._replace(tables=tables)).graph)
+        tables[LOOPS] = tables[LOOPS]._replace(valid=~doubted)
+    graph = graph._replace(tables=tables)
+    if kept.any():
+        graph = _host(graphs.optimize(graph).graph)
     return Closed(graph, loops._replace(first=keyframe[loops.first], second=keyframe[loops.second]))
 
 

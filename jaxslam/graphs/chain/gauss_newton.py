@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.graphs.chain.elimination import Chain, Policy, eliminate
+from jaxslam.graphs.chain.problem import Iterate, Problem, cost, linearize_at, roll_out
 from jaxslam.graphs.solver.search import Ending
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.smoothing.chain import Chain, Policy, eliminate
-from jaxslam.smoothing.problem import Iterate, Problem, cost, linearize_at, roll_out
 
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
 """of the Gauss-Newton step that are tried, all at once; the first that lowers the cost is taken."""

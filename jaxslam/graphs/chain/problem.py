@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.graphs.chain.elimination import Chain, LinearizedStep, Policy, Start
+from jaxslam.graphs.chain.rows import pose_difference, whitened_rows
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.smoothing.chain import Chain, LinearizedStep, Policy, Start
-from jaxslam.smoothing.linearization import pose_difference, whitened_rows
 
 
 class Problem(NamedTuple):
@@ -65,7 +65,7 @@ def cost(sensor: Sensor, problem: Problem, at: Iterate) -> Float[Array, ""]:
 def linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
     """The chain of the Gauss-Newton step: the models linearized at an iterate.
 
-    It has as many rows a measurement as that of `linearization.chain_of`.
+    It has as many rows a measurement as the chain of a filter (`smoothing.linearization`).
     """
     spare = max(0, len(sensor.landmark) - len(sensor.measurements))
 

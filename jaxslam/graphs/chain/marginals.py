@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.graphs.chain.elimination import Chain, Gain, LinearizedStep, Policy
 from jaxslam.math import linalg
-from jaxslam.smoothing.chain import Chain, Gain, LinearizedStep, Policy
 
 
 class ChainMarginals(NamedTuple):

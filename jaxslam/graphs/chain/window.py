@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
+from jaxslam.graphs.chain.elimination import CostToGo, Gain, LinearizedStep, eliminate_steps
+from jaxslam.graphs.chain.rows import pose_difference, whitened_rows
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.slots import Joint
-from jaxslam.smoothing.chain import CostToGo, Gain, LinearizedStep, eliminate_steps
-from jaxslam.smoothing.linearization import pose_difference, whitened_rows
 
 
 class WindowPrior(NamedTuple):
@@ -75,7 +75,7 @@ def linearize_window(
     at: WindowIterate,
     first: bool,
 ) -> LinearizedStep:
-    """The steps of the window linearized at an iterate, as `chain.LinearizedStep`.
+    """The steps of the window linearized at an iterate, as `LinearizedStep`.
 
     first: Jacobians by a variable that the prior is of are taken at `WindowPrior.points`,
     everything else at the iterate (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag
@@ -117,7 +117,7 @@ def solve_window(
 ) -> WindowSolution:
     """The solution of a linearized window. alive: the landmarks of the map.
 
-    With Λ and y of all steps (`chain.eliminate_steps`) and e = (x_0, m) - μ at the iterate, the
+    With Λ and y of all steps (`eliminate_steps`) and e = (x_0, m) - μ at the iterate, the
     deviation δ has (I + P Λ) δ = P y - e in the rows of the prior, Λ δ = y in those of landmarks
     without one; its covariance is the inverse of that matrix times P, or I.
     """
