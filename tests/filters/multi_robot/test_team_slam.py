@@ -318,7 +318,8 @@ def test_a_team_in_a_campaign():
     """With the cheapest of filters: campaigns draw, bound and score worlds of teams."""
     scenario = hundred(1, 10)[1]
     still = filters.dead_reckoning(scenario.motion, scenario.sensor)
-    campaign = jaxslam.monte_carlo(scenario, {"still": still}, 2, jax.random.key(2))
+    options = {"block": 2, "devices": jax.devices()[:1]}
+    campaign = jaxslam.monte_carlo(scenario, {"still": still}, 2, jax.random.key(2), **options)
     assert campaign.filters["still"].counts["runs"] == 2
 
 
