@@ -196,6 +196,16 @@ def test_the_others_do_and_are_mistaken(name):
     assert heading_deviation(name)[-1] < np.deg2rad(4.9)
 
 
+@pytest.mark.parametrize("name", ["fixed_lag", "fixed_lag_fej"])
+def test_a_window_learns_no_heading_with_first_estimates(name):
+    """Dong-Si & Mourikis 2011: marginalization at old estimates makes the heading observable."""
+    deviation = np.rad2deg(heading_deviation(name))
+    if name == "fixed_lag_fej":
+        np.testing.assert_allclose(deviation, 5.0, rtol=1e-6)
+    else:
+        assert deviation[-1] < 4.99
+
+
 # --- each linearizer does what it says ----------------------------------------------------------
 
 

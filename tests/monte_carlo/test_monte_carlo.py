@@ -410,7 +410,8 @@ def lineup():
         "right_invariant": catalog.FILTERS["right_invariant"](WORLD),
         "ideal": catalog.ideal(WORLD),
     } | {name: make(WORLD) for name, make in worlds.WRONG.items()}
-    return monte_carlo(WORLD, candidates, LARGE, worlds.key(), block=LARGE).filters
+    options = {"block": LARGE, "devices": jax.devices()[:1], "bound": True}
+    return monte_carlo(WORLD, candidates, LARGE, worlds.key(), **options).filters
 
 
 @pytest.mark.parametrize("name", ["ekf", "right_invariant", "ideal"])

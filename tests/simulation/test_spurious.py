@@ -156,7 +156,8 @@ def ruined():
         "trusting": ekf_slam(*parts),
         "careful": pruning(ekf_slam(*parts, associate=METHODS["nearest"]), manager),
     }
-    return monte_carlo(world, filters, 6, jax.random.key(0)).filters
+    options = {"block": 6, "devices": jax.devices()[:1]}
+    return monte_carlo(world, filters, 6, jax.random.key(0), **options).filters
 
 
 @pytest.mark.parametrize("which", range(len(METHODS)), ids=METHODS)
