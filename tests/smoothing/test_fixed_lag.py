@@ -1,4 +1,5 @@
-"""The fixed-lag smoother against the batch solution, the EKF of a linear world, and observability."""
+"""The fixed-lag smoother against the batch solution, and the EKF of a linear world. Observability:
+tests/consistency/test_catalog.py."""
 
 import dataclasses
 from functools import partial
@@ -13,11 +14,8 @@ from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world
 
 from jaxslam import motion, run, sensors, simulate
 from jaxslam.filters import ekf_slam
-from jaxslam.simulation.scenarios import stationary
 from jaxslam.smoothing import batch_map, fixed_lag
 from jaxslam.types import Log, Scan, Status
-
-TWO = pytest.mark.parametrize("first", [False, True], ids=["standard", "first estimates"])
 
 
 @pytest.fixture(scope="module")
@@ -77,19 +75,6 @@ def regular(log):
     """The log without the measurement that claims to be exact."""
     exact = log.scan.z[:, :, 0] == 5.0
     return log._replace(scan=log.scan._replace(valid=log.scan.valid & ~exact))
-
-
-@TWO
-def test_a_robot_that_stands_still_learns_no_heading_with_first_estimates(first):
-    """Dong-Si & Mourikis 2011: marginalization at old estimates makes the heading observable."""
-    world = stationary(30)
-    log = simulate(world, jax.random.key(2))[1]
-    trace = run(lag(world, window=2, first_estimates=first), log, world.pose, world.pose_cov, KEY)
-    deviation = np.rad2deg(np.sqrt(np.asarray(trace.estimate.pose_cov)[:, 2, 2]))
-    if first:
-        np.testing.assert_allclose(deviation, 5.0, rtol=1e-6)
-    else:
-        assert deviation[-1] < 4.99
 
 
 def test_float32_and_gradients(short):
