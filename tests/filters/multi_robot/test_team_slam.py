@@ -47,14 +47,14 @@ def unknown(robots):
     return [dataclasses.replace(robot, start=None) for robot in robots]
 
 
-def world(robots, steps=40, count=8, **options):
+def world(robots, steps=40, **options):
     rng = np.random.default_rng(5)
     around = 2 * np.pi * np.arange(8) / 8
     radius = 3.0 + rng.uniform(-0.5, 0.5, 8)
     points = np.stack([radius * np.cos(around), 1.0 + radius * np.sin(around)], axis=1)
     turns = [4 * np.pi / 100, -0.1, 0.15][: len(robots)]
     controls = np.tile(np.ravel([(0.12, turn) for turn in turns]), (steps, 1))
-    return team_world.team_world(robots, points[:count], controls, **options)
+    return team_world.team_world(robots, points, controls, **options)
 
 
 @cache
@@ -341,15 +341,16 @@ def test_a_world_is_the_same_whatever_is_reported():
 def driven_by(theta, log):
     """A run of two robots, one from an unknown place, by all parameters of their models."""
     eyes = sensors.range_bearing(jnp.diag(theta[:2]) ** 2, mount=theta[2:5])
-    robot = team.Robot(motion.increment(jnp.diag(theta[5:7]) ** 2), suite((eyes, 2)))
-    filter = team_slam([robot, robot], 2, update="joint")
+    robot = team.Robot(motion.increment(jnp.diag(theta[5:7]) ** 2), suite((eyes, 4)))
+    filter = team_slam([robot, robot], 8, update="joint")
     return jaxslam.run(filter, log, np.zeros(3), NOTHING, jax.random.key(0))
 
 
 def test_gradients_are_finite_and_float32_is_near():
-    """Through births, corrections and the way in by two landmarks, which both robots see."""
-    sight = suite((sensors.range_bearing(R1, mount=MOUNT), 2))
-    scenario = world([team.Robot(motion.increment(Q), sight, at) for at in STARTS[:2]], 4, count=2)
+    """Through births, corrections and the way in by two landmarks."""
+    eyes = sensors.range_bearing(R1, mount=MOUNT)
+    sight = suite(Part(eyes, 4, visible=between_ranges(0.0, 3.2)))
+    scenario = world([team.Robot(motion.increment(Q), sight, at) for at in STARTS[:2]], 4)
     _, log = draw(scenario, 0)
 
     def loss(theta):
@@ -365,7 +366,6 @@ def test_gradients_are_finite_and_float32_is_near():
     np.testing.assert_allclose(found.estimate.pose, double.estimate.pose, atol=2e-4)
     np.testing.assert_array_equal(found.info.status, double.info.status)
     assert (double.info.status == Status.BORN).sum() > 2
-    assert (double.info.status[-1] == Status.FUSED).all()
 
 
 def compass_only():
