@@ -1,7 +1,6 @@
 """The fixed-lag smoother: the last poses and the map are optimized together at every scan."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -10,11 +9,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam import validation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.graphs.chain.elimination import LinearizedStep
 from jaxslam.graphs.chain.window import (
     WindowIterate,
     WindowPrior,
-    WindowSolution,
     WindowSteps,
     linearize_window,
     marginalize_oldest,
@@ -141,13 +138,10 @@ def fixed_lag(
         born = joint.alive & ~state.joint.alive
         landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
         at = state.at._replace(landmarks=landmarks)
-
-        def improved(at: WindowIterate) -> tuple[WindowIterate, LinearizedStep, WindowSolution]:
+        for _ in range(iterations):
             system = linearize_window(motion, sensor, state.prior, steps, at, first_estimates)
             solved = solve_window(state.prior, system, at, joint.alive)
-            return moved_by(motion, steps, at, solved), system, solved
-
-        at, system, solved = repeated(improved, at, iterations)
+            at = moved_by(motion, steps, at, solved)
         newest = with_newest(joint, at, newest_cov(system, solved))
         after = WindowState(newest, state.prior, steps, at)
         exhausted = jnp.asarray(info.exhausted) | ~is_finite(after)
@@ -175,21 +169,6 @@ def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -
     path = jnp.tile(joint.pose, (window + 1, 1))
     at = WindowIterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
     return WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
-
-
-def repeated(
-    improved: Callable[[WindowIterate], tuple[WindowIterate, LinearizedStep, WindowSolution]],
-    at: WindowIterate,
-    times: int,
-) -> tuple[WindowIterate, LinearizedStep, WindowSolution]:
-    """What the last of some iterations gives; compiled once, whatever their number."""
-    if times == 1:
-        return improved(at)
-    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(improved, at))
-    found: tuple[WindowIterate, LinearizedStep, WindowSolution] = jax.lax.fori_loop(
-        0, times, lambda _, last: improved(last[0]), (at, *nothing[1:])
-    )
-    return found
 
 
 def is_finite(state: WindowState) -> Bool[Array, ""]:

@@ -385,10 +385,12 @@ def test_any_method_resamples_whole_particles(name):
 
 def test_a_batch_is_a_loop_and_keys_matter():
     logs = [worlds.draw(RING, seed)[1] for seed in range(2)]
-    keys = list(jax.random.split(jax.random.key(3), 2))
-    filter = of()
-    both = jax.jit(jax.vmap(lambda log, key: drive(filter, log, key=key)))(
-        *(jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (logs, keys))
+    together = jax.random.split(jax.random.key(3), 2)
+    keys, filter = list(together), of()
+    both = jax.device_get(
+        jax.jit(jax.vmap(lambda log, key: drive(filter, log, key=key)))(
+            jax.tree.map(lambda *x: np.stack(x), *logs), together
+        )
     )
     alone = [jax.device_get(drive(filter, logs[i], key=keys[i])) for i in range(2)]
     for i in range(2):
