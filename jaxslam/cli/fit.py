@@ -11,7 +11,14 @@ from jaxslam.cli.runtime import cache
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
 from jaxslam.datasets.table.settings_text import changed, toml_lines
 from jaxslam.logs.tables import POSE
-from jaxslam.results.files import Json, check_writable, json_text, versions, write_files
+from jaxslam.results.files import (
+    Json,
+    check_writable,
+    json_number,
+    json_text,
+    versions,
+    write_files,
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -96,8 +103,8 @@ def _summary(data: Dataset, result: DatasetFit) -> Json:
             name: {
                 "before": float(before),
                 "after": float(after),
-                "standard error": _finite(error),
-                "robust error": _finite(robust),
+                "standard error": json_number(error),
+                "robust error": json_number(robust),
                 "upper limit, 95 %": found.upper.get(name),
                 "not determined, confounded with": (
                     list(found.loose[name]) if name in found.loose else None
@@ -109,8 +116,8 @@ def _summary(data: Dataset, result: DatasetFit) -> Json:
         "log-likelihood": list(found.log_likelihood),
         "NIS / dof": list(found.nis_per_dof),
         "dof": found.dof,
-        "innovation autocorrelation": _finite(result.autocorrelation[0]),
-        "innovation autocorrelation, 95 % band": _finite(result.autocorrelation[1]),
+        "innovation autocorrelation": json_number(result.autocorrelation[0]),
+        "innovation autocorrelation, 95 % band": json_number(result.autocorrelation[1]),
         "steps": len(found.path) - 1,
         "converged": found.converged,
         "rounds of association and gate": result.rounds,
@@ -201,7 +208,3 @@ def _notes(result: DatasetFit) -> list[str]:
         "NIS / dof is near 1 after any fit of all noises; test them on another log (jaxslam run)"
     )
     return notes
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -10,6 +10,7 @@ from jaxslam import programs
 from jaxslam.consistency import LEVEL, percentage
 from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.math.stats import chi2_band, chi2_quantile
+from jaxslam.metrics.paths import alignment, carried
 from jaxslam.protocols import Chart, Filter
 from jaxslam.slots import Joint
 
@@ -105,7 +106,7 @@ def judge_map(
     if not values[0] > 1e-12 * values[-1]:
         return None
     white = vectors.T / np.sqrt(values)[:, None]
-    error = points - (survey if one_frame else _moved(survey, _best_frame(points, survey, white)))
+    error = points - (survey if one_frame else carried(_best_frame(points, survey, white), survey))
     if joint:
         nees = float(np.sum((white @ error.reshape(-1)) ** 2))
         return MapTest(nees, size, chi2_band(size, 1, LEVEL), True)
@@ -118,16 +119,9 @@ def _best_frame(points: np.ndarray, survey: np.ndarray, white: np.ndarray) -> np
 
     Gauss-Newton from the plain alignment; points far from the origin are no worse.
     """
-    middle = survey.mean(axis=0)
-    there, here = survey - middle, points - points.mean(axis=0)
-    turn = np.arctan2(
-        np.sum(there[:, 0] * here[:, 1] - there[:, 1] * here[:, 0]), np.sum(there * here)
-    )
-    c, s = np.cos(turn), np.sin(turn)
-    shift = points.mean(axis=0) - np.array([[c, -s], [s, c]]) @ middle
-    pose = np.array([*shift, turn])
+    pose = alignment(survey, points)
     for _ in range(_ITERATIONS):
-        at = _moved(survey, pose)
+        at = carried(pose, survey)
         lever = at - pose[:2]
         slope = np.zeros((len(points), 2, 3))
         slope[:, 0, 0] = slope[:, 1, 1] = 1.0
@@ -139,8 +133,3 @@ def _best_frame(points: np.ndarray, survey: np.ndarray, white: np.ndarray) -> np
         if np.abs(step).max() < 1e-12:
             break
     return pose
-
-
-def _moved(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.asarray(points @ np.array([[c, s], [-s, c]]) + pose[:2])

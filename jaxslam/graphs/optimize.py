@@ -18,7 +18,7 @@ from jaxslam.graphs.solver.implicit import followed
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import chi2_of, data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
-from jaxslam.graphs.solver.padding import cut, own_number, padded
+from jaxslam.graphs.solver.padding import cut, own_number, padded_graph
 from jaxslam.graphs.solver.plan import Plan, plan_for
 from jaxslam.graphs.solver.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
@@ -64,7 +64,7 @@ def optimize(
     check_graph(caller, graph, known)
     limits = np.asarray(iterations), np.asarray(tolerance, float)
     own, fill = graph, plan is None and programs.outside(graph)
-    graph = padded(graph) if fill else graph
+    graph = padded_graph(graph) if fill else graph
     plan = plan_for(caller, graph, known, plan)
     found = programs.call(_optimize, (model, method), graph, plan, *limits)
     if not fill:

@@ -9,8 +9,8 @@ from jaxslam import graphs
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.loops.closing import closed
 from jaxslam.laser_slam.mapping import frame_of, map_of
-from jaxslam.laser_slam.odometry import Odometry, laser_odometry
-from jaxslam.laser_slam.raw_odometry import steps_of
+from jaxslam.laser_slam.odometry.raw import steps_of
+from jaxslam.laser_slam.odometry.tracking import Odometry, laser_odometry
 from jaxslam.laser_slam.records import LogOfScans, LoopOutcome, Loops, Solved
 from jaxslam.laser_slam.scans import check_laser_log, scans_of
 from jaxslam.laser_slam.settings import Settings

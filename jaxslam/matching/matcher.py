@@ -3,18 +3,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, TypeAlias, TypeVar, cast
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam import programs
 from jaxslam.grids.grid import Grid, check_grid
 from jaxslam.matching.points import Points
 from jaxslam.matching.prior import Prior
+from jaxslam.math.arrays import in_dtype
 from jaxslam.validation.numbers import is_concrete, shape_told
 
 _T = TypeVar("_T")
@@ -122,17 +123,6 @@ def floats(tree: PyTree) -> list[Array]:
     """The arrays of a tree that hold real numbers."""
     leaves = jax.tree.leaves(tree)
     return [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
-
-
-def in_dtype(tree: _T, dtype: DTypeLike) -> _T:
-    """The tree with its real numbers in one precision; arrays of it stay as they are."""
-
-    def one(leaf: PyTree) -> PyTree:
-        own = jnp.result_type(leaf)
-        other = jnp.issubdtype(own, jnp.floating) and own != dtype
-        return jnp.asarray(leaf, dtype) if other else leaf
-
-    return cast(_T, jax.tree.map(one, tree))
 
 
 def _one(

@@ -1,10 +1,17 @@
-"""Named array types for signatures; their shapes are checked in the tests.
+"""Named array types for signatures, whose shapes the tests check; and arrays in one precision.
 
 Of one pose, one landmark, one measurement; `vmap` and `scan` add leading axes.
 """
 
+from typing import TypeVar, cast
+
+import jax
+import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jax.typing import DTypeLike
+from jaxtyping import Float, PyTree
+
+_T = TypeVar("_T")
 
 Scalar = Float[Array, ""]
 Pose = Float[Array, "3"]
@@ -30,3 +37,14 @@ ObserveJacobians = tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]
 """∂z/∂(pose, l)"""
 InvertJacobians = tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]
 """∂l/∂(pose, z, s)"""
+
+
+def in_dtype(tree: _T, dtype: DTypeLike) -> _T:
+    """The tree with its real numbers in one precision; arrays of it stay as they are."""
+
+    def one(leaf: PyTree) -> PyTree:
+        own = jnp.result_type(leaf)
+        other = jnp.issubdtype(own, jnp.floating) and own != dtype
+        return jnp.asarray(leaf, dtype) if other else leaf
+
+    return cast(_T, jax.tree.map(one, tree))

@@ -1,16 +1,18 @@
-"""Files of results: JSON and CSV as text, and files that are written completely or not at all."""
+"""Files of results: JSON, CSV and HTML as text, and files that are written whole or not at all."""
 
 import contextlib
 import csv
 import io
 import json
+import math
 import os
 import platform
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from importlib.metadata import version
 from pathlib import Path
-from typing import TypeAlias
+from typing import SupportsFloat, TypeAlias
 
 Json: TypeAlias = dict[str, object]
 """What JSON can hold, by name."""
@@ -22,6 +24,34 @@ Files: TypeAlias = dict[str, str | Callable[[Path], object]]
 def json_text(content: Mapping[str, object]) -> str:
     """Indented JSON; raises ValueError on NaN and infinity, which JSON does not have."""
     return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def json_number(value: SupportsFloat) -> float | None:
+    """The number, or None (null) where it is not finite, which JSON does not have."""
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def html_page(title: str, policy: str, style: str, body: str) -> str:
+    """A page of HTML that stands alone, in the colours of the reader's browser.
+
+    policy: of its contents (Content-Security-Policy); only the title is escaped.
+    """
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<title>{escape(title)}</title>
+<style>{style}</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
 
 
 def csv_text(header: list[str], rows: list[list[str]]) -> str:

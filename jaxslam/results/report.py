@@ -18,7 +18,7 @@ from jaxslam.consistency import (
 )
 from jaxslam.consistency.verdict import POWER, TESTS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.files import csv_text, json_text, versions
+from jaxslam.results.files import csv_text, json_number, json_text, versions
 from jaxslam.results.meanings import VERDICTS, count_label, notes_on
 from jaxslam.types import Estimate
 
@@ -292,7 +292,7 @@ def _band_text(band: tuple[float, float] | None) -> str:
 
 def _finite_or_none(values: Iterable[float]) -> list[float | None]:
     """The values, with None for those that are not finite."""
-    return [float(value) if np.isfinite(value) else None for value in values]
+    return [json_number(value) for value in values]
 
 
 def _blank(value: float) -> str:

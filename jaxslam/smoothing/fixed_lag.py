@@ -1,6 +1,7 @@
 """The fixed-lag smoother: the last poses and the map are optimized together at every scan."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -9,9 +10,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam import validation
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.graphs.chain.elimination import LinearizedStep
 from jaxslam.graphs.chain.window import (
     WindowIterate,
     WindowPrior,
+    WindowSolution,
     WindowSteps,
     linearize_window,
     marginalize_oldest,
@@ -138,10 +141,13 @@ def fixed_lag(
         born = joint.alive & ~state.joint.alive
         landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
         at = state.at._replace(landmarks=landmarks)
-        for _ in range(iterations):
+
+        def improved(at: WindowIterate) -> tuple[WindowIterate, LinearizedStep, WindowSolution]:
             system = linearize_window(motion, sensor, state.prior, steps, at, first_estimates)
             solved = solve_window(state.prior, system, at, joint.alive)
-            at = moved_by(motion, steps, at, solved)
+            return moved_by(motion, steps, at, solved), system, solved
+
+        at, system, solved = repeated(improved, at, iterations)
         newest = with_newest(joint, at, newest_cov(system, solved))
         after = WindowState(newest, state.prior, steps, at)
         exhausted = jnp.asarray(info.exhausted) | ~is_finite(after)
@@ -169,6 +175,21 @@ def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -
     path = jnp.tile(joint.pose, (window + 1, 1))
     at = WindowIterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
     return WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
+
+
+def repeated(
+    improved: Callable[[WindowIterate], tuple[WindowIterate, LinearizedStep, WindowSolution]],
+    at: WindowIterate,
+    times: int,
+) -> tuple[WindowIterate, LinearizedStep, WindowSolution]:
+    """What the last of some iterations gives; compiled once, whatever their number."""
+    if times == 1:
+        return improved(at)
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(improved, at))
+    found: tuple[WindowIterate, LinearizedStep, WindowSolution] = jax.lax.fori_loop(
+        0, times, lambda _, last: improved(last[0]), (at, *nothing[1:])
+    )
+    return found
 
 
 def is_finite(state: WindowState) -> Bool[Array, ""]:

@@ -179,6 +179,7 @@ def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, refused, mo
         ),
         (["consistency", "--run", "3"], "unrecognized arguments: --run 3 (did you mean --runs?)"),
         (["verify", "--qq"], "jaxslam verify: unrecognized arguments: --qq; jaxslam verify --help"),
+        (["verify", "--states", "1"], "jaxslam: --states: expected at least 2, got 1"),
     ],
 )
 def test_what_is_no_command_or_option_is_told_in_a_line(refused, arguments, message):

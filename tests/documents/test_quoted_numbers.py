@@ -24,12 +24,12 @@ GIVEN = {
     "docs/methods/association.md": {"500"},  # draws
     "docs/methods/bearings_and_ranges.md": {"2.5", "0.5"},  # standard deviations of range
     "docs/methods/graphs.md": {"100", "434", "3,300"},  # steps, sizes of graphs, a bound of χ²
-    "docs/methods/grid_localization.md": {"5,000"},  # particles
-    "docs/methods/grids.md": {"2.37"},  # the honest median of a NEES
-    "docs/methods/laser_slam.md": {"910", "406", "340", "292"},  # scans of the logs
-    "docs/methods/lines.md": {"180"},  # beams
+    "docs/methods/laser/grid_localization.md": {"5,000"},  # particles
+    "docs/methods/laser/grids.md": {"2.37"},  # the honest median of a NEES
+    "docs/methods/laser/laser_slam.md": {"910", "406", "340", "292"},  # scans of the logs
+    "docs/methods/laser/lines.md": {"180"},  # beams
     "docs/methods/particles.md": {"5,000", "0.5", "99.9"},  # particles, a radius, a gate
-    "docs/methods/scan_matching.md": {"180", "0.05"},  # beams, the scale of a kernel
+    "docs/methods/laser/scan_matching.md": {"180", "0.05"},  # beams, the scale of a kernel
 }
 """numbers beside results that are none: what a benchmark is given"""
 

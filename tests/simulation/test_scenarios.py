@@ -24,6 +24,9 @@ def draw(world, seed=0):
 def test_loop_has_the_parameters_of_huang_et_al():
     world = loop()
     assert world.steps == 2500
+    assert repr(world) == (
+        "Scenario('loop', 2500 steps, 20 landmarks, unicycle, relative_position)"
+    )
     np.testing.assert_array_equal(world.controls, np.tile([0.25, 0.025, 1.0], (2500, 1)))
     sigma = 0.05 * 0.25
     q = world.motion.noise_cov(np.zeros(3), world.controls[0])

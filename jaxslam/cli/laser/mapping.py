@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxslam import grids
 from jaxslam.cli.laser.job import Job, figure_files
+from jaxslam.cli.run.piecewise import padded_rows
 from jaxslam.datasets import LaserLog
 from jaxslam.datasets.formats import ros_map
 from jaxslam.grids import Counts, Grid
@@ -16,7 +17,7 @@ from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
 from jaxslam.results.files import Files
 from jaxslam.results.laser_slam import map_size
-from jaxslam.types import Beams, Estimate, JaxOrNumPy
+from jaxslam.types import Beams, Estimate
 
 TOGETHER = 64
 """Scans between two updates of the progress."""
@@ -102,14 +103,14 @@ def counted(
     outside = unusable = 0
     for begin in range(0, total, TOGETHER):
         rows = slice(begin, begin + TOGETHER)
-        beams = Beams(*(_padded(part[rows]) for part in log.beams))
+        beams = Beams(*(padded_rows(part[rows], TOGETHER) for part in log.beams))
         unusable += int((~np.asarray(beams.valid)).sum()) - width * (TOGETHER - len(log.time[rows]))
         if beams.valid.any():
             found = grids.count(
                 shape,
                 origin,
                 resolution,
-                _padded(log.corrected[rows]),
+                padded_rows(log.corrected[rows], TOGETHER),
                 beams,
                 max_range=log.max_range,
                 no_return=0.0,
@@ -120,10 +121,6 @@ def counted(
         progress(min(begin + TOGETHER, total), total)
     sums = np.array(outside), np.array(unusable)
     return Counts(hits, misses, origin, np.array(resolution), *sums)
-
-
-def _padded(rows: JaxOrNumPy) -> np.ndarray:
-    return np.pad(rows, [(0, TOGETHER - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
 
 
 def beams_told(log: LaserLog, counts: Counts) -> dict[str, int]:

@@ -1,12 +1,10 @@
 """The command `jaxslam optimize`: the optimum of a graph in a file."""
 
 import argparse
-import math
 import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import SupportsFloat
 
 import jax
 import numpy as np
@@ -21,7 +19,7 @@ from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
 from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
-from jaxslam.results.files import csv_text, json_text, versions, write_files
+from jaxslam.results.files import csv_text, json_number, json_text, versions, write_files
 from jaxslam.types import JaxOrNumPy
 from jaxslam.validation.numbers import check_count
 
@@ -76,7 +74,10 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     found = jax.tree.map(np.asarray, solution.graph)
     squared = {k: np.asarray(s) for k, s in graphs.squared_residuals(found, factors).items()}
     converged = int(solution.status) == Ending.CONVERGED
-    costs = _finite(graphs.chi2(begun, factors)), _finite(sum(s.sum() for s in squared.values()))
+    costs = (
+        json_number(graphs.chi2(begun, factors)),
+        json_number(sum(s.sum() for s in squared.values())),
+    )
     status = _status(solution, found)
     summary = {
         "file": str(options.path),
@@ -91,14 +92,14 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "start": options.start,
         "method": options.method,
         "kernel": options.kernel or "none",
-        "chi2 of the file": _finite(graphs.chi2(given, factors)),
+        "chi2 of the file": json_number(graphs.chi2(given, factors)),
         "chi2 at the start": costs[0],
         "chi2": costs[1],
         "degrees of freedom": graphs.degrees_of_freedom(found, factors),
-        **({} if kernel is None else {"robust cost": _finite(solution.chi2)}),
+        **({} if kernel is None else {"robust cost": json_number(solution.chi2)}),
         "status": status,
         "iterations": int(solution.iterations),
-        "gradient / at the start": _finite(solution.gradient / solution.gradient_start),
+        "gradient / at the start": json_number(solution.gradient / solution.gradient_start),
         "seconds to compile": round(compiling, 3),
         "seconds to run": round(seconds - compiling, 3),
         **(_certificate(found, converged, kernel is None) if options.certificate else {}),
@@ -157,18 +158,12 @@ def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, object
         "certificate": "the chordal optimum next to it is global"
         if proof.certified
         else "not certified: another optimum of the chordal cost may be lower; try another --start",
-        "chordal chi2": _finite(proof.chi2),
-        "lower by at most": _finite(proof.gap),
-        "distance of the two optima [m]": _finite(proof.position),
-        "distance of the two optima [rad]": _finite(proof.heading),
+        "chordal chi2": json_number(proof.chi2),
+        "lower by at most": json_number(proof.gap),
+        "distance of the two optima [m]": json_number(proof.position),
+        "distance of the two optima [rad]": json_number(proof.heading),
         "seconds of the certificate": round(time.perf_counter() - began, 3),
     }
-
-
-def _finite(value: SupportsFloat) -> float | None:
-    """A number, or None where JSON has none."""
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def _worst(
@@ -189,7 +184,7 @@ def _worst(
                 "table": key,
                 "row": row,
                 "between": [label(graph, int(variable)) for variable in between],
-                "squared residual": _finite(squared[key][row]),
+                "squared residual": json_number(squared[key][row]),
             }
         )
     return found

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, PyTree
 
 from jaxslam.protocols import Filter
-from jaxslam.types import Estimate, Info, Log
+from jaxslam.types import Estimate, Info, JaxOrNumPy, Log
 
 State: TypeAlias = PyTree
 """A filter's own state, a pytree."""
@@ -113,7 +113,7 @@ def run_in_pieces(
     while done < total:
         until = total if not every else min(total, (done // every + 1) * every)
         until = min(until, done + size)
-        rows = jax.tree.map(lambda leaf, a=done, b=until: _padded(leaf[a:b], size), log)
+        rows = jax.tree.map(lambda leaf, a=done, b=until: padded_rows(leaf[a:b], size), log)
         state, kept, last = piece(state, rows, jnp.asarray(until - done), jnp.asarray(done))
         pieces.append(jax.tree.map(lambda leaf, n=until - done: np.asarray(leaf)[:n], kept[0]))
         if at is not None:
@@ -148,7 +148,7 @@ def run_in_pieces(
     )
 
 
-def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+def padded_rows(rows: JaxOrNumPy, size: int) -> np.ndarray:
     """The rows with zeros appended up to `size` of them."""
     rows = np.asarray(rows)
     return np.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])

@@ -16,7 +16,7 @@ from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import data_of, linearize, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
-from jaxslam.graphs.solver.padding import LEAST, cut, own_number, padded, padded_number
+from jaxslam.graphs.solver.padding import LEAST, cut, own_number, padded_graph, padded_number
 from jaxslam.graphs.solver.plan import Plan, checked_pairs, plan_for
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
 from jaxslam.graphs.sparse.inverse import selected_inverse
@@ -69,7 +69,7 @@ def marginals(
     check_graph(caller, graph, known)
     wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     if plan is None and programs.outside(graph):
-        more = padded(graph)
+        more = padded_graph(graph)
         rows = np.zeros((padded_size(len(wanted), LEAST), 2), int)
         rows[: len(wanted)] = padded_number(wanted, graph, more)
         new = plan_for(caller, more, known, None, marginals=True, pairs=rows)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxslam.graphs.graph import Graph
+from jaxslam.math.arrays import in_dtype
 
 _T = TypeVar("_T")
 
@@ -74,10 +75,4 @@ def graph_in_one_dtype(graph: Graph) -> Graph:
     """The graph with its numbers in one precision, the highest of them."""
     numbers = [graph.poses, graph.points]
     numbers += [x for table in graph.tables.values() for x in (table.z, table.information)]
-    dtype = jnp.result_type(*numbers)
-
-    def one(x: Array) -> Array:
-        x = jnp.asarray(x)
-        return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
-
-    return cast(Graph, jax.tree.map(one, graph))
+    return in_dtype(graph, jnp.result_type(*numbers))

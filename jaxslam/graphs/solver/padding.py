@@ -20,7 +20,7 @@ LEAST = 16
 """The step of the sizes of small graphs."""
 
 
-def padded(graph: Graph) -> Graph:
+def padded_graph(graph: Graph) -> Graph:
     """The graph with more poses and points, which are fixed, and rows, which are not valid.
 
     For concrete graphs: its arrays are NumPy's. The rows are of variable -1, which is nowhere, so

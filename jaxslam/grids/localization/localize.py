@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, PyTree
 
 from jaxslam import validation
@@ -28,6 +28,7 @@ from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
 from jaxslam.grids.grid import Grid, check_grid, to_cells
 from jaxslam.grids.localization.beam_log import beams_of
 from jaxslam.grids.localization.free_space import free_region
+from jaxslam.math.arrays import in_dtype
 from jaxslam.math.xla import no_inline
 from jaxslam.protocols import Filter, Motion, Resample
 from jaxslam.resampling.systematic import systematic
@@ -136,7 +137,7 @@ def localize(
             return -jax.vmap(one)(poses)
 
         # Else XLA computes it again in each of its consumers.
-        fit = no_inline(fit_of, state.pose, _in_dtype(prepared, state.pose.dtype), beams)
+        fit = no_inline(fit_of, state.pose, in_dtype(prepared, state.pose.dtype), beams)
         blocked = _blocked(grid, state.pose)
         fit = jnp.where(blocked, jnp.inf, fit)
         misfit = jnp.where(blocked, jnp.inf, jnp.asarray(exponent, fit.dtype) * fit)
@@ -151,14 +152,6 @@ def localize(
         return jnp.zeros((0, 2), pose.dtype)
 
     return pose_filter(settings, update, 2, no_points, np.zeros(0, np.int32))
-
-
-def _in_dtype(prepared: PyTree, dtype: DTypeLike) -> PyTree:
-    """The numbers of a prepared map in the dtype of the run."""
-    return jax.tree.map(
-        lambda x: x.astype(dtype) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x,
-        prepared,
-    )
 
 
 def _blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:

@@ -16,7 +16,7 @@ from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_pl
 from jaxslam.laser_slam.loops.descriptor import descriptors
 from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
-from jaxslam.laser_slam.odometry import Odometry
+from jaxslam.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops
 from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings

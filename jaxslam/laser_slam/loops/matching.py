@@ -1,4 +1,4 @@
-"""Candidates matched: a keyframe in a submap, by correlation over a window and by lines."""
+"""Candidates of loops, accepted or refused: a keyframe in a submap, by correlation and lines."""
 
 import os
 from collections.abc import Callable
@@ -11,8 +11,7 @@ from jaxtyping import Array, Float, Int
 from jaxslam import programs
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.loops.candidates import Candidates
-from jaxslam.laser_slam.records import LoopOutcome
-from jaxslam.laser_slam.reference import (
+from jaxslam.laser_slam.odometry.reference import (
     PEAK,
     Reference,
     gathered,
@@ -22,6 +21,7 @@ from jaxslam.laser_slam.reference import (
     taken,
     thinned,
 )
+from jaxslam.laser_slam.records import LoopOutcome
 from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Match, Matcher, MatchStatus, Points

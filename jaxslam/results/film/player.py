@@ -10,6 +10,7 @@ from html import escape
 import numpy as np
 from PIL import Image
 
+from jaxslam.results.files import html_page
 from jaxslam.results.film.encoding import size_of
 
 _ICONS = {
@@ -201,29 +202,18 @@ def _file(indices: np.ndarray, palette: Sequence[int], **more: int) -> bytes:
     return out.getvalue()
 
 
+_PAGE_CSS = """
+:root { color-scheme: light dark; --ink: #1c2330; --line: #b9c0cc; --accent: #0072b2; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e4e8ef; --line: #4a5467;
+  --accent: #7cc0f0; } body { background: #14181f; } }
+body { margin: 1rem; text-align: center; }
+.jaxslam-film { text-align: left; }
+"""
+
+
 def player_page(fragment: str, title: str = "") -> str:
     """A page of HTML with a player alone; the browser may load nothing."""
     policy = (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {SCRIPT_SOURCE}"
     )
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="{policy}">
-<title>{escape(title or "film")}</title>
-<style>
-:root {{ color-scheme: light dark; --ink: #1c2330; --line: #b9c0cc; --accent: #0072b2; }}
-@media (prefers-color-scheme: dark) {{ :root {{ --ink: #e4e8ef; --line: #4a5467;
-  --accent: #7cc0f0; }} body {{ background: #14181f; }} }}
-body {{ margin: 1rem; text-align: center; }}
-.jaxslam-film {{ text-align: left; }}
-</style>
-</head>
-<body>
-{fragment}
-</body>
-</html>
-"""
+    return html_page(title or "film", policy, _PAGE_CSS, fragment)

@@ -10,6 +10,7 @@ from html import escape
 
 from jaxslam.consistency import DOF, LEVEL
 from jaxslam.monte_carlo import Campaign
+from jaxslam.results.files import html_page
 from jaxslam.results.page import curves
 from jaxslam.results.page.parts import (
     VERDICTS,
@@ -59,18 +60,7 @@ def page(
     data = curves.embedded_curves(campaign)
     scripts = f"""<script type="application/json" id="curves">{data.text}</script>
 <script>{SCRIPT}</script>"""
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="{policy(film + scripts)}">
-<title>{escape(heading)}</title>
-<style>{CSS}</style>
-</head>
-<body>
-<header>
+    body = f"""<header>
 <p class="kicker">jaxslam · consistency report</p>
 <h1>{escape(heading)}</h1>
 <p class="lead">{escape(_setup(campaign))} each, in {escape(campaign.dtype)}; every filter on the
@@ -100,10 +90,8 @@ same draws.</p>
 {_parameters(campaign, command, seed, versions, data)}
 </section>
 </main>
-{scripts}
-</body>
-</html>
-"""
+{scripts}"""
+    return html_page(heading, policy(film + scripts), CSS, body)
 
 
 def fragment(

@@ -1,4 +1,4 @@
-"""State augmentation of a Kalman-type SLAM filter, for any chart and linearizer."""
+"""New landmarks: the state augmentation of a Kalman-type SLAM filter, and their covariances."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The innovations of m measurements, their covariance S, and V = L⁻¹ H P for the correction.
+"""The innovations of m measurements, their covariance S, their gate, and V = L⁻¹ H P.
 
 `innovate` linearizes, forms S = H P Hᵀ + R, gates, factors S = L Lᵀ and whitens by L⁻¹, with
 one function for each step. Its result, an `Innovation`, serves all forms of the update (`update`).

@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import programs
 from jaxslam.laser_slam import covariances
-from jaxslam.laser_slam.raw_odometry import Steps
-from jaxslam.laser_slam.reference import (
+from jaxslam.laser_slam.odometry.raw import Steps
+from jaxslam.laser_slam.odometry.reference import (
     BLUR,
     PEAK,
     gathered,

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.laser_slam.odometry import Odometry
+from jaxslam.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser_slam.records import Solved
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov

@@ -1,0 +1,1 @@
+"""Laser odometry: steps of raw odometry, scans matched with keyframes, increments for a filter."""
