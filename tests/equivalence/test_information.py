@@ -14,7 +14,7 @@ from jaxslam import filters, sensors
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.scenarios.view import between_ranges
-from jaxslam.types import Scan, Status
+from jaxslam.types import Status
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.1, 0.1, 0.05]) ** 2
@@ -167,42 +167,3 @@ def test_refusals(changes, message):
     options = {"motion": scene.motion, "sensor": scene.sensor, "capacity": 36} | changes
     with pytest.raises(ValueError, match=message):
         filters.eif_slam(**options)
-
-
-SPARSE = {"active": 2, "links": 1}
-FAMILY = {
-    "compressed_ekf_slam": (filters.compressed_ekf_slam, {"area": 1}),
-    "ekf_slam": (filters.ekf_slam, {}),
-    "ekf_slam, joint": (filters.ekf_slam, {"update": "joint"}),
-    "eif_slam": (filters.eif_slam, {}),
-    "seif": (filters.seif, SPARSE),
-    "eseif": (filters.eseif, SPARSE),
-}
-
-
-@pytest.mark.parametrize("name", FAMILY)
-def test_scans_without_places_and_measurements_beyond_all_numbers(name):
-    """A scan of none is none; a d² that overflows is outside any gate, and moves nothing."""
-    make, options = FAMILY[name]
-    scene = world(2, pose_cov=P0)
-    filter = make(scene.motion, scene.sensor, 2, **options)
-    nothing = Scan(np.zeros((0, 2)), np.zeros(0, np.int32), np.zeros(0, bool))
-
-    @jax.jit
-    def go(pose, pose_cov, scans):
-        start = filter.init(pose, pose_cov)
-        state, infos = jax.lax.scan(lambda s, scan: filter.update(s, scan, KEY), start, scans)
-        after, info = filter.update(state, nothing, KEY)
-        assert info.status.shape == (0,)
-        return state, after, infos.status[:, 0]
-
-    z = np.array([[[2.0, 0.1]], [[1e200, 0.1]], [[2.0, 0.1]]])
-    tag, yes = np.zeros((3, 1), np.int32), np.ones((3, 1), bool)
-    left_out = np.array([[True], [False], [True]])
-    start = np.asarray(scene.pose, float), P0
-    *states, status = go(*start, Scan(z, tag, yes))
-    states.append(go(*start, Scan(z, tag, left_out))[0])
-    far, after, left = map(jax.jit(filter.estimate), states)
-    np.testing.assert_array_equal(status, [Status.BORN, Status.REJECTED, Status.FUSED])
-    chex.assert_trees_all_close(far, left, rtol=0, atol=1e-12)
-    chex.assert_trees_all_close(far, after, rtol=0, atol=1e-12)

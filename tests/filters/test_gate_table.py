@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -136,7 +137,23 @@ SPARSE = {
 }
 
 
-def after_two_scans(filter, tags):
+@functools.cache
+def programs_of(family):
+    """The filter of a family, and as programs its start and a step, for all tests of it."""
+    filter = (FAMILIES | SPARSE)[family](seen_in_the_map())
+
+    @jax.jit
+    def step(state, scan):
+        key = jax.random.key(0)
+        return filter.update(filter.predict(state, jnp.zeros(3), key), scan, key)
+
+    return filter, jax.jit(filter.init), step
+
+
+START = np.zeros(3), np.diag([1e-4, 1e-4, 1e-6])
+
+
+def after_two_scans(family, tags):
     """The info of SCAN, after a scan that started the first three landmarks."""
     z = np.array([where for _, where, _ in SCAN.values()])
     valid = np.array([status != Status.EMPTY for *_, status in SCAN.values()])
@@ -147,13 +164,8 @@ def after_two_scans(filter, tags):
     )
     second = Scan(z, np.array(tags), valid)
 
-    @jax.jit
-    def step(state, scan):
-        key = jax.random.key(0)
-        return filter.update(filter.predict(state, jnp.zeros(3), key), scan, key)
-
-    state = jax.jit(filter.init)(np.zeros(3), np.diag([1e-4, 1e-4, 1e-6]))
-    state, _ = step(state, first)
+    _, init, step = programs_of(family)
+    state, _ = step(init(*START), first)
     return jax.device_get(step(state, second)[1])
 
 
@@ -166,7 +178,7 @@ def test_every_family_reports_a_scan_by_the_table(family):
     if "localization" in family:  # nothing is new in a map that is known
         born = (Status.BORN, Status.REPEATED, Status.OVERFLOW)
         wanted = [Status.UNMATCHED if status in born else status for status in wanted]
-    info = after_two_scans((FAMILIES | SPARSE)[family](seen_in_the_map()), tags)
+    info = after_two_scans(family, tags)
     got = [Status(int(status)).name for status in info.status]
     assert dict(zip(SCAN, got, strict=True)) == {
         name: status.name for name, status in zip(SCAN, wanted, strict=True)
@@ -176,6 +188,44 @@ def test_every_family_reports_a_scan_by_the_table(family):
     assert not np.asarray(info.nis)[~compared].any()
     np.testing.assert_array_equal(info.dof, np.where(info.status == Status.FUSED, 2, 0))
     assert np.isfinite(info.log_likelihood)
+
+
+@pytest.mark.parametrize(
+    "family",
+    ["compressed_ekf_slam", "ekf_slam", "ekf_slam, at once", "eif_slam", "seif", "eseif"],
+)
+def test_scans_without_places_and_measurements_beyond_all_numbers(family):
+    """A scan of none is none; a d² that overflows is outside any gate, and moves nothing."""
+    filter, init, step = programs_of(family)
+    places = len(SCAN)
+
+    def scan_of(z, valid=True):
+        rows = np.concatenate([[z], np.zeros((places - 1, 2))])
+        tag = np.array([0, *[-1] * (places - 1)])
+        return Scan(rows, tag, (np.arange(places) < 1) & valid)
+
+    def driven(*scans):
+        state, status = init(*START), []
+        for scan in scans:
+            state, info = step(state, scan)
+            status.append(int(info.status[0]))
+        return state, status
+
+    here, beyond = LANDMARKS[0], np.array([LANDMARKS[0, 0], 1e200])
+    far, status = driven(scan_of(here), scan_of(beyond), scan_of(here))
+    left, _ = driven(scan_of(here), scan_of(beyond, False), scan_of(here))
+    nothing = Scan(np.zeros((0, 2)), np.zeros(0, np.int32), np.zeros(0, bool))
+
+    @jax.jit
+    def of_nothing(state):
+        after, info = filter.update(state, nothing, jax.random.key(0))
+        assert info.status.shape == (0,)
+        return after
+
+    far, after, left = map(jax.jit(filter.estimate), (far, of_nothing(far), left))
+    assert status == [Status.BORN, Status.REJECTED, Status.FUSED]
+    chex.assert_trees_all_close(far, left, rtol=0, atol=1e-12)
+    chex.assert_trees_all_close(far, after, rtol=0, atol=1e-12)
 
 
 def test_a_delayed_filter_reports_bearings_by_the_table():

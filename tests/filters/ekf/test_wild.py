@@ -13,6 +13,7 @@ from jaxslam.filters import ekf_slam
 from jaxslam.filters.map_management.merging import merging
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.math.stats import chi2_quantile
+from jaxslam.protocols import Association
 from jaxslam.types import Log, Scan, Status
 
 STEPS, PLACES = 400, 4
@@ -33,16 +34,20 @@ CASES = [(method, 6) for method in METHODS] + [("joint", 1)]
 
 
 @cache
-def program(maker, capacity):
-    """A run as a program of the log and the gates."""
+def program(capacity, names):
+    """A run as a program of the log, the number of the method and the gates: one for all methods."""
     manager = life.existence(
         lambda pose, point: ((point - pose[:2]) ** 2).sum() < 25, patience=5, replace=True
     )
 
-    def one(log, *gates):
-        plain = ekf_slam(
-            MOTION, SENSOR, capacity, associate=MAKERS[maker](*gates), make_room=manager
-        )
+    def one(log, which, *gates):
+        methods = [MAKERS[name](*gates) for name in names]
+
+        def chosen(prediction, scan):
+            branches = [lambda m=m: Association(*m(prediction, scan)) for m in methods]
+            return jax.lax.switch(which, branches)
+
+        plain = ekf_slam(MOTION, SENSOR, capacity, associate=chosen, make_room=manager)
         filter = pruning(merging(plain, 0.3), manager)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0))
 
@@ -52,7 +57,8 @@ def program(maker, capacity):
 @cache
 def go(method, capacity, world):
     maker, *gates = METHODS[method]
-    return jax.device_get(program(maker, capacity)(WORLDS[world], *gates))
+    names = tuple(MAKERS) if capacity > 1 else (maker,)
+    return jax.device_get(program(capacity, names)(WORLDS[world], names.index(maker), *gates))
 
 
 def log_of(z, valid):
