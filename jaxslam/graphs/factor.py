@@ -42,6 +42,14 @@ class Factor:
     """the residual where a heading is cosine and sine, by which `certificate` bounds the cost; None
     where there is none"""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError on a kind of variable that graphs do not have."""
+        if lost := [kind for kind in self.variables if kind not in ("pose", "point")]:
+            raise ValueError(
+                f"graphs.Factor: {self.name}: expected variables 'pose' and 'point', "
+                f"got {lost[0]!r}"
+            )
+
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
 

@@ -43,14 +43,16 @@ def write(path: str | Path, graph: Graph) -> None:
     """Write a graph as a file that `read` reads as the same graph, number by number.
 
     The format is g2o; in a file that ends in .toro or .graph it is TORO, which has lines for poses
-    and relative poses alone.
+    and relative poses alone. A file that ends in .gz, after that, is packed by gzip.
 
     Poses, points, `FIX`, then the tables in their order; rows that are not valid are left out. A
     table "name/part" is written as the table "name", and read as part of it.
 
     Raises ValueError, before anything is written, on what the format has no line for: in TORO
     points, fixed poses, and tables other than relative poses; in g2o tables that `read` does not
-    name and points of other than two numbers. In both on an id of both a pose and a point.
+    name and points of other than two numbers. In both on an id of both a pose and a point, and on
+    what `read` refuses: ids twice or below zero, numbers that are not finite, and informations that
+    are not symmetric and positive semidefinite.
     """
     from jaxslam.datasets.formats import g2o
 

@@ -86,6 +86,8 @@ def of_log(
     validation.check_log(name, log, control_size=size_u, measurement_size=size_z)
     if np.shape(pose) != (3,):
         raise ValueError(f"{name}: expected a pose of shape (3,), got {np.shape(pose)}")
+    if is_concrete(pose) and not np.isfinite(np.asarray(pose)).all():
+        raise ValueError(f"{name}: the pose is not finite")
     known = is_concrete(pose_cov) and not np.any(np.asarray(pose_cov))
     index, valid, ids = _points_of(name, log, sensor, tags, capacity)
     arguments = jnp.asarray(pose), jnp.asarray(pose_cov), index, valid, ids
@@ -129,6 +131,8 @@ def _points_of(
         return log.scan.tag * 0, valid, np.zeros(0, np.int32)
     if np.shape(asked) != np.shape(valid):
         raise ValueError(f"{name}: expected tags of shape {np.shape(valid)}, got {np.shape(asked)}")
+    if not jnp.issubdtype(asked.dtype, np.integer):
+        raise ValueError(f"{name}: expected tags to be integers, got {asked.dtype}")
     if is_concrete(asked) and is_concrete(valid):
         unknown = np.asarray(valid) & (np.asarray(asked) < 0)
         if tags is None and unknown.any():

@@ -22,7 +22,7 @@ from jaxslam.graphs.solver.padding import cut, own_number, padded_graph
 from jaxslam.graphs.solver.plan import Plan, plan_for
 from jaxslam.graphs.solver.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
-from jaxslam.validation.numbers import check_count
+from jaxslam.validation.numbers import check_count, is_concrete
 
 
 def optimize(
@@ -59,6 +59,10 @@ def optimize(
     if method not in METHODS:
         raise ValueError(f"{caller}: no method {method!r}; there are: {', '.join(METHODS)}")
     check_count(f"{caller}: iterations", iterations)
+    if is_concrete(tolerance) and not 0 <= tolerance < np.inf:
+        raise ValueError(
+            f"{caller}: expected tolerance to be a finite number >= 0, got {tolerance}"
+        )
     model = model_of(caller, graph, factors, kernel)
     known = dict(model.factors)
     check_graph(caller, graph, known)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
@@ -11,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.solver.model import factors_of
+from jaxslam.types import JaxOrNumPy
 from jaxslam.validation.numbers import is_concrete
 
 INDEFINITE = 1e-6
@@ -26,12 +28,15 @@ class Parts(NamedTuple):
     anchored: Bool[np.ndarray, "parts"]
     """whether a part has a gauge: a fixed pose, two fixed points or a measurement of one pose
     alone"""
+    free: Bool[np.ndarray, "parts"]
+    """whether a part has a variable that is not fixed: only then it needs a gauge"""
 
 
 def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
     """Raise ValueError, which begins with a caller's name, unless a graph can be solved.
 
-    Refused are tables without a factor or of other sizes than their factor's, numbers that are not
+    Refused are tables without a factor or of other sizes than their factor's, arrays of another
+    kind than `Graph` and `Table` say, numbers that are not
     finite, an id twice, a measurement of a variable that is nowhere or of one variable twice, an
     information that is not symmetric or not positive semidefinite, no measurement at all, and parts
     that neither a fixed variable nor a measurement of one pose holds in place: a disconnected
@@ -47,12 +52,18 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
         _check_sizes(f"{name}: table {key!r}", table, factors[key])
     if not is_concrete(graph):
         return
-    _check_variables(name, graph)
-    for key, table in graph.tables.items():
-        _check_rows(name, graph, key, table, factors[key])
+    check_numbers(name, graph, factors)
     if not any(np.asarray(table.valid).any() for table in graph.tables.values()):
         raise ValueError(f"{name}: the graph has no measurement")
     _check_gauge(name, graph, factors)
+
+
+def check_numbers(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
+    """Raise ValueError on what `check_graph` refuses of the variables and rows of a concrete graph,
+    whatever holds it in place."""
+    _check_variables(name, graph)
+    for key, table in graph.tables.items():
+        _check_rows(name, graph, key, table, factors[key])
 
 
 def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
@@ -74,7 +85,9 @@ def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
     count, part = connected_components(joined, directed=False)
     anchored = np.bincount(part[:poses], held, minlength=count) > 0
     fixed = np.bincount(part[poses:], np.asarray(graph.fixed_point), minlength=count)
-    return Parts(part, anchored | (fixed > 1))
+    loose = np.concatenate([~np.asarray(graph.fixed_pose), ~np.asarray(graph.fixed_point)])
+    free = np.bincount(part, loose, minlength=count) > 0
+    return Parts(part, anchored | (fixed > 1), free)
 
 
 def variables_in(graph: Graph, table: Table, factor: Factor) -> Int[np.ndarray, "rows K"]:
@@ -106,6 +119,17 @@ def _check_sizes(what: str, table: Table, factor: Factor) -> None:
     for field, shape in wanted.items():
         if (got := np.shape(getattr(table, field))) != shape:
             raise ValueError(f"{what}: expected {field} of shape {shape}, got {got}")
+    _check_kind(what, who=(table.who, np.integer), valid=(table.valid, np.bool_))
+
+
+def _check_kind(what: str, **values: tuple[JaxOrNumPy, type]) -> None:
+    """Raise ValueError on arrays of another kind of number; those without entries are as good."""
+    for field, (value, kind) in values.items():
+        if not hasattr(value, "dtype"):
+            raise ValueError(f"{what}: expected {field} to be an array, got {type(value).__name__}")
+        if np.size(value) and not jnp.issubdtype(value.dtype, kind):
+            told = "bool" if kind is np.bool_ else "integers"
+            raise ValueError(f"{what}: expected {field} of {told}, got {value.dtype}")
 
 
 def _check_shapes(name: str, graph: Graph) -> None:
@@ -120,6 +144,13 @@ def _check_shapes(name: str, graph: Graph) -> None:
     ):
         if (got := np.shape(getattr(graph, field))) != (count,):
             raise ValueError(f"{name}: expected {field} of shape ({count},), got {got}")
+    _check_kind(
+        name,
+        fixed_pose=(graph.fixed_pose, np.bool_),
+        fixed_point=(graph.fixed_point, np.bool_),
+        pose_id=(graph.pose_id, np.integer),
+        point_id=(graph.point_id, np.integer),
+    )
 
 
 def _check_variables(name: str, graph: Graph) -> None:
@@ -169,20 +200,21 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
 
 def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
     parts = parts_of(graph, factors)
-    if parts.anchored.all():
+    loose = np.flatnonzero(~parts.anchored & parts.free)
+    if not len(loose):
         return
-    loose = np.flatnonzero(~parts.anchored)
     members = np.flatnonzero(parts.part == loose[0])
     told = ", ".join(label(graph, int(variable)) for variable in members[:3])
     told += f", … ({len(members):,} variables)" if len(members) > 3 else ""
-    if len(parts.anchored) == 1:
+    count = int(parts.free.sum())
+    if count == 1:
         raise ValueError(
             f"{name}: the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
             "give one a prior"
         )
     raise ValueError(
         f"{name}: the graph is disconnected: no measurement with information joins {told} to a "
-        f"fixed pose or one with a prior; {len(parts.anchored)} parts, {len(loose)} of them loose"
+        f"fixed pose or one with a prior; {count} parts, {len(loose)} of them loose"
     )
 
 

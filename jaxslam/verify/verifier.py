@@ -112,9 +112,12 @@ def verify_jacobians(
         and makes_a_model(model)
     ):
         factory = getattr(model, "__name__", "factory")
+        parameters = inspect.signature(model).parameters.values()
+        noise = "noise_cov" if any(p.default is p.empty for p in parameters) else ""
         raise ValueError(
-            f"verify_jacobians: expected a Motion or a Sensor, got the factory {factory} of one: "
-            f"call it, as in {factory}(noise_cov), or use jaxslam.verify.build({factory})"
+            "verify_jacobians: expected a Motion, a Sensor or a Factor, got the factory "
+            f"{factory} of one: call it, as in {factory}({noise}), or use "
+            f"jaxslam.verify.build({factory})"
         )
     if not (jacobian is None or callable(jacobian)):
         raise ValueError(
@@ -175,9 +178,11 @@ def notes_of(evaluated: Evaluated, kind: str) -> Iterator[str]:
         )
 
 
-def build(factory: Callable[..., Motion | Sensor | BeamModel]) -> Motion | Sensor | BeamModel:
+def build(
+    factory: Callable[..., Motion | Sensor | BeamModel | Factor],
+) -> Motion | Sensor | BeamModel | Factor:
     """A model made by a factory like those of the registries: with noise 0.01 I, or, of a beam
-    model, with the maximum range of the trial.
+    model, with the maximum range of the trial; a factor with nothing.
 
     A sensor, and a laser, is mounted off the robot's centre. Raises ValueError where the factory
     returns none of these.
@@ -187,6 +192,10 @@ def build(factory: Callable[..., Motion | Sensor | BeamModel]) -> Motion | Senso
     if "max_range" in parameters:
         made = factory(max_range=FAR, **mounted)
         if isinstance(made, BeamModel):
+            return made
+    if all(p.default is not p.empty for p in parameters.values()):
+        made = factory()
+        if isinstance(made, Factor):
             return made
     probe = factory(lambda *_: None)
     if not isinstance(probe, Motion | Sensor):

@@ -223,3 +223,13 @@ def test_unknown_options_are_refused(file, tmp_path, refused, option, message):
 
 def test_a_file_that_is_not_there(tmp_path, refused):
     refused(["optimize", tmp_path / "none.g2o"], "none.g2o: cannot be read")
+
+
+def test_points_of_an_earlier_result_do_not_stay(file, tmp_path, undrawn):
+    out = tmp_path / "out"
+    posed = tmp_path / "posed.g2o"
+    text = [line for line in file.read_text().splitlines() if "XY" not in line]
+    posed.write_text("\n".join(text))
+    for path, there in ((file, True), (posed, False)):
+        assert cli.main(["optimize", str(path), "--out", str(out), "--no-certificate"]) == 0
+        assert (out / "points.csv").exists() is there

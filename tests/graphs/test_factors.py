@@ -109,6 +109,13 @@ def test_where_the_noise_does_not_move_the_pose_nothing_is_infinite():
     assert np.isfinite(slopes(x, x)).all()
 
 
+def test_a_variable_is_a_pose_or_a_point():
+    with pytest.raises(
+        ValueError, match="mine: expected variables 'pose' and 'point', got 'place'"
+    ):
+        graphs.Factor("mine", ("place",), ("x [m]",), ("x [m]",), lambda v, z: z)
+
+
 def test_a_motion_of_two_noises_is_refused():
     with pytest.raises(ValueError, match=r"3 components.*unicycle with 2: v"):
         graphs.from_motion(motion.unicycle(np.eye(2)))

@@ -143,6 +143,38 @@ def test_what_toro_cannot_hold_is_refused(tmp_path):
     assert not (tmp_path / "out.toro").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "kind"), [("a.g2o.gz", b"VERTEX_SE2 "), ("a.toro.gz", b"VERTEX2 ")]
+)
+def test_a_packed_file_is_written_and_read_to_the_bit(tmp_path, name, kind):
+    graph = small_graphs.only(graphs.read(wrote(tmp_path, SMALL)), "relative_pose")
+    graph = graph._replace(
+        points=graph.points[:0],
+        point_id=graph.point_id[:0],
+        fixed_point=graph.fixed_point[:0],
+        fixed_pose=np.zeros(2, bool),
+    )
+    graphs.write(tmp_path / name, graph)
+    assert gzip.decompress((tmp_path / name).read_bytes()).startswith(kind)
+    assert_same(graphs.read(tmp_path / name), graph)
+
+
+def test_what_would_not_be_read_is_not_written(tmp_path):
+    graph = graphs.read(wrote(tmp_path, SMALL))
+    table = graph.tables["prior"]
+    skew = table.information + np.triu(np.ones((3, 3)), 1)
+    for change, message in (
+        ({"poses": graph.poses * np.nan}, "pose 7 is not finite"),
+        ({"pose_id": np.array([7, 7])}, "pose 7 occurs twice"),
+        ({"pose_id": np.array([7, -3])}, "expected ids >= 0, got -3"),
+        ({"tables": {"prior": table._replace(information=skew)}}, "is not symmetric"),
+        ({"tables": {"prior": table._replace(information=-table.information)}}, "semidefinite"),
+    ):
+        with pytest.raises(ValueError, match=f"graphs.write: .*{message}"):
+            graphs.write(tmp_path / "out.g2o", graph._replace(**change))
+    assert not (tmp_path / "out.g2o").exists()
+
+
 def test_rows_that_are_not_valid_are_not_written(tmp_path):
     graph = graphs.read(wrote(tmp_path, SMALL))
     table = graph.tables["relative_pose"]._replace(valid=np.array([False, True]))

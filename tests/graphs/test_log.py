@@ -219,6 +219,12 @@ def test_logs_are_batched_with_a_capacity():
     assert np.abs(points[1][:6] - points[0][:6]).max() > 0.01
 
 
+def test_points_of_a_capacity_that_no_scan_saw_are_no_hindrance():
+    here, log, _, _, solution = solved()
+    made = graphs.of_log(log, here.motion, here.sensor, START, START_COV, capacity=9)
+    np.testing.assert_allclose(graphs.optimize(*made).chi2, solution.chi2, rtol=1e-9)
+
+
 def test_an_association_stands_in_for_tags():
     here, log, graph, _, _ = solved()
     unknown = Log(log.control, log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
@@ -256,6 +262,8 @@ def _log(**change):
         ({}, {"pose_cov": np.diag([1.0, 0, 1])}, "pose_cov is singular; expected zero"),
         ({}, {"pose": np.zeros(2)}, r"expected a pose of shape \(3,\), got \(2,\)"),
         ({}, {"capacity": 3}, "expected tags below 3, the capacity, got 3"),
+        ({}, {"pose": np.full(3, np.nan)}, "the pose is not finite"),
+        ({}, {"tags": np.zeros((STEPS, 6))}, "expected tags to be integers, got float64"),
         ({}, {"tags": np.zeros((2, 2), int)}, r"expected tags of shape \(8, 6\)"),
         ({"tag": np.full((STEPS, 6), -1)}, {}, "has no identity: give tags="),
         ({"valid": np.zeros((STEPS, 6), bool)}, {}, "no measurement of a landmark"),

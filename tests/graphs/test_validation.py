@@ -130,6 +130,66 @@ def test_parts_with_a_gauge_each_are_a_graph():
     graphs.check_graph("optimize", loose(small_graphs.drawn(), fixed=True), of_files())
 
 
+def test_a_part_that_is_fixed_needs_no_gauge():
+    """A point that no row sees, fixed, as `of_log` leaves those of its capacity."""
+    graph = small_graphs.drawn()
+    unseen = graph._replace(
+        points=np.vstack([graph.points, [[0.0, 0.0]]]),
+        fixed_point=np.append(graph.fixed_point, True),
+        point_id=np.append(graph.point_id, 99),
+    )
+    graphs.check_graph("optimize", unseen, of_files())
+    free = small_graphs.only(at(unseen, "fixed_pose", 0, False), "relative_pose")
+    free = free._replace(points=unseen.points[-1:], fixed_point=np.ones(1, bool))
+    free = free._replace(point_id=unseen.point_id[-1:])
+    with pytest.raises(ValueError, match="the graph has no gauge"):
+        graphs.check_graph("optimize", free, of_files())
+    graphs.check_graph("optimize", graphs.with_gauge(free), of_files())
+
+
+def test_another_kind_of_number_is_refused():
+    graph = small_graphs.drawn()
+    table = graph.tables["prior"]
+    for spoilt, message in (
+        (table._replace(valid=table.valid.astype(int)), "expected valid of bool, got int"),
+        (table._replace(who=table.who.astype(float)), "expected who of integers, got float"),
+        (table._replace(valid=table.valid.tolist()), "expected valid to be an array, got list"),
+    ):
+        with pytest.raises(ValueError, match=f"table 'prior': {message}"):
+            graphs.optimize(graph._replace(tables=graph.tables | {"prior": spoilt}))
+    with pytest.raises(ValueError, match="expected fixed_pose of bool, got int"):
+        graphs.optimize(graph._replace(fixed_pose=graph.fixed_pose.astype(int)))
+
+
+def test_whole_numbers_are_real_ones():
+    """Of poses and of measurements, by optimization and by starts."""
+    steps = np.array([[2, 0, 1], [1, 1, 0]])
+    table = graphs.Table(
+        np.array([[0, 1], [1, 2]]),
+        steps,
+        np.tile(np.eye(3, dtype=int), (2, 1, 1)),
+        np.ones(2, bool),
+    )
+    graph = graphs.Graph(
+        poses=np.zeros((3, 3), int),
+        points=np.zeros((0, 2)),
+        tables={"relative_pose": table},
+        fixed_pose=np.arange(3) == 0,
+        fixed_point=np.zeros(0, bool),
+        pose_id=np.arange(3),
+        point_id=np.arange(0),
+    )
+    end = [2 + np.cos(1) - np.sin(1), np.sin(1) + np.cos(1), 1]
+    np.testing.assert_allclose(graphs.starts.odometry(graph).poses[2], end, atol=1e-12)
+    np.testing.assert_allclose(graphs.optimize(graph).graph.poses[2], end, atol=1e-6)
+
+
+def test_a_tolerance_is_a_number_from_zero_on():
+    for tolerance in (-1.0, np.nan):
+        with pytest.raises(ValueError, match="expected tolerance to be a finite number >= 0"):
+            graphs.optimize(small_graphs.drawn(), tolerance=tolerance)
+
+
 def test_rounding_of_a_file_is_not_indefinite():
     graph = small_graphs.drawn()
     flat = np.diag([1e4, 1e4, -1e-3])

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import pytest
 from verified import failed
 
 from jaxslam import graphs, verify_jacobians
@@ -28,3 +29,16 @@ def test_factors_of_a_file_are_found(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text("from jaxslam import graphs\nmine = graphs.prior()\n")
     assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [("mine", "prior")]
+
+
+def test_a_factory_of_a_factor_is_one(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "from jaxslam import graphs\n\n\ndef mine() -> graphs.Factor:\n    return graphs.prior()\n"
+    )
+    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [("mine", "prior")]
+
+
+def test_a_factory_in_the_place_of_a_factor_is_to_be_called():
+    with pytest.raises(ValueError, match=r"got the factory prior of one: call it, as in prior\(\)"):
+        verify_jacobians(graphs.prior)

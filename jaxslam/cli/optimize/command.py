@@ -118,7 +118,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         files |= film_writers(options, begun, factors, doubted, solution)
     if len(found.points):
         files["points.csv"] = _csv(("x", "y"), found.point_id, found.points, found.fixed_point)
-    written = write_files(options.out, files, replaces=films.NAMES)
+    written = write_files(options.out, files, replaces=(*films.NAMES, "points.csv"))
     print("\nwrote " + ", ".join(str(path) for path in written))
     if converged:
         return 0

@@ -10,6 +10,7 @@ from jaxtyping import PyTree
 
 from jaxslam.graphs.graph import Graph
 from jaxslam.math.arrays import in_dtype
+from jaxslam.types import JaxOrNumPy
 
 _T = TypeVar("_T")
 
@@ -72,7 +73,18 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
 
 
 def graph_in_one_dtype(graph: Graph) -> Graph:
-    """The graph with its numbers in one precision, the highest of them."""
+    """The graph with its numbers in one precision, the highest of them; whole numbers become real
+    ones."""
     numbers = [graph.poses, graph.points]
     numbers += [x for table in graph.tables.values() for x in (table.z, table.information)]
-    return in_dtype(graph, jnp.result_type(*numbers))
+    dtype = jnp.result_type(*numbers, float)
+
+    def real(x: JaxOrNumPy) -> JaxOrNumPy:
+        return x if jnp.issubdtype(x.dtype, jnp.floating) else jnp.asarray(x, dtype)
+
+    tables = {
+        key: table._replace(z=real(table.z), information=real(table.information))
+        for key, table in graph.tables.items()
+    }
+    graph = graph._replace(poses=real(graph.poses), points=real(graph.points), tables=tables)
+    return in_dtype(graph, dtype)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from jaxslam.validation.numbers import check_positive
+
 Array = jax.Array
 
 
@@ -25,6 +27,7 @@ class Kernel:
 def huber(limit: float = 1.345) -> Kernel:
     """Huber's kernel: s below k², else 2k√s - k² (Huber 1964; k = 1.345 keeps 95 % efficiency for
     one Gaussian residual)."""
+    check_positive("graphs.huber", limit=limit)
 
     def cost(s: Array) -> Array:
         near = s <= limit**2
@@ -40,6 +43,7 @@ def huber(limit: float = 1.345) -> Kernel:
 
 def cauchy(limit: float = 2.385) -> Kernel:
     """Cauchy's kernel: k² log(1 + s/k²) (k = 2.385: 95 % efficiency for one Gaussian residual)."""
+    check_positive("graphs.cauchy", limit=limit)
     return Kernel(
         "cauchy",
         lambda s: limit**2 * jnp.log1p(s / limit**2),
@@ -53,6 +57,7 @@ def dcs(limit: float = 1.0) -> Kernel:
     Agarwal et al. 2013, "Robust map optimization using dynamic covariance scaling", ICRA: the
     information is multiplied by c², c = min(1, 2Φ/(Φ + s)); ρ is the integral of c² (s).
     """
+    check_positive("graphs.dcs", limit=limit)
 
     def cost(s: Array) -> Array:
         return jnp.where(s <= limit, s, limit * (3 * s - limit) / (s + limit))
@@ -69,6 +74,7 @@ def truncated(limit: float = 3.37) -> Kernel:
     c² should be a quantile of χ² with as many degrees of freedom as residuals: c = 3.37 is that of
     99 % for three. `optimize` finds its minimum by graduated non-convexity.
     """
+    check_positive("graphs.truncated", limit=limit)
     return Kernel(
         "truncated",
         lambda s: jnp.minimum(s, limit**2),

@@ -131,9 +131,17 @@ def plan(
 
 
 def checked_pairs(name: str, pairs: ArrayLike, size: int) -> Int[np.ndarray, "Q 2"]:
-    """Pairs of variables, (Q, 2); raises ValueError, which begins with a caller's name, if one is
-    not among so many."""
-    wanted = np.asarray(pairs, int).reshape(-1, 2)
+    """Pairs of variables, (Q, 2); raises ValueError, which begins with a caller's name, on another
+    shape, on numbers that are not whole, and if one is not among so many."""
+    given = np.asarray(pairs)
+    if given.size == 0:
+        return np.zeros((0, 2), int)
+    if given.ndim != 2 or given.shape[1] != 2 or not np.issubdtype(given.dtype, np.integer):
+        raise ValueError(
+            f"{name}: expected pairs of whole numbers, (Q, 2), got {given.dtype} of shape "
+            f"{given.shape}"
+        )
+    wanted = given.astype(int)
     if ((wanted < 0) | (wanted >= size)).any():
         raise ValueError(
             f"{name}: expected pairs of variables from 0 to {size - 1}, got {wanted.tolist()}"

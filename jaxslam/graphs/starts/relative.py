@@ -113,8 +113,9 @@ def with_poses(graph: Graph, poses: Float[np.ndarray, "N 3"]) -> Graph:
 
 
 def as_before(before: JaxOrNumPy, values: np.ndarray) -> np.ndarray:
-    """The values in the type of those before."""
-    return values.astype(np.asarray(before).dtype)
+    """The values in the type of those before, unless that is of whole numbers."""
+    dtype = np.asarray(before).dtype
+    return values.astype(dtype) if np.issubdtype(dtype, np.floating) else values
 
 
 def with_points(

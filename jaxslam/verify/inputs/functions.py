@@ -273,7 +273,8 @@ def _has_signature(call: Callable[..., object]) -> bool:
 
 
 def makes_a_model(factory: Callable[..., object]) -> bool:
-    """Whether a function is annotated as a factory: `def mine(noise_cov, mount=…) -> Sensor`."""
+    """Whether a function is annotated as a factory: `def mine(noise_cov, mount=…) -> Sensor`,
+    or, without required parameters, `def mine() -> Factor`."""
     try:
         signature = inspect.signature(factory)
     except (TypeError, ValueError):
@@ -281,4 +282,5 @@ def makes_a_model(factory: Callable[..., object]) -> bool:
     returns = signature.return_annotation
     required = [p for p in signature.parameters.values() if p.default is p.empty]
     named = returns if isinstance(returns, str) else getattr(returns, "__name__", "")
-    return named.rpartition(".")[2] in ("Motion", "Sensor") and len(required) == 1
+    wanted = {"Motion": 1, "Sensor": 1, "Factor": 0}
+    return wanted.get(named.rpartition(".")[2]) == len(required)

@@ -75,8 +75,8 @@ def load(target: str) -> list[Target]:
 
     These are objects of the types `Motion`, `Sensor`, `graphs.Factor` and `grids.BeamModel`;
     factories annotated to return a motion or a sensor, whose only required parameter is a noise
-    covariance; and functions
-    f with a function f_jacobian (or f_jacobians), whose entries may be named as
+    covariance, or a factor, without required parameters; and functions f with a function
+    f_jacobian (or f_jacobians), whose entries may be named as
     f_arguments = {"pose": ("x [m]", …), …} and f_outputs = ("range [m]", …), and their states given
     as f_states = (array (S, n), …).
 
@@ -100,7 +100,7 @@ def load(target: str) -> list[Target]:
         raise UnusableFile(
             f"{path.name}: defines nothing to verify: no Motion, no Sensor, no Factor, no "
             "BeamModel, no function f with an f_jacobian, no factory whose result is annotated as "
-            "-> Motion or -> Sensor"
+            "-> Motion, -> Sensor or -> Factor"
         )
     return found
 

@@ -68,3 +68,10 @@ def test_the_weight_of_a_kernel_is_the_slope_of_its_cost(name):
     cost, weight = both(s)
     np.testing.assert_allclose(weight, slope, atol=1e-5)
     np.testing.assert_allclose(cost[:2], [0, 1e-3], rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", graphs.KERNELS)
+def test_a_limit_is_above_zero(name):
+    for limit in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match=f"graphs.{name}: expected limit above 0"):
+            graphs.KERNELS[name](limit)

@@ -1,20 +1,30 @@
 """Writer of pose and landmark graphs: g2o, and TORO by the ending of the file's name."""
 
+import gzip
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jaxslam.datasets.formats.g2o.kinds import EDGES, ENDINGS, G2O, Format
+from jaxslam.graphs.factor import of_files
 from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.validation import check_numbers
 from jaxslam.results.files import write_files
 
 
 def save(path: str | Path, graph: Graph) -> None:
     """Write a graph as a file of g2o, or TORO by the file's ending; see `graphs.write`."""
     path = Path(path)
-    text = text_of(graph, ENDINGS.get(path.suffix, G2O))
-    write_files(path.parent, {path.name: text})
+    packed = path.suffix == ".gz"
+    ending = path.with_suffix("").suffix if packed else path.suffix
+    text = text_of(graph, ENDINGS.get(ending, G2O))
+    _check_readable(graph)
+
+    def pack(target: Path) -> None:
+        target.write_bytes(gzip.compress(text.encode("utf-8"), mtime=0))
+
+    write_files(path.parent, {path.name: pack if packed else text})
 
 
 def text_of(graph: Graph, form: Format = G2O) -> str:
@@ -40,6 +50,15 @@ def text_of(graph: Graph, form: Format = G2O) -> str:
         names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
         lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
     return "\n".join(lines) + "\n"
+
+
+def _check_readable(graph: Graph) -> None:
+    """Raise ValueError on what `read` refuses."""
+    ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
+    if (ids < 0).any():
+        raise ValueError(f"graphs.write: expected ids >= 0, got {ids.min()}")
+    known = of_files()
+    check_numbers("graphs.write", graph, {key: known[key.split("/")[0]] for key in graph.tables})
 
 
 def _check_writable(graph: Graph, form: Format) -> None:
