@@ -50,7 +50,7 @@ from benchmarks import (
 from benchmarks.association.__main__ import measure as measure_association
 from benchmarks.consistency import circle, loop, stationary, webmap
 from benchmarks.gate import Metric, report
-from benchmarks.graph_consistency.__main__ import measure as measure_graphs
+from benchmarks.graphs.__main__ import measure as measure_graphs
 from benchmarks.grids.__main__ import measure as measure_grids
 from benchmarks.laser_slam.__main__ import measure as measure_laser_slam
 from benchmarks.mrclam.__main__ import measure as measure_mrclam

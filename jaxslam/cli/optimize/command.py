@@ -17,6 +17,7 @@ from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.solver.search import METHODS
 from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import csv_text, json_number, json_text, versions, write_files
@@ -42,6 +43,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     start = pick("start", options.start, starts.STARTS)
     kernel = None if options.kernel is None else pick("kernel", options.kernel, graphs.KERNELS)()
     relative, equation = pick("error", options.error, ERRORS)
+    pick("method", options.method, {name: name for name in METHODS})
     if options.animate and kernel is not None and kernel.limit is not None:
         raise ValueError(
             f"--animate: the kernel {options.kernel} is solved in rounds of many iterations each; "

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
-from benchmarks.graph_consistency import kernels as robust
+from benchmarks.graphs import kernels as robust
 from jaxslam import plot
 from jaxslam.results.plot.style import INK, PAGE, caption, curve, every_handle, panels_of, titled
 

@@ -1,6 +1,6 @@
 """Is a graph honest about its own covariance?
 
-    python -m benchmarks.graph_consistency [--quick] [--part draws,…] [--runs 40]
+    python -m benchmarks.graphs [--quick] [--part draws,…] [--runs 40]
 
 - `draws`: many draws of the Manhattan world at its true poses (with --quick, or without the data, a
   square of 100 poses), noise as the file has it, times 1, 3 and 10 (`monte_carlo`);
@@ -17,10 +17,10 @@ import argparse
 import jax
 
 from benchmarks.gate import Metric, report
-from benchmarks.graph_consistency import bicocca, figures, kernels
-from benchmarks.graph_consistency.filters import campaigns
-from benchmarks.graph_consistency.monte_carlo import SCALES, draws, summary
-from benchmarks.graph_consistency.worlds import MANHATTAN, manhattan, ring
+from benchmarks.graphs import bicocca, figures, kernels
+from benchmarks.graphs.filters import campaigns
+from benchmarks.graphs.monte_carlo import SCALES, draws, summary
+from benchmarks.graphs.worlds import MANHATTAN, manhattan, ring
 
 PARTS = ("draws", "kernels", "filters", "bicocca")
 
@@ -125,7 +125,7 @@ def _table(rows, head):
 
 
 def main():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.graph_consistency")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.graphs")
     parser.add_argument("--quick", action="store_true", help="a small graph and few runs")
     parser.add_argument("--part", default=",".join(PARTS), help="some of " + ", ".join(PARTS))
     parser.add_argument("--runs", type=int, default=40, help="draws of the Manhattan world")

@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from benchmarks.graph_consistency.worlds import measured, with_false_closures
+from benchmarks.graphs.worlds import measured, with_false_closures
 from jaxslam import graphs
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.math import stats

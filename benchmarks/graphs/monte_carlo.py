@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import scipy.stats
 
-from benchmarks.graph_consistency.worlds import measured
+from benchmarks.graphs.worlds import measured
 from jaxslam import graphs
 from jaxslam.consistency.nees import pose_error
 from jaxslam.math import stats

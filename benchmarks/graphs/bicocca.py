@@ -18,7 +18,7 @@ import gtsam
 import jax
 import numpy as np
 
-from benchmarks.graph_consistency.worlds import with_false_closures
+from benchmarks.graphs.worlds import with_false_closures
 from benchmarks.real_data import DATA
 from jaxslam import graphs, metrics
 from jaxslam.math import se2, stats
