@@ -232,7 +232,7 @@ def final_covariance(
 def _by_parameters(
     run: RunJacobians, start: Float[np.ndarray, "3 3"], at: Int[np.ndarray, "K"]
 ) -> Iterator[tuple[Float[np.ndarray, "3 P"], Float[np.ndarray, "P P"]]]:
-    """The ∂x_t/∂p, and the information of the scans until then on p, at each step of at."""
+    """The derivative ∂x_t/∂p, and the information on p of the scans until then, at steps `at`."""
     steps, _, width = run.by_noise.shape
     count, size = run.landmarks.shape
     map_at = 3 + steps * width

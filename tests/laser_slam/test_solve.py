@@ -173,6 +173,15 @@ def test_a_scan_of_another_place_does_not_move_the_path(drive):
     assert laser_slam.closure_score(found, true).precision == 1.0
 
 
+def test_matches_beyond_raw_odometry_that_stands_still_are_in_doubt(drive):
+    _, log, _ = drive
+    steps = poses.between(log.raw[:-1], log.raw[1:])
+    steps[10:20] = 0.0
+    raw = poses.chain(log.raw[0], steps)
+    found = laser_odometry(scans_of(log, SETTINGS), steps_of(raw, SETTINGS), SETTINGS, raw[0])
+    assert found.doubted[11:21].sum() >= 4 and not found.doubted[:11].any()
+
+
 def test_a_log_of_maximum_ranges_is_raw_odometry(drive):
     _, log, _ = drive
     short = laser_slam.ScanLog(*(part[:3] for part in (log.time, log.time, log.raw)), FAR)

@@ -43,6 +43,10 @@ def closed(
     the graph is optimized with Cauchy's kernel on them. In the end loops whose squared residual is
     above the quantile of `settings.consistency` are left out, and the graph is optimized without a
     kernel.
+
+    A keyframe whose match is in doubt begins and ends no loop. Until the last optimum the steps of
+    odometry have `Odometry.cov_if_right`, there `Odometry.cov`: with the wider covariances places
+    that look alike, metres away, would agree.
     """
     keyframe = odometry.keyframe
     at = odometry.poses[keyframe]
