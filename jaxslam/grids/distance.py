@@ -1,5 +1,7 @@
 """The exact Euclidean distance of each cell from the nearest one that is occupied."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,6 +86,30 @@ def squared_distances(occupied: Bool[JaxOrNumPy, "H W"]) -> Int[Array, "H W"]:
     k = jnp.arange(width, dtype=jnp.int32)[:, None]
     squared = (k - nearest) ** 2 + jnp.take_along_axis(column, nearest, axis=0) ** 2
     return jnp.where(occupied.any(), squared.T, nothing)
+
+
+def near_distances(occupied: Bool[JaxOrNumPy, "H W"], reach: int) -> Int[Array, "H W"]:
+    """The squared distances of `squared_distances` up to reach², in cells; (reach + 1)² beyond.
+
+    The minimum over 2 reach + 1 shifts along each axis: for a few cells many times as fast as the
+    exact transform, since it has no loop.
+    """
+    beyond = (reach + 1) ** 2
+    # Small integers: more of them fit into a register of the processor.
+    squared = jnp.where(occupied, 0, beyond).astype(jnp.int16 if reach <= 100 else jnp.int32)
+    for axis in (0, 1):
+        size = squared.shape[axis]
+        border = [(reach, reach) if axis == k else (0, 0) for k in (0, 1)]
+        wide = jnp.pad(squared, border, constant_values=beyond)
+        # Without a barrier XLA would compute the first axis again for each shift of the second.
+        wide = jax.lax.optimization_barrier(wide)
+        shifted = [
+            jax.lax.slice_in_dim(wide, k, k + size, axis=axis)
+            + jnp.asarray((k - reach) ** 2, squared.dtype)
+            for k in range(2 * reach + 1)
+        ]
+        squared = functools.reduce(jnp.minimum, shifted)
+    return jnp.minimum(squared, beyond)
 
 
 @jax.custom_batching.custom_vmap

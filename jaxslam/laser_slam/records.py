@@ -24,11 +24,19 @@ class LogOfScans(Protocol):
 
     @property
     def raw(self) -> Float[np.ndarray, "K 3"]:
-        """Raw odometry at each scan."""
+        """Raw odometry at each scan: the robot's pose."""
 
     @property
     def max_range(self) -> float:
         """[m] from which on a beam met nothing."""
+
+    @property
+    def mount(self) -> Float[np.ndarray, "3"] | tuple[float, float, float]:
+        """Pose of the laser on the robot."""
+
+    @property
+    def odometry_known(self) -> Bool[np.ndarray, "K"] | None:
+        """Whether odometry was logged since the scan before; None: at all scans."""
 
 
 class ScanLog(NamedTuple):
@@ -39,9 +47,13 @@ class ScanLog(NamedTuple):
     beams: Beams
     """with leading K"""
     raw: Float[np.ndarray, "K 3"]
-    """pose by raw odometry; only its increments matter"""
+    """pose of the robot by raw odometry; only its increments matter"""
     max_range: float
     """[m] from which on a beam met nothing"""
+    mount: Float[np.ndarray, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """pose of the laser on the robot"""
+    odometry_known: Bool[np.ndarray, "K"] | None = None
+    """whether odometry was logged since the scan before; None: at all scans"""
 
 
 class LoopOutcome(IntEnum):
@@ -78,7 +90,7 @@ class Loops(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """The result of laser SLAM; all arrays are NumPy's, all poses are in the frame of `raw`."""
+    """The result of laser SLAM; all arrays are NumPy's, all poses the robot's, in `raw`'s frame."""
 
     time: Float[np.ndarray, "K"]
     poses: Float[np.ndarray, "K 3"]

@@ -1,23 +1,33 @@
 """The scans of a log as points with the directions of their walls, and what of it is unusable."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import programs
 from jaxslam.laser_slam.records import LogOfScans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Points
 from jaxslam.matching.surface import Surface, surface
+from jaxslam.types import Beams
 
 GAP = 0.5
 """[m] between points beyond which they are not of one wall"""
+SPAN = np.deg2rad(2.0)
+"""Angle to either side of a point within which its neighbours lie."""
+MAX_NEIGHBOURS = 8
+"""to either side"""
+WIDTH, ROWS = 384, 64
+"""Beams and scans of one call that fits lines: logs are cut and filled up to these, so that all
+share one program."""
+CHANGED, SHARE = 0.1, 0.2
+"""A scan differs from the one before if more than this share of its beams do, by this much [m]."""
 
 
 class Scans(NamedTuple):
-    """K scans of B points, each in the frame of its robot; float32, as matching computes."""
+    """K scans of at most B points, each in the frame of its robot; float32, as matching computes."""
 
     points: Points
     """(K, B), the robot's place where not valid"""
@@ -25,6 +35,8 @@ class Scans(NamedTuple):
     """(K, B) the lines through them and their neighbours"""
     usable: Bool[np.ndarray, "K"]
     """enough points to match"""
+    changed: Bool[np.ndarray, "K"]
+    """whether a scan differs from the one before, as that of a robot at rest does not"""
 
 
 def check_laser_log(name: str, log: LogOfScans) -> None:
@@ -41,6 +53,13 @@ def check_laser_log(name: str, log: LogOfScans) -> None:
         )
     if np.shape(log.time) != (shape[0],):
         raise ValueError(f"{name}: expected {shape[0]} times, got {np.shape(log.time)}")
+    if log.odometry_known is not None and np.shape(log.odometry_known) != (shape[0],):
+        raise ValueError(
+            f"{name}: expected odometry_known of each of {shape[0]} scans, got "
+            f"{np.shape(log.odometry_known)}"
+        )
+    if np.shape(log.mount) != (3,) or not np.isfinite(log.mount).all():
+        raise ValueError(f"{name}: expected a mount of three finite numbers, got {log.mount}")
     lost = np.asarray(log.beams.valid, bool) & ~np.isfinite(log.beams.angle)
     for what, bad in (
         ("raw odometry", ~np.isfinite(log.raw).all(axis=1)),
@@ -53,24 +72,62 @@ def check_laser_log(name: str, log: LogOfScans) -> None:
         raise ValueError(f"{name}: expected a max_range above 0, got {log.max_range}")
 
 
-def scans_of(log: LogOfScans, settings: Settings) -> Scans:
-    """The points of a log's scans, and the lines through those within two degrees of each."""
-    ranges, angles, there = (np.asarray(part, np.float64) for part in log.beams)
-    nearest = min(settings.max_range, log.max_range * (1 - 1e-6))
+def met_something(log: LogOfScans) -> Beams:
+    """The beams of a log; valid are those that met something."""
+    ranges, angles, valid = (np.asarray(part) for part in log.beams)
     with np.errstate(invalid="ignore"):
-        valid = (there > 0) & (ranges > 0) & (ranges < nearest)
-    ranges, angles = np.where(valid, ranges, 0.0), np.where(there > 0, angles, 0.0)
-    rays = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
-    points: Any = ranges[..., None].astype(np.float32) * rays, rays, valid
-    span = max(2, round(np.deg2rad(2.0) / max(_spacing(angles, there > 0), 1e-3)))
-    stride = -(-ranges.shape[1] // settings.beams)
-    lines = programs.call(_surfaces, (span,), Points(*points))
-    kept, lines = jax.tree.map(lambda part: np.asarray(part)[:, ::stride], (Points(*points), lines))
-    return Scans(kept, lines, usable=np.asarray(kept.valid).sum(axis=1) >= settings.fewest)
+        met = (valid > 0) & (ranges > 0) & (ranges < log.max_range * (1 - 1e-6))
+    return Beams(np.where(met, ranges, 0.0), np.where(valid > 0, angles, 0.0), met)
 
 
-def _surfaces(span: int, points: Points) -> Surface:
-    found: Surface = jax.vmap(lambda of: surface(of, span, GAP))(points)
+def scans_of(log: LogOfScans, settings: Settings) -> Scans:
+    """The points of a log's scans in the robot's frame, and the lines through those within two
+    degrees of each."""
+    ranges, angles, met = met_something(log)
+    changed = _changed(ranges, met)
+    stride = -(-ranges.shape[1] // WIDTH)
+    ranges, angles, met = (part[:, ::stride] for part in (ranges, angles, met))
+    there = np.asarray(log.beams.valid)[:, ::stride] > 0
+    near = met & (ranges < settings.max_range)
+    spacing = max(_spacing(angles, there), 1e-3)
+    span = np.int32(np.clip(round(SPAN / spacing), 2, MAX_NEIGHBOURS))
+    x, y, heading = np.asarray(log.mount, float)
+    rays = np.stack([np.cos(heading + angles), np.sin(heading + angles)], axis=-1)
+    position = np.where(near[..., None], [x, y] + ranges[..., None] * rays, 0.0)
+    points = Points(position.astype(np.float32), rays.astype(np.float32), near)
+    every = -(-ranges.shape[1] // settings.beams)
+    kept, lines = [], []
+    for begin in range(0, len(ranges), ROWS):
+        rows = _filled(points, slice(begin, begin + ROWS), ROWS, WIDTH)
+        found = jax.tree.map(np.asarray, programs.call(_surfaces, (), rows, span))
+        size = len(ranges[begin : begin + ROWS])
+        # Points of no beam come last: the first WIDTH / `every` hold all that are kept.
+        for into, of in ((kept, rows), (lines, found)):
+            into.append(jax.tree.map(lambda part: _thinned(part[:size], every, settings.beams), of))
+    whole, line = (jax.tree.map(lambda *parts: np.concatenate(parts), *of) for of in (kept, lines))
+    usable = np.asarray(whole.valid).sum(axis=1) >= settings.fewest
+    return Scans(whole, line, usable, changed)
+
+
+def _thinned(part: np.ndarray, every: int, width: int) -> np.ndarray:
+    """Each n-th of the beams, cut or filled up to a width."""
+    found = part[:, ::every][:, :width]
+    return np.pad(found, [(0, 0), (0, width - found.shape[1])] + [(0, 0)] * (part.ndim - 2))
+
+
+def _filled(points: Points, rows: slice, count: int, width: int) -> Points:
+    """Some scans, filled up to so many of so many beams by points that are not valid."""
+
+    def one(part: np.ndarray) -> np.ndarray:
+        some = part[rows]
+        more = [(0, count - len(some)), (0, width - some.shape[1])] + [(0, 0)] * (part.ndim - 2)
+        return np.pad(some, more)
+
+    return Points(*(one(part) for part in points))
+
+
+def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
+    found: Surface = jax.vmap(lambda of: surface(of, span, GAP, most=MAX_NEIGHBOURS))(points)
     return found
 
 
@@ -78,3 +135,11 @@ def _spacing(angles: np.ndarray, there: np.ndarray) -> float:
     """The angle between beams [rad]."""
     steps = np.abs(np.diff(angles, axis=1))[there[:, 1:] & there[:, :-1]]
     return float(np.median(steps)) if steps.size else 0.02
+
+
+def _changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
+    """Whether each scan differs from the one before; the first does."""
+    differs = (np.abs(np.diff(ranges, axis=0)) > CHANGED) | (met[1:] != met[:-1])
+    either = met[1:] | met[:-1]
+    share = (differs & either).sum(axis=1) / np.maximum(either.sum(axis=1), 1)
+    return np.concatenate([[True], share > SHARE])

@@ -16,8 +16,8 @@ class Settings:
 
     max_range: float = 25.0
     """ranges from here on are not used"""
-    beams: int = 180
-    """of a scan with more, each second, third … is used"""
+    beams: int = 192
+    """of a scan at most; of one with more, each second, third … is used"""
     fewest: int = 20
     """a scan with fewer points is left out"""
     sigma: float = 0.02
@@ -82,6 +82,11 @@ class Settings:
         for name in ("loop_probability", "consistency", "least_inliers", "loop_inliers"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{caller}: {name}: expected in (0, 1), got {getattr(self, name)}")
+
+    @property
+    def scans_of_reference(self) -> int:
+        """Scans of a reference, the largest of odometry and loops, which share a program."""
+        return max(self.reference, 2 * self.submap + 1)
 
     @staticmethod
     def _check_numbers(name: str, given: object, shape: tuple[int, ...]) -> None:

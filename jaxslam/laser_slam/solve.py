@@ -9,7 +9,7 @@ from jaxslam import graphs
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.loops.closing import closed
 from jaxslam.laser_slam.mapping import frame_of, map_of
-from jaxslam.laser_slam.odometry.raw import steps_of
+from jaxslam.laser_slam.odometry.raw import Steps, steps_of
 from jaxslam.laser_slam.odometry.tracking import Odometry, laser_odometry
 from jaxslam.laser_slam.records import LogOfScans, LoopOutcome, Loops, Solved
 from jaxslam.laser_slam.scans import check_laser_log, scans_of
@@ -52,7 +52,8 @@ def solve(
         return None if progress is None else lambda done, of: progress(stage, done, of)
 
     raw = np.asarray(log.raw, np.float64)
-    scans, steps = scans_of(log, settings), steps_of(raw, settings)
+    scans = scans_of(log, settings)
+    steps = steps_of(raw, settings, np.asarray(log.time, float), scans.changed, log.odometry_known)
     lap("reading the scans")
     odometry = laser_odometry(scans, steps, settings, raw[0], telling("odometry"))
     lap("odometry")
@@ -78,7 +79,7 @@ def solve(
         loops=loops,
         map=maps[0],
         map_before=maps[1],
-        counts=_counts(log, scans.usable, steps.jump, odometry, loops),
+        counts=_counts(log, scans.usable, steps, odometry, loops),
         chi2=chi2,
         dof=graphs.degrees_of_freedom(graph) if len(graph.poses) > 1 else 0,
         seconds=seconds,
@@ -103,7 +104,7 @@ def _of_scans(graph: graphs.Graph, odometry: Odometry) -> tuple[np.ndarray, np.n
 
 
 def _counts(
-    log: LogOfScans, usable: np.ndarray, jump: np.ndarray, odometry: Odometry, loops: Loops
+    log: LogOfScans, usable: np.ndarray, steps: Steps, odometry: Odometry, loops: Loops
 ) -> dict[str, int]:
     counts = {
         "scans": len(usable),
@@ -111,7 +112,9 @@ def _counts(
         "scans with too few points": int((~usable).sum()),
         "scans by raw odometry alone": int((~odometry.matched[1:]).sum()),
         "scans whose match is in doubt": int(odometry.doubted.sum()),
-        "jumps of raw odometry": int(jump.sum()),
+        "jumps of raw odometry": int(steps.jump.sum()),
+        "steps in which raw odometry is frozen": int(steps.frozen.sum()),
+        "steps in which raw odometry lags": int(steps.lags.sum()),
         "scans stamped before their predecessor": int((np.diff(log.time) < 0).sum()),
         "loops matched": len(loops.outcome),
     }

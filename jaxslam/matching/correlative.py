@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxslam.grids.distance import distance_field
+from jaxslam.grids.distance import near_distances
 from jaxslam.grids.grid import Field, Grid, to_cells
 from jaxslam.grids.interpolation import interpolate
 from jaxslam.matching.branch_and_bound import Nodes, best_shift
@@ -25,10 +25,14 @@ class Scores(NamedTuple):
     """What a point scores by its cell, with `block` cells of 0 around the map."""
 
     table: Float[Array, "L H W"]
-    """first exp(-d²/2σ²), d the distance to the nearest occupied cell; then, at level l, the
-    largest of the 2^l × 2^l cells of which this is the lower left one"""
+    """first exp(-d²/2σ²), d the distance to the nearest occupied cell, 0 beyond `REACH` σ; then, at
+    level l, the largest of the 2^l × 2^l cells of which this is the lower left one"""
     field: Field
-    """d [m], of the map alone"""
+    """d [m], of the map alone, up to `REACH` σ"""
+
+
+REACH = 4.0
+"""Distance in σ beyond which a point scores 0, where exp(-d²/2σ²) is below 3.4e-4."""
 
 
 def correlative(
@@ -51,7 +55,7 @@ def correlative(
 
     The window holds the headings start ± turn_window in steps of `turn` [rad], and shifts of the
     start by whole cells of the reference's grid up to ± window [m] along its axes. A point scores
-    by the cell that it falls into, 0 off the map. A prior takes eᵀ Λ e/(2 σ² n) from the mean score
+    by the cell that it falls into, 0 off the map and beyond 4 σ. A prior takes eᵀ Λ e/(2 σ² n) from the mean score
     of n points, as near a wall exp(-d²/2σ²) is 1 - d²/2σ².
 
     The maximum is exact on this lattice: blocks of shifts are scored by the largest score of any
@@ -89,17 +93,22 @@ def correlative(
     shifts = int(np.ceil(window / cell - 1e-9))
     steps = int(np.ceil(turn_window / turn - 1e-9))
     levels = block.bit_length() - 1
+    reach = int(np.ceil(REACH * sigma / cell))
     offsets = turn * np.arange(-steps, steps + 1)
     limits = Limits(fewest, least_score, least_condition)
     corners = _square(np.arange(-shifts, shifts + 1, block))
 
     def prepare(grid: Grid) -> Scores:
-        field = distance_field(grid)
-        tables = [jnp.pad(jnp.exp(-0.5 * (field.values / sigma) ** 2), block)]
+        squared = near_distances(grid.log_odds > 0, reach)
+        dtype = grid.log_odds.dtype
+        d = jnp.asarray(grid.resolution, dtype) * jnp.sqrt(squared.astype(dtype))
+        score = jnp.where(squared <= reach**2, jnp.exp(-0.5 * (d / sigma) ** 2), 0.0)
+        tables = [jnp.pad(score, block)]
         for level in range(levels):
             right = jnp.maximum(tables[-1], jnp.roll(tables[-1], -(2**level), 1))
             tables.append(jnp.maximum(right, jnp.roll(right, -(2**level), 0)))
-        return Scores(jnp.stack(tables), field)
+        frame = jnp.asarray(grid.origin), jnp.asarray(grid.resolution)
+        return Scores(jnp.stack(tables), Field(d, *frame))
 
     def match(of: Scores, points: Points, start: Array, prior: Prior | None = None) -> Match:
         turns = start[2] + jnp.asarray(offsets, start.dtype)

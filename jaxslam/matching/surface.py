@@ -34,14 +34,14 @@ class Surface(NamedTuple):
     about it as they do elsewhere, so that it goes round no corner"""
 
 
-def surface(of: Points, span: int, gap: float) -> Surface:
+def surface(of: Points, span: int | Array, gap: float, *, most: int | None = None) -> Surface:
     """The lines through up to 2 span + 1 neighbours, in the order of the beams.
 
     Neighbours are those up to which no two points that follow each other are more than `gap` [m]
     apart. The line is that of least squared distances: with the moments S = Σ (p - m)(p - m)ᵀ its
     direction is ½ atan2(2 S_xy, S_xx - S_yy). With eigenvalues λ₁ >= λ₂ of S and n points, the
     variance of a point across it is estimated by λ₂/(n - 2), and that of the direction by
-    λ₂/((n - 2) λ₁). Differentiable by the positions.
+    λ₂/((n - 2) λ₁). Differentiable by the positions. A traced span needs `most`, its largest value.
     """
     p, valid = of.position, of.valid
     step = jnp.where(valid[1:] & valid[:-1], ((p[1:] - p[:-1]) ** 2).sum(axis=1), jnp.inf)
@@ -50,10 +50,10 @@ def surface(of: Points, span: int, gap: float) -> Surface:
     shifted = [p]
     for side in (-1, 1):
         reached = valid
-        for k in range(1, span + 1):
+        for k in range(1, (span if most is None else most) + 1):
             # The join between neighbours k-1 and k on this side of each point.
             link = jnp.roll(joined[1:], -(k - 1)) if side == 1 else jnp.roll(joined[:-1], k - 1)
-            reached = reached & link
+            reached = reached & link & (k <= span)
             weight.append(reached.astype(p.dtype))
             shifted.append(jnp.roll(p, -side * k, axis=0))
     w, q = jnp.stack(weight), jnp.stack(shifted)

@@ -1,17 +1,23 @@
-"""Scans as the reference of another: points and walls in one frame, and how it is matched."""
+"""Keyframes as the reference of a scan: one map of points and walls, and how a scan is matched."""
 
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from jaxslam import programs
 from jaxslam.graphs import cauchy
+from jaxslam.laser_slam import covariances
+from jaxslam.laser_slam.scans import Scans
+from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import (
     IcpSettings,
     Match,
     Matcher,
+    MatchStatus,
     Points,
     Prior,
     correlative,
@@ -20,6 +26,8 @@ from jaxslam.matching import (
     transformed,
 )
 from jaxslam.matching.surface import Surface, surface_at
+from jaxslam.math import numpy_poses as poses
+from jaxslam.math import se2
 
 CELL = 0.1
 """[m] side of a cell that is searched"""
@@ -30,21 +38,38 @@ HALF = 16.0
 PEAK = 0.9
 """A pose elsewhere of this share of the best score makes a match ambiguous."""
 
+SECTORS = 180
+"""of a turn, in which beams are compared with the reference"""
+CLEAR = 0.4
+"""[m] by which a point lies before what a beam met, at least, to be passed through"""
+
 
 class Reference(NamedTuple):
-    """The points of some scans, and the lines through them, in one frame."""
+    """The points of some scans, the lines through them, and the table that a search needs."""
 
     points: Points
     surface: Surface
+    table: Array
 
 
-def gathered(points: Points, surface: Surface, poses: Float[Array, "n 3"]) -> Reference:
-    """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
-    there = jax.vmap(transformed)(points, poses), jax.vmap(surface_at)(surface, poses)
-    return Reference(*jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there))
+class ScanMatch(NamedTuple):
+    """A scan matched with a reference."""
+
+    pose: Float[np.ndarray, "3"]
+    """in the frame of the reference"""
+    cov: Float[np.ndarray, "3 3"]
+    """of the end of the pose"""
+    inliers: float
+    """share of the points that lie on walls"""
+    residual: float
+    """[m] root mean square of their distances from these"""
+    ambiguous: bool
+    """whether the search found another pose nearly as good"""
+    through: float
+    """share of the reference's points in view that the scan's beams pass through"""
 
 
-def search(distance: float, angle: float, turn: float, *, ambiguous: float = 1.0) -> Matcher:
+def search(distance: float, angle: float, turn: float, *, ambiguous: float = PEAK) -> Matcher:
     """The search over a window of the reference's grid, [m] and [rad] to either side."""
     return correlative(
         window=distance,
@@ -64,23 +89,129 @@ _OF_WALLS = IcpSettings(kernel=cauchy(), scale=0.05, lone=0.5, iterations=10, le
 WALLS = point_to_line(replace(_OF_WALLS, reach=0.5))
 NEAR_WALLS = point_to_line(replace(_OF_WALLS, reach=0.15))
 """From where `WALLS` ends: its pairs are the points that lie on walls."""
+ANY = search(1.0, 0.5, 0.1)
+"""Whose table serves all searches, since they differ by their windows alone."""
 
 
-def searched(matcher: Matcher, reference: Reference) -> Array:
-    """What a search needs of a reference."""
-    prepared: Array = matcher.prepare(raster(reference.points, CELL, HALF))
-    return prepared
+def reference_of(
+    scans: Scans,
+    rows: Int[np.ndarray, "n"],
+    path: Float[np.ndarray, "n 3"],
+    origin: Float[np.ndarray, "3"],
+    size: int,
+) -> Reference:
+    """The reference of at most `size` scans at their poses, in the frame of a pose."""
+    take = np.append(rows, np.repeat(rows[-1:], size - len(rows)))
+    at = np.concatenate([path, np.repeat(path[-1:], size - len(rows), axis=0)])
+    points = taken(scans.points, take)
+    # The last scan is repeated without its points: a reference always has as many scans.
+    points = points._replace(valid=points.valid & (np.arange(size) < len(rows))[:, None])
+    there = poses.between(origin, at).astype(np.float32)
+    return programs.call(_gathered, (), points, taken(scans.surface, take), there)
 
 
-def on_walls(
-    reference: Reference, scan: Points, start: Float[Array, "3"], prior: Prior | None
-) -> Match:
-    """The match with the walls of a reference from a start within half a metre of it."""
-    near = WALLS.match(reference.surface, scan, start, prior)
-    return NEAR_WALLS.match(reference.surface, scan, near.pose, prior)
+def match(
+    matcher: Matcher,
+    reference: Reference,
+    scan: Points,
+    guess: Float[np.ndarray, "3"],
+    prior_cov: Float[np.ndarray, "3 3"] | None,
+    floor: Float[np.ndarray, "3 3"],
+    settings: Settings,
+) -> ScanMatch:
+    """The match of a scan with a reference: a search, then the distances of points from walls.
+
+    Args:
+        guess: pose in the frame of the reference. prior_cov: of the end of it; None: only a start.
+        floor: information added to that of the walls where there is no prior.
+    """
+    known = floor
+    prior = np.zeros((3, 3))
+    if prior_cov is not None:
+        known = np.linalg.inv(covariances.of_coordinates(prior_cov, guess))
+        prior = settings.correlation * known
+    found = np.asarray(
+        programs.call(
+            _match,
+            (matcher,),
+            reference,
+            scan,
+            guess.astype(np.float32),
+            prior.astype(np.float32),
+            np.float32(settings.sigma),
+        ),
+        np.float64,
+    )
+    pose, information = found[:3], found[3:12].reshape(3, 3)
+    inliers, residual, ambiguous, through = found[12:]
+    sigma = max(settings.sigma, residual) ** 2 * settings.correlation
+    cov = np.linalg.inv(covariances.semidefinite(information) / sigma + known)
+    return ScanMatch(
+        pose,
+        covariances.at_end(cov, pose) + np.diag(np.square(settings.floor)),
+        float(inliers),
+        float(residual),
+        bool(ambiguous),
+        float(through),
+    )
 
 
-def thinned(of: Points) -> Points:
+def _gathered(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Reference:
+    """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
+    there = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
+    one = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there)
+    return Reference(*one, ANY.prepare(raster(one[0], CELL, HALF)))
+
+
+def _match(
+    matcher: Matcher,
+    reference: Reference,
+    scan: Points,
+    guess: Array,
+    information: Array,
+    sigma: Array,
+) -> Array:
+    """Pose, information, share of inliers, residual, whether it is ambiguous, and share of points
+    that beams pass through, in one array, since each transfer from the device takes time.
+
+    information: of the prior, beside points of variance 1.
+    """
+    coarse = Prior(guess, BLUR**2 * information)
+    found = matcher.match(reference.table, _thinned(scan), guess, coarse)
+    fine = Prior(guess, sigma**2 * information)
+    near: Match = WALLS.match(reference.surface, scan, found.pose, fine)
+    near = NEAR_WALLS.match(reference.surface, scan, near.pose, fine)
+    ambiguous = (found.status == MatchStatus.AMBIGUOUS).astype(guess.dtype)
+    through = _seen_through(reference.points, scan, near.pose)
+    rest = jnp.stack([near.inliers, near.residual, ambiguous, through])
+    return jnp.concatenate([near.pose, near.information.reshape(-1), rest])
+
+
+def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
+    """The share of the reference's points in view that lie before what the scan meets there.
+
+    At the right pose the beams of a scan pass through no wall of the reference, but for what has
+    moved; at a wrong one that has as many points on walls they do. By sectors of two degrees:
+    points in sectors without a beam, and those behind what it met, are not in view.
+    """
+
+    def sector(at: Array) -> Array:
+        turn = jnp.arctan2(at[:, 1], at[:, 0]) / (2 * jnp.pi) + 0.5
+        return jnp.minimum((SECTORS * turn).astype(jnp.int32), SECTORS - 1)
+
+    far = jnp.sqrt((scan.position**2).sum(axis=1))
+    where = jnp.where(scan.valid, sector(scan.position), SECTORS)
+    nearest = jnp.full(SECTORS + 1, jnp.inf, far.dtype).at[where].min(far)[:SECTORS]
+    farthest = jnp.zeros(SECTORS + 1, far.dtype).at[where].max(far)[:SECTORS]
+    own = (reference.position - pose[None, :2]) @ se2.rotation(pose[2])
+    r, at = jnp.sqrt((own**2).sum(axis=1)), sector(own)
+    met = reference.valid & jnp.isfinite(nearest[at])
+    before = met & (r < nearest[at] - CLEAR - 0.02 * r)
+    in_view = met & (r < farthest[at] + 0.2)
+    return (before.sum() / jnp.maximum(in_view.sum(), 1)).astype(far.dtype)
+
+
+def _thinned(of: Points) -> Points:
     """Every second point."""
     return Points(*(part[::2] for part in of))
 

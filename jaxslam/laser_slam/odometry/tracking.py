@@ -4,44 +4,42 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jaxslam import programs
 from jaxslam.laser_slam import covariances
-from jaxslam.laser_slam.odometry.raw import Steps
+from jaxslam.laser_slam.odometry.raw import FARTHEST, Steps, reach_cov
 from jaxslam.laser_slam.odometry.reference import (
-    BLUR,
-    PEAK,
-    gathered,
-    on_walls,
+    Reference,
+    ScanMatch,
+    match,
+    reference_of,
     search,
-    searched,
     taken,
-    thinned,
 )
 from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
-from jaxslam.matching import Match, Matcher, MatchStatus, Points, Prior
-from jaxslam.matching.surface import Surface
+from jaxslam.matching import Matcher
 from jaxslam.math import numpy_poses as poses
 
-NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0))
+NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0), ambiguous=1.0)
 """About raw odometry."""
-FAR = search(1.6, np.deg2rad(60.0), np.deg2rad(2.5))
-"""Where that finds little, with raw odometry's covariance times `DOUBT`."""
-LOST = search(2.0, np.deg2rad(100.0), np.deg2rad(2.5), ambiguous=PEAK)
-"""Where raw odometry is no guess, as after a jump: the match must be as good as that of a loop."""
-WIDE = 0.3
-"""[m] standard deviation of raw odometry's position from which on it is none"""
-DOUBT = 16.0
-SURE = 0.6
-"""Share of the points on walls below which the wider search is made."""
-BETTER = 0.1
-"""By how much more its share has to be."""
+FAR = search(*FARTHEST, np.deg2rad(2.5))
+"""Where that finds little, or raw odometry is no guess."""
+INFLATION = 16.0
+"""Of raw odometry's covariance in the wider search."""
+MIN_INLIERS = 0.6
+"""Share of points on walls below which the wider search is made, and a match is in doubt."""
+MIN_GAIN = 0.2
+"""Extra share of points on walls, less those passed through, that the wider search must reach."""
+MAX_THROUGH = 0.15
+"""Share of points that beams pass through, above which a match is of another place."""
 GATE = 30.66
 """χ² of three degrees of freedom at 1 - 1e-6: a match farther from raw odometry is in doubt."""
 WRONG = 0.1
 """Probability that a match in doubt is of another place."""
+LOST = 6
+"""Scans in a row without a match after which the next one is a keyframe without one."""
+NO_FLOOR = np.zeros((3, 3))
 
 
 class Odometry(NamedTuple):
@@ -79,16 +77,24 @@ def laser_odometry(
     The pose in the frame of the last keyframe minimizes the squared distances of the points from
     the lines of the reference, and the error of raw odometry from the scan before, by their
     covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
-    by `settings.correlation`. Where too few points meet a wall the step is raw odometry alone; so
-    it is where that is no guess, as after a jump, and the match is worse than that of a loop, or
-    another pose is nearly as good.
+    by `settings.correlation`.
+
+    Where fewer than 0.6 of the points meet a wall, where raw odometry is no guess (σ above 0.3 m),
+    and after a gap in the stamps, all poses are searched that the robot can have reached in that
+    time (`Steps.reach`). Such a match counts if more points meet walls, and, where raw odometry is
+    no guess, if it is as good as that of a loop and no other pose is nearly as good.
+
+    A scan without a match has the pose of raw odometry, is no keyframe, and is matched once more at
+    the end, with the keyframes before and after it, from the path between its neighbours. After
+    `LOST` such scans in a row the next one is a keyframe, and only keyframes since then are matched
+    with.
 
     A match is in doubt that has few points on walls, or that raw odometry contradicts: it may be of
     another place that looks the same. It stays, and is taken to be wrong with probability p = 0.1:
     its covariance is about that of the mixture with raw odometry, C + p (P + e eᵀ), where e leads
     from one to the other. So are those of the scans after it until the next keyframe.
     """
-    count, width = len(scans.usable), settings.reference
+    count = len(scans.usable)
     result = Odometry(
         poses=np.zeros((count, 3)),
         base=np.zeros(count, int),
@@ -102,52 +108,166 @@ def laser_odometry(
         residual=np.zeros(count),
     )
     result.poses[0] = first
-    keys = [0]
+    keys, since = [0], 0  # since: the keyframe from which on scans are matched with
+    reference = _reference_of_last(scans, keys, result.poses, settings)
     # Of the last scan, relative to the last keyframe; doubt is what is added to its covariance.
     z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+    missed, blind = 0, False
+    # Pose and covariance by raw odometry from before a step that lags, for the step after it.
+    late: tuple[np.ndarray, np.ndarray] | None = None
     for scan in range(1, count):
-        key = keys[-1]
-        guess = poses.compose(z, steps.step[scan])
-        prior = covariances.composed_cov(cov, steps.step[scan], steps.cov[scan])
-        of = [one for one in keys[-width:] if scans.usable[one]]
+        step, step_cov = steps.step[scan], steps.cov[scan]
+        begin, begin_cov = (z, cov) if late is None else late
+        guess = poses.compose(begin, step)
+        prior = covariances.composed_cov(begin_cov, step, step_cov)
+        late = None
+        if steps.lags[scan]:
+            usual = step_cov - reach_cov(steps.reach[scan])
+            late = guess, covariances.composed_cov(begin_cov, step, usual)
+        bound = reach_cov(steps.reach[scan])
+        blind = bool(blind or steps.unknown[scan])
         before, z, cov = z, guess, prior
         doubted = False
-        if scans.usable[scan] and of:
-
-            def tracked(matcher: Matcher, prior: np.ndarray) -> _Tracked:
-                return _tracked(matcher, scans, scan, of, result.poses, key, guess, prior, settings)  # noqa: B023
-
-            least = settings.least_inliers
-            if np.sqrt(prior.diagonal()[:2].max()) > WIDE:
-                found, least = tracked(LOST, prior), max(least, settings.loop_inliers)
-            else:
-                found = tracked(NEAR, prior)
-                if found.match.inliers < SURE:
-                    wider = tracked(FAR, DOUBT * prior)
-                    if wider.match.inliers > found.match.inliers + BETTER:
-                        found = wider
-            fit = found.match
-            result.inliers[scan], result.residual[scan] = fit.inliers, fit.residual
-            if fit.inliers >= least and not found.ambiguous:
-                result.matched[scan] = True
-                z, cov = np.asarray(fit.pose, np.float64), found.cov
-                off = poses.between(guess, z)
-                contradicted = off @ np.linalg.solve(prior, off) > GATE
-                doubted = bool(contradicted or fit.inliers < SURE)
+        found = None
+        if scans.usable[scan] and reference is not None:
+            points = taken(scans.points, scan)
+            gap, unknown = bool(steps.gap[scan]), bool(blind or steps.lags[scan])
+            found = _matched(reference, points, guess, prior, bound, gap, unknown, settings)
+            result.inliers[scan] = found.inliers
+            result.residual[scan] = found.residual
+        if found is not None and found.accepted:
+            result.matched[scan] = True
+            z, cov = found.pose, found.cov
+            off = poses.between(guess, z)
+            contradicted = off @ np.linalg.solve(found.prior, off) > GATE
+            doubted = bool(contradicted or found.inliers < MIN_INLIERS)
+            missed, blind = 0, False
+        else:
+            missed += 1
+            if steps.gap[scan]:
+                cov = cov + bound
         doubt = covariances.moved(doubt, poses.between(before, z))
-        if doubted:
-            doubt = _doubt(prior, poses.between(z, guess))
+        if doubted and found is not None:
+            doubt = _doubt(found.prior, poses.between(z, guess))
         result.doubted[scan] = doubted
-        result.base[scan], result.z[scan] = key, z
+        result.base[scan], result.z[scan] = keys[-1], z
         result.cov[scan], result.cov_if_right[scan] = cov + doubt, cov
-        result.poses[scan] = poses.compose(result.poses[key], z)
+        result.poses[scan] = poses.compose(result.poses[keys[-1]], z)
         far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > settings.key_turn
-        if far and scans.usable[scan]:
+        restart = missed > LOST or reference is None
+        if scans.usable[scan] and (restart or (far and result.matched[scan])):
             keys.append(scan)
+            if restart:
+                since, missed = scan, 0
+            if late is not None:
+                late = poses.between(z, late[0]), late[1] + cov
             z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+            of = [key for key in keys if key >= since]
+            reference = _reference_of_last(scans, of, result.poses, settings)
         if progress is not None:
             progress(scan + 1, count)
-    return result._replace(keyframe=np.array(keys))
+    result = result._replace(keyframe=np.array(keys))
+    _place_unmatched(result, scans, steps, settings)
+    return result
+
+
+class _Found(NamedTuple):
+    """A match with raw odometry as its prior."""
+
+    pose: Float[np.ndarray, "3"]
+    cov: Float[np.ndarray, "3 3"]
+    prior: Float[np.ndarray, "3 3"]
+    """the covariance that raw odometry was taken to have"""
+    inliers: float
+    residual: float
+    accepted: bool
+
+
+def _matched(
+    reference: Reference,
+    points: object,
+    guess: Float[np.ndarray, "3"],
+    prior: Float[np.ndarray, "3 3"],
+    bound: Float[np.ndarray, "3 3"],
+    gap: bool,
+    unknown: bool,
+    settings: Settings,
+) -> _Found:
+    """The match of a scan about raw odometry, or over all that the robot can have reached."""
+
+    def by(matcher: Matcher, prior: np.ndarray) -> ScanMatch:
+        return match(matcher, reference, points, guess, prior, NO_FLOOR, settings)
+
+    if unknown:
+        fit = by(FAR, prior)
+        accepted = _sure(fit, settings)
+    else:
+        fit = by(NEAR, prior)
+        if fit.inliers < MIN_INLIERS:
+            wide = by(FAR, INFLATION * prior + bound)
+            if _sure(wide, settings) and _quality(wide) > _quality(fit) + MIN_GAIN:
+                fit = wide
+                prior = prior + bound if gap else prior
+        accepted = fit.inliers >= settings.least_inliers
+    return _Found(fit.pose, fit.cov, prior, fit.inliers, fit.residual, accepted)
+
+
+def _sure(fit: ScanMatch, settings: Settings) -> bool:
+    """Whether a match may be believed without raw odometry: as good as that of a loop."""
+    good = fit.inliers >= settings.loop_inliers and fit.through <= MAX_THROUGH
+    return good and not fit.ambiguous
+
+
+def _quality(fit: ScanMatch) -> float:
+    return fit.inliers - fit.through
+
+
+def _reference_of_last(
+    scans: Scans, keys: list[int], path: Float[np.ndarray, "K 3"], settings: Settings
+) -> Reference | None:
+    """The last keyframes with enough points, in the frame of the last; None without any."""
+    of = np.array([key for key in keys[-settings.reference :] if scans.usable[key]], int)
+    if not len(of):
+        return None
+    return reference_of(scans, of, path[of], path[keys[-1]], settings.scans_of_reference)
+
+
+def _place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Settings) -> None:
+    """Match the scans without a match with the keyframes around them, in place.
+
+    They are taken to lie in the middle of their neighbours, up to half of the way between these.
+    The poses of the others do not change.
+    """
+    keys = result.keyframe
+    placed = result.matched.copy()
+    placed[keys] = True
+    for scan in np.flatnonzero(~placed & scans.usable):
+        base = keys[np.searchsorted(keys, scan) - 1]
+        after = np.flatnonzero(placed[scan:])
+        if not len(after):
+            continue
+        before, after = scan - 1 - int(np.argmax(placed[:scan][::-1])), scan + int(after[0])
+        share = (scan - before) / (after - before)
+        way = poses.between(result.poses[before], result.poses[after])
+        middle = poses.compose(result.poses[before], share * way)
+        row = np.searchsorted(keys, scan)
+        half = settings.reference // 2
+        of = keys[max(row - half, 0) : row + half]
+        of = of[scans.usable[of]]
+        if not len(of):
+            continue
+        path = result.poses
+        reference = reference_of(scans, of, path[of], path[base], settings.scans_of_reference)
+        guess = poses.between(path[base], middle)
+        prior = steps.cov[scan] + reach_cov(np.array([np.hypot(way[0], way[1]), abs(way[2])]))
+        points = taken(scans.points, scan)
+        fit = match(FAR, reference, points, guess, prior, NO_FLOOR, settings)
+        if fit.inliers < MIN_INLIERS - 0.1 or fit.through > MAX_THROUGH or fit.ambiguous:
+            continue
+        result.matched[scan] = True
+        result.inliers[scan], result.residual[scan] = fit.inliers, fit.residual
+        result.z[scan], result.cov[scan], result.cov_if_right[scan] = fit.pose, fit.cov, fit.cov
+        result.poses[scan] = poses.compose(path[base], fit.pose)
 
 
 def _doubt(prior: np.ndarray, off: np.ndarray) -> np.ndarray:
@@ -156,69 +276,4 @@ def _doubt(prior: np.ndarray, off: np.ndarray) -> np.ndarray:
     off: e, the mean of raw odometry seen from the match.
     """
     at_match = covariances.propagated(covariances.turns(off[2]), prior)
-    return WRONG * (at_match + np.outer(off, off))
-
-
-class _Tracked(NamedTuple):
-    """A match of a scan with the keyframes before it."""
-
-    match: Match
-    cov: Float[np.ndarray, "3 3"]
-    """of the end of its pose"""
-    ambiguous: bool
-    """whether the search found another pose nearly as good"""
-
-
-def _tracked(
-    matcher: Matcher,
-    scans: Scans,
-    scan: int,
-    of: list[int],
-    path: np.ndarray,
-    key: int,
-    guess: np.ndarray,
-    prior: np.ndarray,
-    settings: Settings,
-) -> _Tracked:
-    """The match of a scan with keyframes, in the frame of the last."""
-    take = np.array(of + [of[-1]] * (settings.reference - len(of)))
-    there = poses.between(path[key], path[take]).astype(np.float32)
-    points = taken(scans.points, take)
-    again = np.arange(len(take)) < len(of)  # padding repeats a keyframe without points
-    wide = covariances.of_coordinates(prior, guess)
-    fit, status = programs.call(
-        _track,
-        (matcher,),
-        points._replace(valid=points.valid & again[:, None]),
-        taken(scans.surface, take),
-        there,
-        taken(scans.points, scan),
-        guess.astype(np.float32),
-        (settings.correlation * np.linalg.inv(wide)).astype(np.float32),
-        np.float32(settings.sigma),
-    )
-    sigma = max(settings.sigma, float(fit.residual)) ** 2 * settings.correlation
-    seen = covariances.semidefinite(np.asarray(fit.information)) / sigma + np.linalg.inv(wide)
-    at_end = covariances.at_end(np.linalg.inv(seen), np.asarray(fit.pose, np.float64))
-    cov = at_end + np.diag(np.square(settings.floor))
-    return _Tracked(fit, cov, int(status) == MatchStatus.AMBIGUOUS)
-
-
-def _track(
-    matcher: Matcher,
-    points: Points,
-    surface: Surface,
-    there: Array,
-    scan: Points,
-    guess: Array,
-    information: Array,
-    sigma: Array,
-) -> tuple[Match, Array]:
-    """By a search and by walls, with a prior of so much information beside points of variance 1;
-    and the status of the search."""
-    reference = gathered(points, surface, there)
-    prepared = searched(matcher, reference)
-    coarse = Prior(guess, BLUR**2 * information)
-    found = matcher.match(prepared, thinned(scan), guess, coarse)
-    near = on_walls(reference, scan, found.pose, Prior(guess, sigma**2 * information))
-    return near, found.status
+    return np.asarray(WRONG * (at_match + np.outer(off, off)))
