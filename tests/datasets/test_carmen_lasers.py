@@ -109,7 +109,8 @@ def test_one_laser_is_read_and_scans_of_the_others_are_counted(read):
 def test_a_log_without_poses_has_the_odometry_of_its_lines_or_none(read):
     lines = [line("RAWLASER1", robot, t=t) for t, robot in enumerate(ROBOT)]
     log = read(*lines)
-    assert log.max_range == 5.6 and not log.raw.any() and not log.corrected.any()
+    assert (log.laser, log.placed, log.max_range) == ("RAWLASER1", False, 5.6)
+    assert not log.raw.any() and not log.corrected.any()
     np.testing.assert_array_equal(log.odometry_known, [True, False, False])
     assert len(log.corrections) == 2
     moved = [f"ODOM {numbers(robot)} 0 0 0 1 host 1" for robot in ROBOT]

@@ -15,14 +15,17 @@ class LaserLog:
 
     name: str
     source: str
+    laser: str
+    """the kind of the lines that hold the scans, as FLASER"""
+    placed: bool
+    """whether these have poses: else `corrected` is zero"""
     time: Float[np.ndarray, "K"]
     """[s] at which each scan was taken; may repeat where the file has few digits"""
     beams: Beams
     """with leading K, in the frame of the laser; shorter scans are padded by beams that are not
     valid"""
     corrected: Float[np.ndarray, "K 3"]
-    """the robot's pose that stands in the line of the scan: a reference, not the truth; zeros where
-    the lines have none"""
+    """the robot's pose that stands in the line of the scan: a reference, not the truth"""
     raw: Float[np.ndarray, "K 3"]
     """raw odometry at each scan"""
     odometry_known: Bool[np.ndarray, "K"]

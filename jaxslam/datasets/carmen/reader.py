@@ -124,6 +124,8 @@ def carmen(
     return LaserLog(
         name=file.path.name.split(".")[0],
         source=str(file.path),
+        laser=kind,
+        placed=has_poses(kind),
         time=time,
         beams=beams,
         corrected=_wrapped(corrected),
