@@ -168,3 +168,17 @@ def test_raw_odometry_of_the_public_benchmark(log, file, told):
         own = datasets.carmen(DATA / f"{log}.log").raw
         off = poses.between(own[:-1], own[1:]) - poses.between(found.raw[:-1], found.raw[1:])
         assert (np.hypot(off[:, 0], off[:, 1]) > 1e-3).sum() == 12
+
+
+def test_lines_that_set_the_odometry_after_scans_of_another_laser(tmp_path):
+    """Such a line comes after FLASER; between it and the next, another laser is read."""
+    lines, _ = corrected_log(lambda t: 0)
+    path = tmp_path / "a.log"
+    path.write_text("\n".join(lines) + "\n")
+    odometry = datasets.carmen(path).odometry
+    scan = "RAWLASER1 0 -1.5 3.0 1.5 50 0.1 0 3 1 2 3 0 {t} host {t}"
+    two = [s for t, one in enumerate(lines) for s in (one, scan.format(t=t))]
+    path.write_text("\n".join(two) + "\n")
+    log = datasets.carmen(path, laser="RAWLASER1")
+    assert len(log.time) == len(lines) and log.dropped == {"scans FLASER": 8}
+    np.testing.assert_allclose(log.odometry, odometry, atol=1e-12)

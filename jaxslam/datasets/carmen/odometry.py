@@ -31,20 +31,17 @@ class RawOdometry(NamedTuple):
 def chained(
     path: Float[np.ndarray, "T 3"],
     time: Float[np.ndarray, "T"],
+    setting: Bool[np.ndarray, "T"],
     row: Int[np.ndarray, "K"],
-    robot: Float[np.ndarray, "K 3"],
 ) -> RawOdometry:
-    """The odometry of T >= 1 lines ODOM without what sets it.
+    """The odometry of T >= 1 lines ODOM, of which some set it, at K scans.
 
-    A line that sets the odometry repeats the pose of the scan before and so differs from the ODOM
-    line before that scan: a program that corrects a log writes it. No motion lies between the two
-    lines, so that the path goes on from where it was.
+    No motion lies between a line that sets the odometry and the line before it: there the path goes
+    on from where it was.
 
     Args:
         row: of each scan, the last ODOM line before it, -1 if none.
-        robot: the pose of the robot in the line of each scan, NaN where there is none.
     """
-    setting = setting_lines(path, time, row, robot)
     out = path.copy()
     begins = [*np.flatnonzero(setting), len(path)]
     for i, end in pairwise(begins):
@@ -59,28 +56,34 @@ def chained(
 def setting_lines(
     path: Float[np.ndarray, "T 3"],
     time: Float[np.ndarray, "T"],
-    row: Int[np.ndarray, "K"],
-    robot: Float[np.ndarray, "K 3"],
+    row: Int[np.ndarray, "S"],
+    robot: Float[np.ndarray, "S 3"],
 ) -> Bool[np.ndarray, "T"]:
-    """Which ODOM lines set the odometry.
+    """Which ODOM lines set the odometry, as a program that corrects a log writes them.
 
-    Of a raw log a line may repeat the pose of the scan before by chance, or since the logger wrote
-    the two in this order. So a line stamped after the one before it counts only where at least half
-    of the scans are followed by such a line, and other lines remain.
+    Such a line repeats the pose of the scan before, and so differs from the ODOM line before that
+    scan. A line of a raw log may repeat it by chance, or since the logger wrote the two in this
+    order. So a line stamped after the one before it counts only where at least half of the lines
+    that follow a scan are such, and other lines remain.
+
+    Args:
+        row: of each scan of any laser, the last ODOM line before it, -1 if none.
+        robot: the pose of the robot in the line of the scan, NaN where there is none.
     """
-    scan_before = np.full(len(path), -1)
-    scan_before[row[row + 1 < len(path)] + 1] = np.flatnonzero(row + 1 < len(path))
-    scan_before[0] = -1  # the first line tells where odometry begins
-    follows = np.flatnonzero(scan_before >= 0)
     near = _printed(path, robot)
-    at_scan = _equal(path[follows], robot[scan_before[follows]], near)
-    as_before = _equal(path[follows], path[follows - 1], near)
+    line = row + 1
+    # The first line tells where odometry begins.
+    scans = np.flatnonzero((line > 0) & (line < len(path)) & np.isfinite(robot).all(axis=1))
+    follows, at_scan = np.zeros((2, len(path)), bool)
+    follows[line[scans]] = True
+    at_scan[line[scans[_equal(path[line[scans]], robot[scans], near)]]] = True
+    as_before = np.zeros(len(path), bool)
+    as_before[1:] = _equal(path[1:], path[:-1], near)
     found = at_scan & ~as_before
     rest = len(path) - 1 - max(int(row[0]), 0) - int(found.sum())
-    common = 2 * found.sum() >= (~(at_scan & as_before)).sum() and rest > 0
-    setting = np.zeros(len(path), bool)
-    setting[follows] = found & (common | (time[follows] < time[follows - 1]))
-    return setting
+    common = 2 * found.sum() >= (follows & ~(at_scan & as_before)).sum() and rest > 0
+    setting = found & (common | (np.diff(time, prepend=time[0]) < 0))
+    return np.asarray(setting)
 
 
 def _printed(path: Float[np.ndarray, "T 3"], robot: Float[np.ndarray, "K 3"]) -> np.ndarray:

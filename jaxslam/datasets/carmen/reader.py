@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike
 
 from jaxslam.datasets.carmen.lines import POSE, Scan, has_poses, is_scan, scan_of
 from jaxslam.datasets.carmen.log import LaserLog
-from jaxslam.datasets.carmen.odometry import RawOdometry, chained, of_file, without_lines
+from jaxslam.datasets.carmen.odometry import (
+    RawOdometry,
+    chained,
+    of_file,
+    setting_lines,
+    without_lines,
+)
 from jaxslam.datasets.carmen.scans import beams_of, checked_mount, clock_of, mount_of, robot_poses
 from jaxslam.datasets.formats.lines import TextFile
 from jaxslam.math import numpy_poses as poses
@@ -57,8 +63,8 @@ def carmen(
     at -90° there).
 
     **Mount**: the laser's pose on the robot, from the two poses of ROBOTLASER; (0, 0, π) for
-    RLASER, zero for FLASER and RAWLASER. The robot's pose of FLASER and RLASER is that of the laser
-    without the mount; where a line has the same pose twice, that is the robot's.
+    RLASER, zero for FLASER and RAWLASER. The robot's corrected pose of these, and where the
+    mount is given, is the laser's without the mount; where a line has one pose twice, that pose.
 
     Args:
         path: NAME, or NAME.gz beside it.
@@ -83,10 +89,12 @@ def carmen(
     kind = _kind(file, Counter(fields[0] for _, fields in lines if is_scan(fields[0])), laser)
     logged: list[list[float]] = []
     scans: list[Scan] = []
+    placed: list[tuple[float, ...]] = []
     dropped: Counter[str] = Counter()
     for line, fields in lines:
         if is_scan(fields[0]):
             scan = scan_of(file, line, fields, len(logged) - 1)
+            placed.append((scan.row, *scan.robot))
             if fields[0] == kind:
                 scans.append(scan)
             else:
@@ -103,16 +111,17 @@ def carmen(
     clock = clock_of(scans, corrections)
     time = np.array([scan.times[clock] for scan in scans])
     frame = mount_of(file, kind, scans) if given is None else given
-    corrected, robot = robot_poses(kind, scans, frame)
+    corrected, robot = robot_poses(kind, scans, frame, given is not None)
     if odometry is not None:
         found, time, told = of_file(odometry, time, str(file.path))
         corrections.append(told)
         if logged:
             dropped["lines ODOM"] = len(logged)
     elif logged:
-        table = np.array(logged)
-        row = np.array([scan.row for scan in scans])
-        found = chained(table[:, :3], table[:, 3 + clock], row, robot)
+        table, every = np.array(logged), np.array(placed)
+        moved, stamp = table[:, :3], table[:, 3 + clock]
+        setting = setting_lines(moved, stamp, every[:, 0].astype(int), every[:, 1:])
+        found = chained(moved, stamp, setting, np.array([scan.row for scan in scans]))
     else:
         found = without_lines(robot)
     beams, limit = beams_of(scans, max_range, dropped, corrections)

@@ -97,11 +97,14 @@ def told(pose: Float[np.ndarray, "3"]) -> str:
 
 
 def robot_poses(
-    kind: str, scans: list[Scan], mount: Float[np.ndarray, "3"]
+    kind: str, scans: list[Scan], mount: Float[np.ndarray, "3"], given: bool
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3"]]:
-    """The robot's corrected poses, and the robot's poses as they stand in the lines."""
+    """The robot's corrected poses, and the robot's poses as they stand in the lines.
+
+    given: the mount is not that of the lines.
+    """
     laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
-    if kind.startswith("ROBOTLASER"):
+    if kind.startswith("ROBOTLASER") and not given:
         return robot, robot
     if kind.startswith("RAWLASER"):
         return np.zeros_like(robot), robot
