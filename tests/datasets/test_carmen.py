@@ -55,6 +55,10 @@ def test_times_are_the_loggers_where_all_measurements_have_one_stamp(tmp_path):
     np.testing.assert_allclose(log.time, [5, 7])
     np.testing.assert_allclose(log.odometry_time, [12.5])
     assert log.corrections[0].startswith("all scans have the same timestamp")
+    log = datasets.carmen(
+        written(tmp_path / "b.log", ODOM.format(x=1, t=0), *[FLASER.format(t=0)] * 2)
+    )
+    assert log.corrections[0] == "all scans have the same time, by the logger as well"
 
 
 @pytest.mark.parametrize(

@@ -89,12 +89,12 @@ def carmen(
     kind = _kind(file, Counter(fields[0] for _, fields in lines if is_scan(fields[0])), laser)
     logged: list[list[float]] = []
     scans: list[Scan] = []
-    placed: list[tuple[float, ...]] = []
+    scan_poses: list[tuple[float, ...]] = []
     dropped: Counter[str] = Counter()
     for line, fields in lines:
         if is_scan(fields[0]):
             scan = scan_of(file, line, fields, len(logged) - 1)
-            placed.append((scan.row, *scan.robot))
+            scan_poses.append((scan.row, *scan.robot))
             if fields[0] == kind:
                 scans.append(scan)
             else:
@@ -118,7 +118,7 @@ def carmen(
         if logged:
             dropped["lines ODOM"] = len(logged)
     elif logged:
-        table, every = np.array(logged), np.array(placed)
+        table, every = np.array(logged), np.array(scan_poses)
         moved, stamp = table[:, :3], table[:, 3 + clock]
         setting = setting_lines(moved, stamp, every[:, 0].astype(int), every[:, 1:])
         found = chained(moved, stamp, setting, np.array([scan.row for scan in scans]))

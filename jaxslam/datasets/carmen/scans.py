@@ -21,9 +21,12 @@ def clock_of(scans: list[Scan], corrections: list[str]) -> int:
     """Which of the two times of a line counts: 0 of the measurement, 1 of the logger, where those
     of the measurements are all the same."""
     taken, logged = np.array([scan.times for scan in scans]).T
-    if np.ptp(taken) == 0 and np.ptp(logged) > 0:
+    if len(scans) == 1 or np.ptp(taken) > 0:
+        return 0
+    if np.ptp(logged) > 0:
         corrections.append("all scans have the same timestamp: times are the logger's")
         return 1
+    corrections.append("all scans have the same time, by the logger as well")
     return 0
 
 
@@ -74,7 +77,7 @@ def mount_of(file: TextFile, kind: str, scans: list[Scan]) -> Float[np.ndarray, 
     Raises ValueError, with file and line, where it differs between lines.
     """
     if not kind.startswith("ROBOTLASER"):
-        return REAR if kind == "RLASER" else np.zeros(3)
+        return REAR.copy() if kind == "RLASER" else np.zeros(3)
     laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
     mounts = poses.between(robot, laser)
     off = poses.between(mounts[0], mounts)
