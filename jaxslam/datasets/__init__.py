@@ -9,7 +9,8 @@ from functools import partial
 from pathlib import Path
 
 from jaxslam.datasets.bonn import bonn
-from jaxslam.datasets.carmen import LaserLog, carmen
+from jaxslam.datasets.carmen.log import LaserLog
+from jaxslam.datasets.carmen.reader import carmen
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
 from jaxslam.datasets.mrclam.own_log import (

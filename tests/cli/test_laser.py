@@ -7,16 +7,19 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from laser_slam.ring_of_rooms import FAR, ranges_of
 
 from jaxslam import cli, grids
 from jaxslam.cli.laser.mapping import TOGETHER
+from jaxslam.cli.laser.options import read_log
+from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot
 from jaxslam.results.film import encoding
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import is_free, rasterize, walls
 
-BEAMS, STEPS = 24, TOGETHER + 6
+BEAMS, STEPS = 25, TOGETHER + 6
 FIT = "beams of the last 10 scans within 0.3 m of the map's range, share"
 
 
@@ -35,9 +38,9 @@ def log_file(tmp_path_factory):
     """A robot in a room with a niche: 70 scans of the beams ahead; scan 3 has no valid one, 4 a NaN."""
     niche = [[0, 0], [6, 0], [6, 4], [7.5, 4], [7.5, 6], [0, 6]]
     room = walls(niche, [[2.6, 2.6], [3.4, 2.6], [3.4, 2.9]])
-    world = dataclasses.replace(square(beams=2 * BEAMS), walls=room)
+    world = dataclasses.replace(square(beams=2 * (BEAMS - 1)), walls=room)
     log = jax.device_get(scan_world(world, jax.random.key(0)))
-    ahead = slice(BEAMS // 2, BEAMS // 2 + BEAMS)  # from -90° on, 7.5° apart
+    ahead = slice(BEAMS // 2, BEAMS // 2 + BEAMS)  # from -90° to 90°, 7.5° apart
     assert np.isclose(log.beams.angle[0, ahead][0], -np.pi / 2)
     ranges = np.where(log.beams.valid, log.beams.range, 0.0)[:STEPS, ahead]
     ranges[3], ranges[4, 5] = 0.0, np.nan
@@ -113,6 +116,16 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
         (["--map", "known", "--resolution", "1e-4"], "--resolution: cells of 0.0001 m make a map"),
         (["--map", "known", "--max-range", "-1"], "--max-range: expected a number above 0"),
         (["--map", "known", "--every", "0"], "--every: expected a number above 0"),
+        (
+            ["--map", "known", "--mount", "-1,0"],
+            "--mount: expected X,Y,HEADING [m, m, deg], got '-1",
+        ),
+        (["--map", "known", "--mount", "0,nan,0"], "--mount: expected X,Y,HEADING [m, m, deg]"),
+        (
+            ["--map", "known", "--laser", "RLASER"],
+            "room.log:141: expected scans of the laser RLASER",
+        ),
+        (["--map", "known", "--odometry", "no.txt"], "no.txt: cannot be read: No such file"),
         (["--map", "known", "--scans", "a:b"], "--scans: expected A:B"),
         (["--map", "known", "--scans", "900:"], "--scans: 900: has none of the 70 scans"),
         (["--map", "known", "--scans", "3:4"], "room.log: none of 1 scans has a valid beam"),
@@ -203,6 +216,67 @@ def test_a_robot_is_localized_in_a_map_by_odometry_and_scans(log_file, room_map,
     summary = json.loads((tmp_path / "lost" / "summary.json").read_text())
     assert summary["particles agree at the end"] and summary[FIT] < 0.6
     assert summary["localized at the end"] == "no: less than 75% of the beams fit the map"
+
+
+@pytest.fixture(scope="module", params=[(-0.2, 0.1, np.pi), (0.5, 0, 0)], ids=["back", "ahead"])
+def mounted(request, log_file, tmp_path_factory):
+    """The same drive with a laser that looks back, or ahead from the front of the robot."""
+    mount, step = np.array(request.param), np.pi / (BEAMS - 1)
+    laser = poses.compose(log_file.pose, mount)
+    angles = -np.pi / 2 + step * np.arange(BEAMS)
+    raw = log_file.pose + [10.0, -3.0, 0.0]
+    text = ""
+    for k, t in enumerate(100 + 0.25 * np.arange(STEPS)):
+        seen = ranges_of(laser[k], angles, log_file.walls.segments)
+        numbers = " ".join(f"{r:.4f}" for r in seen)
+        both = " ".join(f"{value}" for value in (*laser[k], *log_file.pose[k]))
+        text += (
+            f"ODOM {raw[k][0]} {raw[k][1]} {raw[k][2]} 0 0 0 {t} robot {t}\n"
+            f"ROBOTLASER1 0 {angles[0]} {np.pi} {step} {FAR} 0.1 0 {BEAMS} {numbers} 0 {both} "
+            f"0 0 0 0 0 {t} robot {t}\n"
+        )
+    path = tmp_path_factory.mktemp("mounted") / "room.log"
+    path.write_text(text)
+    return SimpleNamespace(path=path, mount=mount, pose=log_file.pose)
+
+
+def test_a_map_by_a_laser_on_a_mount(log_file, mounted, tmp_path):
+    out = tmp_path / "out"
+    options = ["--map", "known", "--resolution", "0.1"]
+    assert run(mounted.path, out, *options) == 0
+    grid = grids.read_map(out / "map.yaml")
+    free = np.asarray(grid.log_odds) < 0
+    assert free.sum() > 1000
+    assert is_free(log_file.walls, np.asarray(grids.centers(grid))[free]).mean() > 0.98
+    rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(rows[:, 1:3], mounted.pose[:, :2], atol=1e-6)
+    summary = json.loads((out / "summary.json").read_text())
+    x, y, heading = summary["mount of the laser [m, m, deg]"]
+    np.testing.assert_allclose([x, y, np.deg2rad(heading)], mounted.mount, atol=1e-6)
+    given = [f"{mounted.mount[0]}", f"{mounted.mount[1]}", f"{np.rad2deg(mounted.mount[2])}"]
+    assert run(mounted.path, tmp_path / "given", *options, "--mount", ",".join(given)) == 0
+    again = grids.read_map(tmp_path / "given" / "map.yaml")
+    assert (again.log_odds == grid.log_odds).mean() > 0.99
+
+
+def test_a_robot_is_localized_by_a_laser_on_a_mount(mounted, room_map, tmp_path):
+    out = tmp_path / "out"
+    assert run(mounted.path, out, "--particles", "500", "--localize", str(room_map)) == 0
+    rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
+    error = np.hypot(*(rows[:, 1:3] - mounted.pose[:, :2]).T)
+    assert np.median(error) < 0.3 and error[-1] < 0.3
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["localized at the end"] == "yes" and summary[FIT] > 0.9
+
+
+def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
+    text = "".join(f"{100 + 0.25 * k} {k / 10} 0 0\n" for k in range(STEPS))
+    (tmp_path / "odometry.txt").write_text(text)
+    asked = {"dataset": "carmen", "path": log_file.path, "odometry": tmp_path / "odometry.txt"}
+    rest = {"max_range": 10.0, "laser": None, "mount": None, "scans": ":", "every": 2}
+    log, _ = read_log(SimpleNamespace(**asked, **rest))
+    np.testing.assert_allclose(log.raw[:, 0], np.arange(0, STEPS, 2) / 10)
+    assert log.odometry_known.shape == (STEPS // 2,)
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,9 @@ def assert_graph(loaded, path):
 
 def assert_laser_log(log, path):
     """Finite numbers, and every line a scan, odometry, or counted."""
-    chex.assert_tree_all_finite((log.time, log.beams, log.corrected, log.raw, log.odometry))
+    chex.assert_tree_all_finite(
+        (log.time, log.beams, log.corrected, log.raw, log.odometry, log.mount)
+    )
     assert (log.beams.range[log.beams.valid] > 0).all()
     left_out = sum(n for what, n in log.dropped.items() if what != "beams without a range")
     assert len(log.time) + len(log.odometry) + left_out == len(rows_of(path))
@@ -130,6 +132,10 @@ EDGES = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0.5 1 0 0 1 0 1\n"
 LASER = """PARAM a b
 ODOM 1 0.5 7.0 0.1 0.2 0 12.5 host 1
 FLASER 4 1.5 nan 81.91 0 1 2 0.5 1 2 0.5 3.25 host 2
+ODOM 1 2 0.5 0 0 0 0 host 0
+FLASER 2 1.5 2 1 2 0.75 1 2 0.75 4.25 host 2
+RLASER 1 1.5 1 2 0.5 1 2 0.5 3.25 host 2
+RAWLASER1 0 -1.5 3.0 0.5 50 0.1 0 3 1 2 60 0 1.0 x 8.5
 ROBOTLASER1 0 -1.5 3.0 0.5 50 0.1 0 3 1 2 60 1 9 4 5 0.5 6 7 -0.5 0 0 0 0 0 1.0 x 8.5
 """
 YAML = """image: map.pgm

@@ -4,6 +4,8 @@ import argparse
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from jaxslam.cli import films
 from jaxslam.cli.common import SUMMARY, asked_figures, check_out, summary_table
 from jaxslam.cli.laser.job import Job
@@ -34,6 +36,7 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
         "scans left out": left_out,
         "dropped by the reader": dict(log.dropped),
         "corrections to the data": list(log.corrections),
+        **_mount_told(log),
         **job.summary,
         "seconds": round(time.perf_counter() - began, 2),
     }
@@ -50,3 +53,11 @@ def _job_of(options: argparse.Namespace) -> Callable[[LaserLog, argparse.Namespa
     if options.localize is not None:
         return run_localization
     return run_slam if options.map is None else run_mapping
+
+
+def _mount_told(log: LaserLog) -> dict[str, object]:
+    """The mount of the laser, where the log has one: an entry of the summary."""
+    if not log.mount.any():
+        return {}
+    x, y, heading = log.mount
+    return {"mount of the laser [m, m, deg]": [float(x), float(y), float(np.rad2deg(heading))]}

@@ -24,7 +24,10 @@ class Job(NamedTuple):
 
 
 def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
-    """The score by the poses in the file, or why there is none: they were the odometry as well."""
+    """The score by the poses in the file, or why there is none: no poses, or they were the odometry
+    as well."""
+    if not log.placed:
+        return {"score": "none: the file has no poses"}
     if np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6):
         return {"score": "none: the odometry is equal to the poses that would score it"}
     return score()

@@ -9,10 +9,12 @@ from jaxtyping import Float
 
 from jaxslam import grids
 from jaxslam.cli.laser.job import Job, figure_files
+from jaxslam.cli.laser.options import check_poses
 from jaxslam.cli.run.piecewise import padded_rows
 from jaxslam.datasets import LaserLog
 from jaxslam.datasets.formats import ros_map
 from jaxslam.grids import Counts, Grid
+from jaxslam.math import numpy_poses as poses
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
 from jaxslam.results.files import Files
@@ -32,8 +34,9 @@ MOST = 10**8
 def run_mapping(log: LaserLog, options: argparse.Namespace) -> Job:
     """The map of the scans at the poses in the file: counts of hits and misses, as log-odds.
 
-    A beam without a return says nothing.
+    A beam without a return says nothing. The path that is written is the robot's.
     """
+    check_poses(log)
     shape, origin = map_frame(log, options.resolution)
     with Progress(f"{log.name}, map", "scans") as progress:
         counts = counted(log, shape, origin, options.resolution, progress)
@@ -67,7 +70,7 @@ def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[
     Raises ValueError where no beam returns, and on more than `MOST` cells.
     """
     ranges, angles, valid = (np.asarray(part) for part in log.beams)
-    pose = log.corrected
+    pose = poses.compose(log.corrected, log.mount)  # of the laser
     heading = pose[:, 2:] + angles
     ends = pose[:, None, :2] + ranges[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
     met = valid & (ranges < log.max_range)
@@ -76,7 +79,7 @@ def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[
             f"{log.source}: no beam returns within {log.max_range:g} m (--max-range), so there is "
             "no map"
         )
-    places = np.concatenate([pose[:, :2], ends[met]])
+    places = np.concatenate([log.corrected[:, :2], pose[:, :2], ends[met]])
     low = resolution * np.floor((places.min(axis=0) - MARGIN) / resolution)
     size = np.ceil((places.max(axis=0) + MARGIN - low) / resolution)
     if not size.prod() <= MOST:
@@ -114,6 +117,7 @@ def counted(
                 beams,
                 max_range=log.max_range,
                 no_return=0.0,
+                mount=log.mount,
             )
             hits += np.asarray(found.hits)
             misses += np.asarray(found.misses)

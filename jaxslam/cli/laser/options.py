@@ -6,12 +6,13 @@ import math
 import re
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxslam import datasets
 from jaxslam.datasets import LaserLog
 
 READERS = {"carmen": datasets.carmen}
-"""Readers of laser logs by name; each takes (path, max_range=…)."""
+"""Readers of laser logs by name; each takes (path, max_range=…, laser=…, odometry=…, mount=…)."""
 
 DEFAULTS: dict[str, object] = {
     "resolution": 0.05,
@@ -24,14 +25,14 @@ DEFAULTS: dict[str, object] = {
 }
 """Of the options that have one; an option that is not given is None in the namespace."""
 
-ALONE = ("map", "localize", *DEFAULTS)
+ALONE = ("map", "localize", "laser", "odometry", "mount", *DEFAULTS)
 """Options that only a laser log has."""
 
 OTHERS = "filters", "gate", "associate", "check_every", "robot"
 """Options that a laser log does not have."""
 
 
-SIGNED = "--start", "--scans"
+SIGNED = "--start", "--scans", "--mount"
 """Options whose value may begin with a minus sign, and is no single number."""
 
 
@@ -65,7 +66,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     for name, kind, metavar, text in (
         ("resolution", float, "M", "side of a cell of the map that is made [m]"),
-        ("max-range", float, "M", "a range from here on is of a beam that met nothing [m]"),
+        (
+            "max-range",
+            float,
+            "M",
+            "a range from here on, or from the maximum that the log states, met nothing [m]",
+        ),
         ("every", int, "N", "use each n-th scan"),
         ("scans", str, "A:B", "use the scans from number A on and before B; :455 is the first 455"),
         (
@@ -82,6 +88,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         group.add_argument(
             f"--{name}", type=kind, metavar=metavar, help=f"{text} (default: {default})"
         )
+    for name, metavar, text in (
+        (
+            "laser",
+            "KIND",
+            "lines of the laser to read: FLASER, RLASER, ROBOTLASER1, RAWLASER1, … (default: of "
+            "those with poses the one with most scans)",
+        ),
+        (
+            "odometry",
+            "FILE",
+            "raw odometry, lines t x y heading [s, m, m, rad], in place of the log's",
+        ),
+        (
+            "mount",
+            "X,Y,HEADING",
+            "pose of the laser on the robot [m, m, deg] (default: that of the log)",
+        ),
+    ):
+        group.add_argument(f"--{name}", metavar=metavar, help=text)
 
 
 def refuse_laser_options(options: argparse.Namespace) -> None:
@@ -132,7 +157,13 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
 
     Raises ValueError, with the file, where no scan is left or none has a valid beam.
     """
-    log = READERS[options.dataset](options.path, max_range=options.max_range)
+    log = READERS[options.dataset](
+        options.path,
+        max_range=options.max_range,
+        laser=options.laser,
+        odometry=options.odometry,
+        mount=None if options.mount is None else _pose("--mount", options.mount),
+    )
     total = len(log.time)
     first, last = _interval(options.scans, total)
     keep = np.arange(first, last)[:: options.every]
@@ -141,6 +172,7 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
     log = dataclasses.replace(
         log,
         **{name: getattr(log, name)[keep] for name in ("time", "corrected", "raw", "row")},
+        odometry_known=_known(log.odometry_known, keep),
         beams=type(log.beams)(*(part[keep] for part in log.beams)),
     )
     blind = int((~np.asarray(log.beams.valid).any(axis=1)).sum())
@@ -149,6 +181,12 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
     left_out = {"outside --scans": total - (last - first), "skipped by --every": last - first}
     left_out["skipped by --every"] -= len(keep)
     return log, left_out | {"without a valid beam": blind}
+
+
+def _known(known: Bool[np.ndarray, "K"], keep: Int[np.ndarray, "k"]) -> Bool[np.ndarray, "k"]:
+    """Whether raw odometry tells of any of the steps that lie between the scans that are kept."""
+    steps = np.cumsum(known)[keep]
+    return np.asarray(np.diff(steps, prepend=-1) > 0)
 
 
 def _interval(text: str, total: int) -> tuple[int, int]:
@@ -164,18 +202,29 @@ def _interval(text: str, total: int) -> tuple[int, int]:
     return start, max(start, stop)
 
 
+def check_poses(log: LaserLog) -> None:
+    """Raise ValueError where the scans of a log have no poses."""
+    if not log.placed:
+        raise ValueError(f"{log.source}: expected poses beside the scans, and {log.laser} has none")
+
+
 def start_pose(text: str, log: LaserLog) -> np.ndarray | None:
     """The pose (3,) at which localization starts; None for anywhere."""
     if text == "global":
         return None
     if text == "file":
+        check_poses(log)
         return np.asarray(log.corrected[0])
-    fields = text.split(",")
+    return _pose("--start", text, "file, global or ")
+
+
+def _pose(option: str, text: str, others: str = "") -> Float[np.ndarray, "3"]:
+    """The pose (3,) of X,Y,HEADING [m, m, deg]."""
     try:
-        pose = np.array([float(field) for field in fields])
+        pose = np.array([float(field) for field in text.split(",")])
     except ValueError:
         pose = np.zeros(0)
     if pose.shape != (3,) or not np.all(np.isfinite(pose)):
-        raise ValueError(f"--start: expected file, global or X,Y,HEADING [m, m, deg], got {text!r}")
+        raise ValueError(f"{option}: expected {others}X,Y,HEADING [m, m, deg], got {text!r}")
     pose[2] = np.angle(np.exp(1j * np.deg2rad(pose[2])))
     return pose

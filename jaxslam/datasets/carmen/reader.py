@@ -1,0 +1,210 @@
+"""Laser logs of CARMEN: odometry and scans, with corrected poses where the file has them.
+
+Source of the public logs: Radish, the robotics data set repository (Howard & Roy 2003); corrected
+by the particle filter of GMapping (Grisetti, Stachniss & Burgard 2007).
+"""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from jaxslam.datasets.carmen.lines import POSE, Scan, has_poses, is_scan, scan_of
+from jaxslam.datasets.carmen.log import LaserLog
+from jaxslam.datasets.carmen.odometry import (
+    RawOdometry,
+    chained,
+    of_file,
+    setting_lines,
+    without_lines,
+)
+from jaxslam.datasets.carmen.scans import beams_of, checked_mount, clock_of, mount_of, robot_poses
+from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.math import numpy_poses as poses
+
+ODOMETRY = (*POSE, "v", "omega", "acceleration", "time", "host", "logger time")
+PREFERRED = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER")
+"""Kinds of scans in the order in which they are taken where there are as many of each."""
+
+
+def carmen(
+    path: str | Path,
+    *,
+    max_range: float = 50.0,
+    laser: str | None = None,
+    odometry: str | Path | None = None,
+    mount: ArrayLike | None = None,
+) -> LaserLog:
+    """A laser log in the format of CARMEN, packed by gzip or not.
+
+    | line | read as |
+    |---|---|
+    | `ODOM x y θ v ω a t host T` | raw odometry, or what sets it |
+    | `FLASER n r… x y θ x y θ t host T` | a scan of n beams, poses of laser and robot |
+    | `RLASER` | the same of a laser that looks back |
+    | `ROBOTLASER1 …`, and other numbers | a scan with angles, a maximum range, both poses |
+    | `RAWLASER1 …` | the same without poses |
+
+    One laser is read. Scans of others, beams whose range is NaN or not above 0, and all other lines
+    are counted in `dropped`. Times are those of the measurements (t); where all scans have the same
+    t, the logger's (T).
+
+    **Raw odometry** at a scan is that of the last ODOM line before it, by the order of lines, since
+    stamps may be rounded. An ODOM line that repeats the pose of the scan before it, and differs
+    from the one before that scan, was written by a program that corrects logs. It sets the
+    odometry and is no motion: raw odometry is the chain of the increments between such lines, and
+    `corrections` says how far it parts from the scans' poses. A file without ODOM lines has the
+    robot's pose of each scan as raw odometry.
+
+    **Angles** of FLASER: as CARMEN has them, 1° apart for 180 beams, ½° for 360, else 180°/(n - 1),
+    from -90° on; of 400 and 401 ¼°, from -50° on (the laser's field of 100°; CARMEN itself begins
+    at -90° there).
+
+    **Mount**: the laser's pose on the robot, from the two poses of ROBOTLASER; (0, 0, π) for
+    RLASER, zero for FLASER and RAWLASER. The robot's corrected pose of these, and where the
+    mount is given, is the laser's without the mount; where a line has one pose twice, that pose.
+
+    Args:
+        path: NAME, or NAME.gz beside it.
+        max_range: [m] a range from here on, or from the maximum that its line states, met nothing;
+            `LaserLog.max_range` is the largest limit of a scan.
+        laser: kind of the lines to read; default: of those with poses the one with most scans.
+        odometry: a file of lines `t x y θ` in place of the log's odometry (`#` begins a comment).
+            They join the scans by stamp, to a millisecond; if no stamp joins, in order, where there
+            are as many as scans, and then their stamps are the scans'.
+        mount: (3,) [m, m, rad] in place of that of the lines.
+    Raises:
+        ValueError: with file and line: where a line ends early or has a field that is no number; on
+            a file without scans (of the laser) or without beams; where the mount differs between
+            two lines by more than 1 cm or ½°; on odometry that does not join. Further on a
+            max_range that is not above 0, and a mount that is not three finite numbers.
+    """
+    if not max_range > 0:
+        raise ValueError(f"carmen: expected a max_range above 0, got {max_range}")
+    given = None if mount is None else checked_mount(mount)
+    file = TextFile(path)
+    lines = list(file)
+    kind = _kind(file, Counter(fields[0] for _, fields in lines if is_scan(fields[0])), laser)
+    logged: list[list[float]] = []
+    scans: list[Scan] = []
+    scan_poses: list[tuple[float, ...]] = []
+    dropped: Counter[str] = Counter()
+    for line, fields in lines:
+        if is_scan(fields[0]):
+            scan = scan_of(file, line, fields, len(logged) - 1)
+            scan_poses.append((scan.row, *scan.robot))
+            if fields[0] == kind:
+                scans.append(scan)
+            else:
+                dropped[f"scans {fields[0]}"] += 1
+        elif fields[0] == "ODOM":
+            file.expect(line, fields[1:], ODOMETRY)
+            numbers = file.numbers(line, [*fields[1:8], fields[9]], [*ODOMETRY[:7], ODOMETRY[8]])
+            logged.append([*numbers[:3], *numbers[6:]])
+        else:
+            dropped["comments" if fields[0].startswith("#") else f"lines {fields[0]}"] += 1
+    if not any(len(scan.ranges) for scan in scans):
+        raise file.end_error(f"expected scans with beams, got {len(scans)} of 0 beams")
+    corrections: list[str] = []
+    clock = clock_of(scans, corrections)
+    time = np.array([scan.times[clock] for scan in scans])
+    frame = mount_of(file, kind, scans) if given is None else given
+    corrected, robot = robot_poses(kind, scans, frame, given is not None)
+    if odometry is not None:
+        found, time, told = of_file(odometry, time, str(file.path))
+        corrections.append(told)
+        if logged:
+            dropped["lines ODOM"] = len(logged)
+    elif logged:
+        table, every = np.array(logged), np.array(scan_poses)
+        moved, stamp = table[:, :3], table[:, 3 + clock]
+        setting = setting_lines(moved, stamp, every[:, 0].astype(int), every[:, 1:])
+        found = chained(moved, stamp, setting, np.array([scan.row for scan in scans]))
+    else:
+        found = without_lines(robot)
+    beams, limit = beams_of(scans, max_range, dropped, corrections)
+    corrections += _odd(kind, time, found, corrected)
+    if file.lines[-1].strip():
+        corrections.append(
+            f"the last line, {len(file.lines)}, has no newline: its last number may be cut off"
+        )
+    return LaserLog(
+        name=file.path.name.split(".")[0],
+        source=str(file.path),
+        laser=kind,
+        placed=has_poses(kind),
+        time=time,
+        beams=beams,
+        corrected=_wrapped(corrected),
+        raw=_wrapped(found.raw),
+        odometry_known=found.known,
+        row=found.row,
+        odometry=_wrapped(found.poses),
+        odometry_time=found.time,
+        max_range=limit,
+        mount=frame,
+        dropped=dict(dropped),
+        corrections=tuple(corrections),
+    )
+
+
+def _kind(file: TextFile, counts: Counter[str], asked: str | None) -> str:
+    """The kind of lines to read: the one asked for, or of those with poses that with most scans."""
+    if not counts:
+        raise file.end_error(
+            "expected a line FLASER, RLASER, ROBOTLASER1 or RAWLASER1, and so on, got none"
+        )
+    if asked is None:
+        first = {kind: rank for rank, kind in enumerate(PREFERRED)}
+        rank = [
+            (not has_poses(kind), -count, first.get(kind, len(first)), kind)
+            for kind, count in counts.items()
+        ]
+        return min(rank)[-1]
+    if asked not in counts:
+        there = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
+        raise file.end_error(f"expected scans of the laser {asked}, got {there}")
+    return asked
+
+
+def _odd(
+    kind: str,
+    time: Float[np.ndarray, "K"],
+    found: RawOdometry,
+    corrected: Float[np.ndarray, "K 3"],
+) -> list[str]:
+    """What is odd about a log, in words."""
+    told = []
+    if len(found.poses) and (early := int((found.row < 0).sum())):
+        told.append(f"scans before the first ODOM line, which take its pose: {early}")
+    if not has_poses(kind):
+        told.append(f"lines {kind} have no poses: there are none to compare with")
+    if not len(found.poses):
+        told.append(
+            "no ODOM lines: raw odometry is the robot's pose of each scan"
+            if has_poses(kind)
+            else "no ODOM lines and no poses: nothing is known of raw odometry, and it is zero"
+        )
+    elif has_poses(kind) and found.setting:
+        apart = poses.between(found.raw[0], found.raw)[:, :2]
+        apart = np.hypot(*(apart - poses.between(corrected[0], corrected)[:, :2]).T)
+        told.append(
+            f"ODOM lines that set the odometry to the pose of the scan before: {found.setting}; "
+            "raw odometry is the chain of the increments between them, and parts from the scans' "
+            f"poses by up to {apart.max():.2f} m, {apart[-1]:.2f} m at the end"
+        )
+    if len(found.poses) and (still := int((~found.known).sum())):
+        told.append(
+            "scans without an ODOM line since the scan before, where raw odometry stands still: "
+            f"{still}"
+        )
+    if backward := int((np.diff(time) < 0).sum()):
+        told.append(f"scans stamped before their predecessor, kept in order: {backward}")
+    return told
+
+
+def _wrapped(path: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The poses with θ in (-π, π]."""
+    return np.column_stack([path[:, :2], np.angle(np.exp(1j * path[:, 2]))])
