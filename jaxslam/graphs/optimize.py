@@ -34,6 +34,7 @@ def optimize(
     iterations: int = 100,
     tolerance: float = 1e-12,
     plan: Plan | None = None,
+    room: int = 0,
 ) -> Solution:
     """The graph at a minimum of χ² = Σ ρ(eᵀ Ω e), from the variables it has.
 
@@ -52,6 +53,7 @@ def optimize(
             predicts, and at least by rounding.
         plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
             of about the same size share a compiled program (`solver.padding`).
+        room: without a plan, all graphs of at most about so many variables share one.
     Raises:
         ValueError: on what `check_graph` refuses, and on unknown methods or tables.
     """
@@ -68,8 +70,8 @@ def optimize(
     check_graph(caller, graph, known)
     limits = np.asarray(iterations), np.asarray(tolerance, float)
     own, fill = graph, plan is None and programs.outside(graph)
-    graph = padded_graph(graph) if fill else graph
-    plan = plan_for(caller, graph, known, plan)
+    graph = padded_graph(graph, room) if fill else graph
+    plan = plan_for(caller, graph, known, plan, room=room)
     found = programs.call(_optimize, (model, method), graph, plan, *limits)
     if not fill:
         return found

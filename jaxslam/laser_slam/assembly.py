@@ -9,6 +9,9 @@ from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.math import numpy_poses as poses
 
+ROOM = 4096
+"""Poses of a graph: smaller graphs are filled up to it, so that all logs share their programs."""
+
 
 def table_of(
     first: Int[np.ndarray, "E"],
@@ -47,14 +50,12 @@ def graph_of(
     )
 
 
-def relative_covs(
-    graph: Graph, pairs: Int[np.ndarray, "Q 2"], plan: graphs.Plan | None = None
-) -> Float[np.ndarray, "Q 3 3"]:
+def relative_covs(graph: Graph, pairs: Int[np.ndarray, "Q 2"]) -> Float[np.ndarray, "Q 3 3"]:
     """The covariance of the end of the second pose in the frame of the first, of each pair.
 
     From the joint marginals of both, by the Jacobians of x_i⁻¹ ∘ x_j.
     """
-    joint = np.asarray(graphs.marginals(graph, pairs=pairs, plan=plan).pairs, np.float64)
+    joint = np.asarray(graphs.marginals(graph, pairs=pairs, room=ROOM).pairs, np.float64)
     at = np.asarray(graph.poses, np.float64)
     i, j = at[pairs[:, 0]], at[pairs[:, 1]]
     # x_i + δ_i is x_i ∘ R(θ_i)ᵀ δ_i to first order, which moves the end by -Ad(z)⁻¹ of it.

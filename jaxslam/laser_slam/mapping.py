@@ -9,13 +9,17 @@ from jaxtyping import Bool, Float, Int
 from jaxslam import grids
 from jaxslam.grids import Counts, Grid
 from jaxslam.laser_slam.records import LogOfScans
+from jaxslam.laser_slam.scans import ROWS, WIDTH, met_something
 from jaxslam.laser_slam.settings import Settings
+from jaxslam.math import numpy_poses as poses
 from jaxslam.types import Beams
 
 LARGEST = 4_000
 """cells along a side of the map; a larger world has larger cells"""
 FILM = 400
 """cells along a side of a map in a film"""
+WINDOW = 2048
+"""Cells along a side of the window in which scans are counted: one program for all maps."""
 
 
 def frame_of(
@@ -23,15 +27,10 @@ def frame_of(
 ) -> tuple[tuple[int, int], Float[np.ndarray, "3"], float]:
     """(shape, origin, resolution) of a map that holds the ends of all beams at all poses."""
     beams = _used(log, settings, np.ones(len(log.time), bool))
-    hit = beams.valid & (beams.range < settings.max_range)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for path in paths:
-        turn = path[:, 2:3] + beams.angle
-        ends = path[:, None, :2] + beams.range[..., None] * np.stack(
-            [np.cos(turn), np.sin(turn)], axis=-1
-        )
-        every = np.concatenate([ends[hit], path[:, :2]])
-        low, high = np.minimum(low, every.min(axis=0)), np.maximum(high, every.max(axis=0))
+        first, last = _boxes(poses.compose(path, np.asarray(log.mount, float)), beams)
+        low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
     resolution = max(settings.resolution, float((high - low).max()) / LARGEST)
     low = np.floor(low / resolution - 4) * resolution
     width, height = (int(n) for n in np.ceil((high - low) / resolution) + 4)
@@ -48,12 +47,75 @@ def map_of(
 ) -> Grid:
     """The occupancy grid of usable scans; beams that met nothing say nothing."""
     shape, origin, resolution = frame
-    beams = _used(log, settings, usable)
-    if not (beams.valid & (beams.range > 0)).any():
-        return Grid(np.zeros(shape), origin, np.asarray(resolution))
-    counts = grids.count(shape, origin, resolution, path, beams, max_range=settings.max_range)
-    found = grids.occupancy(counts)
-    return Grid(*(np.asarray(part) for part in found))
+    counts = np.zeros((2, *shape), np.int32)
+    laser = poses.compose(path, np.asarray(log.mount, float))
+    _count(counts, origin, resolution, laser, _used(log, settings, usable), settings)
+    return _occupancy(counts, origin, resolution)
+
+
+def _count(
+    counts: Int[np.ndarray, "2 H W"],
+    origin: Float[np.ndarray, "3"],
+    resolution: float,
+    laser: Float[np.ndarray, "n 3"],
+    beams: Beams,
+    settings: Settings,
+) -> None:
+    """Add the hits and misses of n scans to those of a map, in place.
+
+    Some scans at a time in a window of fixed size, some beams at a time, so that all logs and maps
+    share one program. The window lies where these scans are; if they do not fit, half of them do.
+    """
+    width = beams.range.shape[1]
+    if width > WIDTH:  # the further beams as further scans
+        for begin in range(0, width, WIDTH):
+            part = Beams(*(each[:, begin : begin + WIDTH] for each in beams))
+            _count(counts, origin, resolution, laser, part, settings)
+        return
+    corner, ends = _boxes(laser, beams)
+    first = np.floor((corner.min(axis=0) - origin[:2]) / resolution).astype(int) - 1
+    size = np.ceil((ends.max(axis=0) - origin[:2]) / resolution).astype(int) + 2 - first
+    if len(laser) > ROWS or ((size > WINDOW).any() and len(laser) > 1):
+        half = ROWS if len(laser) > ROWS else len(laser) // 2
+        for rows in (slice(half), slice(half, None)):
+            part = Beams(*(each[rows] for each in beams))
+            _count(counts, origin, resolution, laser[rows], part, settings)
+        return
+    if not beams.valid.any():
+        return
+    fill = [(0, ROWS - len(laser)), (0, WIDTH - width)]
+    found = grids.count(
+        (WINDOW, WINDOW),
+        np.array([*(origin[:2] + first * resolution), 0.0]),
+        resolution,
+        np.pad(laser, [fill[0], (0, 0)]),
+        Beams(*(np.pad(each, fill) for each in beams)),
+        max_range=settings.max_range,
+    )
+    height, width = counts.shape[1:]
+    low, high = np.maximum(first, 0), np.minimum(first + size, [width, height])
+    here = (slice(low[1], high[1]), slice(low[0], high[0]))
+    there = tuple(slice(s.start - f, s.stop - f) for s, f in zip(here, first[::-1], strict=True))
+    for total, found_there in zip(counts, (found.hits, found.misses), strict=True):
+        total[here] += np.asarray(found_there)[there]
+
+
+def _occupancy(
+    counts: Int[np.ndarray, "2 H W"], origin: Float[np.ndarray, "3"], resolution: float
+) -> Grid:
+    """The log-odds of `grids.occupancy`, which are linear in the counts, on the host."""
+    one = Counts(np.eye(2)[:1], np.eye(2)[1:], origin, np.asarray(resolution), *np.zeros((2, 1)))
+    hit, miss = np.asarray(grids.occupancy(one).log_odds)[0]
+    return Grid(counts[0] * hit + counts[1] * miss, origin, np.asarray(resolution))
+
+
+def _boxes(laser: Float[np.ndarray, "n 3"], beams: Beams) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 2) the lowest and the highest x and y of the ends of each scan's beams and its laser."""
+    turn = laser[:, 2:3] + beams.angle
+    ray = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    reach = np.where(np.asarray(beams.valid), beams.range, 0.0)
+    ends = laser[:, None, :2] + reach[..., None] * ray
+    return ends.min(axis=1, initial=np.inf), ends.max(axis=1, initial=-np.inf)
 
 
 def growing_maps(
@@ -77,31 +139,21 @@ def growing_maps(
     coarse = max(resolution, max(shape) * resolution / FILM)
     shape, origin, resolution = frame_of(log, paths, replace(settings, resolution=coarse))
     beams = _used(log, settings, np.ones(len(path), bool))
+    laser = poses.compose(path, np.asarray(log.mount, float))
     together = -(-len(path) // min(frames, len(path)))
-    hits, misses = np.zeros((2, *shape), np.int32)
-    none = np.array(0)
+    counts = np.zeros((2, *shape), np.int32)
     maps, until = [], []
     for begin in range(0, len(path), together):
-        end = min(begin + together, len(path))
-        fill = together - (end - begin)
-        scans = Beams(*(np.pad(part[begin:end], [(0, fill), (0, 0)]) for part in beams))
-        if scans.valid.any():
-            poses = np.pad(path[begin:end], [(0, fill), (0, 0)])
-            found = grids.count(
-                shape, origin, resolution, poses, scans, max_range=settings.max_range
-            )
-            hits += np.asarray(found.hits)
-            misses += np.asarray(found.misses)
-        counts = Counts(hits, misses, origin, np.asarray(resolution), none, none)
-        maps.append(Grid(*(np.asarray(part) for part in grids.occupancy(counts))))
-        until.append(end)
+        rows = slice(begin, begin + together)
+        scans = Beams(*(part[rows] for part in beams))
+        _count(counts, origin, resolution, laser[rows], scans, settings)
+        maps.append(_occupancy(counts, origin, resolution))
+        until.append(min(begin + together, len(path)))
     return maps, np.array(until)
 
 
 def _used(log: LogOfScans, settings: Settings, usable: np.ndarray) -> Beams:
-    ranges, angles, valid = (np.asarray(part) for part in log.beams)
-    with np.errstate(invalid="ignore"):
-        seen = (valid > 0) & (ranges > 0) & (ranges < log.max_range * (1 - 1e-6))
-    seen &= usable[:, None]
+    ranges, angles, met = (np.asarray(part) for part in met_something(log))
+    seen = met & usable[:, None]
     ranges = np.where(seen, np.minimum(ranges, settings.max_range), 0.0)
     return Beams(ranges, angles, seen)

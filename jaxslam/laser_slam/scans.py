@@ -1,6 +1,6 @@
 """The scans of a log as points with the directions of their walls, and what of it is unusable."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,7 +27,7 @@ CHANGED, SHARE = 0.1, 0.2
 
 
 class Scans(NamedTuple):
-    """K scans of at most B points, each in the frame of its robot; float32, as matching computes."""
+    """K scans of at most B points, in the frame of the robot; float32, as matching computes."""
 
     points: Points
     """(K, B), the robot's place where not valid"""
@@ -83,7 +83,7 @@ def met_something(log: LogOfScans) -> Beams:
 def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     """The points of a log's scans in the robot's frame, and the lines through those within two
     degrees of each."""
-    ranges, angles, met = met_something(log)
+    ranges, angles, met = (np.asarray(part) for part in met_something(log))
     changed = _changed(ranges, met)
     stride = -(-ranges.shape[1] // WIDTH)
     ranges, angles, met = (part[:, ::stride] for part in (ranges, angles, met))
@@ -94,17 +94,20 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     x, y, heading = np.asarray(log.mount, float)
     rays = np.stack([np.cos(heading + angles), np.sin(heading + angles)], axis=-1)
     position = np.where(near[..., None], [x, y] + ranges[..., None] * rays, 0.0)
-    points = Points(position.astype(np.float32), rays.astype(np.float32), near)
-    every = -(-ranges.shape[1] // settings.beams)
-    kept, lines = [], []
+    parts: Any = position.astype(np.float32), rays.astype(np.float32), near
+    points = Points(*parts)
+    every, kept = -(-ranges.shape[1] // settings.beams), settings.beams
+    rows, found = [], []
     for begin in range(0, len(ranges), ROWS):
-        rows = _filled(points, slice(begin, begin + ROWS), ROWS, WIDTH)
-        found = jax.tree.map(np.asarray, programs.call(_surfaces, (), rows, span))
-        size = len(ranges[begin : begin + ROWS])
-        # Points of no beam come last: the first WIDTH / `every` hold all that are kept.
-        for into, of in ((kept, rows), (lines, found)):
-            into.append(jax.tree.map(lambda part: _thinned(part[:size], every, settings.beams), of))
-    whole, line = (jax.tree.map(lambda *parts: np.concatenate(parts), *of) for of in (kept, lines))
+        rows.append(_filled(points, begin))
+        found.append(jax.tree.map(np.asarray, programs.call(_surfaces, (), rows[-1], span)))
+    # Beams that fill a scan up come last: they are cut off, or stay without a point.
+    whole, line = (
+        jax.tree.map(
+            lambda *parts: _thinned(np.concatenate(parts)[: len(ranges)], every, kept), *of
+        )
+        for of in (rows, found)
+    )
     usable = np.asarray(whole.valid).sum(axis=1) >= settings.fewest
     return Scans(whole, line, usable, changed)
 
@@ -115,15 +118,16 @@ def _thinned(part: np.ndarray, every: int, width: int) -> np.ndarray:
     return np.pad(found, [(0, 0), (0, width - found.shape[1])] + [(0, 0)] * (part.ndim - 2))
 
 
-def _filled(points: Points, rows: slice, count: int, width: int) -> Points:
-    """Some scans, filled up to so many of so many beams by points that are not valid."""
+def _filled(points: Points, begin: int) -> Points:
+    """The next scans, filled up to `ROWS` of `WIDTH` beams by points that are not valid."""
 
     def one(part: np.ndarray) -> np.ndarray:
-        some = part[rows]
-        more = [(0, count - len(some)), (0, width - some.shape[1])] + [(0, 0)] * (part.ndim - 2)
+        some = np.asarray(part[begin : begin + ROWS])
+        more = [(0, ROWS - len(some)), (0, WIDTH - some.shape[1])] + [(0, 0)] * (some.ndim - 2)
         return np.pad(some, more)
 
-    return Points(*(one(part) for part in points))
+    filled: Points = jax.tree.map(one, points)
+    return filled
 
 
 def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxslam import graphs
 from jaxslam.laser_slam import covariances
+from jaxslam.laser_slam.assembly import ROOM
 from jaxslam.laser_slam.loops.closing import closed
 from jaxslam.laser_slam.mapping import frame_of, map_of
 from jaxslam.laser_slam.odometry.raw import Steps, steps_of
@@ -97,7 +98,7 @@ def _of_scans(graph: graphs.Graph, odometry: Odometry) -> tuple[np.ndarray, np.n
     if len(at) == 1:
         marginal = np.zeros((1, 3, 3))
     else:
-        marginal = np.asarray(graphs.marginals(graph).poses, np.float64)
+        marginal = np.asarray(graphs.marginals(graph, room=ROOM).poses, np.float64)
     at_key = covariances.turns(-at[row, 2]) @ marginal[row] @ covariances.turns(at[row, 2])
     step = np.where(is_key[:, None, None], 0.0, odometry.cov)
     return path, covariances.of_coordinates(covariances.composed_cov(at_key, z, step), path)

@@ -55,8 +55,8 @@ def correlative(
 
     The window holds the headings start ± turn_window in steps of `turn` [rad], and shifts of the
     start by whole cells of the reference's grid up to ± window [m] along its axes. A point scores
-    by the cell that it falls into, 0 off the map and beyond 4 σ. A prior takes eᵀ Λ e/(2 σ² n) from the mean score
-    of n points, as near a wall exp(-d²/2σ²) is 1 - d²/2σ².
+    by the cell that it falls into, 0 off the map and beyond 4 σ. A prior takes eᵀ Λ e/(2 σ² n) from
+    the mean score of n points, as near a wall exp(-d²/2σ²) is 1 - d²/2σ².
 
     The maximum is exact on this lattice: blocks of shifts are scored by the largest score of any
     cell that a point meets within the block, less what the prior takes at least there: an upper

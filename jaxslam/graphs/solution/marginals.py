@@ -46,6 +46,7 @@ def marginals(
     kernel: Kernel | Mapping[str, Kernel] | None = None,
     pairs: ArrayLike = (),
     plan: Plan | None = None,
+    room: int = 0,
 ) -> Marginals:
     """The covariances (Σ Jᵀ ρ' Ω J)⁻¹ of all poses and points of a graph, and of pairs of them.
 
@@ -59,6 +60,7 @@ def marginals(
         pairs: (Q, 2), two variables each, points counted on from the poses.
         plan: of `plan(graph, marginals=True, pairs=pairs)`; needed under `jit` and `vmap`. Its
             pairs stand if none are given here.
+        room: as in `optimize`.
     Raises:
         ValueError: on what `check_graph` refuses, on a plan without marginals or those pairs, and
             outside of a trace on a variable that the measurements do not determine.
@@ -69,10 +71,10 @@ def marginals(
     check_graph(caller, graph, known)
     wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     if plan is None and programs.outside(graph):
-        more = padded_graph(graph)
-        rows = np.zeros((padded_size(len(wanted), LEAST), 2), int)
+        more = padded_graph(graph, room)
+        rows = np.zeros((padded_size(max(len(wanted), room), LEAST), 2), int)
         rows[: len(wanted)] = padded_number(wanted, graph, more)
-        new = plan_for(caller, more, known, None, marginals=True, pairs=rows)
+        new = plan_for(caller, more, known, None, marginals=True, pairs=rows, room=room)
         found = programs.call(_marginals, (model,), more, new)
         poses, points, pairs = cut(found[:3], (graph.poses, graph.points, wanted))
         found = Marginals(poses, points, pairs, own_number(found.singular, graph, more))

@@ -20,28 +20,35 @@ LEAST = 16
 """The step of the sizes of small graphs."""
 
 
-def padded_graph(graph: Graph) -> Graph:
+def padded_graph(graph: Graph, room: int = 0) -> Graph:
     """The graph with more poses and points, which are fixed, and rows, which are not valid.
+
+    With room for so many variables there are as many poses, and two rows a pose.
 
     For concrete graphs: its arrays are NumPy's. The rows are of variable -1, which is nowhere, so
     that a plan leaves them out.
     """
 
-    def more(x: PyTree, value: float = 0) -> np.ndarray:
+    def more(x: PyTree, value: float = 0, least: int = 0) -> np.ndarray:
         x = np.asarray(x)
-        rows = [(0, padded_size(len(x), LEAST) - len(x))] + [(0, 0)] * (x.ndim - 1)
+        rows = [(0, padded_size(max(len(x), least), LEAST) - len(x))] + [(0, 0)] * (x.ndim - 1)
         return np.pad(x, rows, constant_values=value)
 
     return Graph(
-        poses=more(graph.poses),
+        poses=more(graph.poses, 0, room),
         points=more(graph.points),
         tables={
-            name: Table(more(t.who, -1), more(t.z), more(t.information), more(t.valid, False))
+            name: Table(
+                more(t.who, -1, 2 * room),
+                more(t.z, 0, 2 * room),
+                more(t.information, 0, 2 * room),
+                more(t.valid, False, 2 * room),
+            )
             for name, t in graph.tables.items()
         },
-        fixed_pose=more(graph.fixed_pose, True),
+        fixed_pose=more(graph.fixed_pose, True, room),
         fixed_point=more(graph.fixed_point, True),
-        pose_id=more(graph.pose_id, -1),
+        pose_id=more(graph.pose_id, -1, room),
         point_id=more(graph.point_id, -1),
     )
 

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.model import factors_of
-from jaxslam.graphs.sparse.cholesky import CholeskyTables, cholesky_tables
+from jaxslam.graphs.sparse.cholesky import CholeskyTables, block_count, cholesky_tables
 from jaxslam.graphs.sparse.gathered import Stages, stages
 from jaxslam.graphs.sparse.inverse import InverseTables, inverse_tables
-from jaxslam.graphs.sparse.sweeps import index_table, padded_size
+from jaxslam.graphs.sparse.sweeps import index_table
 from jaxslam.graphs.sparse.symbolic import factor_pattern
 from jaxslam.validation.numbers import is_concrete
 
@@ -50,6 +50,7 @@ def plan(
     *,
     marginals: bool = False,
     pairs: ArrayLike = (),
+    room: int = 0,
 ) -> Plan:
     """The plan of a graph, made on the host from `who`, which must be concrete.
 
@@ -67,6 +68,8 @@ def plan(
         marginals: whether to plan `marginals` as well.
         pairs: (Q, 2), two variables each, points counted on from the poses, of which `marginals`
             shall give the joint covariance.
+        room: the number of variables for which tables have room, so that graphs of fewer share a
+            compiled program.
     Raises:
         ValueError: where `who` is traced, or the tables do not fit their factors.
     """
@@ -102,7 +105,7 @@ def plan(
     wanted = checked_pairs("graphs.plan", pairs, size)
     first, second = np.concatenate([wanted.T, *joined], axis=1)
     pattern = factor_pattern(size, first, second)
-    cholesky, place = cholesky_tables(pattern)
+    cholesky, place = cholesky_tables(pattern, room)
     order = np.argsort(place[:-1])
     blocks, columns = [], []
     for its, lost in rows:
@@ -114,18 +117,18 @@ def plan(
         blocks.append(target.ravel())
         columns.append(np.where(lost[:, None], -1, column).ravel())
     block_column, block_row = pattern.columns[order], pattern.rows[order]
-    width = padded_size(len(order))
+    width = block_count(pattern, room)
     return Plan(
         who={name: index_table(rows) for name, rows in who.items()},
         order=index_table(pattern.order),
         column=index_table(pattern.position),
-        information=stages(np.concatenate(blocks), width),
-        gradient=stages(np.concatenate(columns), size),
+        information=stages(np.concatenate(blocks), width, 8 * room),
+        gradient=stages(np.concatenate(columns), size, 4 * room),
         block_column=index_table(block_column, width),
         block_row=index_table(block_row, width),
         on_diagonal=index_table(block_row == block_column, width),
         cholesky=cholesky,
-        inverse=inverse_tables(pattern, place, *wanted.T) if marginals else None,
+        inverse=inverse_tables(pattern, place, *wanted.T, room) if marginals else None,
         pairs=index_table(wanted),
     )
 
@@ -157,10 +160,12 @@ def plan_for(
     *,
     marginals: bool = False,
     pairs: Int[np.ndarray, "Q 2"] | None = None,
+    room: int = 0,
 ) -> Plan:
     """The given plan, checked against the graph as far as that is concrete, or a new one."""
     if given is None:
-        return plan(graph, factors, marginals=marginals, pairs=() if pairs is None else pairs)
+        wanted = () if pairs is None else pairs
+        return plan(graph, factors, marginals=marginals, pairs=wanted, room=room)
     size = len(graph.poses) + len(graph.points)
     same = given.order.shape == (size,) and set(given.who) == set(graph.tables)
     for key, who in given.who.items():

@@ -59,8 +59,8 @@ class Factored(NamedTuple):
     """whether the pivots of a column are positive"""
 
 
-def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
-    """The tables of a pattern, and the place of each of its blocks, and of none, in
+def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, Ints]:
+    """The tables of a pattern, with room for so many variables, and the place of each of its blocks, and of none, in
     `Factored.blocks`."""
     size, heights, columns, rows = (
         len(pattern.order),
@@ -75,9 +75,9 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
         right.append(blocks[:, other].ravel())
         target.append(pattern.find(rows[left[-1]], rows[right[-1]]))
     sums = Sums(heights[columns], *map(np.concatenate, (target, left, right)))
-    _, place = places(sums, padded_size(len(columns)))
+    _, place = places(sums, block_count(pattern, room))
     one = np.append(np.arange(size), nothing(size))
-    factor = sweep(sums, place, place, one[np.append(columns, size)])
+    factor = sweep(sums, place, place, one[np.append(columns, size)], room)
     # Columns are sorted by height: those of a level lie side by side.
     first = np.searchsorted(heights, np.arange(heights[-1] + 2)).tolist()
     chunks = [range(low, high, TARGETS) for low, high in pairwise(first)]
@@ -90,13 +90,18 @@ def cholesky_tables(pattern: Pattern) -> tuple[CholeskyTables, Ints]:
     return CholeskyTables(
         factor,
         diagonal=index_table(place[pattern.first[:-1]]),
-        pivots=level_table(np.cumsum([0, *map(len, chunks)]).tolist()),
-        pivot_base=index_table(pivot_base, padded_table_size(len(pivot_base))),
-        forward=sweep(downward, place, forward_place, one),
+        pivots=level_table(np.cumsum([0, *map(len, chunks)]).tolist(), room),
+        pivot_base=index_table(pivot_base, padded_table_size(len(pivot_base), room)),
+        forward=sweep(downward, place, forward_place, one, room),
         forward_order=index_table(forward_order),
-        backward=sweep(upward, place, backward_place, one),
+        backward=sweep(upward, place, backward_place, one, room),
         backward_order=index_table(backward_order),
     ), place
+
+
+def block_count(pattern: Pattern, room: int) -> int:
+    """The size of the array of a pattern's blocks, with room for so many variables."""
+    return padded_size(max(len(pattern.columns), 8 * room))
 
 
 def by_transposed(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -12,8 +12,10 @@ LEAST = 2
 Stages = tuple[Int[Array, "_ terms"], ...]
 
 
-def stages(target: Int[np.ndarray, "rows"], size: int) -> Stages:
+def stages(target: Int[np.ndarray, "rows"], size: int, room: int = 0) -> Stages:
     """The tables of sums of rows into so many targets; a target of -1 drops its row.
+
+    With room there are four stages at least, enough for 256 rows of a target, of so many rows.
 
     Each stage sums up to four rows; it gives its targets in order, until each has one row.
     """
@@ -28,8 +30,8 @@ def stages(target: Int[np.ndarray, "rows"], size: int) -> Stages:
         sums = np.full((groups.sum(), TERMS), absent, np.int32)
         rank = np.arange(len(owner)) - begin[owner]
         sums[group_begin[owner] + rank // TERMS, rank % TERMS] = numbers
-        done = last and len(out) + 1 >= LEAST
-        rows = len(sums) if done else padded_size(len(sums))
+        done = last and len(out) + 1 >= (4 if room else LEAST)
+        rows = len(sums) if done else padded_size(max(len(sums), room))
         out.append(index_table(sums, rows, absent))
         if done:
             return tuple(out)

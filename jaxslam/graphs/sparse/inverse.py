@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.graphs.sparse.cholesky import Factored, by
+from jaxslam.graphs.sparse.cholesky import Factored, block_count, by
 from jaxslam.graphs.sparse.sweeps import (
     Sums,
     Sweep,
     finish,
     index_table,
     nothing,
-    padded_size,
     places,
     subtract_products,
     sweep,
@@ -35,7 +34,7 @@ class InverseTables(NamedTuple):
 
 
 def inverse_tables(
-    pattern: Pattern, cholesky_places: Ints, first: Ints, second: Ints
+    pattern: Pattern, cholesky_places: Ints, first: Ints, second: Ints, room: int = 0
 ) -> InverseTables:
     """The tables of a pattern, and of pairs of its variables whose blocks it has.
 
@@ -57,12 +56,12 @@ def inverse_tables(
     # The diagonal block of a column comes after those below it, of which it is a sum.
     level = 2 * depth[columns] + (rows == columns)
     sums = Sums(level, *map(np.concatenate, (target, left, right, flip)))
-    _, place = places(sums, padded_size(len(columns)))
+    _, place = places(sums, block_count(pattern, room))
     end = np.append(columns, nothing(size))
     one, other = pattern.position[first], pattern.position[second]
     pairs = place[pattern.find(np.maximum(one, other), np.minimum(one, other))]
     return InverseTables(
-        sweep(sums, place, cholesky_places, end),
+        sweep(sums, place, cholesky_places, end, 2 * room),
         index_table(place[pattern.first[:-1]]),
         index_table(pairs),
         index_table(one < other),

@@ -70,9 +70,9 @@ def padded_size(size: int, least: int = 64, parts: int = 8) -> int:
     return -(-size // step) * step
 
 
-def padded_table_size(size: int) -> int:
-    """The padded size of a table, whose rows beyond its size cost memory alone."""
-    return padded_size(size, parts=2)
+def padded_table_size(size: int, room: int = 0) -> int:
+    """The padded size of a table, whose rows beyond its size cost memory alone; `room` at least."""
+    return padded_size(max(size, room), parts=2)
 
 
 def index_table(numbers: np.ndarray, size: int | None = None, fill: int = 0) -> Array:
@@ -84,9 +84,9 @@ def index_table(numbers: np.ndarray, size: int | None = None, fill: int = 0) -> 
     return jnp.asarray(jax.device_put(kept))
 
 
-def level_table(ends: Sequence[int]) -> Array:
-    """The end of each level, from 0, as a table."""
-    return index_table(np.array(ends), padded_table_size(len(ends)))
+def level_table(ends: Sequence[int], room: int = 0) -> Array:
+    """The end of each level, from 0, as a table with room for so many variables."""
+    return index_table(np.array(ends), padded_table_size(len(ends), room // 4))
 
 
 def places(sums: Sums, size: int) -> tuple[Ints, Ints]:
@@ -112,8 +112,8 @@ def padded(array: jax.Array) -> jax.Array:
     return jnp.pad(array, [(0, TARGETS + 1)] + [(0, 0)] * (array.ndim - 1))
 
 
-def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
-    """The tables of a sweep.
+def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Sweep:
+    """The tables of a sweep, with room for those of so many variables.
 
     left, right: the place of each factor, and of none, by its number. end: what each target is
     finished with, and what leaves a target as it is.
@@ -145,7 +145,8 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
     end_place = np.array(end_base, int)[:, None] + np.arange(TARGETS)
     inside = end_place < np.repeat(first[1:], np.diff(ends))[:, None]
     ending = order[np.minimum(end_place, size - 1)]
-    width = padded_table_size(len(bases))
+    width = padded_table_size(len(bases), 16 * room)
+    finished = padded_table_size(len(end_base), 4 * room)
 
     def factors(numbers: Ints, place: Ints) -> Array:
         numbers = np.append(numbers, 0)[product]
@@ -153,15 +154,13 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints) -> Sweep:
 
     return Sweep(
         index_table(np.array(levels)),
-        level_table(rounds),
+        level_table(rounds, room),
         index_table(bases, width),
         factors(sums.left, left),
         factors(sums.right, right),
-        level_table(ends),
-        index_table(np.array(end_base, int), padded_table_size(len(end_base))),
-        index_table(
-            end[np.where(inside, ending, -1)], padded_table_size(len(end_base)), int(end[-1])
-        ),
+        level_table(ends, room),
+        index_table(np.array(end_base, int), finished),
+        index_table(end[np.where(inside, ending, -1)], finished, int(end[-1])),
         None if sums.flip is None else index_table(np.append(sums.flip, False)[product], width),
     )
 

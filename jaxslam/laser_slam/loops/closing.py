@@ -11,7 +11,7 @@ from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
 from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
-from jaxslam.laser_slam.assembly import graph_of, relative_covs, table_of
+from jaxslam.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
 from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_place, near
 from jaxslam.laser_slam.loops.descriptor import descriptors
 from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
@@ -94,7 +94,7 @@ def closed(
         edges = table_of(loops.first[kept], loops.second[kept], loops.z[kept], loops.cov[kept])
         graph = graph_of(path, keyframe, chain, edges)
         if kept.any():
-            graph = _host(graphs.optimize(graph, kernel={LOOPS: graphs.cauchy()}).graph)
+            graph = _host(graphs.optimize(graph, kernel={LOOPS: graphs.cauchy()}, room=ROOM).graph)
     doubtful = table_of(index[:-1], index[1:], steps, odometry.cov[keyframe[1:]])
     return _final(graph, doubtful, loops, kept, keyframe, settings)
 
@@ -120,7 +120,7 @@ def _final(
         tables[LOOPS] = tables[LOOPS]._replace(valid=~doubted)
     graph = graph._replace(tables=tables)
     if kept.any():
-        graph = _host(graphs.optimize(graph).graph)
+        graph = _host(graphs.optimize(graph, room=ROOM).graph)
     return Closed(graph, loops._replace(first=keyframe[loops.first], second=keyframe[loops.second]))
 
 

@@ -40,7 +40,7 @@ class Steps(NamedTuple):
     @property
     def unknown(self) -> Bool[np.ndarray, "K"]:
         """Steps of which raw odometry says nothing."""
-        return self.jump | self.frozen
+        return np.asarray(self.jump | self.frozen)
 
 
 def steps_of(
@@ -108,7 +108,7 @@ def _by_speeds(
         fastest = FASTER * np.quantile(way[moves] / duration[moves], 0.95)
         can = fastest * duration
         reach[timed, column] = np.minimum(FARTHEST[column], can[timed])
-        # Two steps that are one of usual speed together, the first too slow and the second too fast.
+        # Two steps, the first too slow and the second too fast, together of usual speed.
         both, time = way[:-1] + way[1:], duration[:-1] + duration[1:]
         slow = way[:-1] * time < 0.5 * both * duration[:-1]
         fast = (way[1:] > can[1:]) & (both <= fastest * time) & (both - way[:-1] > much)

@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam import programs
 from jaxslam.graphs import cauchy
@@ -45,11 +45,12 @@ CLEAR = 0.4
 
 
 class Reference(NamedTuple):
-    """The points of some scans, the lines through them, and the table that a search needs."""
+    """The points of some scans, and the lines through them."""
 
     points: Points
     surface: Surface
-    table: Array
+    table: PyTree
+    """what all searches need"""
 
 
 class ScanMatch(NamedTuple):
@@ -159,8 +160,8 @@ def match(
 def _gathered(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Reference:
     """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
     there = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
-    one = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there)
-    return Reference(*one, ANY.prepare(raster(one[0], CELL, HALF)))
+    gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there)
+    return Reference(gathered, lines, ANY.prepare(raster(gathered, CELL, HALF)))
 
 
 def _match(
@@ -219,7 +220,7 @@ def _thinned(of: Points) -> Points:
 Of = TypeVar("Of", Points, Surface)
 
 
-def taken(of: Of, rows: int | np.ndarray) -> Of:
+def taken(of: Of, rows: int | np.integer | np.ndarray) -> Of:
     """Some scans of many."""
     found: Of = jax.tree.map(lambda part: part[rows], of)
     return found

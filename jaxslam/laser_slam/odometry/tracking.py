@@ -18,7 +18,7 @@ from jaxslam.laser_slam.odometry.reference import (
 )
 from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
-from jaxslam.matching import Matcher
+from jaxslam.matching import Matcher, Points
 from jaxslam.math import numpy_poses as poses
 
 NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0), ambiguous=1.0)
@@ -185,7 +185,7 @@ class _Found(NamedTuple):
 
 def _matched(
     reference: Reference,
-    points: object,
+    points: Points,
     guess: Float[np.ndarray, "3"],
     prior: Float[np.ndarray, "3 3"],
     bound: Float[np.ndarray, "3 3"],
@@ -242,15 +242,15 @@ def _place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Set
     placed = result.matched.copy()
     placed[keys] = True
     for scan in np.flatnonzero(~placed & scans.usable):
-        base = keys[np.searchsorted(keys, scan) - 1]
-        after = np.flatnonzero(placed[scan:])
-        if not len(after):
+        row = int(np.searchsorted(keys, scan))
+        base = keys[row - 1]
+        if not placed[scan:].any():
             continue
-        before, after = scan - 1 - int(np.argmax(placed[:scan][::-1])), scan + int(after[0])
+        before = scan - 1 - int(np.argmax(placed[:scan][::-1]))
+        after = scan + int(np.argmax(placed[scan:]))
         share = (scan - before) / (after - before)
         way = poses.between(result.poses[before], result.poses[after])
         middle = poses.compose(result.poses[before], share * way)
-        row = np.searchsorted(keys, scan)
         half = settings.reference // 2
         of = keys[max(row - half, 0) : row + half]
         of = of[scans.usable[of]]
