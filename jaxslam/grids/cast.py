@@ -34,21 +34,42 @@ class RayMap(NamedTuple):
     resolution: Float[Array, ""]
 
 
-def ray_map(grid: Grid, *, method: str = "surface", skip: bool = True) -> RayMap:
+def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayMap:
     """A grid prepared for `cast` by one of two methods, of which only `cast` knows the difference.
 
     Args:
-        method: "surface" or "cells", see `cast`.
+        method: "surface" or "cells", see `cast`. None chooses by the map: "surface" where each cell
+            is known and there are more than three log-odds, as `simulation.walls.rasterize` makes
+            graded maps; else "cells": for trinary maps, as `read_map` reads most files, for maps
+            made from scans, and within a trace, where the values are not known.
         skip: compute the distance field, with which rays cross free space in long steps (sphere
             tracing). The ranges are the same to rounding, but for rays through an exact corner.
     Raises:
         ValueError: a grid that is none, or without a free cell; an unknown method.
     """
     check_grid("ray_map", grid)
+    method = default_method(grid) if method is None else method
     check_method("ray_map", method)
     if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError("ray_map: the map has no free cell (log-odds below 0)")
     return programs.call(_ray_map, (_SQUARES[method], skip), grid)
+
+
+def default_method(grid: Grid) -> str:
+    """The method of `ray_map` for a grid: "surface" where p may be the share of a cell that is
+    solid.
+
+    It is not with three log-odds or fewer, which have no grades, nor where cells are unknown, which
+    a map made from scans has: its p says how sure a cell is. There "surface" goes too far (`cast`).
+    """
+    if not is_concrete(grid.log_odds):
+        return "cells"
+    log_odds = np.asarray(grid.log_odds)
+    if np.any(log_odds == 0):
+        return "cells"
+    # More than three values: at least two between the ends. Without sorting millions of cells.
+    between = log_odds[(log_odds > log_odds.min()) & (log_odds < log_odds.max())]
+    return "surface" if between.size and between.min() < between.max() else "cells"
 
 
 def check_method(name: str, method: str) -> None:
@@ -107,7 +128,8 @@ def cast(
     A beam leaves the pose (x, y, θ) in direction θ + angle. Unknown cells do not stop it. A beam
     that leaves the map, or starts off it, has max_range; one that starts in an obstacle has 0.
 
-    Two methods, by `ray_map`; a plain grid is cast by "surface":
+    Two methods, by `ray_map`, and both are differentiable; a plain grid is cast by the one that
+    `ray_map` takes by default:
 
     "cells": the beam ends where it enters an occupied cell. Every cell that it crosses is visited
         in order (Amanatides & Woo 1987, "A fast voxel traversal algorithm for ray tracing"). A wall
@@ -119,12 +141,11 @@ def cast(
         the wall to a fraction of a cell: the range of a beam less than 63° from the normal, and one
         and a half cells from edges and corners, is wrong by less than half a cell, in the median by
         less than a tenth (`python -m benchmarks.grids`). These are rounded: beside an edge a beam
-        may hit or miss wrongly. In a trinary map the line is the border between an
-        occupied and a free cell, with corners cut. In a map of log-odds it passes walls that are
-        weakly occupied beside cells that are surely free: between two such cells that touch by a
-        corner p is below ½. There take "cells", or the trinary map
-        `grid._replace(log_odds=4 * jnp.sign(grid.log_odds))` (`python -m benchmarks.grids` has
-        the share of beams that pass walls of a real map).
+        may hit or miss wrongly. Where p is no share, it goes too far. In a trinary map the corners
+        of cells are cut, by half a cell from a pillar or an end of a wall, and beams behind them go
+        on to the next wall. In a map of log-odds it passes walls that are weakly occupied beside
+        cells that are surely free: between two such cells that touch by a corner p is below ½
+        (`python -m benchmarks.grids` has the share of beams that pass walls of a real map).
 
     The derivative by the pose is that of the range to a straight wall through the hit,
     dr = -n·(dt + r dφ e⊥)/(n·e), with e the direction, φ its angle, dt the shift of the origin, and

@@ -101,8 +101,6 @@ def near_distances(occupied: Bool[JaxOrNumPy, "H W"], reach: int) -> Int[Array, 
         size = squared.shape[axis]
         border = [(reach, reach) if axis == k else (0, 0) for k in (0, 1)]
         wide = jnp.pad(squared, border, constant_values=beyond)
-        # Without a barrier XLA would compute the first axis again for each shift of the second.
-        wide = jax.lax.optimization_barrier(wide)
         shifted = [
             jax.lax.slice_in_dim(wide, k, k + size, axis=axis)
             + jnp.asarray((k - reach) ** 2, squared.dtype)

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
+from jaxslam.math.xla import one_kernel
+
 STOP, OFF = 255, 254
 """Squares in which a ray may end, and squares off the map."""
 
@@ -63,7 +65,7 @@ def _march(
 ) -> tuple[Array, Array]:
     count = start.shape[0]
     if count <= CHUNK or jax.default_backend() != "cpu":
-        return _together(ahead, corners, start, direction, limit)
+        return one_kernel(_together, ahead, corners, start, direction, limit)
     parts = -(-count // CHUNK)
     padded = parts * CHUNK - count
 
@@ -71,7 +73,7 @@ def _march(
         return jnp.pad(x, [(0, padded), (0, 0)], mode="edge").reshape(parts, CHUNK, 2)
 
     length, hit = jax.lax.map(
-        lambda rays: _together(ahead, corners, rays[0], rays[1], limit),
+        lambda rays: one_kernel(_together, ahead, corners, rays[0], rays[1], limit),
         (split(start), split(direction)),
     )
     return length.reshape(-1)[:count], hit.reshape(-1)[:count]

@@ -40,6 +40,32 @@ def no_inline(function: Callable[..., _T], *arguments: PyTree) -> _T:
         return cast(_T, jax.jit(whole)(*arguments))
 
 
+def one_kernel(function: Callable[..., _T], *arguments: PyTree) -> _T:
+    """The result of function(*arguments), on a CPU compiled as one kernel, its loops included.
+
+    For loops whose iterations do little: elsewhere XLA on CPU drives a `while` from outside the
+    compiled code, with one kernel for its condition and one for each fusion of its body, and
+    launching these took seven times as long as a step of 32 rays. The call carries the mark that
+    XLA gives to loops it finds small (`SmallWhileLoopHoistingPass`); jaxlib 0.12 finds the loop of
+    the rays small, 0.8 to 0.11 do not.
+
+    The kernel runs in one thread. The function must use each argument and must not sort, scatter or
+    call a library (LAPACK, FFT): XLA cannot compile that in one kernel, and may abort the process.
+    """
+    if jax.default_backend() != "cpu":
+        return function(*arguments)
+
+    @functools.wraps(function)
+    def whole(*arguments: PyTree) -> _T:
+        with set_xla_metadata(inlineable="true", xla_cpu_small_call="false"):  # functions it calls
+            return function(*arguments)
+
+    # A constant would be moved into the function, and leave an argument that is not used.
+    arguments = jax.lax.optimization_barrier(arguments)
+    with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
+        return cast(_T, jax.jit(whole)(*arguments))
+
+
 def quick_options(platform: str) -> dict[str, int] | None:
     """Compiler options that shorten the compilation of loop-free programs; None if there are none.
 

@@ -2,16 +2,14 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
-from types import ModuleType
 from typing import NamedTuple, TypeAlias
 
 import jax
-import jax.experimental
 import numpy as np
 
 from jaxslam.graphs import Factor
 from jaxslam.grids.beam_models import BeamModel
+from jaxslam.math.arrays import float64
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties
@@ -134,12 +132,3 @@ def _samples_of(
         with contextlib.suppress(Exception, SystemExit):
             return samples.sensor_samples(model, count, seed)
     return tuple(samples.argument_samples(f.arguments, count, seed) for f in functions)
-
-
-def float64() -> AbstractContextManager[object]:
-    """A block in which JAX has 64-bit types, in this thread."""
-    home: ModuleType = (
-        jax if hasattr(jax, "enable_x64") else jax.experimental
-    )  # from jax 0.8 on, before
-    context: AbstractContextManager[object] = home.enable_x64(True)
-    return context

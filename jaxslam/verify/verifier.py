@@ -8,10 +8,11 @@ from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
 from jaxslam.grids.beam_models import BeamModel
+from jaxslam.math.arrays import float64
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify.comparison import compare_methods
 from jaxslam.verify.derivatives.jacobians import Evaluated
-from jaxslam.verify.examination import Model, examine, float64, functions_of, typical_linearity
+from jaxslam.verify.examination import Model, examine, functions_of, typical_linearity
 from jaxslam.verify.inputs.beam_models import FAR, beam_function, beam_samples
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.functions import (

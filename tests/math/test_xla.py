@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.math.xla import anywhere, hot_options, materialize, no_inline, quick_jit, where_any
+from jaxslam.math.xla import (
+    anywhere,
+    hot_options,
+    materialize,
+    no_inline,
+    one_kernel,
+    quick_jit,
+    where_any,
+)
 
 
 def test_settle_is_the_identity_under_every_transformation():
@@ -32,6 +40,35 @@ def test_apart_is_the_function_under_every_transformation():
     np.testing.assert_allclose(sine, np.sin(x))
     slope = jax.vmap(jax.grad(lambda x, y: sum(f(x, y))))(x, y)
     np.testing.assert_allclose(slope, y + np.cos(x))
+
+
+def halvings(table, x):
+    """The number of halvings of x down to the entry of a table."""
+
+    def step(state):
+        x, count = state
+        above = x > table.reshape(-1).at[count % table.size].get(mode="promise_in_bounds")
+        return jnp.where(above, x / 2, 0.0), count + above
+
+    return jax.lax.while_loop(lambda s: (s[0] > 0).any(), step, (x, jnp.zeros(x.shape, int)))[1]
+
+
+@pytest.mark.parametrize("given", ["argument", "constant", "all constant", "in a loop", "vmap"])
+def test_a_loop_in_one_kernel_is_the_loop(given):
+    """XLA before 0.12 aborts the process where an argument of the kernel is not used, which is what
+    it makes of a constant one."""
+    table, x = np.ones((200, 100)), np.array([1.5, 9.0, 100.0])
+    f = {
+        "argument": lambda t, x: one_kernel(halvings, t, x),
+        "constant": lambda t, x: one_kernel(halvings, table, x),
+        "all constant": lambda t, _: one_kernel(halvings, table, np.array([1.5, 9.0, 100.0])),
+        "in a loop": lambda t, x: jax.lax.map(lambda y: one_kernel(halvings, table, y[None]), x),
+        "vmap": lambda t, x: jax.vmap(lambda y: one_kernel(halvings, t, y[None]))(x),
+    }[given]
+    program = jax.jit(f).lower(table, x).compile()
+    np.testing.assert_array_equal(np.ravel(program(table, x)), [1, 4, 7])
+    if given == "argument":
+        assert re.search(r"call\(.*xla_cpu_small_call=\"true\"", program.as_text())
 
 
 @pytest.mark.parametrize("platform", ["cpu", "gpu"])

@@ -93,23 +93,23 @@ def ray_cast(
     mixture: Mixture = USUAL,
     *,
     max_range: float,
-    method: str = "surface",
+    method: str | None = None,
     mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> BeamModel:
     """The ray-cast model: `mixture_log_density` of each range given that of `grids.cast`.
 
-    Differentiable by the parameters, and by the pose in the sense of `cast`. In a map made from
-    scans take `method="cells"`, since "surface" passes walls that are weakly occupied (`cast`).
+    Differentiable by the parameters, and by the pose in the sense of `cast`, with either method.
 
     Args:
         mixture: parameters, which `fit` learns from data; the four shares have sum 1.
-        max_range: [m]. method: of `ray_map`.
+        max_range: [m]. method: of `ray_map`; None chooses by the map.
         mount: (3,) pose of the laser on the robot.
     Raises:
         ValueError: numbers out of range, an unknown method, a mount that is no pose.
     """
     check_positive("ray_cast", max_range=max_range, sigma=mixture.sigma, rate=mixture.rate)
-    check_method("ray_cast", method)
+    if method is not None:
+        check_method("ray_cast", method)
     check_mount("ray_cast", mount)
     check_weights("ray_cast", dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
 
