@@ -55,7 +55,9 @@ def relative_covs(graph: Graph, pairs: Int[np.ndarray, "Q 2"]) -> Float[np.ndarr
 
     From the joint marginals of both, by the Jacobians of x_i⁻¹ ∘ x_j.
     """
-    joint = np.asarray(graphs.marginals(graph, pairs=pairs, room=ROOM).pairs, np.float64)
+    parts = [pairs[begin : begin + 4 * ROOM] for begin in range(0, len(pairs), 4 * ROOM)]
+    found = [np.asarray(graphs.marginals(graph, pairs=of, room=ROOM).pairs) for of in parts]
+    joint = np.concatenate(found).astype(np.float64)
     at = np.asarray(graph.poses, np.float64)
     i, j = at[pairs[:, 0]], at[pairs[:, 1]]
     # x_i + δ_i is x_i ∘ R(θ_i)ᵀ δ_i to first order, which moves the end by -Ad(z)⁻¹ of it.

@@ -63,7 +63,7 @@ def solve(
         graph, loops = closed(scans, odometry, settings, telling("loop closing"))
         lap("loop closing")
         path, cov = _of_scans(graph, odometry)
-        squared = graphs.squared_residuals(graph)
+        squared = graphs.squared_residuals(graph, room=ROOM)
     chi2 = float(sum(np.asarray(each).sum() for each in squared.values())) if squared else 0.0
     lap("marginals")
     frame = frame_of(log, [path, odometry.poses], settings)

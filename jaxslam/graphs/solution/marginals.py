@@ -72,7 +72,7 @@ def marginals(
     wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     if plan is None and programs.outside(graph):
         more = padded_graph(graph, room)
-        rows = np.zeros((padded_size(max(len(wanted), room), LEAST), 2), int)
+        rows = np.zeros((padded_size(max(len(wanted), 4 * room), LEAST), 2), int)
         rows[: len(wanted)] = padded_number(wanted, graph, more)
         new = plan_for(caller, more, known, None, marginals=True, pairs=rows, room=room)
         found = programs.call(_marginals, (model,), more, new)

@@ -128,7 +128,9 @@ def plan(
         block_row=index_table(block_row, width),
         on_diagonal=index_table(block_row == block_column, width),
         cholesky=cholesky,
-        inverse=inverse_tables(pattern, place, *wanted.T, room) if marginals else None,
+        inverse=inverse_tables(pattern, place, wanted[:, 0], wanted[:, 1], room)
+        if marginals
+        else None,
         pairs=index_table(wanted),
     )
 

@@ -10,18 +10,23 @@ from jaxslam import programs
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.model import factors_of
+from jaxslam.graphs.solver.padding import cut, padded_graph
 
 
 def squared_residuals(
-    graph: Graph, factors: Mapping[str, Factor] | None = None
+    graph: Graph, factors: Mapping[str, Factor] | None = None, *, room: int = 0
 ) -> dict[str, Float[Array, "E"]]:
     """The squared residual eᵀ Ω e of every row of every table, 0 where not valid; their sum is χ².
 
     Of a row with R residuals, at the truth and with the right Ω, it is χ² distributed with R
-    degrees of freedom. factors: as for `optimize`.
+    degrees of freedom. factors, room: as for `optimize`.
     """
     factors = factors_of("graphs.squared_residuals", graph, factors)
-    return programs.call(_squared, tuple(factors[key] for key in sorted(graph.tables)), graph)
+    of = tuple(factors[key] for key in sorted(graph.tables))
+    if not programs.outside(graph):
+        return _squared(*of, graph)
+    found = programs.call(_squared, of, padded_graph(graph, room))
+    return {key: cut(square, graph.tables[key].valid) for key, square in found.items()}
 
 
 def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None) -> int:

@@ -60,8 +60,8 @@ class Factored(NamedTuple):
 
 
 def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, Ints]:
-    """The tables of a pattern, with room for so many variables, and the place of each of its blocks, and of none, in
-    `Factored.blocks`."""
+    """The tables of a pattern, with room for so many variables, and the place of each of its
+    blocks, and of none, in `Factored.blocks`."""
     size, heights, columns, rows = (
         len(pattern.order),
         pattern.heights,

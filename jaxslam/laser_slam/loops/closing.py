@@ -114,7 +114,7 @@ def _final(
     """
     tables = {**graph.tables, "relative_pose": chain}
     if kept.any():
-        square = np.asarray(graphs.squared_residuals(graph)[LOOPS])
+        square = np.asarray(graphs.squared_residuals(graph, room=ROOM)[LOOPS])
         doubted = square > chi2_quantile(settings.consistency, 3)
         loops.outcome[np.flatnonzero(kept)[doubted]] = LoopOutcome.DOUBTED
         tables[LOOPS] = tables[LOOPS]._replace(valid=~doubted)
