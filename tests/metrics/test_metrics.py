@@ -146,6 +146,21 @@ def test_statistics_by_hand():
     assert told["rotation mean [deg]"] == pytest.approx(3.0)
 
 
+def test_the_figures_of_the_benchmark_by_hand():
+    found = metrics.benchmark_figures(
+        metrics.Errors(np.array([1.0, 2.0, 6.0]), np.deg2rad([1.0, 3.0, 2.0]))
+    )
+    expected = {
+        "translation [m]": (3, np.sqrt(14 / 3)),
+        "translation² [m²]": (41 / 3, np.std([1, 4, 36])),
+        "rotation [deg]": (2, np.sqrt(2 / 3)),
+        "rotation² [deg²]": (14 / 3, np.std([1, 9, 4])),
+    }
+    assert list(found) == list(expected)
+    for name, figures in expected.items():
+        np.testing.assert_allclose(found[name], figures)
+
+
 # --- maps ---------------------------------------------------------------------------------------
 
 
@@ -218,6 +233,10 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
         ),
         (lambda: metrics.joined(), "joined: expected at least one"),
         (lambda: metrics.statistics([]), "statistics: expected finite"),
+        (
+            lambda: metrics.benchmark_figures(metrics.Errors(np.zeros(0), np.zeros(0))),
+            "statistics: expected finite errors",
+        ),
     ],
 )
 def test_bad_input_is_refused_by_name(call, message):
