@@ -22,6 +22,7 @@ from jaxslam.datasets.mrclam.reader import mrclam
 from jaxslam.datasets.mrclam.team import mrclam_team
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza import plaza
+from jaxslam.datasets.relation_file import StampedRelations, relation_file
 from jaxslam.datasets.table.reader import table
 from jaxslam.datasets.victoria_park import victoria_park
 
@@ -59,6 +60,7 @@ __all__ = [
     "LaserLog",
     "OwnCalibration",
     "RobotCalibration",
+    "StampedRelations",
     "bonn",
     "carmen",
     "fit",
@@ -66,6 +68,7 @@ __all__ = [
     "mrclam_calibration",
     "mrclam_team",
     "plaza",
+    "relation_file",
     "table",
     "victoria_park",
 ]

@@ -4,6 +4,7 @@ from jaxslam.laser_slam.odometry.increments import match_controls, match_motion
 from jaxslam.laser_slam.odometry.raw import Steps, steps_of
 from jaxslam.laser_slam.odometry.tracking import Odometry, laser_odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops, ScanLog, Solved
+from jaxslam.laser_slam.relations import relation_covs, relation_nees
 from jaxslam.laser_slam.scans import Scans, scans_of
 from jaxslam.laser_slam.score import ClosureScore, closure_score
 from jaxslam.laser_slam.settings import Settings
@@ -23,6 +24,8 @@ __all__ = [
     "laser_odometry",
     "match_controls",
     "match_motion",
+    "relation_covs",
+    "relation_nees",
     "scans_of",
     "solve",
     "steps_of",

@@ -105,6 +105,12 @@ class Solved(NamedTuple):
     """scans whose match is in doubt (`laser_odometry`)"""
     keyframe: Int[np.ndarray, "N"]
     """scans that are poses of the graph"""
+    base: Int[np.ndarray, "K"]
+    """row in the graph of the keyframe that each scan is relative to; of a keyframe, its own"""
+    z: Float[np.ndarray, "K 3"]
+    """pose of each scan in the frame of that keyframe; zero for keyframes"""
+    z_cov: Float[np.ndarray, "K 3 3"]
+    """of the end of `z`; zero for keyframes"""
     graph: Graph
     """the optimum; `pose_id` is the index of the scan"""
     start: Graph

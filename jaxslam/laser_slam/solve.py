@@ -62,7 +62,7 @@ def solve(
     with float64():  # a step that is hardly known and a match differ too much for 32 bits
         graph, loops = closed(scans, odometry, settings, telling("loop closing"))
         lap("loop closing")
-        path, cov = _of_scans(graph, odometry)
+        path, cov, hung = _of_scans(graph, odometry)
         squared = graphs.squared_residuals(graph, room=ROOM)
     chi2 = float(sum(np.asarray(each).sum() for each in squared.values())) if squared else 0.0
     lap("marginals")
@@ -77,6 +77,9 @@ def solve(
         cov=cov,
         doubted=odometry.doubted,
         keyframe=odometry.keyframe,
+        base=hung[0],
+        z=hung[1],
+        z_cov=hung[2],
         graph=graph,
         start=graph._replace(poses=odometry.poses[odometry.keyframe]),
         loops=loops,
@@ -89,8 +92,11 @@ def solve(
     )
 
 
-def _of_scans(graph: graphs.Graph, odometry: Odometry) -> tuple[np.ndarray, np.ndarray]:
-    """The pose of every scan and its covariance, from those of the keyframes."""
+def _of_scans(
+    graph: graphs.Graph, odometry: Odometry
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """The pose of every scan and its covariance, from those of the keyframes; then `Solved.base`,
+    `z` and `z_cov`."""
     keyframe = odometry.keyframe
     at = np.asarray(graph.poses, np.float64)
     row = np.searchsorted(keyframe, np.arange(len(odometry.poses)), side="right") - 1
@@ -103,7 +109,8 @@ def _of_scans(graph: graphs.Graph, odometry: Odometry) -> tuple[np.ndarray, np.n
         marginal = np.asarray(graphs.marginals(graph, room=ROOM).poses, np.float64)
     at_key = covariances.turns(-at[row, 2]) @ marginal[row] @ covariances.turns(at[row, 2])
     step = np.where(is_key[:, None, None], 0.0, odometry.cov)
-    return path, covariances.of_coordinates(covariances.composed_cov(at_key, z, step), path)
+    cov = covariances.of_coordinates(covariances.composed_cov(at_key, z, step), path)
+    return path, cov, (row, z, step)
 
 
 def _counts(

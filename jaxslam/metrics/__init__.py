@@ -16,16 +16,24 @@ from jaxslam.metrics.relations import (
     revisits,
     rpe,
 )
-from jaxslam.metrics.statistics import Statistics, statistics, summary
+from jaxslam.metrics.statistics import (
+    MeanAndStd,
+    Statistics,
+    benchmark_figures,
+    statistics,
+    summary,
+)
 
 __all__ = [
     "Errors",
+    "MeanAndStd",
     "PathErrors",
     "Relations",
     "Statistics",
     "align_map",
     "alignment",
     "ate",
+    "benchmark_figures",
     "carried",
     "correlation",
     "given",

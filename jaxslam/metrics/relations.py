@@ -117,38 +117,40 @@ def given(
 ) -> tuple[Relations, int]:
     """Relations that a file gives by their stamps, by the rows of a path, and how many are dropped.
 
-    Each stamp takes the row nearest in time; a relation of which one is further than `tolerance`
-    [s] away is dropped.
+    Each stamp takes the row nearest in time, the first of several with the same stamp; a relation
+    of which one is further than `tolerance` away is dropped.
 
     Args:
-        time: (K,) stamps of the path [s], which do not go back.
-        first, second: (R,) stamps of the relations.
+        time: (K,) stamps of the path [s], in any order: logs have scans stamped before their
+            predecessor.
+        first, second: (R,) stamps of the relations [s].
         pose: (R, 3) of the second in the frame of the first.
+        tolerance: [s].
     Raises:
-        ValueError: on shapes that do not fit, and on stamps of the path that go back.
+        ValueError: on shapes that do not fit, stamps of the path that are not finite, a tolerance
+            that is no number of at least 0; and where no relation is kept, with both time ranges.
     """
     stamps, of = np.asarray(time, np.float64), poses_of("given", pose)
-    if (
-        stamps.ndim != 1
-        or not len(stamps)
-        or not np.isfinite(stamps).all()
-        or not (np.diff(stamps) >= 0).all()
-    ):
+    if stamps.ndim != 1 or not len(stamps) or not np.isfinite(stamps).all():
+        raise ValueError(f"given: expected finite stamps (K,), got {stamps.shape}")
+    if not tolerance >= 0:
+        raise ValueError(f"given: expected a tolerance of at least 0 s, got {tolerance}")
+    order = np.argsort(stamps, kind="stable")
+    ordered = stamps[order]
+    ends = np.stack([_stamps_of("given", each, len(of)) for each in (first, second)])
+    after = np.clip(np.searchsorted(ordered, ends), 0, len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    place = np.where(np.abs(ends - ordered[before]) <= np.abs(ordered[after] - ends), before, after)
+    place = np.searchsorted(ordered, ordered[place])  # the first of the same stamp
+    near = (np.abs(ordered[place] - ends) <= tolerance).all(axis=0)
+    if not near.any():
         raise ValueError(
-            f"given: expected finite stamps (K,) that do not go back, got {stamps.shape}"
+            f"given: none of {len(of):,} relations, from {ends.min():.6f} s to {ends.max():.6f} s, "
+            f"joins the path, from {ordered[0]:.6f} s to {ordered[-1]:.6f} s, within {tolerance:g} "
+            "s at both ends"
         )
-    rows, near = [], np.ones(len(of), bool)
-    for wanted in (np.asarray(first, np.float64), np.asarray(second, np.float64)):
-        if wanted.shape != (len(of),):
-            raise ValueError(f"given: expected {len(of)} stamps of relations, got {wanted.shape}")
-        after = np.clip(np.searchsorted(stamps, wanted), 1, max(len(stamps) - 1, 1))
-        after = np.minimum(after, len(stamps) - 1)
-        before = np.maximum(after - 1, 0)
-        row = np.where(wanted - stamps[before] <= stamps[after] - wanted, before, after)
-        near &= np.abs(stamps[row] - wanted) <= tolerance
-        rows.append(row)
-    kept = Relations(rows[0][near], rows[1][near], of[near])
-    return kept, int((~near).sum())
+    rows = order[place]
+    return Relations(rows[0][near], rows[1][near], of[near]), int((~near).sum())
 
 
 def joined(*parts: Relations) -> Relations:
@@ -205,6 +207,15 @@ def travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]:
     """The length of a path up to each of its poses [m]."""
     steps = np.diff(path[:, :2], axis=0)
     return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+
+
+def _stamps_of(caller: str, given: ArrayLike, count: int) -> Float[np.ndarray, "R"]:
+    stamps = np.asarray(given, np.float64)
+    if stamps.shape != (count,) or not np.isfinite(stamps).all():
+        raise ValueError(
+            f"{caller}: expected {count} finite stamps of relations, got {stamps.shape}"
+        )
+    return stamps
 
 
 def _between(

@@ -57,3 +57,29 @@ def summary(errors: Errors | PathErrors) -> dict[str, float]:
             told = "RMSE" if figure == "rmse" else figure
             found[f"{name} {told} [{unit}]"] = float(getattr(figures, figure))
     return found
+
+
+class MeanAndStd(NamedTuple):
+    """Mean and standard deviation, as `Statistics` has them."""
+
+    mean: float
+    std: float
+
+
+def benchmark_figures(errors: Errors) -> dict[str, MeanAndStd]:
+    """The figures that the Freiburg benchmark reports of the errors of relations, by quantity.
+
+    Of "translation [m]", "rotation [deg]" and their squares, "translation² [m²]" and
+    "rotation² [deg²]".
+
+    Kümmerle et al. 2009, as in `relation_errors`. Raises ValueError where there are no errors.
+    """
+    found = {}
+    for name, unit, values in (
+        ("translation", "m", np.asarray(errors.translation, np.float64)),
+        ("rotation", "deg", np.rad2deg(errors.rotation)),
+    ):
+        for mark, power in (("", 1), ("²", 2)):
+            figures = statistics(values**power)
+            found[f"{name}{mark} [{unit}{mark}]"] = MeanAndStd(figures.mean, figures.std)
+    return found

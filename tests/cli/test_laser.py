@@ -104,6 +104,12 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
     [
         (["--map", "known", "--filters", "seif"], "--filters: a laser log does not have this"),
         (["--map", "known", "--animate"], "--animate: a laser log has a film of laser SLAM alone"),
+        (["--map", "known", "--relations", "a"], "--relations: relations score laser SLAM alone"),
+        (
+            ["--localize", "m.yaml", "--relations", "a"],
+            "--relations: relations score laser SLAM alone",
+        ),
+        (["--relations", "no.txt"], "no.txt: cannot be read: No such file"),
         (
             ["--map", "known", "--start", "global"],
             "--start: expected --localize MAP.yaml beside it",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ring_of_rooms import FAR, SETTINGS, driven, errors
 
-from jaxslam import filters, laser_slam, run, sensors
+from jaxslam import filters, laser_slam, metrics, run, sensors
 from jaxslam.cli import main
 from jaxslam.laser_slam import LoopOutcome, covariances, laser_odometry, scans_of, steps_of
 from jaxslam.laser_slam.mapping import growing_maps
@@ -241,10 +241,8 @@ def test_its_files(drive, tmp_path):
     assert results.result_summary(found)["keyframes"] == len(found.keyframe)
 
 
-def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_path):
-    """`jaxslam run --dataset carmen FILE`, with the result of above in place of a second one."""
-    true, log, found = drive
-    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+def carmen_lines(true, log):
+    """ODOM and FLASER lines of the drive, one of each a scan."""
     lines = []
     rows = zip(true, log.raw, np.asarray(log.beams.range), strict=True)
     for k, (pose, raw, ranges) in enumerate(rows):
@@ -252,6 +250,14 @@ def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_
         lines.append(f"ODOM {driven} 0 0 0 {k} host {k}")
         ranges = " ".join(f"{value:.3f}" for value in ranges)
         lines.append(f"FLASER 60 {ranges} {told} {told} {k} host {k}")
+    return lines
+
+
+def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_path):
+    """`jaxslam run --dataset carmen FILE`, with the result of above in place of a second one."""
+    true, log, found = drive
+    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+    lines = carmen_lines(true, log)
     (tmp_path / "ring.log").write_text("\n".join(lines))
     out = tmp_path / "out"
     command = ["run", "--dataset", "carmen", str(tmp_path / "ring.log"), "--out", str(out)]
@@ -267,3 +273,65 @@ def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_
     assert main([*command, "--figures", "svg"]) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["score"].startswith("none: ") and "ATE, RMSE [m]" not in summary
+
+
+def relation_text(made, time):
+    """Lines of a file of relations."""
+    rows = zip(time[made.first], time[made.second], made.pose.tolist(), strict=True)
+    return "".join(f"{a:.5f} {b:.5f} {x} {y} 0 0 0 {yaw}\n" for a, b, (x, y, yaw) in rows)
+
+
+def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys):
+    true, log, found = drive
+    time = 1e9 + 2.0 * log.time
+    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+    lines = [
+        " ".join([*line.split()[:-3], str(time[k // 2]), "host", "0"])
+        for k, line in enumerate(carmen_lines(true, log))
+    ]
+    (tmp_path / "ring.log").write_text("\n".join(lines))
+    made = metrics.joined(*(metrics.relations(true, rows=rows) for rows in (1, 3, 30, 31)))
+    far = int((made.second - made.first == 31).sum())
+    text = relation_text(made, time) + "5 6 0 0 0 0 0 0\n"
+    (tmp_path / "ring.relations").write_text(text)
+    out = tmp_path / "out"
+    command = ["run", "--dataset", "carmen", str(tmp_path / "ring.log"), "--out", str(out)]
+    asked = ["--relations", str(tmp_path / "ring.relations"), "--figures", "svg"]
+    assert main([*command, *asked]) == 0
+    told = json.loads((out / "summary.json").read_text())["relations"]
+    count = len(made.first)
+    assert (told["joined"], told["not joined"], told["tolerance [s]"]) == (count, 1, 1e-4)
+    assert told["all"]["relations"] == count and told["over 60 s apart"]["relations"] == far
+    for name, some in (("all", made), ("over 60 s apart", metrics.relations(true, rows=31))):
+        for path, at in (
+            ("laser SLAM", found.poses),
+            ("laser odometry", found.odometry),
+            ("raw odometry", found.raw),
+        ):
+            errors = metrics.relation_errors(some, at)
+            expected = metrics.benchmark_figures(errors)
+            for quantity, figures in told[name][path].items():
+                given = figures["mean"], figures["std"]
+                np.testing.assert_allclose(given, expected[quantity], rtol=1e-6)
+    assert told["all"]["in the 95 % ellipse"] == count
+    assert told["all"]["without a covariance"] == 0
+    printed = capsys.readouterr().out
+    assert f"{count} of {count + 1} join the scans, within 0.0001 s" in printed
+    assert f"all: {count} relations, 100.0 % in the 95 % ellipse" in printed
+    assert "all, laser odometry" in printed and "over 60 s apart, laser SLAM" in printed
+
+
+def test_relations_that_do_not_join_are_refused_before_the_work(
+    drive, monkeypatch, tmp_path, capsys
+):
+    true, log, _ = drive
+    monkeypatch.setattr(laser_slam, "solve", None)
+    (tmp_path / "ring.log").write_text("\n".join(carmen_lines(true, log)))
+    (tmp_path / "ring.relations").write_text("7.5 8.5 0 0 0 0 0 0\n50 60 0 0 0 0 0 0\n")
+    out = tmp_path / "out"
+    command = ["run", "--dataset", "carmen", str(tmp_path / "ring.log"), "--out", str(out)]
+    assert main([*command, "--relations", str(tmp_path / "ring.relations")]) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert "ring.relations: none of 2 relations, from 7.500000 s to 60.000000 s, " in told
+    assert told.endswith("from 0.000000 s to 39.000000 s, within 0.0001 s at both ends")
+    assert not out.exists()

@@ -114,6 +114,16 @@ def test_given_relations_take_the_nearest_rows_and_count_what_is_dropped():
     np.testing.assert_allclose(metrics.relation_errors(found, SQUARE).translation, 0, atol=1e-15)
 
 
+def test_given_relations_join_a_path_whose_stamps_go_back():
+    time = 1e9 + np.array([0.0, 2.0, 1.0, 1.0, 3.0])
+    pose, ends = np.zeros((4, 3)), 1e9 + np.array([[1, 2, 3.1, 3.1], [2, 0, 0, 9]])
+    found, dropped = metrics.given(time, *ends, pose, tolerance=0.2)
+    assert dropped == 1
+    np.testing.assert_array_equal([found.first, found.second], [[2, 1, 4], [1, 0, 0]])
+    found, dropped = metrics.given([7, 7], [7], [7.1], pose[:1], tolerance=0.1 + 1e-9)
+    assert (found.first, found.second, dropped) == (0, 0, 0)
+
+
 def test_a_relation_error_is_that_of_the_composed_matrices():
     path, moved = random_paths(1)
     made = metrics.relations(path, metres=(0.5, 3.0))
@@ -134,6 +144,21 @@ def test_statistics_by_hand():
     told = metrics.summary(metrics.Errors(np.array([1.0, 2.0, 6.0]), np.deg2rad([1.0, 2.0, 6.0])))
     assert told["translation RMSE [m]"] == pytest.approx(np.sqrt(41 / 3))
     assert told["rotation mean [deg]"] == pytest.approx(3.0)
+
+
+def test_the_figures_of_the_benchmark_by_hand():
+    found = metrics.benchmark_figures(
+        metrics.Errors(np.array([1.0, 2.0, 6.0]), np.deg2rad([1.0, 3.0, 2.0]))
+    )
+    expected = {
+        "translation [m]": (3, np.sqrt(14 / 3)),
+        "translation² [m²]": (41 / 3, np.std([1, 4, 36])),
+        "rotation [deg]": (2, np.sqrt(2 / 3)),
+        "rotation² [deg²]": (14 / 3, np.std([1, 9, 4])),
+    }
+    assert list(found) == list(expected)
+    for name, figures in expected.items():
+        np.testing.assert_allclose(found[name], figures)
 
 
 # --- maps ---------------------------------------------------------------------------------------
@@ -189,8 +214,29 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
             "relation_errors: the relations are of rows up to 4, and the path has 3",
         ),
         (lambda: metrics.given([0, 1], [0], [1, 2], SQUARE[:1], tolerance=1), "given: expected 1"),
+        (
+            lambda: metrics.given([3, 0, 1], [7, 0], [8, 9], SQUARE[:2], tolerance=0.5),
+            r"given: none of 2 relations, from 0\.0+ s to 9\.0+ s, joins the path, from 0\.0+ s to "
+            r"3\.0+ s, within 0\.5 s",
+        ),
+        (
+            lambda: metrics.given([0, 1], [0], [np.nan], SQUARE[:1], tolerance=1),
+            "given: expected 1 finite stamps",
+        ),
+        (
+            lambda: metrics.given([0, np.inf], [0], [1], SQUARE[:1], tolerance=1),
+            "given: expected finite stamps",
+        ),
+        (
+            lambda: metrics.given([0, 1], [0], [1], SQUARE[:1], tolerance=-1),
+            "given: expected a tolerance",
+        ),
         (lambda: metrics.joined(), "joined: expected at least one"),
         (lambda: metrics.statistics([]), "statistics: expected finite"),
+        (
+            lambda: metrics.benchmark_figures(metrics.Errors(np.zeros(0), np.zeros(0))),
+            "statistics: expected finite errors",
+        ),
     ],
 )
 def test_bad_input_is_refused_by_name(call, message):

@@ -41,8 +41,10 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
         "seconds": round(time.perf_counter() - began, 2),
     }
     print(summary_table({"": summary}))
+    if job.told:
+        print("\n" + job.told)
     files = job.files | figures
-    files[SUMMARY] = json_text(summary | {"versions": versions()})
+    files[SUMMARY] = json_text(summary | (job.more or {}) | {"versions": versions()})
     written = write_files(options.out, files, replaces=films.NAMES)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0

@@ -21,6 +21,10 @@ class Job(NamedTuple):
     files: Files
     figures: Callable[[tuple[str, ...]], Files]
     """(formats) -> the figures"""
+    told: str = ""
+    """what is printed below the summary"""
+    more: Json | None = None
+    """entries of `summary.json` that are printed in `told`"""
 
 
 def scored(log: LaserLog, score: Callable[[], Json]) -> Json:

@@ -25,7 +25,7 @@ DEFAULTS: dict[str, object] = {
 }
 """Of the options that have one; an option that is not given is None in the namespace."""
 
-ALONE = ("map", "localize", "laser", "odometry", "mount", *DEFAULTS)
+ALONE = ("map", "localize", "laser", "odometry", "mount", "relations", *DEFAULTS)
 """Options that only a laser log has."""
 
 OTHERS = "filters", "gate", "associate", "check_every", "robot"
@@ -105,6 +105,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             "X,Y,HEADING",
             "pose of the laser on the robot [m, m, deg] (default: that of the log)",
         ),
+        (
+            "relations",
+            "FILE",
+            "relative poses between stamps that score laser SLAM, lines t1 t2 x y z roll pitch yaw "
+            "[s, m, rad]",
+        ),
     ):
         group.add_argument(f"--{name}", metavar=metavar, help=text)
 
@@ -130,6 +136,11 @@ def complete(options: argparse.Namespace) -> argparse.Namespace:
         raise ValueError(
             "--animate: a laser log has a film of laser SLAM alone: leave out --animate, or --map "
             "and --localize"
+        )
+    if options.relations is not None and (options.map is not None or options.localize is not None):
+        raise ValueError(
+            "--relations: relations score laser SLAM alone: leave out --relations, or --map and "
+            "--localize"
         )
     for_localization = [
         n for n in ("start", "particles", "seed") if getattr(options, n) is not None

@@ -7,16 +7,20 @@ import numpy as np
 from jaxslam import laser_slam, metrics
 from jaxslam.cli.films import film_files
 from jaxslam.cli.laser.job import Job, scored
+from jaxslam.cli.laser.relations import given_relations, score_entries, score_text, scores_of
 from jaxslam.datasets import LaserLog
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import laser_slam as results
+from jaxslam.results.files import Json
 
 METRES = (1.0, 2.0, 5.0, 10.0)
 """Lengths of path of the relations that score the result."""
 
 
 def run_slam(log: LaserLog, options: argparse.Namespace) -> Job:
-    """Path, graph, loops and map from raw odometry and scans; the poses in the file score them."""
+    """Path, graph, loops and map from raw odometry and scans; the poses in the file score them,
+    and the relations of another file."""
+    given = None if options.relations is None else given_relations(options.relations, log)
     settings = laser_slam.Settings(resolution=options.resolution)
     solved = _solved(log, settings)
     files = results.result_files(solved)
@@ -24,10 +28,17 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> Job:
         with Progress(f"{log.name}: film", "frames") as progress:
             made = results.film(log, solved, settings, title=log.name, progress=progress)
         files |= film_files({"slam": made}, suffixed=False)
+    told = ""
+    more: Json = {}
+    if given is not None:
+        scores = scores_of(given, solved)
+        told, more = score_text(given, scores), {"relations": score_entries(given, scores)}
     return Job(
         results.result_summary(solved) | scored(log, lambda: _scores(log, solved)),
         files,
         lambda formats: results.figures(solved, formats, log.corrected),
+        told,
+        more,
     )
 
 
