@@ -33,6 +33,9 @@ MIN_GAIN = 0.2
 """Extra share of points on walls, less those passed through, that the wider search must reach."""
 MAX_THROUGH = 0.15
 """Share of points that beams pass through, above which a match is of another place."""
+MAX_THROUGH_FROZEN = 0.4
+"""The same where odometry is frozen: a pose without a match would be farther off than most wrong
+matches, so these are taken, and are in doubt."""
 GATE = 30.66
 """χ² of three degrees of freedom at 1 - 1e-6: a match farther from raw odometry is in doubt."""
 WRONG = 0.1
@@ -87,7 +90,8 @@ def laser_odometry(
     A scan without a match has the pose of raw odometry, is no keyframe, and is matched once more at
     the end, with the keyframes before and after it, from the path between its neighbours. After
     `LOST` such scans in a row the next one is a keyframe, and only keyframes since then are matched
-    with.
+    with; so is the first where raw odometry is frozen, but there matches that are less good count,
+    too, and are in doubt.
 
     A match is in doubt that has few points on walls, or that raw odometry contradicts: it may be of
     another place that looks the same. It stays, and is taken to be wrong with probability p = 0.1:
@@ -131,8 +135,10 @@ def laser_odometry(
         found = None
         if scans.usable[scan] and reference is not None:
             points = taken(scans.points, scan)
-            gap, unknown = bool(steps.gap[scan]), bool(blind or steps.lags[scan])
-            found = _matched(reference, points, guess, prior, bound, gap, unknown, settings)
+            how = _How(
+                bool(steps.gap[scan]), bool(blind or steps.lags[scan]), bool(steps.frozen[scan])
+            )
+            found = _matched(reference, points, guess, prior, bound, how, settings)
             result.inliers[scan] = found.inliers
             result.residual[scan] = found.residual
         if found is not None and found.accepted:
@@ -140,7 +146,7 @@ def laser_odometry(
             z, cov = found.pose, found.cov
             off = poses.between(guess, z)
             contradicted = off @ np.linalg.solve(found.prior, off) > GATE
-            doubted = bool(contradicted or found.inliers < MIN_INLIERS)
+            doubted = bool(contradicted or not found.sure)
             missed, blind = 0, False
         else:
             missed += 1
@@ -154,11 +160,12 @@ def laser_odometry(
         result.cov[scan], result.cov_if_right[scan] = cov + doubt, cov
         result.poses[scan] = poses.compose(result.poses[keys[-1]], z)
         far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > settings.key_turn
-        restart = missed > LOST or reference is None
+        # Where odometry is frozen the robot is soon farther off than is searched.
+        restart = missed > (0 if steps.frozen[scan] else LOST) or reference is None
         if scans.usable[scan] and (restart or (far and result.matched[scan])):
             keys.append(scan)
             if restart:
-                since, missed = scan, 0
+                since, missed, blind = scan, 0, False
             if late is not None:
                 late = poses.between(z, late[0]), late[1] + cov
             z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
@@ -181,6 +188,19 @@ class _Found(NamedTuple):
     inliers: float
     residual: float
     accepted: bool
+    sure: bool
+    """else it is in doubt"""
+
+
+class _How(NamedTuple):
+    """What is known of a step of raw odometry."""
+
+    gap: bool
+    """it is long after the scan before"""
+    unknown: bool
+    """it is no guess"""
+    frozen: bool
+    """so are most likely those after it"""
 
 
 def _matched(
@@ -189,8 +209,7 @@ def _matched(
     guess: Float[np.ndarray, "3"],
     prior: Float[np.ndarray, "3 3"],
     bound: Float[np.ndarray, "3 3"],
-    gap: bool,
-    unknown: bool,
+    how: _How,
     settings: Settings,
 ) -> _Found:
     """The match of a scan about raw odometry, or over all that the robot can have reached."""
@@ -198,18 +217,21 @@ def _matched(
     def by(matcher: Matcher, prior: np.ndarray) -> ScanMatch:
         return match(matcher, reference, points, guess, prior, NO_FLOOR, settings)
 
-    if unknown:
+    least = settings.least_inliers
+    if how.unknown:
         fit = by(FAR, prior)
-        accepted = _sure(fit, settings)
+        sure = _sure(fit, settings)
+        likely = fit.inliers >= least and fit.through <= MAX_THROUGH_FROZEN
+        accepted = sure or (how.frozen and likely)
     else:
         fit = by(NEAR, prior)
         if fit.inliers < MIN_INLIERS:
             wide = by(FAR, INFLATION * prior + bound)
             if _sure(wide, settings) and _quality(wide) > _quality(fit) + MIN_GAIN:
                 fit = wide
-                prior = prior + bound if gap else prior
-        accepted = fit.inliers >= settings.least_inliers
-    return _Found(fit.pose, fit.cov, prior, fit.inliers, fit.residual, accepted)
+                prior = prior + bound if how.gap else prior
+        accepted, sure = fit.inliers >= least, fit.inliers >= MIN_INLIERS
+    return _Found(fit.pose, fit.cov, prior, fit.inliers, fit.residual, accepted, sure)
 
 
 def _sure(fit: ScanMatch, settings: Settings) -> bool:
