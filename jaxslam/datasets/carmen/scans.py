@@ -44,6 +44,12 @@ def beams_of(
     if lost := int((there & ~valid).sum()):
         dropped["beams without a range"] = lost
     limits = np.minimum([scan.limit for scan in scans], max_range)
+    if (code := _code_of_no_return(ranges[valid & (ranges < limits[:, None])])) is not None:
+        corrections.append(
+            f"ranges from {code:.2f} m on, where the log has many and just below hardly any, are "
+            "taken for the laser's sign that a beam met nothing"
+        )
+        limits = np.minimum(limits, code)
     if unstated := sum(scan.bad_limit for scan in scans):
         corrections.append(
             "scans whose line states no maximum range above 0, which take the one asked for: "
@@ -57,6 +63,21 @@ def beams_of(
         )
     ranges = np.where(ranges >= limits[:, None], limit, ranges)
     return Beams(np.where(valid, ranges, 0.0), angles, valid), limit
+
+
+def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
+    """The range from which on beams met nothing [m], of a laser that says so by its largest range;
+    None where ranges do not show that.
+
+    They do if the last hundredth of the largest range has more than one beam in 500, and ten times
+    as many as the tenth below it: walls are not found at one distance alone.
+    """
+    if len(ranges) < 1000:
+        return None
+    code = 0.99 * float(ranges.max())
+    last = int((ranges >= code).sum())
+    below = int(((ranges < code) & (ranges >= 0.9 * code)).sum())
+    return code if last > max(len(ranges) / 500, 10 * below) else None
 
 
 def checked_mount(mount: ArrayLike) -> Float[np.ndarray, "3"]:

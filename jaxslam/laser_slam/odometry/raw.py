@@ -16,6 +16,8 @@ ENOUGH = 20
 """steps in which the robot moves, for a largest speed to be known"""
 MOVES = (0.02, 0.02)
 """[m], [rad] of a step in which it moves"""
+AS_BEFORE = 0.6
+"""of the reach, by which a step that is not known differs from the one before"""
 MUCH = (0.3, 0.35)
 """[m], [rad]: shorter steps are not timed well enough to be called too fast"""
 
@@ -53,8 +55,9 @@ def steps_of(
     """The steps of raw odometry; σ of position and heading grow with distance and turn.
 
     The largest speed of the robot is the 95 % quantile of the speeds in the log, and 1.5 times it
-    is faster than can be. A step that is unknown, or lags, has σ of half of what the robot can have
-    gone in that time, since raw odometry may err by all of it. The step after one that lags is
+    is faster than can be. A step that is a jump, or lags, has σ of half of what the robot can have
+    gone in that time, since raw odometry may err by all of it; one that is frozen 0.6 of that,
+    about a step like the one before. The step after one that lags is
     right only together with it.
 
     Args:
@@ -82,8 +85,9 @@ def steps_of(
     cov = np.stack([position, position, heading], axis=1)[:, :, None] ** 2 * np.eye(3)
     cov[0] = 0.0
     steps = Steps(step, cov, reach, jump, frozen, lags, duration > 2.5 * usual)
-    doubtful = steps.unknown | lags
+    doubtful = jump | lags
     cov[doubtful] += reach_cov(reach[doubtful])
+    cov[frozen] += reach_cov(AS_BEFORE * reach[frozen])
     return steps
 
 

@@ -116,11 +116,13 @@ def laser_odometry(
     reference = _reference_of_last(scans, keys, result.poses, settings)
     # Of the last scan, relative to the last keyframe; doubt is what is added to its covariance.
     z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
-    missed, blind = 0, False
+    missed, blind, last = 0, False, np.zeros(3)
     # Pose and covariance by raw odometry from before a step that lags, for the step after it.
     late: tuple[np.ndarray, np.ndarray] | None = None
     for scan in range(1, count):
         step, step_cov = steps.step[scan], steps.cov[scan]
+        if steps.frozen[scan]:
+            step = last  # the robot most likely goes on as it did
         begin, begin_cov = (z, cov) if late is None else late
         guess = poses.compose(begin, step)
         prior = covariances.composed_cov(begin_cov, step, step_cov)
@@ -152,12 +154,15 @@ def laser_odometry(
             missed += 1
             if steps.gap[scan]:
                 cov = cov + bound
-        doubt = covariances.moved(doubt, poses.between(before, z))
+        last = poses.between(before, z)
+        doubt = covariances.moved(doubt, last)
         if doubted and found is not None:
             doubt = _doubt(found.prior, poses.between(z, guess))
         result.doubted[scan] = doubted
         result.base[scan], result.z[scan] = keys[-1], z
-        result.cov[scan], result.cov_if_right[scan] = cov + doubt, cov
+        result.cov[scan] = cov + doubt
+        # Nothing speaks for a match in doubt where odometry is frozen.
+        result.cov_if_right[scan] = cov + doubt if steps.frozen[scan] else cov
         result.poses[scan] = poses.compose(result.poses[keys[-1]], z)
         far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > settings.key_turn
         # Where odometry is frozen the robot is soon farther off than is searched.
