@@ -6,7 +6,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import programs
 from jaxslam.laser_slam.records import LogOfScans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Points
@@ -100,7 +99,7 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     rows, found = [], []
     for begin in range(0, len(ranges), ROWS):
         rows.append(_filled(points, begin))
-        found.append(jax.tree.map(np.asarray, programs.call(_surfaces, (), rows[-1], span)))
+        found.append(jax.tree.map(np.asarray, _surfaces(rows[-1], span)))
     # Beams that fill a scan up come last: they are cut off, or stay without a point.
     whole, line = (
         jax.tree.map(
@@ -130,6 +129,7 @@ def _filled(points: Points, begin: int) -> Points:
     return filled
 
 
+@jax.jit
 def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
     found: Surface = jax.vmap(lambda of: surface(of, span, GAP, most=MAX_NEIGHBOURS))(points)
     return found

@@ -66,9 +66,12 @@ def matched(
                 outcome[row] = LoopOutcome.AMBIGUOUS
         return len(rows)
 
+    submaps = np.unique(candidates.first)
+    for _ in range(of_submap(submaps[0]) if count else 0):  # compiles what the others share
+        progress()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
-            for done in pool.map(of_submap, np.unique(candidates.first)):
+            for done in pool.map(of_submap, submaps[1:]):
                 for _ in range(done):
                     progress()
         except BaseException:

@@ -1,5 +1,6 @@
 """Keyframes as the reference of a scan: one map of points and walls, and how a scan is matched."""
 
+import functools
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
@@ -8,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxslam import programs
 from jaxslam.graphs import cauchy
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.scans import Scans
@@ -38,6 +38,10 @@ HALF = 16.0
 PEAK = 0.9
 """A pose elsewhere of this share of the best score makes a match ambiguous."""
 
+THIN = 0.05
+"""[m] side of a cell of which one point is kept"""
+CELLS = 512
+"""along a side, after which cells repeat, so that far points need no larger table"""
 SECTORS = 180
 """of a turn, in which beams are compared with the reference"""
 CLEAR = 0.4
@@ -108,7 +112,8 @@ def reference_of(
     # The last scan is repeated without its points: a reference always has as many scans.
     points = points._replace(valid=points.valid & (np.arange(size) < len(rows))[:, None])
     there = poses.between(origin, at).astype(np.float32)
-    return programs.call(_gathered, (), points, taken(scans.surface, take), there)
+    gathered: Reference = _gathered(points, taken(scans.surface, take), there)
+    return gathered
 
 
 def match(
@@ -132,9 +137,8 @@ def match(
         known = np.linalg.inv(covariances.of_coordinates(prior_cov, guess))
         prior = settings.correlation * known
     found = np.asarray(
-        programs.call(
-            _match,
-            (matcher,),
+        _match(
+            matcher,
             reference,
             scan,
             guess.astype(np.float32),
@@ -157,13 +161,35 @@ def match(
     )
 
 
+@jax.jit
 def _gathered(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Reference:
     """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
     there = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
     gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there)
-    return Reference(gathered, lines, ANY.prepare(raster(gathered, CELL, HALF)))
+    kept = _one_a_cell(gathered)
+    return Reference(
+        taken(gathered, kept), taken(lines, kept), ANY.prepare(raster(gathered, CELL, HALF))
+    )
 
 
+def _one_a_cell(of: Points) -> Int[Array, "half"]:
+    """The points of a cell are of one wall: of each cell the last, half as many in all at most.
+
+    The search for the nearest point takes most of the time of a match.
+    """
+    count = len(of.valid)
+    cell = jnp.floor(of.position / THIN).astype(jnp.int32) % CELLS
+    at = jnp.where(of.valid, cell[:, 0] * CELLS + cell[:, 1], CELLS**2)
+    index = jnp.arange(count, dtype=jnp.int32)
+    last = jnp.full(CELLS**2 + 1, -1, jnp.int32).at[at].max(index)
+    # The points of the newest scans are kept first; a point that is not valid fills up.
+    wanted = (of.valid & (last[at] == index))[::-1]
+    nothing = jnp.argmin(of.valid[::-1])
+    (kept,) = jnp.nonzero(wanted, size=(count + 1) // 2, fill_value=nothing)
+    return count - 1 - kept
+
+
+@functools.partial(jax.jit, static_argnums=0)
 def _match(
     matcher: Matcher,
     reference: Reference,
@@ -220,7 +246,7 @@ def _thinned(of: Points) -> Points:
 Of = TypeVar("Of", Points, Surface)
 
 
-def taken(of: Of, rows: int | np.integer | np.ndarray) -> Of:
+def taken(of: Of, rows: int | np.integer | np.ndarray | Array) -> Of:
     """Some scans of many."""
     found: Of = jax.tree.map(lambda part: part[rows], of)
     return found
