@@ -22,6 +22,9 @@ from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.math.stats import chi2_quantile
 
+KERNEL = {LOOPS: graphs.cauchy()}
+"""One object, so that the optimum is traced once."""
+
 
 class Closed(NamedTuple):
     """The graph of keyframes with its loops."""
@@ -94,7 +97,7 @@ def closed(
         edges = table_of(loops.first[kept], loops.second[kept], loops.z[kept], loops.cov[kept])
         graph = graph_of(path, keyframe, chain, edges)
         if kept.any():
-            graph = _host(graphs.optimize(graph, kernel={LOOPS: graphs.cauchy()}, room=ROOM).graph)
+            graph = _host(graphs.optimize(graph, kernel=KERNEL, room=ROOM).graph)
     doubtful = table_of(index[:-1], index[1:], steps, odometry.cov[keyframe[1:]])
     return _final(graph, doubtful, loops, kept, keyframe, settings)
 

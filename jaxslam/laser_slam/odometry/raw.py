@@ -117,4 +117,8 @@ def _by_speeds(
         slow = way[:-1] * time < 0.5 * both * duration[:-1]
         fast = (way[1:] > can[1:]) & (both <= fastest * time) & (both - way[:-1] > much)
         lags[:-1] |= slow & fast & (timed & ~useless)[:-1] & (timed & ~useless)[1:]
+    # A step that is faster than can be, and makes up for no other, has wrong stamps.
+    made_up = np.concatenate([[False], lags[:-1]])
+    odd = (size > reach).any(axis=1) & ~made_up & ~useless
+    reach[odd] = FARTHEST
     return reach, lags

@@ -38,7 +38,7 @@ HALF = 16.0
 PEAK = 0.9
 """A pose elsewhere of this share of the best score makes a match ambiguous."""
 
-THIN = 0.05
+THIN = 0.04
 """[m] side of a cell of which one point is kept"""
 CELLS = 512
 """along a side, after which cells repeat, so that far points need no larger table"""

@@ -130,7 +130,6 @@ def laser_odometry(
         if steps.lags[scan]:
             usual = step_cov - reach_cov(steps.reach[scan])
             late = guess, covariances.composed_cov(begin_cov, step, usual)
-        bound = reach_cov(steps.reach[scan])
         blind = bool(blind or steps.unknown[scan])
         before, z, cov = z, guess, prior
         doubted = False
@@ -140,7 +139,7 @@ def laser_odometry(
             how = _How(
                 bool(steps.gap[scan]), bool(blind or steps.lags[scan]), bool(steps.frozen[scan])
             )
-            found = _matched(reference, points, guess, prior, bound, how, settings)
+            found = _matched(reference, points, guess, prior, steps.reach[scan], how, settings)
             result.inliers[scan] = found.inliers
             result.residual[scan] = found.residual
         if found is not None and found.accepted:
@@ -153,7 +152,7 @@ def laser_odometry(
         else:
             missed += 1
             if steps.gap[scan]:
-                cov = cov + bound
+                cov = cov + reach_cov(steps.reach[scan])
         last = poses.between(before, z)
         doubt = covariances.moved(doubt, last)
         if doubted and found is not None:
@@ -213,7 +212,7 @@ def _matched(
     points: Points,
     guess: Float[np.ndarray, "3"],
     prior: Float[np.ndarray, "3 3"],
-    bound: Float[np.ndarray, "3 3"],
+    reach: Float[np.ndarray, "2"],
     how: _How,
     settings: Settings,
 ) -> _Found:
@@ -231,8 +230,10 @@ def _matched(
     else:
         fit = by(NEAR, prior)
         if fit.inliers < MIN_INLIERS:
+            bound = reach_cov(reach)
             wide = by(FAR, INFLATION * prior + bound)
-            if _sure(wide, settings) and _quality(wide) > _quality(fit) + MIN_GAIN:
+            better = _sure(wide, settings) and _quality(wide) > _quality(fit) + MIN_GAIN
+            if better and _reached(wide, guess, prior, reach):
                 fit = wide
                 prior = prior + bound if how.gap else prior
         accepted, sure = fit.inliers >= least, fit.inliers >= MIN_INLIERS
@@ -243,6 +244,18 @@ def _sure(fit: ScanMatch, settings: Settings) -> bool:
     """Whether a match may be believed without raw odometry: as good as that of a loop."""
     good = fit.inliers >= settings.loop_inliers and fit.through <= MAX_THROUGH
     return good and not fit.ambiguous
+
+
+def _reached(
+    fit: ScanMatch,
+    guess: Float[np.ndarray, "3"],
+    prior: Float[np.ndarray, "3 3"],
+    reach: Float[np.ndarray, "2"],
+) -> bool:
+    """Whether raw odometry is off by no more than the robot can have gone, and 2 σ of its own."""
+    off, sigma = poses.between(guess, fit.pose), np.sqrt(prior.diagonal())
+    near = np.hypot(off[0], off[1]) <= reach[0] + 2 * sigma[:2].max()
+    return bool(near and abs(off[2]) <= reach[1] + 2 * sigma[2])
 
 
 def _quality(fit: ScanMatch) -> float:
