@@ -18,7 +18,7 @@ LARGEST = 4_000
 """cells along a side of the map; a larger world has larger cells"""
 FILM = 400
 """cells along a side of a map in a film"""
-WINDOW = 2048
+WINDOW = 1024
 """Cells along a side of the window in which scans are counted: one program for all maps."""
 
 
@@ -29,8 +29,11 @@ def frame_of(
     beams = _used(log, settings, np.ones(len(log.time), bool))
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for path in paths:
-        first, last = _boxes(poses.compose(path, np.asarray(log.mount, float)), beams)
-        low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
+        laser = poses.compose(path, np.asarray(log.mount, float))
+        for begin in range(0, len(laser), ROWS):
+            rows = slice(begin, begin + ROWS)
+            first, last = _boxes(laser[rows], Beams(*(part[rows] for part in beams)))
+            low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
     resolution = max(settings.resolution, float((high - low).max()) / LARGEST)
     low = np.floor(low / resolution - 4) * resolution
     width, height = (int(n) for n in np.ceil((high - low) / resolution) + 4)

@@ -48,11 +48,12 @@ def closure_score(
     off = poses.between(loops.z[kept], poses.between(known[first], known[second]))
     right = (np.hypot(off[:, 0], off[:, 1]) < position) & (np.abs(off[:, 2]) < heading)
     keys = known[solved.keyframe]
-    far = np.linalg.norm(keys[:, None, :2] - keys[None, :, :2], axis=-1)
-    turn = np.abs(poses.wrapped(keys[:, None, 2] - keys[None, :, 2]))
-    order = np.arange(len(keys))
-    seen = (far < near) & (turn < turned) & (order[:, None] - order[None, :] >= gap)
-    again = solved.keyframe[seen.any(axis=1)]
+    seen = np.zeros(len(keys), bool)
+    for k in range(gap, len(keys)):
+        before = keys[: k - gap + 1]
+        far = np.hypot(*(before[:, :2] - keys[k, :2]).T)
+        seen[k] = ((far < near) & (np.abs(poses.wrapped(before[:, 2] - keys[k, 2])) < turned)).any()
+    again = solved.keyframe[seen]
     met = np.isin(again, second[right])
     return ClosureScore(
         precision=float(right.mean()) if kept.any() else float("nan"),

@@ -60,7 +60,7 @@ def solve(
     odometry = laser_odometry(scans, steps, settings, raw[0], telling("odometry"))
     lap("odometry")
     with float64():  # a step that is hardly known and a match differ too much for 32 bits
-        graph, loops = closed(scans, odometry, settings, telling("loop closing"))
+        graph, loops, left_out = closed(scans, odometry, settings, telling("loop closing"))
         lap("loop closing")
         path, cov, hung = _of_scans(graph, odometry)
         squared = graphs.squared_residuals(graph, room=ROOM)
@@ -85,7 +85,8 @@ def solve(
         loops=loops,
         map=maps[0],
         map_before=maps[1],
-        counts=_counts(log, scans.usable, steps, odometry, loops),
+        counts=_counts(log, scans.usable, steps, odometry, loops)
+        | {"loop candidates left out, being too many": left_out},
         chi2=chi2,
         dof=graphs.degrees_of_freedom(graph) if len(graph.poses) > 1 else 0,
         seconds=seconds,

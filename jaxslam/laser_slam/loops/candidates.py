@@ -8,6 +8,10 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.math import numpy_poses as poses
 
+MOST = 4_000
+"""Candidates that are matched in a round, at most: in a log with more of them loops abound."""
+NEAREST = 24
+"""Submaps near a keyframe that may be candidates."""
 SAME = 15
 """Keyframes between submaps that are taken to be of one place."""
 
@@ -31,11 +35,19 @@ def near(
     reach: float,
     gap: int,
 ) -> Int[np.ndarray, "Q 2"]:
-    """Pairs (middle of a submap, keyframe) that are near by the path, and not near in the log."""
-    far = np.linalg.norm(path[middle][:, None, :2] - path[None, :, :2], axis=-1)
-    apart = np.arange(len(path))[None, :] - middle[:, None] >= gap
-    s, j = np.nonzero((far < reach) & apart & usable[None, :])
-    return np.stack([middle[s], j], axis=1)
+    """Pairs (middle of a submap, keyframe) that are near by the path, and not near in the log.
+
+    Of each keyframe those with the nearest `NEAREST` submaps, since each pair of which the
+    covariance is computed fills the factor of the graph.
+    """
+    found = [np.zeros((0, 2), int)]
+    for keyframe in np.flatnonzero(usable):
+        before = middle[middle <= keyframe - gap]
+        far = np.hypot(*(path[before, :2] - path[keyframe, :2]).T)
+        order = np.argsort(far, kind="stable")[:NEAREST]
+        ones = before[order[far[order] < reach]]
+        found.append(np.stack([ones, np.full(len(ones), keyframe)], axis=1))
+    return np.concatenate(found)
 
 
 def by_place(
@@ -86,6 +98,15 @@ def by_place(
     )
 
 
+def thinned(of: Candidates) -> tuple[Candidates, int]:
+    """At most `MOST` of the candidates, spread evenly over the log, and how many are left out."""
+    count = len(of.first)
+    if count <= MOST:
+        return of, 0
+    kept = np.argsort(of.second, kind="stable")[np.linspace(0, count - 1, MOST).astype(int)]
+    return Candidates(*(part[kept] for part in of)), count - MOST
+
+
 def by_appearance(
     descriptors: Float[np.ndarray, "N D"],
     middle: Int[np.ndarray, "S"],
@@ -95,11 +116,11 @@ def by_appearance(
     alike: float = 0.9,
 ) -> Int[np.ndarray, "M 2"]:
     """Pairs (keyframe, later keyframe) whose descriptors are most alike, one for each keyframe."""
-    score = descriptors @ descriptors.T
-    index = np.arange(len(descriptors))
-    allowed = (index[:, None] - index[None, :] >= settings.loop_gap) & usable & usable[:, None]
-    score = np.where(allowed, score, 0.0)
-    best = score.argmax(axis=1)
-    found = np.flatnonzero(score[index, best] > alike)
-    nearest = middle[np.abs(middle[None, :] - best[found][:, None]).argmin(axis=1)]
-    return np.stack([nearest, found], axis=1)
+    pairs = []
+    for keyframe in np.flatnonzero(usable)[settings.loop_gap :]:
+        before = np.flatnonzero(usable[: keyframe - settings.loop_gap + 1])
+        score = descriptors[before] @ descriptors[keyframe]
+        if len(before) and score.max() > alike:
+            nearest = middle[np.abs(middle - before[score.argmax()]).argmin()]
+            pairs.append((nearest, keyframe))
+    return np.array(pairs, int).reshape(-1, 2)

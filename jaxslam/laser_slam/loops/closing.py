@@ -12,7 +12,7 @@ from jaxslam.graphs import Graph, Table
 from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
-from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_place, near
+from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_place, near, thinned
 from jaxslam.laser_slam.loops.descriptor import descriptors
 from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
@@ -31,6 +31,8 @@ class Closed(NamedTuple):
 
     graph: Graph
     loops: Loops
+    left_out: int
+    """candidates that were not matched, being too many"""
 
 
 def closed(
@@ -68,6 +70,7 @@ def closed(
     done: set[tuple[int, int, bool]] = set()
     ends: set[tuple[int, int]] = set()
     loops, kept = _agreeing(tried, found, at, total, settings)
+    left_out = 0
     for turn in range(settings.rounds if len(keyframe) > settings.loop_gap else 0):
         path = np.asarray(graph.poses, np.float64)
         pairs = near(path, middle, usable, settings.loop_reach + WIDE[0], settings.loop_gap)
@@ -79,6 +82,8 @@ def closed(
         new = by_place(path, pairs, cov, done, ends, settings, NARROW, WIDE)
         if turn == 0 and settings.appearance:
             new = _with(new, by_appearance(looks, middle, usable, settings))
+        new, out = thinned(new)
+        left_out += out
         done |= set(zip(new.first.tolist(), new.second.tolist(), new.wide.tolist(), strict=True))
         if not len(new.first):
             break
@@ -99,7 +104,7 @@ def closed(
         if kept.any():
             graph = _host(graphs.optimize(graph, kernel=KERNEL, room=ROOM).graph)
     doubtful = table_of(index[:-1], index[1:], steps, odometry.cov[keyframe[1:]])
-    return _final(graph, doubtful, loops, kept, keyframe, settings)
+    return _final(graph, doubtful, loops, kept, keyframe, settings)._replace(left_out=left_out)
 
 
 def _final(
@@ -124,7 +129,8 @@ def _final(
     graph = graph._replace(tables=tables)
     if kept.any():
         graph = _host(graphs.optimize(graph, room=ROOM).graph)
-    return Closed(graph, loops._replace(first=keyframe[loops.first], second=keyframe[loops.second]))
+    loops = loops._replace(first=keyframe[loops.first], second=keyframe[loops.second])
+    return Closed(graph, loops, 0)
 
 
 def _with(place: Candidates, pairs: np.ndarray) -> Candidates:

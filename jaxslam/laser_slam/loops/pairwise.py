@@ -81,7 +81,8 @@ def clique(agree: Bool[np.ndarray, "M M"], weight: Float[np.ndarray, "M"]) -> Bo
     none = np.zeros(len(agree), bool)
     if not len(agree):
         return none
-    joined = np.where(agree & ~np.eye(len(agree), dtype=bool), weight[None, :], 0.0)
+    joined = np.where(agree, weight[None, :].astype(np.float32), np.float32(0))
+    np.fill_diagonal(joined, 0)
     best, most = none, -1.0
     for start in np.argsort(-joined.sum(axis=1), kind="stable")[:STARTS]:
         chosen, left = none.copy(), joined[start] > 0
