@@ -19,7 +19,8 @@ LARGEST = 4_000
 FILM = 400
 """cells along a side of a map in a film"""
 WINDOW = 2048
-"""Cells along a side of the window in which scans are counted: one program for all maps."""
+"""Cells along a side of the window in which scans are counted: one program for all maps. A scan
+that is larger than that has larger cells."""
 
 
 def frame_of(
@@ -27,11 +28,13 @@ def frame_of(
 ) -> tuple[tuple[int, int], Float[np.ndarray, "3"], float]:
     """(shape, origin, resolution) of a map that holds the ends of all beams at all poses."""
     beams = _used(log, settings, np.ones(len(log.time), bool))
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    low, high, largest = np.full(2, np.inf), np.full(2, -np.inf), 0.0
     for path in paths:
         first, last = _boxes(poses.compose(path, np.asarray(log.mount, float)), beams)
         low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
-    resolution = max(settings.resolution, float((high - low).max()) / LARGEST)
+        largest = max(largest, float((last - first).max()))
+    fits = max(float((high - low).max()) / LARGEST, largest / (WINDOW - 6))
+    resolution = max(settings.resolution, fits)
     low = np.floor(low / resolution - 4) * resolution
     width, height = (int(n) for n in np.ceil((high - low) / resolution) + 4)
     # Whole pieces of 64 cells: maps of nearly the same size share a program.
