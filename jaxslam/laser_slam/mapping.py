@@ -22,6 +22,10 @@ WINDOW = 2048
 """Cells along a side of the window in which scans are counted: one program for all maps. A scan
 that is larger than that has larger cells."""
 
+ASIDE = np.array([0.37, 0.29])
+"""Cells from the origin of `raw` to a corner of a cell: a robot that starts there, or drives along
+an axis, has no beams along the borders of cells, where rounding decides what they cross."""
+
 
 def frame_of(
     log: LogOfScans, paths: list[Float[np.ndarray, "K 3"]], settings: Settings
@@ -35,7 +39,7 @@ def frame_of(
         largest = max(largest, float((last - first).max()))
     fits = max(float((high - low).max()) / LARGEST, largest / (WINDOW - 6))
     resolution = max(settings.resolution, fits)
-    low = np.floor(low / resolution - 4) * resolution
+    low = (np.floor(low / resolution - 4) + ASIDE) * resolution
     width, height = (int(n) for n in np.ceil((high - low) / resolution) + 4)
     # Whole pieces of 64 cells: maps of nearly the same size share a program.
     return (-(-height // 64) * 64, -(-width // 64) * 64), np.array([*low, 0.0]), resolution

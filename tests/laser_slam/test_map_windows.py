@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from ring_of_rooms import SETTINGS
+from ring_of_rooms import SETTINGS, driven
 
 from jaxslam import grids
 from jaxslam.laser_slam import ScanLog, mapping
@@ -65,6 +65,15 @@ def test_a_scan_that_is_larger_than_a_window_has_larger_cells(monkeypatch, far):
     log = wandering(3, 40, far)
     found, whole, _ = both(log, monkeypatch, 64)
     assert mapping.frame_of(log, [log.raw], SETTINGS)[2] > RESOLUTION or far < 4
+    np.testing.assert_array_equal(found, whole)
+
+
+def test_beams_along_the_axes_from_the_origin_are_counted_alike_in_every_window(monkeypatch):
+    """Without care they lie on the borders of cells, and rounding decides."""
+    _, log = driven()
+    monkeypatch.setattr(mapping, "ROWS", 8)
+    found, whole, windows = both(log, monkeypatch, 128)
+    assert windows == 5 and not log.raw[0].any()
     np.testing.assert_array_equal(found, whole)
 
 
