@@ -89,7 +89,7 @@ def squared_distances(occupied: Bool[JaxOrNumPy, "H W"]) -> Int[Array, "H W"]:
 
 
 def near_distances(occupied: Bool[JaxOrNumPy, "H W"], reach: int) -> Int[Array, "H W"]:
-    """The squared distances of `squared_distances` up to reach², in cells; (reach + 1)² beyond.
+    """The squared distances of `squared_distances`, in cells, but (reach + 1)² at most.
 
     The minimum over 2 reach + 1 shifts along each axis: for a few cells many times as fast as the
     exact transform, since it has no loop.

@@ -19,7 +19,11 @@ LARGEST = 4_000
 FILM = 400
 """cells along a side of a map in a film"""
 WINDOW = 1024
-"""Cells along a side of the window in which scans are counted: one program for all maps."""
+"""Cells along a side of the window in which scans are counted: one program for all maps, but for
+scans that are larger."""
+ASIDE = np.array([0.37, 0.29])
+"""Cells from the origin of `raw` to a corner of a cell: a robot that starts there, or drives along
+an axis, has no beams along the borders of cells, where rounding decides what they cross."""
 
 
 def frame_of(
@@ -35,7 +39,7 @@ def frame_of(
             first, last = _boxes(laser[rows], Beams(*(part[rows] for part in beams)))
             low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
     resolution = max(settings.resolution, float((high - low).max()) / LARGEST)
-    low = np.floor(low / resolution - 4) * resolution
+    low = (np.floor(low / resolution - 4) + ASIDE) * resolution
     width, height = (int(n) for n in np.ceil((high - low) / resolution) + 4)
     # Whole pieces of 64 cells: maps of nearly the same size share a program.
     return (-(-height // 64) * 64, -(-width // 64) * 64), np.array([*low, 0.0]), resolution
@@ -67,7 +71,8 @@ def _count(
     """Add the hits and misses of n scans to those of a map, in place.
 
     Some scans at a time in a window of fixed size, some beams at a time, so that all logs and maps
-    share one program. The window lies where these scans are; if they do not fit, half of them do.
+    share one program. The window lies where these scans are; if they do not fit, half of them may,
+    and for a single one it is larger.
     """
     width = beams.range.shape[1]
     if width > WIDTH:  # the further beams as further scans
@@ -86,9 +91,10 @@ def _count(
         return
     if not beams.valid.any():
         return
+    window = max(WINDOW, 1 << int(size.max() - 1).bit_length())
     fill = [(0, ROWS - len(laser)), (0, WIDTH - width)]
     found = grids.count(
-        (WINDOW, WINDOW),
+        (window, window),
         np.array([*(origin[:2] + first * resolution), 0.0]),
         resolution,
         np.pad(laser, [fill[0], (0, 0)]),

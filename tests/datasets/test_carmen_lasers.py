@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxslam import datasets
+from jaxslam.datasets.carmen.scans import _code_of_no_return
 from jaxslam.math import numpy_poses as poses
 
 MOUNT = np.array([0.2, -0.1, np.pi])
@@ -118,3 +119,57 @@ def test_a_log_without_poses_has_the_odometry_of_its_lines_or_none(read):
     np.testing.assert_allclose(log.raw, ROBOT)
     assert log.odometry_known.all() and not log.corrected.any()
     np.testing.assert_allclose(log.beams.angle[0], [-1.570796, 0, 1.570796])
+
+
+def office(count, largest=12.0, seed=0):
+    """Ranges in rooms, none favoured, the farthest of them rare."""
+    return largest * np.random.default_rng(seed).beta(1.2, 4.0, count)
+
+
+def test_the_sign_that_a_beam_met_nothing_is_found_in_the_ranges():
+    walls = office(5000)
+    signs = 32.76 + np.random.default_rng(1).uniform(-0.005, 0.005, 300)
+    code = _code_of_no_return(np.concatenate([walls, signs]))
+    assert walls.max() < code < signs.min() and code > 32.0
+    # A few walls as far as that change nothing, if signs are many more.
+    far = np.array([31.0, 32.2])
+    code = _code_of_no_return(np.concatenate([walls, far, signs]))
+    assert far.max() < code < signs.min()
+
+
+def test_a_far_wall_that_is_seen_often_is_no_sign():
+    """A hall of 30 m: beams beside that to the middle of its wall meet it a little farther on."""
+    bearing = np.linspace(-0.8, 0.8, 4000)
+    wall = 30.0 / np.cos(bearing)
+    noise = np.random.default_rng(2).normal(scale=0.01, size=len(wall))
+    assert _code_of_no_return(np.concatenate([office(4000), wall + noise])) is None
+    # And one that is seen while the robot drives up to it.
+    distance = np.random.default_rng(3).uniform(5.0, 30.0, 4000)
+    assert _code_of_no_return(np.concatenate([office(4000), distance])) is None
+
+
+def test_ranges_that_show_no_sign_have_none():
+    assert _code_of_no_return(office(5000)) is None
+    few = np.concatenate([office(900), np.full(80, 32.76)])
+    assert _code_of_no_return(few) is None
+    assert _code_of_no_return(np.zeros(0)) is None
+    # Fewer than one beam in 500.
+    assert _code_of_no_return(np.concatenate([office(5000), np.full(8, 32.76)])) is None
+    assert _code_of_no_return(np.concatenate([office(5000), np.full(12, 32.76)])) is not None
+
+
+def test_a_log_with_the_sign_says_so_and_its_beams_met_nothing(read):
+    random = np.random.default_rng(4)
+    lines = []
+    for k in range(12):
+        ranges = office(100, seed=k)
+        none = random.random(100) < 0.1
+        ranges[none] = 32.76 + random.uniform(-0.005, 0.005, none.sum())
+        told = " ".join(f"{value:.3f}" for value in ranges)
+        lines.append(f"FLASER 100 {told} 0 0 0 0 0 0 {k} host {k}")
+    log = read(*lines)
+    assert 12.0 < log.max_range < 32.755
+    met = np.asarray(log.beams.range) < log.max_range
+    assert 0.85 < met.mean() < 0.95 and log.beams.range[met].max() < 12.0
+    assert any("sign that a beam met nothing" in what for what in log.corrections)
+    assert (np.asarray(log.beams.range)[~met] == log.max_range).all()

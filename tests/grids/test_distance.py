@@ -6,7 +6,7 @@ import pytest
 from scipy import ndimage
 
 from jaxslam import grids, se2
-from jaxslam.grids.distance import squared_distances
+from jaxslam.grids.distance import near_distances, squared_distances
 from jaxslam.grids.grid import Field
 
 
@@ -170,3 +170,28 @@ def test_correlation_of_maps():
 def test_bad_input_is_refused(call, reason):
     with pytest.raises(ValueError, match=reason):
         call(grid_of(np.zeros((3, 4))))
+
+
+NEAR = jax.jit(near_distances, static_argnums=1)
+
+
+@pytest.mark.parametrize("reach", [3, 120])
+def test_near_distances_are_the_exact_ones_up_to_their_reach(reach):
+    """By 16 bits and by 32."""
+    for kind in ("sparse", "row", "dense", "thin"):
+        cells = occupied(kind, np.random.default_rng(5))
+        exact = np.rint(ndimage.distance_transform_edt(~cells) ** 2)
+        np.testing.assert_array_equal(squared_distances(cells), exact)
+        found = np.asarray(NEAR(cells, reach))
+        assert found.dtype == (np.int16 if reach == 3 else np.int32)
+        np.testing.assert_array_equal(found, np.minimum(exact, (reach + 1) ** 2))
+
+
+@pytest.mark.parametrize("reach", [0, 3, 120])
+def test_near_distances_without_an_occupied_cell_and_of_a_single_one(reach):
+    beyond = (reach + 1) ** 2
+    cells = np.zeros((40, 57), bool)
+    np.testing.assert_array_equal(NEAR(cells, reach), beyond)
+    cells[4, 50] = True
+    exact = (np.arange(40)[:, None] - 4) ** 2 + (np.arange(57) - 50) ** 2
+    np.testing.assert_array_equal(NEAR(cells, reach), np.minimum(exact, beyond))

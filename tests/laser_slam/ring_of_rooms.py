@@ -40,19 +40,24 @@ def ranges_of(pose, angles, segments):
     return np.minimum(np.where(met, r, FAR).min(axis=1), FAR)
 
 
-def driven(scans=40, beams=60, seed=0, drift=(0.03, 0.03, 0.03)):
-    """(true poses, log): steps of a metre, a quarter turn at each corner on the way."""
+def driven(scans=40, beams=60, seed=0, drift=(0.03, 0.03, 0.03), mount=(0.0, 0.0, 0.0), scale=1.0):
+    """(true poses, log): steps of a metre, a quarter turn at each corner on the way.
+
+    mount: pose of the laser on the robot. scale: of the walls and steps.
+    """
     random = np.random.default_rng(seed)
-    side = [[STEP, 0.0, 0.0]] * 5 + [[STEP, 0.0, np.pi / 2]]
+    step = scale * STEP
+    side = [[step, 0.0, 0.0]] * 5 + [[step, 0.0, np.pi / 2]]
     steps = np.array((side * 12)[: scans - 1])
     true = poses.chain(np.zeros(3), steps)
     raw = poses.chain(np.zeros(3), steps + random.normal(size=steps.shape) * drift)
     angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)
-    found = np.array([ranges_of(pose, angles, walls()) for pose in true])
+    laser = poses.compose(true, np.array(mount, float))
+    found = np.array([ranges_of(pose, angles, scale * walls()) for pose in laser])
     noisy = np.where(found < FAR, found + 0.01 * random.normal(size=found.shape), FAR)
     shape = found.shape
     beams_of = Beams(noisy, np.broadcast_to(angles, shape), np.ones(shape, bool))
-    return true, ScanLog(np.arange(float(scans)), beams_of, raw, FAR)
+    return true, ScanLog(np.arange(float(scans)), beams_of, raw, FAR, mount)
 
 
 def errors(estimate, true):

@@ -38,10 +38,6 @@ HALF = 16.0
 PEAK = 0.9
 """A pose elsewhere of this share of the best score makes a match ambiguous."""
 
-THIN = 0.04
-"""[m] side of a cell of which one point is kept"""
-CELLS = 512
-"""along a side, after which cells repeat, so that far points need no larger table"""
 SECTORS = 180
 """of a turn, in which beams are compared with the reference"""
 CLEAR = 0.4
@@ -166,27 +162,7 @@ def _gathered(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Refe
     """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
     there = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
     gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there)
-    kept = _one_a_cell(gathered)
-    return Reference(
-        taken(gathered, kept), taken(lines, kept), ANY.prepare(raster(gathered, CELL, HALF))
-    )
-
-
-def _one_a_cell(of: Points) -> Int[Array, "half"]:
-    """The points of a cell are of one wall: of each cell the last, half as many in all at most.
-
-    The search for the nearest point takes most of the time of a match.
-    """
-    count = len(of.valid)
-    cell = jnp.floor(of.position / THIN).astype(jnp.int32) % CELLS
-    at = jnp.where(of.valid, cell[:, 0] * CELLS + cell[:, 1], CELLS**2)
-    index = jnp.arange(count, dtype=jnp.int32)
-    last = jnp.full(CELLS**2 + 1, -1, jnp.int32).at[at].max(index)
-    # The points of the newest scans are kept first; a point that is not valid fills up.
-    wanted = (of.valid & (last[at] == index))[::-1]
-    nothing = jnp.argmin(of.valid[::-1])
-    (kept,) = jnp.nonzero(wanted, size=(count + 1) // 2, fill_value=nothing)
-    return count - 1 - kept
+    return Reference(gathered, lines, ANY.prepare(raster(gathered, CELL, HALF)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -246,7 +222,7 @@ def _thinned(of: Points) -> Points:
 Of = TypeVar("Of", Points, Surface)
 
 
-def taken(of: Of, rows: int | np.integer | np.ndarray | Array) -> Of:
+def taken(of: Of, rows: int | np.integer | np.ndarray) -> Of:
     """Some scans of many."""
     found: Of = jax.tree.map(lambda part: part[rows], of)
     return found

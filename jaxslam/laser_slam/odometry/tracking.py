@@ -33,9 +33,9 @@ MIN_GAIN = 0.2
 """Extra share of points on walls, less those passed through, that the wider search must reach."""
 MAX_THROUGH = 0.15
 """Share of points that beams pass through, above which a match is of another place."""
-MAX_THROUGH_FROZEN = 0.4
-"""The same where odometry is frozen: a pose without a match would be farther off than most wrong
-matches, so these are taken, and are in doubt."""
+MAX_THROUGH_LIKELY = 0.4
+"""The same about raw odometry, and where that is frozen: a pose without a match would be farther
+off than most wrong matches, so these are taken, and are in doubt."""
 GATE = 30.66
 """χ² of three degrees of freedom at 1 - 1e-6: a match farther from raw odometry is in doubt."""
 WRONG = 0.1
@@ -87,6 +87,10 @@ def laser_odometry(
     time (`Steps.reach`). Such a match counts if more points meet walls, and, where raw odometry is
     no guess, if it is as good as that of a loop and no other pose is nearly as good.
 
+    Where raw odometry was frozen, or a match contradicts it, the next step may make up for that, or
+    not: the scan is matched from the match before and from raw odometry before, and the better of
+    both counts.
+
     A scan without a match has the pose of raw odometry, is no keyframe, and is matched once more at
     the end, with the keyframes before and after it, from the path between its neighbours. After
     `LOST` such scans in a row the next one is a keyframe, and only keyframes since then are matched
@@ -119,6 +123,9 @@ def laser_odometry(
     missed, blind, last = 0, False, np.zeros(3)
     # Pose and covariance by raw odometry from before a step that lags, for the step after it.
     late: tuple[np.ndarray, np.ndarray] | None = None
+    # The same from before steps that are frozen, or after one that a match contradicts: the next
+    # may make up for them, or not.
+    other: tuple[np.ndarray, np.ndarray] | None = None
     for scan in range(1, count):
         step, step_cov = steps.step[scan], steps.cov[scan]
         if steps.frozen[scan]:
@@ -140,6 +147,12 @@ def laser_odometry(
                 bool(steps.gap[scan]), bool(blind or steps.lags[scan]), bool(steps.frozen[scan])
             )
             found = _matched(reference, points, guess, prior, steps.reach[scan], how, settings)
+            if other is not None and not steps.unknown[scan]:
+                there = poses.compose(other[0], step)
+                wide = covariances.composed_cov(other[1], step, step_cov)
+                back = _matched(reference, points, there, wide, steps.reach[scan], how, settings)
+                if back.accepted and back.quality > found.quality:
+                    found, guess, prior = back, there, wide
             result.inliers[scan] = found.inliers
             result.residual[scan] = found.residual
         if found is not None and found.accepted:
@@ -148,8 +161,14 @@ def laser_odometry(
             off = poses.between(guess, z)
             contradicted = off @ np.linalg.solve(found.prior, off) > GATE
             doubted = bool(contradicted or not found.sure)
+            if steps.frozen[scan]:
+                other = (begin, begin_cov) if other is None else other
+            else:
+                lied = contradicted and late is None and not steps.jump[scan]
+                other = (guess, prior) if lied else None
             missed, blind = 0, False
         else:
+            other = None
             missed += 1
             if steps.gap[scan]:
                 cov = cov + reach_cov(steps.reach[scan])
@@ -172,6 +191,8 @@ def laser_odometry(
                 since, missed, blind = scan, 0, False
             if late is not None:
                 late = poses.between(z, late[0]), late[1] + cov
+            if other is not None:
+                other = poses.between(z, other[0]), other[1] + cov
             z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
             of = [key for key in keys if key >= since]
             reference = _reference_of_last(scans, of, result.poses, settings)
@@ -194,6 +215,7 @@ class _Found(NamedTuple):
     accepted: bool
     sure: bool
     """else it is in doubt"""
+    quality: float
 
 
 class _How(NamedTuple):
@@ -225,7 +247,7 @@ def _matched(
     if how.unknown:
         fit = by(FAR, prior)
         sure = _sure(fit, settings)
-        likely = fit.inliers >= least and fit.through <= MAX_THROUGH_FROZEN
+        likely = fit.inliers >= least and fit.through <= MAX_THROUGH_LIKELY
         accepted = sure or (how.frozen and likely)
     else:
         fit = by(NEAR, prior)
@@ -236,8 +258,10 @@ def _matched(
             if better and _reached(wide, guess, prior, reach):
                 fit = wide
                 prior = prior + bound if how.gap else prior
-        accepted, sure = fit.inliers >= least, fit.inliers >= MIN_INLIERS
-    return _Found(fit.pose, fit.cov, prior, fit.inliers, fit.residual, accepted, sure)
+        accepted = fit.inliers >= least and fit.through <= MAX_THROUGH_LIKELY
+        sure = fit.inliers >= MIN_INLIERS
+    parts = fit.pose, fit.cov, prior, fit.inliers, fit.residual
+    return _Found(*parts, accepted, sure, _quality(fit))
 
 
 def _sure(fit: ScanMatch, settings: Settings) -> bool:
