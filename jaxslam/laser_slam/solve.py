@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -67,7 +68,13 @@ def solve(
     chi2 = float(sum(np.asarray(each).sum() for each in squared.values())) if squared else 0.0
     lap("marginals")
     frame = frame_of(log, [path, odometry.poses], settings)
-    maps = [map_of(log, each, scans.usable, frame, settings) for each in (path, odometry.poses)]
+    with ThreadPoolExecutor(2) as pool:
+        maps = list(
+            pool.map(
+                lambda each: map_of(log, each, scans.usable, frame, settings),
+                (path, odometry.poses),
+            )
+        )
     lap("map")
     return Solved(
         time=np.asarray(log.time, np.float64),
@@ -86,7 +93,7 @@ def solve(
         map=maps[0],
         map_before=maps[1],
         counts=_counts(log, scans.usable, steps, odometry, loops)
-        | {"loop candidates left out, being too many": left_out},
+        | {"keyframes and candidates of loops left out, being too many": left_out},
         chi2=chi2,
         dof=graphs.degrees_of_freedom(graph) if len(graph.poses) > 1 else 0,
         seconds=seconds,

@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.math import numpy_poses as poses
 
-MOST = 4_000
-"""Candidates that are matched in a round, at most: in a log with more of them loops abound."""
+MOST = 2_500
+"""Candidates that are matched in a round, and keyframes that are tried, at most: in a log with more
+of them loops abound."""
 NEAREST = 24
 """Submaps near a keyframe that may be candidates."""
 SAME = 15
@@ -38,10 +39,14 @@ def near(
     """Pairs (middle of a submap, keyframe) that are near by the path, and not near in the log.
 
     Of each keyframe those with the nearest `NEAREST` submaps, since each pair of which the
-    covariance is computed fills the factor of the graph.
+    covariance is computed fills the factor of the graph. Of more than `MOST` keyframes so many are
+    tried, spread evenly over the log.
     """
     found = [np.zeros((0, 2), int)]
-    for keyframe in np.flatnonzero(usable):
+    tried = np.flatnonzero(usable)
+    if len(tried) > MOST:
+        tried = tried[np.linspace(0, len(tried) - 1, MOST).astype(int)]
+    for keyframe in tried:
         before = middle[middle <= keyframe - gap]
         far = np.hypot(*(path[before, :2] - path[keyframe, :2]).T)
         order = np.argsort(far, kind="stable")[:NEAREST]

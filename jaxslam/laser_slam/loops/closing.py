@@ -12,7 +12,14 @@ from jaxslam.graphs import Graph, Table
 from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
-from jaxslam.laser_slam.loops.candidates import Candidates, by_appearance, by_place, near, thinned
+from jaxslam.laser_slam.loops.candidates import (
+    MOST,
+    Candidates,
+    by_appearance,
+    by_place,
+    near,
+    thinned,
+)
 from jaxslam.laser_slam.loops.descriptor import descriptors
 from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
@@ -32,7 +39,7 @@ class Closed(NamedTuple):
     graph: Graph
     loops: Loops
     left_out: int
-    """candidates that were not matched, being too many"""
+    """keyframes that were not tried, and candidates that were not matched, being too many"""
 
 
 def closed(
@@ -70,7 +77,7 @@ def closed(
     done: set[tuple[int, int, bool]] = set()
     ends: set[tuple[int, int]] = set()
     loops, kept = _agreeing(tried, found, at, total, settings)
-    left_out = 0
+    left_out = max(int(usable.sum()) - MOST, 0)
     for turn in range(settings.rounds if len(keyframe) > settings.loop_gap else 0):
         path = np.asarray(graph.poses, np.float64)
         pairs = near(path, middle, usable, settings.loop_reach + WIDE[0], settings.loop_gap)
