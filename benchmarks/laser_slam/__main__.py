@@ -4,9 +4,9 @@
 benchmark (Kümmerle et al. 2009), which were checked by hand, and the share of them in the 95 %
 ellipse of the graph's own covariance; errors to the poses in the files along 1, 2, 5 and 10 m of
 path, precision and recall of the loops; χ² of the graph, seconds. `size`: a log of 4,791 scans,
-warm, and one of 20,000: time and memory. `office`: NEES of laser odometry's covariance in a simulated office,
-of a match, of the chain of matches, of an EKF that these drive (a campaign), and of the graph with
-loops.
+warm, and one of 20,000: time and memory. `office`: NEES of laser odometry's covariance in a
+simulated office, of a match, of the chain of matches, of an EKF that these drive (a campaign), and
+of the graph with loops.
 """
 
 from benchmarks.gate import Metric, alone

@@ -11,7 +11,7 @@ from jaxslam.math import numpy_poses as poses
 MOST = 2_500
 """Candidates that are matched in a round, and keyframes that are tried, at most: in a log with more
 of them loops abound."""
-NEAREST = 24
+NEAREST = 12
 """Submaps near a keyframe that may be candidates."""
 SAME = 15
 """Keyframes between submaps that are taken to be of one place."""
