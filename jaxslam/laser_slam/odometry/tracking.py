@@ -1,6 +1,7 @@
 """Laser odometry: each scan against the keyframes before it, fused with raw odometry."""
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -118,6 +119,7 @@ def laser_odometry(
     result.poses[0] = first
     keys, since = [0], 0  # since: the keyframe from which on scans are matched with
     reference = _reference_of_last(scans, keys, result.poses, settings)
+    _compile_wide_search(reference, scans, settings)
     # Of the last scan, relative to the last keyframe; doubt is what is added to its covariance.
     z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     missed, blind, last = 0, False, np.zeros(3)
@@ -201,6 +203,19 @@ def laser_odometry(
     result = result._replace(keyframe=np.array(keys))
     _place_unmatched(result, scans, steps, settings)
     return result
+
+
+def _compile_wide_search(
+    reference: Reference | None, scans: Scans, settings: Settings
+) -> Future[ScanMatch] | None:
+    """Compile the wider search beside the loop, so that a later log that needs it does not wait."""
+    if reference is None:
+        return None
+    pool = ThreadPoolExecutor(1)
+    scan, start = taken(scans.points, 0), np.zeros(3)
+    done = pool.submit(match, FAR, reference, scan, start, np.eye(3), NO_FLOOR, settings)
+    pool.shutdown(wait=False)
+    return done
 
 
 class _Found(NamedTuple):
