@@ -17,6 +17,7 @@ from jaxslam.results import plot
 FIGURES = Path(__file__).parents[1] / "figures"
 METRES = (1.0, 2.0, 5.0, 10.0)
 """Lengths of path of the relations to the file's poses, of each as many as there are scans."""
+DRAWN = ("intel", "csail", "fhw", "orebro")
 TOLERANCE = 1e-4
 """[s] within which the stamp of a hand-checked relation is that of a scan."""
 LONG = 60.0
@@ -91,9 +92,9 @@ def measure(names: tuple[str, ...] = tuple(LOGS), draw: bool = True) -> list[Met
             found += _by_relations(name, log, solved)
         if LOGS[name].scored:
             found += _by_file(name, log, solved)
-        if draw:
+        if draw and name in DRAWN:
             figure = plot.maps_before_after(solved)
-            figure.savefig(FIGURES / f"laser_slam_{name.split(',')[0]}.png")
+            figure.savefig(FIGURES / f"laser_slam_{name}.png")
     return found
 
 
