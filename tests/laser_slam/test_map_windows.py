@@ -28,7 +28,7 @@ def wandering(scans, beams, far, seed=0):
 
 
 def both(log, monkeypatch, window, settings=SETTINGS):
-    """(hits, misses), counted in windows and at once; and in how many windows."""
+    """(hits, misses), counted in windows and at once; and the shapes of the windows."""
     monkeypatch.setattr(mapping, "WINDOW", window)
     shape, origin, resolution = mapping.frame_of(log, [log.raw], settings)
     beams = mapping._used(log, settings, np.ones(len(log.time), bool))
@@ -44,27 +44,32 @@ def both(log, monkeypatch, window, settings=SETTINGS):
     monkeypatch.setattr(grids, "count", counting)
     found = np.zeros((2, *shape), np.int32)
     mapping._count(found, origin, resolution, laser, beams, settings)
-    assert set(calls) == {(window, window)}
-    return found, np.stack([whole.hits, whole.misses]), len(calls)
+    return found, np.stack([whole.hits, whole.misses]), calls
 
 
 def test_scans_that_do_not_fit_a_window_are_split(monkeypatch):
     found, whole, windows = both(wandering(50, 40, 2.5), monkeypatch, 64)
-    assert windows > 4 and whole[0].sum() > 500 and max(whole.shape) > 64
+    assert (
+        len(windows) > 4
+        and set(windows) == {(64, 64)}
+        and whole[0].sum() > 500
+        and max(whole.shape) > 64
+    )
     np.testing.assert_array_equal(found, whole)
 
 
 def test_so_are_long_logs_and_scans_of_many_beams(monkeypatch):
     found, whole, windows = both(wandering(150, 400, 1.5), monkeypatch, 512)
-    assert windows >= 6
+    assert len(windows) >= 6 and set(windows) == {(512, 512)}
     np.testing.assert_array_equal(found, whole)
 
 
-@pytest.mark.parametrize("far", [3.2, 5.0, 9.0])
-def test_a_scan_that_is_larger_than_a_window_has_larger_cells(monkeypatch, far):
+@pytest.mark.parametrize(("far", "side"), [(2.5, 64), (5.0, 128), (9.0, 256)])
+def test_a_scan_that_is_larger_than_a_window_has_a_larger_one(monkeypatch, far, side):
     log = wandering(3, 40, far)
-    found, whole, _ = both(log, monkeypatch, 64)
-    assert mapping.frame_of(log, [log.raw], SETTINGS)[2] > RESOLUTION or far < 4
+    found, whole, windows = both(log, monkeypatch, 64)
+    assert max(windows) == (side, side)
+    assert mapping.frame_of(log, [log.raw], SETTINGS)[2] == RESOLUTION
     np.testing.assert_array_equal(found, whole)
 
 
@@ -73,7 +78,7 @@ def test_beams_along_the_axes_from_the_origin_are_counted_alike_in_every_window(
     _, log = driven()
     monkeypatch.setattr(mapping, "ROWS", 8)
     found, whole, windows = both(log, monkeypatch, 128)
-    assert windows == 5 and not log.raw[0].any()
+    assert len(windows) == 5 and not log.raw[0].any()
     np.testing.assert_array_equal(found, whole)
 
 

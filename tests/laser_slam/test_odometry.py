@@ -74,26 +74,24 @@ def test_a_message_that_is_missing_and_comes_with_the_next_moves_no_scan(drive, 
     np.testing.assert_array_equal(np.flatnonzero(steps.frozen), [k])
 
 
-POOR = "a match that few points meet and whose beams pass through walls is taken"
-
-
 @pytest.mark.parametrize("share", [0.05, 0.0])
 @pytest.mark.parametrize("k", CORNERS)
-def test_a_turn_that_comes_late_bends_nothing(drive, k, share, request):
+def test_a_turn_that_comes_late_bends_nothing(drive, k, share):
     """By its speed it cannot be told: the robot turns as fast at every corner."""
-    if (k, share) == (6, 0.05):
-        request.applymarker(pytest.mark.xfail(strict=True, reason=POOR))
     check_late(drive, k, share)
 
 
 @pytest.mark.parametrize("k", [3, 15, 27])
 @pytest.mark.parametrize("wrong", [(1.8, 0.0, 0.0), (0.0, 1.5, 0.0), (0.0, 0.0, 1.2)])
-def test_a_single_wrong_pose_of_raw_odometry_moves_no_scan(drive, k, wrong):
+def test_a_single_wrong_pose_of_raw_odometry_moves_no_other_scan(drive, k, wrong):
+    """The scan itself may match a place that looks alike, in doubt."""
     true, log, _ = drive
     raw = log.raw.copy()
     raw[k] = poses.compose(raw[k], np.array(wrong))
     _, found = solved(drive, raw)
-    assert errors(found.poses, true)[0].max() < 0.2
+    position, _ = errors(found.poses, true)
+    assert np.delete(position, k).max() < 0.2
+    assert position[k] < 0.2 or found.doubted[k]
     assert nees(found, true, k) < 20
 
 

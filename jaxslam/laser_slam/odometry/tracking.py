@@ -100,8 +100,9 @@ def laser_odometry(
 
     A match is in doubt that has few points on walls, or that raw odometry contradicts: it may be of
     another place that looks the same. It stays, and is taken to be wrong with probability p = 0.1:
-    its covariance is about that of the mixture with raw odometry, C + p (P + e eᵀ), where e leads
-    from one to the other. So are those of the scans after it until the next keyframe.
+    its covariance is about that of the mixture with raw odometry, C + p (P + diag(d², d², t²)),
+    where d is the distance and t the turn from one to the other. So are those of the scans after
+    it until the next keyframe.
     """
     count = len(scans.usable)
     result = Odometry(
@@ -350,9 +351,13 @@ def _place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Set
 
 
 def _doubt(prior: np.ndarray, off: np.ndarray) -> np.ndarray:
-    """What is added to the covariance of a match that may be wrong: p (P + e eᵀ).
+    """What is added to the covariance of a match that may be wrong: p (P + diag(d², d², t²)).
+
+    By the distance d and the turn t to raw odometry, and not by e eᵀ, since of a wrong match not
+    even the direction of its error is known.
 
     off: e, the mean of raw odometry seen from the match.
     """
     at_match = covariances.propagated(covariances.turns(off[2]), prior)
-    return np.asarray(WRONG * (at_match + np.outer(off, off)))
+    far = off[0] ** 2 + off[1] ** 2
+    return np.asarray(WRONG * (at_match + np.diag([far, far, off[2] ** 2])))
