@@ -57,8 +57,7 @@ def steps_of(
     The largest speed of the robot is the 95 % quantile of the speeds in the log, and 1.5 times it
     is faster than can be. A step that is a jump, or lags, has σ of half of what the robot can have
     gone in that time, since raw odometry may err by all of it; one that is frozen 0.6 of that,
-    about a step like the one before. The step after one that lags is
-    right only together with it.
+    about a step like the one before. The step after one that lags is right only together with it.
 
     Args:
         time: [s] of the scans; None: no speed is known.
@@ -115,7 +114,7 @@ def _by_speeds(
         # Two steps, the first too slow and the second too fast, together of usual speed.
         both, time = way[:-1] + way[1:], duration[:-1] + duration[1:]
         slow = way[:-1] * time < 0.5 * both * duration[:-1]
-        fast = (way[1:] > can[1:]) & (both <= fastest * time) & (both - way[:-1] > much)
+        fast = (way[1:] > can[1:]) & (both <= fastest * time) & (way[1:] > much)
         lags[:-1] |= slow & fast & (timed & ~useless)[:-1] & (timed & ~useless)[1:]
     # A step that is faster than can be, and makes up for no other, has wrong stamps.
     made_up = np.concatenate([[False], lags[:-1]])

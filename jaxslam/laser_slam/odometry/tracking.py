@@ -1,7 +1,7 @@
 """Laser odometry: each scan against the keyframes before it, fused with raw odometry."""
 
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -83,10 +83,11 @@ def laser_odometry(
     covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
     by `settings.correlation`.
 
-    Where fewer than 0.6 of the points meet a wall, where raw odometry is no guess (σ above 0.3 m),
-    and after a gap in the stamps, all poses are searched that the robot can have reached in that
-    time (`Steps.reach`). Such a match counts if more points meet walls, and, where raw odometry is
-    no guess, if it is as good as that of a loop and no other pose is nearly as good.
+    Where fewer than 0.6 of the points meet a wall, and where raw odometry is no guess (a jump, a
+    frozen step, one that lags), all poses are searched that the robot can have reached in that time
+    (`Steps.reach`). Such a match counts if it is as good as that of a loop, no other pose is nearly
+    as good, and few beams pass through the reference; about raw odometry also if it is better by
+    0.2 than the match there.
 
     Where raw odometry was frozen, or a match contradicts it, the next step may make up for that, or
     not: the scan is matched from the match before and from raw odometry before, and the better of
@@ -206,17 +207,14 @@ def laser_odometry(
     return result
 
 
-def _compile_wide_search(
-    reference: Reference | None, scans: Scans, settings: Settings
-) -> Future[ScanMatch] | None:
+def _compile_wide_search(reference: Reference | None, scans: Scans, settings: Settings) -> None:
     """Compile the wider search beside the loop, so that a later log that needs it does not wait."""
     if reference is None:
-        return None
+        return
     pool = ThreadPoolExecutor(1)
     scan, start = taken(scans.points, 0), np.zeros(3)
-    done = pool.submit(match, FAR, reference, scan, start, np.eye(3), NO_FLOOR, settings)
+    pool.submit(match, FAR, reference, scan, start, np.eye(3), NO_FLOOR, settings)
     pool.shutdown(wait=False)
-    return done
 
 
 class _Found(NamedTuple):
