@@ -465,8 +465,8 @@ def test_a_batch_of_runs_ends_where_each_does():
     assert (ending == Ending.CONVERGED).mean() > 0.95
     assert len(set(traces["batch"].final.iterations.tolist())) > 1  # each its own number
     # Shorter than √eps, or than what a cost that rounds hides: a step s takes s²/2 off it, and a
-    # sum of some hundred terms is known to several eps.
-    hidden = np.sqrt(16 * np.finfo(float).eps * traces["batch"].final.cost)
+    # sum of some hundred terms is known to that many eps at worst (17 were seen on one processor).
+    hidden = np.sqrt(100 * np.finfo(float).eps * traces["batch"].final.cost)
     assert (traces["batch"].final.step < np.maximum(2e-8, hidden)).all()
 
 
