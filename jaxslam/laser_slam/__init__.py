@@ -1,8 +1,9 @@
 """Laser SLAM: from the raw odometry and scans of a log to a path, a pose graph and a map."""
 
 from jaxslam.laser_slam.odometry.increments import match_controls, match_motion
+from jaxslam.laser_slam.odometry.pieces import laser_odometry
 from jaxslam.laser_slam.odometry.raw import Steps, steps_of
-from jaxslam.laser_slam.odometry.tracking import Odometry, laser_odometry
+from jaxslam.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops, ScanLog, Solved
 from jaxslam.laser_slam.relations import relation_covs, relation_nees
 from jaxslam.laser_slam.scans import Scans, scans_of

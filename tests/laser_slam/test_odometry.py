@@ -9,7 +9,7 @@ from ring_of_rooms import SETTINGS, driven, errors
 
 from jaxslam import laser_slam
 from jaxslam.laser_slam import laser_odometry, scans_of, steps_of
-from jaxslam.laser_slam.odometry import tracking
+from jaxslam.laser_slam.odometry import pieces, tracking
 from jaxslam.math import numpy_poses as poses
 
 COUNT = 40
@@ -59,6 +59,36 @@ def check_late(drive, k, share):
     assert nees(found, true, k) < 20
     assert position[k] < 0.3 or not found.matched[k]
     return steps
+
+
+def test_a_log_in_pieces_has_the_path_of_one(drive, monkeypatch):
+    true, _, _ = drive
+    _, whole = solved(drive)
+    monkeypatch.setattr(pieces, "PIECE", 13)
+    _, found = solved(drive)
+    inner = sorted({13, 26} & set(found.keyframe.tolist()))
+    assert inner == [13, 26], "the first scan of a piece is a keyframe"
+    assert (found.base[1:] < np.arange(1, COUNT)).all() and found.matched[1:].all()
+    for path in (whole.poses, found.poses):
+        position, heading = errors(path, true)
+        assert position.max() < 0.2 and heading.max() < np.deg2rad(5)
+    chained = poses.compose(found.poses[found.base[1:]], found.z[1:])
+    np.testing.assert_allclose(chained, found.poses[1:], atol=1e-9)
+
+
+def test_an_interrupt_ends_all_pieces(drive, monkeypatch):
+    _, log, scans = drive
+    monkeypatch.setattr(pieces, "PIECE", 10)
+    steps, calls = steps_of(log.raw, SETTINGS), []
+
+    def progress(done, of):
+        calls.append(done)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        laser_odometry(scans, steps, SETTINGS, log.raw[0], progress)
+    assert len(calls) < 10
 
 
 @pytest.mark.parametrize("k", [3, 10, 21, 29, 38])
@@ -173,7 +203,7 @@ def test_a_scan_that_matches_nothing_before_is_placed_by_what_comes_after(drive,
     assert np.hypot(*relative_error(found, true, k)[:2]) < 0.1
     assert nees(found, true, k) < 20
     # With nothing but the scans before it, it stays where raw odometry leads.
-    monkeypatch.setattr(tracking, "_place_unmatched", lambda *_: None)
+    monkeypatch.setattr(pieces, "place_unmatched", lambda *_: None)
     _, alone = solved(drive, raw)
     assert k not in alone.keyframe and not alone.matched[k]
     others = np.arange(COUNT) != k

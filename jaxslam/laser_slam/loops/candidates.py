@@ -11,8 +11,8 @@ from jaxslam.math import numpy_poses as poses
 MOST = 2_500
 """Candidates that are matched in a round, and keyframes that are tried, at most: in a log with more
 of them loops abound."""
-NEAREST = 12
-"""Submaps near a keyframe that may be candidates."""
+PLACES = 12
+"""Submaps near a keyframe whose relative pose is examined by odometry, which costs little."""
 SAME = 15
 """Keyframes between submaps that are taken to be of one place."""
 
@@ -33,26 +33,42 @@ def near(
     path: Float[np.ndarray, "N 3"],
     middle: Int[np.ndarray, "S"],
     usable: Bool[np.ndarray, "N"],
+    closed: set[tuple[int, int]],
+    most: int,
     reach: float,
     gap: int,
 ) -> Int[np.ndarray, "Q 2"]:
     """Pairs (middle of a submap, keyframe) that are near by the path, and not near in the log.
 
-    Of each keyframe those with the nearest `NEAREST` submaps, since each pair of which the
-    covariance is computed fills the factor of the graph. Of more than `MOST` keyframes so many are
-    tried, spread evenly over the log.
+    Of each keyframe those with the nearest submaps, `most` places at most: submaps that follow each
+    other in the log are one place, and those of `closed` count. Of more than `MOST` keyframes so
+    many are tried, spread evenly over the log.
+
+    closed: pairs that matched.
     """
-    found = [np.zeros((0, 2), int)]
+    pairs = []
+    known: dict[int, list[int]] = {}
+    for first, second in closed:
+        known.setdefault(second, []).append(first)
     tried = np.flatnonzero(usable)
     if len(tried) > MOST:
         tried = tried[np.linspace(0, len(tried) - 1, MOST).astype(int)]
-    for keyframe in tried:
-        before = middle[middle <= keyframe - gap]
-        far = np.hypot(*(path[before, :2] - path[keyframe, :2]).T)
-        order = np.argsort(far, kind="stable")[:NEAREST]
-        ones = before[order[far[order] < reach]]
-        found.append(np.stack([ones, np.full(len(ones), keyframe)], axis=1))
-    return np.concatenate(found)
+    for keyframe in tried.tolist():
+        places = known.get(keyframe, [])
+        rest = middle[: np.searchsorted(middle, keyframe - gap, side="right")]
+        far = np.hypot(*(path[rest, :2] - path[keyframe, :2]).T)
+        rest, far = rest[far < reach], far[far < reach]
+        for place in places:
+            apart = np.abs(rest - place) >= SAME
+            rest, far = rest[apart], far[apart]
+        for _ in range(len(places), most):
+            if not len(rest):
+                break
+            nearest = rest[far.argmin()]
+            pairs.append((nearest, keyframe))
+            apart = np.abs(rest - nearest) >= SAME
+            rest, far = rest[apart], far[apart]
+    return np.array(pairs, int).reshape(-1, 2)
 
 
 def by_place(
@@ -60,7 +76,6 @@ def by_place(
     pairs: Int[np.ndarray, "Q 2"],
     cov: Float[np.ndarray, "Q 3 3"],
     tried: set[tuple[int, int, bool]],
-    closed: set[tuple[int, int]],
     settings: Settings,
     narrow: tuple[float, float],
     wide: tuple[float, float],
@@ -68,12 +83,12 @@ def by_place(
     """The pairs whose ellipse of uncertainty fits into a window, at most some for each keyframe.
 
     A place is sought where it is within `loop_reach` of the keyframe, by the ellipse of
-    `loop_probability`. For each keyframe the nearest submaps come first, and those that follow each
-    other in the log count as one place.
+    `loop_probability`.
 
     Args:
+        pairs: `near`, of each keyframe the nearest first.
         cov: of the end of the relative pose of each pair.
-        tried: (first, second, wide) of rounds before. closed: (first, second) that matched.
+        tried: (first, second, wide) of rounds before.
         narrow, wide: windows, [m] and [rad] to either side.
     """
     sigmas = np.sqrt(-2 * np.log(1 - settings.loop_probability))
@@ -84,20 +99,11 @@ def by_place(
     small = (position < narrow[0]) & (heading < narrow[1])
     fits = (position < wide[0]) & (heading < wide[1]) & (far < settings.loop_reach + position)
     rows = np.flatnonzero(fits)
-    rows = rows[np.lexsort((far[rows], pairs[rows, 1]))]
-    chosen: list[int] = []
-    taken: dict[int, list[int]] = {}
-    for first, second in closed:
-        taken.setdefault(second, []).append(first)
-    for row in rows:
-        first, second = (int(one) for one in pairs[row])
-        same = taken.setdefault(second, [])
-        if len(same) >= settings.candidates or any(abs(first - one) < SAME for one in same):
-            continue
-        same.append(first)
-        if (first, second, not small[row]) not in tried:
-            chosen.append(int(row))
-    take = np.array(chosen, int)
+    # The first `candidates` of each keyframe, whose pairs follow each other.
+    rank = np.arange(len(rows)) - np.searchsorted(pairs[rows, 1], pairs[rows, 1])
+    rows = rows[rank < settings.candidates]
+    new = [(*pairs[row].tolist(), not small[row]) not in tried for row in rows]
+    take = rows[np.array(new, bool)]
     return Candidates(
         pairs[take, 0], pairs[take, 1], z[take], ~small[take], np.zeros(len(take), bool)
     )
@@ -121,11 +127,15 @@ def by_appearance(
     alike: float = 0.9,
 ) -> Int[np.ndarray, "M 2"]:
     """Pairs (keyframe, later keyframe) whose descriptors are most alike, one for each keyframe."""
+    rows = np.flatnonzero(usable)
+    known = descriptors[rows].astype(np.float32)
     pairs = []
-    for keyframe in np.flatnonzero(usable)[settings.loop_gap :]:
-        before = np.flatnonzero(usable[: keyframe - settings.loop_gap + 1])
-        score = descriptors[before] @ descriptors[keyframe]
-        if len(before) and score.max() > alike:
-            nearest = middle[np.abs(middle - before[score.argmax()]).argmin()]
-            pairs.append((nearest, keyframe))
+    for begin in range(0, len(rows), 256):
+        part = slice(begin, begin + 256)
+        before = rows[None, : part.stop] <= rows[part, None] - settings.loop_gap
+        score = np.where(before, known[part] @ known[: part.stop].T, -1.0)
+        best = score.argmax(axis=1)
+        for row in np.flatnonzero(score.max(axis=1) > alike):
+            nearest = middle[np.abs(middle - rows[best[row]]).argmin()]
+            pairs.append((nearest, rows[begin + row]))
     return np.array(pairs, int).reshape(-1, 2)

@@ -14,6 +14,7 @@ from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
 from jaxslam.laser_slam.loops.candidates import (
     MOST,
+    PLACES,
     Candidates,
     by_appearance,
     by_place,
@@ -80,13 +81,17 @@ def closed(
     left_out = max(int(usable.sum()) - MOST, 0)
     for turn in range(settings.rounds if len(keyframe) > settings.loop_gap else 0):
         path = np.asarray(graph.poses, np.float64)
-        pairs = near(path, middle, usable, settings.loop_reach + WIDE[0], settings.loop_gap)
+        # By the graph few places, since each pair of which the covariance is computed fills its
+        # factor; after a first optimum the nearest ones fit a window.
+        most = PLACES if turn == 0 else settings.candidates
+        reach = settings.loop_reach + WIDE[0]
+        pairs = near(path, middle, usable, ends, most, reach, settings.loop_gap)
         cov = (
             covariances.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
             if turn == 0 or not len(pairs)
             else relative_covs(graph, pairs)
         )
-        new = by_place(path, pairs, cov, done, ends, settings, NARROW, WIDE)
+        new = by_place(path, pairs, cov, done, settings, NARROW, WIDE)
         if turn == 0 and settings.appearance:
             new = _with(new, by_appearance(looks, middle, usable, settings))
         new, out = thinned(new)

@@ -1,11 +1,20 @@
 """Which loops agree: pairwise consistency and a large clique of it."""
 
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.laser_slam import covariances
 from jaxslam.math import numpy_poses as poses
+from jaxslam.math import se2
+from jaxslam.math.arrays import float64
 from jaxslam.math.stats import chi2_quantile
+
+TILE = 256
+"""Loops that are compared with as many others at once, so that any number shares one program."""
 
 STARTS = 10
 """Loops from which a clique is grown."""
@@ -38,36 +47,72 @@ def consistent(
         first, second, z, cov: of the loops; the covariance of the end of z.
     """
     limit = chi2_quantile(probability, 3)
-    out = np.ones((len(z), len(z)), bool)
+    count = len(z)
+    out = np.zeros((count, count), bool)
     end = poses.compose(path[first], z)
     moved = poses.compose(end, poses.inverse(path[second]))
-    at_end, at_moved = poses.adjoint(end), poses.adjoint(moved)
-    own = covariances.propagated(at_end, cov)
-    for a in range(len(z) - 1):
-        b = slice(a + 1, len(z))
-        around = poses.compose(moved[b], path[second[a]])
-        error = poses.between(end[a], around) @ at_end[a].T
-        spread = own[a] + own[b] + _along(total, first[a], first[b])
-        spread += covariances.propagated(at_moved[b], _along(total, second[a], second[b]))
-        out[a, b] = out[b, a] = _squared(error, spread) < limit
-    return out
+    own = covariances.propagated(poses.adjoint(end), cov)
+    parts = path[second], end, moved, own, total[first], total[second], first, second
+    with float64():
+        tiles = [
+            _Loop(*(jnp.asarray(_filled(part[begin : begin + TILE])) for part in parts))
+            for begin in range(0, count, TILE)
+        ]
+        for i, a in enumerate(tiles):
+            for j, b in enumerate(tiles[i:], i):
+                rows, columns = (slice(k * TILE, min((k + 1) * TILE, count)) for k in (i, j))
+                square = np.asarray(_squared(a, b))
+                square = square[: rows.stop - rows.start, : columns.stop - columns.start]
+                out[rows, columns] = square < limit
+    earlier = np.triu(out, 1)
+    return np.asarray(earlier | earlier.T | np.eye(count, dtype=bool))
 
 
-def _along(total: np.ndarray, one: np.ndarray, others: np.ndarray) -> Float[np.ndarray, "n 3 3"]:
-    return np.asarray(total[np.maximum(one, others)] - total[np.minimum(one, others)])
+class _Loop(NamedTuple):
+    """What the agreement of loops needs of each, in the world's frame; see `consistent`."""
+
+    at: Array
+    """x_j, by odometry"""
+    end: Array
+    """x_i ∘ z"""
+    moved: Array
+    """g"""
+    own: Array
+    """A"""
+    total_first: Array
+    """S_i"""
+    total_second: Array
+    first: Array
+    second: Array
 
 
-def _squared(
-    error: Float[np.ndarray, "n 3"], cov: Float[np.ndarray, "n 3 3"]
-) -> Float[np.ndarray, "n"]:
-    """The squares eᵀ Σ⁻¹ e, by cofactors: `np.linalg.solve` takes most of the time otherwise."""
-    x, y, t = error.T
-    xx, xy, xt, yy, yt, tt = (cov[:, i, j] for i, j in zip(*np.triu_indices(3), strict=True))
-    a, b, c = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
-    d, e, f = xx * tt - xt * xt, xy * xt - xx * yt, xx * yy - xy * xy
-    determinant = xx * a + xy * b + xt * c
-    square = a * x * x + d * y * y + f * t * t + 2 * (b * x * y + c * x * t + e * y * t)
-    return np.asarray(square / determinant)
+def _filled(part: np.ndarray) -> np.ndarray:
+    """A part of the loops, its last one repeated up to the size of a tile."""
+    return np.concatenate([part, np.repeat(part[-1:], TILE - len(part), axis=0)])
+
+
+@jax.jit
+def _squared(a: _Loop, b: _Loop) -> Float[Array, "tile tile"]:
+    """eᵀ Σ⁻¹ e of each loop of one tile with each of another, the first of them the earlier."""
+    return jax.vmap(lambda one: jax.vmap(lambda other: _of_pair(one, other))(b))(a)
+
+
+def _of_pair(a: _Loop, b: _Loop) -> Float[Array, ""]:
+    error = se2.adjoint(a.end) @ se2.between(a.end, se2.compose(b.moved, a.at))
+    ad = se2.adjoint(b.moved)
+    forward = jnp.where(a.first <= b.first, 1.0, -1.0)
+    backward = jnp.where(a.second <= b.second, 1.0, -1.0)
+    first = forward * (b.total_first - a.total_first)
+    second = backward * (b.total_second - a.total_second)
+    cov = a.own + b.own + first + ad @ second @ ad.T
+    # By cofactors: XLA's solver takes the matrices one by one.
+    x, y, t = error
+    xx, xy, xt, yy, yt, tt = (cov[i, j] for i, j in zip(*np.triu_indices(3), strict=True))
+    c_xx, c_xy, c_xt = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
+    c_yy, c_yt, c_tt = xx * tt - xt * xt, xy * xt - xx * yt, xx * yy - xy * xy
+    determinant = xx * c_xx + xy * c_xy + xt * c_xt
+    square = c_xx * x * x + c_yy * y * y + c_tt * t * t
+    return (square + 2 * (c_xy * x * y + c_xt * x * t + c_yt * y * t)) / determinant
 
 
 def clique(agree: Bool[np.ndarray, "M M"], weight: Float[np.ndarray, "M"]) -> Bool[np.ndarray, "M"]:
@@ -81,19 +126,20 @@ def clique(agree: Bool[np.ndarray, "M M"], weight: Float[np.ndarray, "M"]) -> Bo
     none = np.zeros(len(agree), bool)
     if not len(agree):
         return none
-    joined = np.where(agree, weight[None, :].astype(np.float32), np.float32(0))
+    joined = agree.astype(np.float32)
     np.fill_diagonal(joined, 0)
+    weight = weight.astype(np.float32)
     best, most = none, -1.0
-    for start in np.argsort(-joined.sum(axis=1), kind="stable")[:STARTS]:
+    for start in np.argsort(-(joined @ weight), kind="stable")[:STARTS]:
         chosen, left = none.copy(), joined[start] > 0
         chosen[start] = True
-        inside = joined[:, left].sum(axis=1)  # weight of those left that each agrees with
+        inside = joined @ (weight * left)  # weight of those left that each agrees with
         while left.any():
             take = int(np.where(left, inside + 1e-3 * weight, -1.0).argmax())
             chosen[take] = True
-            gone = left & ~(joined[take] > 0)
-            inside -= joined[:, gone].sum(axis=1)
-            left &= ~gone
+            gone = np.flatnonzero(left & ~(joined[take] > 0))
+            inside -= weight[gone] @ joined[gone]
+            left[gone] = False
         if (sum_of := float(weight[chosen].sum())) > most:
             best, most = chosen, sum_of
     return best

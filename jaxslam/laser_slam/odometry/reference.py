@@ -219,10 +219,10 @@ def _thinned(of: Points) -> Points:
     return Points(*(part[::2] for part in of))
 
 
-Of = TypeVar("Of", Points, Surface)
+Of = TypeVar("Of", bound=PyTree)
 
 
-def taken(of: Of, rows: int | np.integer | np.ndarray) -> Of:
+def taken(of: Of, rows: int | np.integer | np.ndarray | slice) -> Of:
     """Some scans of many."""
     found: Of = jax.tree.map(lambda part: part[rows], of)
     return found

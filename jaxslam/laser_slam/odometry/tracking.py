@@ -1,7 +1,6 @@
 """Laser odometry: each scan against the keyframes before it, fused with raw odometry."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -69,42 +68,10 @@ class Odometry(NamedTuple):
     """[m] root mean square of their distances from these"""
 
 
-def laser_odometry(
-    scans: Scans,
-    steps: Steps,
-    settings: Settings,
-    first: Float[np.ndarray, "3"],
-    progress: Callable[[int, int], object] | None = None,
+def tracked(
+    scans: Scans, steps: Steps, settings: Settings, advance: Callable[[], object]
 ) -> Odometry:
-    """The path of a log's scans, each matched with the last keyframes and fused with raw odometry.
-
-    The pose in the frame of the last keyframe minimizes the squared distances of the points from
-    the lines of the reference, and the error of raw odometry from the scan before, by their
-    covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
-    by `settings.correlation`.
-
-    Where fewer than 0.6 of the points meet a wall, and where raw odometry is no guess (a jump, a
-    frozen step, one that lags), all poses are searched that the robot can have reached in that time
-    (`Steps.reach`). Such a match counts if it is as good as that of a loop, no other pose is nearly
-    as good, and few beams pass through the reference; about raw odometry also if it is better by
-    0.2 than the match there.
-
-    Where raw odometry was frozen, or a match contradicts it, the next step may make up for that, or
-    not: the scan is matched from the match before and from raw odometry before, and the better of
-    both counts.
-
-    A scan without a match has the pose of raw odometry, is no keyframe, and is matched once more at
-    the end, with the keyframes before and after it, from the path between its neighbours. After
-    `LOST` such scans in a row the next one is a keyframe, and only keyframes since then are matched
-    with; so is the first where raw odometry is frozen, but there matches that are less good count,
-    too, and are in doubt.
-
-    A match is in doubt that has few points on walls, or that raw odometry contradicts: it may be of
-    another place that looks the same. It stays, and is taken to be wrong with probability p = 0.1:
-    its covariance is about that of the mixture with raw odometry, C + p (P + diag(d², d², t²)),
-    where d is the distance and t the turn from one to the other. So are those of the scans after
-    it until the next keyframe.
-    """
+    """The odometry of a piece of a log, from the pose zero, as `laser_odometry` describes it."""
     count = len(scans.usable)
     result = Odometry(
         poses=np.zeros((count, 3)),
@@ -118,10 +85,8 @@ def laser_odometry(
         inliers=np.zeros(count),
         residual=np.zeros(count),
     )
-    result.poses[0] = first
     keys, since = [0], 0  # since: the keyframe from which on scans are matched with
     reference = _reference_of_last(scans, keys, result.poses, settings)
-    _compile_wide_search(reference, scans, settings)
     # Of the last scan, relative to the last keyframe; doubt is what is added to its covariance.
     z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     missed, blind, last = 0, False, np.zeros(3)
@@ -200,21 +165,8 @@ def laser_odometry(
             z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
             of = [key for key in keys if key >= since]
             reference = _reference_of_last(scans, of, result.poses, settings)
-        if progress is not None:
-            progress(scan + 1, count)
-    result = result._replace(keyframe=np.array(keys))
-    _place_unmatched(result, scans, steps, settings)
-    return result
-
-
-def _compile_wide_search(reference: Reference | None, scans: Scans, settings: Settings) -> None:
-    """Compile the wider search beside the loop, so that a later log that needs it does not wait."""
-    if reference is None:
-        return
-    pool = ThreadPoolExecutor(1)
-    scan, start = taken(scans.points, 0), np.zeros(3)
-    pool.submit(match, FAR, reference, scan, start, np.eye(3), NO_FLOOR, settings)
-    pool.shutdown(wait=False)
+        advance()
+    return result._replace(keyframe=np.array(keys))
 
 
 class _Found(NamedTuple):
@@ -310,7 +262,7 @@ def _reference_of_last(
     return reference_of(scans, of, path[of], path[keys[-1]], settings.scans_of_reference)
 
 
-def _place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Settings) -> None:
+def place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Settings) -> None:
     """Match the scans without a match with the keyframes around them, in place.
 
     They are taken to lie in the middle of their neighbours, up to half of the way between these.
