@@ -45,10 +45,10 @@ ROWS = ("nees_pose", "nees_heading", "nis_per_dof", "rmse_position", "rmse_landm
 
 def worlds():
     cov = np.array([[SIGMA**2]])
-    camera = sensors.bearing_only(cov, free=RANGE)
-    rays = sensors.bearing_inverse_depth(cov, min_distance=MIN_DISTANCE)
-    to_points = sensors.bearing_inverse_depth(cov, min_distance=MIN_DISTANCE, to_point=TO_POINT)
-    matched = sensors.bearing_inverse_depth(cov, free=MATCHED, to_point=TO_POINT)
+    camera = sensors.BearingOnly(cov, free=RANGE)
+    rays = sensors.BearingInverseDepth(cov, min_distance=MIN_DISTANCE)
+    to_points = sensors.BearingInverseDepth(cov, min_distance=MIN_DISTANCE, to_point=TO_POINT)
+    matched = sensors.BearingInverseDepth(cov, free=MATCHED, to_point=TO_POINT)
     for world in (cloister(), circle()):
         scenario = dataclasses.replace(
             world, name=f"{world.name}, bearings", sensor=camera, filter_options={}, published={}

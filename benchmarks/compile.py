@@ -25,7 +25,7 @@ from jaxslam.filters.map_management.merging import merging
 from jaxslam.filters.map_management.pruning import pruning
 from jaxslam.protocols import Filter
 from jaxslam.run import run
-from jaxslam.sensors import Part, suite
+from jaxslam.sensors import Part, Suite
 from jaxslam.simulation.scenarios import circle
 from jaxslam.simulation.team_world import team_world
 from jaxslam.simulation.worlds import Scenario, simulate
@@ -40,8 +40,8 @@ def world(scale: float) -> Scenario:
     there = circle(STEPS)
     return dataclasses.replace(
         there,
-        motion=motion.increment(np.diag([0.02, 0.01]) ** 2 * scale),
-        sensor=sensors.range_bearing(np.diag([0.3, 0.03]) ** 2 * scale),
+        motion=motion.Increment(np.diag([0.02, 0.01]) ** 2 * scale),
+        sensor=sensors.RangeBearing(np.diag([0.3, 0.03]) ** 2 * scale),
         landmarks=np.asarray(there.landmarks) * scale,
         controls=np.asarray(there.controls)[:, :2] * scale,
         filter_options={},
@@ -49,9 +49,9 @@ def world(scale: float) -> Scenario:
 
 
 def crew(scale: float) -> tuple[Scenario, Filter]:
-    eyes = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2 * scale)
-    sees = suite(Part(eyes, 4), Part(eyes, 1, every=2, sees="robots"))
-    moves = motion.increment(np.diag([0.01, 0.01]) ** 2 * scale)
+    eyes = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2 * scale)
+    sees = Suite((Part(eyes, 4), Part(eyes, 1, every=2, sees="robots")))
+    moves = motion.Increment(np.diag([0.01, 0.01]) ** 2 * scale)
     second = (0.8, 0.6, 1.0), np.diag([0.05, 0.05, 0.05]) ** 2
     robots = [team.Robot(moves, sees), team.Robot(moves, sees, second)]
     points = 3.0 * scale * np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=1)
@@ -162,7 +162,7 @@ def gradients(key: jax.Array) -> list[Metric]:
     for update in ("joint", "sequential"):
 
         def cost(p: jax.Array, log: Any, update: str = update) -> jax.Array:
-            sensor = sensors.range_bearing(jnp.diag(p[:2]) ** 2, mount=p[2:])
+            sensor = sensors.RangeBearing(jnp.diag(p[:2]) ** 2, mount=p[2:])
             ekf = ekf_slam(there.motion, sensor, len(there.landmarks), update=update)
             trace = run(ekf, log, there.pose, there.pose_cov, key)
             return trace.info.log_likelihood.sum()

@@ -44,8 +44,8 @@ HEADER = ("pose NEES", "median", "position [m]", "landmarks [m]", "wait", "found
 def named(every):
     world = cloister()
     columns = world.landmarks[::every]
-    camera = sensors.bearing_only([[SIGMA**2]], free=([5.0], [[2.5**2]]))
-    rays = sensors.bearing_inverse_depth([[SIGMA**2]], min_distance=1.0)
+    camera = sensors.BearingOnly([[SIGMA**2]], free=([5.0], [[2.5**2]]))
+    rays = sensors.BearingInverseDepth([[SIGMA**2]], min_distance=1.0)
     scenario = dataclasses.replace(
         world, name="cloister", sensor=camera, landmarks=columns, filter_options={}, published={}
     )
@@ -64,10 +64,10 @@ def named(every):
 
 
 def nameless():
-    camera = sensors.bearing_only([[SIGMA**2]])
+    camera = sensors.BearingOnly([[SIGMA**2]])
     scenario = Scenario(
         name="five without names",
-        motion=motion.increment(np.diag([0.005, 0.003]) ** 2),
+        motion=motion.Increment(np.diag([0.005, 0.003]) ** 2),
         sensor=camera,
         landmarks=[[4.0, 5.0], [-3.0, 4.0], [-2.0, 0.5], [5.0, -1.0], [0.5, 8.0]],
         controls=np.tile([0.2, 0.08], (120, 1)),

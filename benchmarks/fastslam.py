@@ -128,8 +128,8 @@ def ring(steps=200):
     points = np.stack([3 * np.cos(around), 1 + 3 * np.sin(around)], axis=1)
     return Scenario(
         name="ring",
-        motion=motion.increment(np.diag([0.01, 0.01]) ** 2),
-        sensor=sensors.range_bearing(np.diag([0.05, 0.02]) ** 2),
+        motion=motion.Increment(np.diag([0.01, 0.01]) ** 2),
+        sensor=sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2),
         landmarks=points,
         controls=np.tile([0.125, 4 * np.pi / 100], (steps, 1)),
     )
@@ -140,8 +140,8 @@ def crowd(measured=10):
     points = np.random.default_rng(0).uniform(-20, 20, (100, 2))
     return Scenario(
         name="crowd",
-        motion=motion.increment(np.diag([0.01, 0.01]) ** 2),
-        sensor=sensors.range_bearing(np.diag([0.05, 0.02]) ** 2),
+        motion=motion.Increment(np.diag([0.01, 0.01]) ** 2),
+        sensor=sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2),
         landmarks=points,
         controls=np.tile([0.3, 0.3 / 12], (200, 1)),
         pose=(0.0, -12.0, 0.0),

@@ -15,9 +15,9 @@ import numpy as np
 
 from benchmarks.gate import Metric, report
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.motion.ackermann import ackermann
+from jaxslam.motion.ackermann import Ackermann
 from jaxslam.run import run
-from jaxslam.sensors.range_bearing import range_bearing
+from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
 
@@ -27,8 +27,8 @@ AT = np.array([0.1, 0.09, 0.1, np.deg2rad(1.0), 0.0, 0.0, 0.0, WHEELBASE])
 
 
 def models(p):
-    car = ackermann(jnp.diag(p[:2]) ** 2, wheelbase=p[7], sensor=(0.0, 0.0), encoder=0.0)
-    return car, range_bearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
+    car = Ackermann(jnp.diag(p[:2]) ** 2, wheelbase=p[7], sensor=(0.0, 0.0), encoder=0.0)
+    return car, RangeBearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
 
 
 def measure(update: str = "joint") -> list[Metric]:

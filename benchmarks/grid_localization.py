@@ -211,7 +211,7 @@ def single_log(log):
 
 def filter_of(grid, particles, sigma=0.1, shares=None, **options):
     """The likelihood-field filter; shares: `hit` and `random` of the model."""
-    moves = motion.odometry(motion.odometry_noise(ALPHA))
+    moves = motion.Odometry(motion.OdometryNoise(ALPHA))
     model = grids.likelihood_field(sigma, max_range=FAR, **(shares or {}))
     return grids.localize(grid, model, moves, particles, **options)
 

@@ -27,7 +27,7 @@ from benchmarks.gate import Metric, alone
 from jaxslam import grids
 from jaxslam.consistency.nees import block_nees
 from jaxslam.grids.slam.particles import copied_rows
-from jaxslam.motion import unicycle
+from jaxslam.motion import Unicycle
 from jaxslam.results import plot
 from jaxslam.results.plot.maps.grids import shades_of_occupancy, shown_occupancy
 from jaxslam.results.plot.style import INK, PAGE, caption, panels_of, titled
@@ -48,7 +48,7 @@ FILTERS = {
 
 def world_of(noise):
     """The square room with the odometry's standard deviations times `noise`."""
-    motion = unicycle((noise * np.diag([0.05, np.deg2rad(3.0)])) ** 2)
+    motion = Unicycle((noise * np.diag([0.05, np.deg2rad(3.0)])) ** 2)
     return dataclasses.replace(square(beams=60), motion=motion)
 
 

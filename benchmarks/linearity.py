@@ -41,9 +41,9 @@ def main() -> int:
     options = parser.parse_args()
     shares = np.geomspace(0.01, 3, 60)
     ask = partial(indices, baselines=shares * NEAREST)
-    inverse = sensors.bearing_inverse_depth([[1e-4]], min_distance=NEAREST)
+    inverse = sensors.BearingInverseDepth([[1e-4]], min_distance=NEAREST)
     curves = {
-        "range d": ask(sensors.bearing_only([[1e-4]]), np.array([1 / RHO, 0.0]), 0, SIGMA / RHO**2),
+        "range d": ask(sensors.BearingOnly([[1e-4]]), np.array([1 / RHO, 0.0]), 0, SIGMA / RHO**2),
         "inverse depth ρ": ask(inverse, np.array([0.0, 0.0, 0.0, RHO]), 3, SIGMA),
     }
     print(f"{'baseline / d_min':>18}" + "".join(f"{name:>18}" for name in curves))

@@ -49,7 +49,7 @@ def carried(world, key):
 
 def filters_of(world, particles):
     """Filter, and what it is told of the start, by name."""
-    blunt = sensors.relative_position(0.5**2 * np.eye(2))
+    blunt = sensors.RelativePosition(0.5**2 * np.eye(2))
     anywhere = region.uniform_pose_moments(jnp.asarray(BOX))
     known = jnp.array([0.0, 0.5 / np.deg2rad(1.5), np.pi]), jnp.zeros((3, 3))
     models = world.motion, world.sensor, world.landmarks

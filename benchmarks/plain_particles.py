@@ -18,8 +18,8 @@ from jaxslam.math import gaussians, linalg
 from jaxslam.resampling import systematic
 from jaxslam.simulation.worlds import Scenario, simulate
 
-MOTION = motion.increment(np.diag([0.01, 0.01]) ** 2)
-SENSOR = sensors.range_bearing(np.diag([0.1, 0.03]) ** 2)
+MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)
+SENSOR = sensors.RangeBearing(np.diag([0.1, 0.03]) ** 2)
 LANDMARKS = (1, 2, 5, 10, 20)
 STEPS = 100
 

@@ -28,8 +28,8 @@ KEY = jax.random.key(0)
 SEEN, PARTICLES = 10, 100
 SPACING, OFFSET = 1.0, 2.0
 SIZES = (10, 30, 100, 300, 1000, 3000, 10000)
-MOTION = motion.increment(np.diag([0.01, 0.001]) ** 2)
-SENSOR = sensors.range_bearing(np.diag([0.1, 0.02]) ** 2)
+MOTION = motion.Increment(np.diag([0.01, 0.001]) ** 2)
+SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2)
 
 
 def ring(count: int, steps: int) -> tuple[np.ndarray, Log]:

@@ -38,8 +38,8 @@ def simulated(runs: int = 8, steps: int = 200, seed: int = 0) -> Callable[[jax.A
 
     def models(sigma: Any) -> tuple[Any, Any]:
         noise = jnp.asarray(sigma) ** 2
-        sensor = jaxslam.sensors.range_bearing(jnp.diag(noise[2:]))
-        return jaxslam.motion.increment(jnp.diag(noise[:2])), sensor
+        sensor = jaxslam.sensors.RangeBearing(jnp.diag(noise[2:]))
+        return jaxslam.motion.Increment(jnp.diag(noise[:2])), sensor
 
     motion, sensor = models(TRUE)
     controls = np.tile([0.1, 4 * np.pi / 200], (steps, 1))
@@ -66,8 +66,8 @@ def recorded(data: Any, steps: int) -> Callable[[jax.Array], Info]:
     log = jax.tree.map(lambda a: jnp.asarray(a[:steps]), data.log)
 
     def info(sigma: jax.Array) -> Info:
-        motion = jaxslam.motion.unicycle(white_noise(sigma[0] ** 2, sigma[1] ** 2))
-        sensor = jaxslam.sensors.range_bearing(jnp.diag(sigma[2:] ** 2))
+        motion = jaxslam.motion.Unicycle(white_noise(sigma[0] ** 2, sigma[1] ** 2))
+        sensor = jaxslam.sensors.RangeBearing(jnp.diag(sigma[2:] ** 2))
         ekf = jaxslam.filters.ekf_slam(motion, sensor, data.capacity, **data.filter_options)
         return jaxslam.run(ekf, log, data.pose, data.pose_cov, jax.random.key(0)).info
 

@@ -1,4 +1,4 @@
-"""Noise covariances of factories, given as arrays or as functions."""
+"""Noise covariances of models: constant, or a function of the state or the measurement."""
 
 from collections.abc import Callable
 
@@ -6,28 +6,49 @@ import jax
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from jaxslam.validation.numbers import check_covariance
+from jaxslam.core.numbers import check_covariance, held_array
+from jaxslam.core.record import is_record, record, set_field, static
 
 NoiseCov = ArrayLike | Callable[..., jax.Array]
+"""As a model takes it: a covariance, a record with `__call__`, or a plain function."""
 
 
-def noise_model(name: str, noise_cov: NoiseCov, size: int) -> Callable[..., jax.Array]:
-    """A function (…) -> (size, size) in the dtype of its first argument.
+@record
+class Constant:
+    """A constant covariance, called with anything."""
 
-    An array is checked once (shape, finite, symmetric, positive semi-definite; ValueError) and held
-    constant; the shape of a function's result is checked when it is traced.
+    cov: ArrayLike
+    """(n, n)"""
+
+    def __call__(self, *arguments: jax.Array) -> jax.Array:
+        return jnp.asarray(self.cov, arguments[0].dtype)
+
+
+@record
+class Function:
+    """A plain function that returns a covariance; its numbers are no leaves."""
+
+    function: Callable[..., jax.Array] = static()
+    owner: str = static()
+    size: int = static()
+
+    def __call__(self, *arguments: jax.Array) -> jax.Array:
+        cov = self.function(*arguments)
+        check_covariance(self.owner, cov, self.size)
+        return jnp.asarray(cov, arguments[0].dtype)
+
+
+def hold_noise(model: object, size: int) -> None:
+    """Make the field noise_cov of a model what can be called, in its `__post_init__`.
+
+    Raises ValueError unless it is a covariance (size, size) or a function.
     """
-    if callable(noise_cov):
-
-        def varying(*arguments: jax.Array) -> jax.Array:
-            cov = noise_cov(*arguments)
-            check_covariance(name, cov, size)
-            return jnp.asarray(cov, arguments[0].dtype)
-
-        return varying
-    check_covariance(name, noise_cov, size)
-
-    def constant(*arguments: jax.Array) -> jax.Array:
-        return jnp.asarray(noise_cov, arguments[0].dtype)
-
-    return constant
+    given, name = getattr(model, "noise_cov"), type(model).__name__  # noqa: B009
+    if is_record(given):
+        return
+    where = f"{name}: noise_cov"
+    if callable(given):
+        set_field(model, "noise_cov", Function(given, where, size))
+        return
+    check_covariance(where, given, size)
+    set_field(model, "noise_cov", Constant(held_array(given)))

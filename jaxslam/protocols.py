@@ -1,24 +1,36 @@
 """The records of pure functions that make up a SLAM method.
 
-Every field that is a function is pure and traceable and acts on *one* pose, landmark or scan; the
-caller vmaps. Records are made by factories that close over their parameters, so calling the factory
-inside a differentiated function lets `jax.grad` reach those parameters.
+Every method, and field that is a function, is pure and traceable and acts on *one* pose, landmark
+or scan; the caller vmaps. The numbers of a motion model or a sensor are the leaves of a record.
 
 Shapes: pose (3,); u (U,) control; w (W,) process noise; z (Z,) measurement; l (L,) landmark
 parameters; s (K,) landmark parameters that z does not determine (K = 0 if none).
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxslam.core.numbers import check_mount, held_array
+from jaxslam.core.record import set_field
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import (
+    Control,
+    Landmark,
+    Measurement,
+    Point,
+    Pose,
+    ProcessNoise,
+    Unmeasured,
+)
+from jaxslam.noise import hold_noise
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace, Truth
 
@@ -51,31 +63,63 @@ def _check_fields(
             raise ValueError(f"{what}: expected {field} to be {wanted}, got {got}")
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A motion model, one function for simulator and filters; w = 0 is the nominal motion.
-
-    This and the other records raise ValueError on a function that is none, or names that are no
-    tuple of strings.
-    """
+class Model:
+    """What motion models and sensors share: a name, and noise that is a covariance or a function."""
 
     name: str
+    """lower case, for tables, files and messages; by default that of the class"""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "name" not in cls.__dict__:
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+
+    def _check(
+        self, base: type, functions: tuple[str, ...], names: tuple[str, ...], noises: str
+    ) -> None:
+        """Check what a subclass of `base` declares, and make its noise_cov what can be called."""
+        what = type(self).__name__
+        for name in functions:
+            if getattr(type(self), name) is getattr(base, name):
+                raise ValueError(f"{what}: expected a method {name}")
+        for name in names:
+            value = getattr(self, name, None)
+            if not isinstance(value, tuple) or not all(isinstance(one, str) for one in value):
+                raise ValueError(
+                    f'{what}: expected {name} to be a tuple of names as ("x [m]",), got {value!r}'
+                )
+        if not hasattr(self, "noise_cov"):
+            raise ValueError(f"{what}: expected a field or a method noise_cov")
+        if "noise_cov" in self.__dict__:
+            hold_noise(self, len(getattr(self, noises)))
+
+
+class Motion(Model):
+    """A motion model, one class for simulator and filters; w = 0 is the nominal motion.
+
+    A subclass is a record (`core.record`) that declares controls and noises, has a field noise_cov,
+    or a method of that name, and defines `step`. Raises ValueError, at construction, on a
+    covariance that is none, names that are no tuple of strings, or a missing method.
+    """
+
     controls: tuple[str, ...]
     """What u holds, with units; its length is U."""
     noises: tuple[str, ...]
     """What w holds, with units; its length is W."""
-    step: Callable[[Array, Array, Array], Array]
-    """(pose, u, w) -> pose, θ wrapped."""
-    noise_cov: Callable[[Array, Array], Array]
-    """(pose, u) -> (W, W)."""
-    perturb: Callable[[Array, Array], Array] | None = None
+    noise_cov: Any
+    """(pose, u) -> (W, W). Given as a covariance, a record with `__call__`, or a function."""
+    perturb: Any = None
     """(u, w) -> u with step(pose, u, w) = step(pose, perturb(u, w), 0), where noise is of that
     kind; needed by worlds that add noise to the odometry instead of the robot's motion."""
-    jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
+    jacobians: Any = None
     """(pose, u, w) -> by pose (3, 3), by u (3, U), by w (3, W); hand-derived, to verify against."""
 
     def __post_init__(self) -> None:
-        _check_fields(self, ("step", "noise_cov"), ("controls", "noises"), ("perturb", "jacobians"))
+        self._check(Motion, ("step",), ("controls", "noises"), "noises")
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+        """The pose after a control, θ wrapped."""
+        raise NotImplementedError
 
 
 class Free(NamedTuple):
@@ -98,65 +142,91 @@ class Reduced(NamedTuple):
     """(pose, l, cov (L, L)) -> () bool"""
 
 
-@dataclass(frozen=True, eq=False)
-class Sensor:
+class Sensor(Model):
     """A measurement model of one landmark, or with L = 0 of the robot itself (an absolute sensor).
+
+    A subclass is a record (`core.record`) that declares measurements, has a field noise_cov, or a
+    method of that name, and defines `observe` and `invert`; the rest has a default. It may have a
+    field `mount`, and then observes from `frame(pose)`. Raises ValueError, at construction, on a
+    covariance or a mount that is none, names that are no tuple of strings, or a missing method.
 
     An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
     embed return (0,), position unused zeros, and K = 0. Each of its measurements
     corrects the robot, whatever the tag.
     """
 
-    name: str
     measurements: tuple[str, ...]
     """What z holds, with units; its length is Z."""
-    observe: Callable[[Array, Array], Array]
-    """(pose, l) -> z."""
-    residual: Callable[[Array, Array], Array]
-    """(z, z_hat) -> z ⊖ z_hat (Z,), angles wrapped; residual(z, 0) is z with its angles wrapped."""
-    noise_cov: Callable[[Array], Array]
-    """(z) -> (Z, Z)."""
-    invert: Callable[[Array, Array, Array], Array]
-    """(pose, z, s) -> l, with observe(pose, invert(pose, z, s)) = z; a range is not negative."""
     landmark: tuple[str, ...] = ("x [m]", "y [m]")
-    """What l holds, with units; its length is L, 0 for an absolute sensor. Default a point."""
-    position: Callable[[Array], Array] = lambda landmark: landmark
-    """(l) -> (2,) position of the landmark. Default that of a point."""
-    embed: Callable[[Array, Array], Array] = lambda pose, point: point
-    """(pose, point (2,)) -> l of a landmark at that point, measured first from pose. Default that
-    of a point."""
-    carry: Callable[[Array, Array], Array] | None = None
+    """What l holds, with units; its length is L, 0 for an absolute sensor."""
+    noise_cov: Any
+    """(z) -> (Z, Z). Given as a covariance, a record with `__call__`, or a function."""
+    mount: Any = None
+    """(3,) pose of the sensor on the robot, Solà's S; None where it is the robot's."""
+    free: Free = NOTHING_FREE
+    """the prior of s. Default that of a full measurement."""
+    carry: Any = None
     """(frame (3,), l) -> l of a landmark given in a frame, in the coordinates that the frame's pose
     is in. Default, of a landmark whose first two numbers are a place (x, y): the place moves,
     entries in [rad] turn, and the others stay."""
-    free: Free = NOTHING_FREE
-    """the prior of s. Default that of a full measurement."""
-    observe_jacobians: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    observe_jacobians: Any = None
     """(pose, l) -> by pose (Z, 3), by l (Z, L); hand-derived, to verify against."""
-    invert_jacobians: Callable[[Array, Array, Array], tuple[Array, Array, Array]] | None = None
+    invert_jacobians: Any = None
     """(pose, z, s) -> by pose (L, 3), by z (L, Z), by s (L, K); hand-derived."""
     reduced: Reduced | None = None
     """the points that landmarks may turn into; None where they never do"""
 
     def __post_init__(self) -> None:
-        functions = ("observe", "residual", "noise_cov", "invert", "position", "embed")
-        optional = ("carry", "observe_jacobians", "invert_jacobians")
-        _check_fields(self, functions, ("measurements", "landmark"), optional)
-        if not isinstance(self.free, Free):
-            raise ValueError(
-                f"Sensor {self.name!r}: expected free to be a Free(mean, cov), got "
-                f"{type(self.free).__name__}"
-            )
+        self._check(Sensor, ("observe", "invert"), ("measurements", "landmark"), "measurements")
+        if self.mount is not None and "mount" in self.__dict__:
+            check_mount(type(self).__name__, self.mount)
+            set_field(self, "mount", held_array(self.mount))
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        """The measurement z of a landmark."""
+        raise NotImplementedError
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        """The landmark with observe(pose, invert(pose, z, s)) = z; a range is not negative."""
+        raise NotImplementedError
+
+    def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
+        """z ⊖ z_hat, entries in [rad] wrapped; residual(z, 0) is z with its angles wrapped."""
+        turns = np.array([name.endswith("[rad]") for name in self.measurements])
+        return jnp.where(turns, wrap(z - z_hat), z - z_hat)
+
+    def position(self, landmark: Landmark) -> Point:
+        """(2,) position of a landmark. By default its first two numbers."""
+        return landmark[:2]
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        """The landmark at a point, measured first from pose. By default zeros beside the point."""
+        rest = max(len(self.landmark) - 2, 0)
+        return jnp.concatenate([point, jnp.zeros(rest, point.dtype)]) if rest else point
+
+    def frame(self, pose: Pose) -> Pose:
+        """The pose of the sensor, pose ∘ mount."""
+        return pose if self.mount is None else se2.compose(pose, self._mount(pose))
+
+    def frame_jacobian(self, pose: Pose) -> Float[Array, "3 3"]:
+        """The derivative of `frame` by the pose."""
+        if self.mount is None:
+            return jnp.eye(3, dtype=pose.dtype)
+        return se2.compose_jacobians(pose, self._mount(pose))[0]
+
+    def _mount(self, pose: Pose) -> Pose:
+        return jnp.asarray(self.mount, pose.dtype)
 
     @property
     def of_points(self) -> bool:
         """Whether a landmark is a point (x, y), as some methods need."""
         return len(self.landmark) == 2 and self.carry is None
 
-    def carried(self, frame: Float[Array, "3"], landmark: Float[Array, "L"]) -> Float[Array, "L"]:
+    def carried(self, frame: Pose, landmark: Landmark) -> Landmark:
         """A landmark given in a frame, in the coordinates that the frame's pose is in."""
         if self.carry is not None:
-            return self.carry(frame, landmark)
+            carried: Array = self.carry(frame, landmark)
+            return carried
         if len(self.landmark) < 2:
             return landmark
         turns = np.array([name.endswith("[rad]") for name in self.landmark[2:]], bool)

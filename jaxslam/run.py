@@ -9,17 +9,17 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
-from jaxslam.protocols import Filter
-from jaxslam.types import Log, Scan, Status, Trace
-from jaxslam.validation import check_record, checked_estimate, same_state, state_and_info
-from jaxslam.validation.logs import check_log
-from jaxslam.validation.numbers import (
+from jaxslam.core.numbers import (
     check_covariance,
     check_key,
     is_concrete,
     largest,
     shape_told,
 )
+from jaxslam.protocols import Filter
+from jaxslam.types import Log, Scan, Status, Trace
+from jaxslam.validation import check_record, checked_estimate, same_state, state_and_info
+from jaxslam.validation.logs import check_log
 
 
 def run(

@@ -4,26 +4,27 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import check_covariance, is_concrete
+from jaxslam.core.record import record, static
+from jaxslam.math.arrays import Control, Pose, ProcessNoise
 from jaxslam.protocols import Motion
-from jaxslam.sensors.suite import Part, Suite, suite
+from jaxslam.sensors.suite import Part, Suite
 from jaxslam.slots import Joint
-from jaxslam.validation.numbers import check_covariance, is_concrete
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Robot:
     """One robot of a team. Raises ValueError on sensors that are no suite, or an invalid start."""
 
     motion: Motion
     sensors: Suite
-    """made by `sensors.suite`, also of a single one"""
+    """a suite, also of a single sensor"""
     start: tuple[ArrayLike, ArrayLike] | None = None
     """pose (3,) before the first control in the frame of robot 0's, and its covariance (3, 3); None
     where unknown, and of robot 0"""
@@ -31,8 +32,7 @@ class Robot:
     def __post_init__(self) -> None:
         if not isinstance(self.motion, Motion) or not isinstance(self.sensors, Suite):
             raise ValueError(
-                f"Robot: expected a motion and a sensors.suite, got {self.motion!r} and "
-                f"{self.sensors!r}"
+                f"Robot: expected a motion and a Suite, got {self.motion!r} and {self.sensors!r}"
             )
         if self.start is not None:
             if np.shape(self.start[0]) != (3,):
@@ -99,18 +99,31 @@ def pose_cross_cov(joint: Joint, robots: int) -> Float[Array, "R 3 R 3"]:
     return joint.cov[at][:, at].reshape(robots, 3, robots, 3)
 
 
-def motion_of(robots: Sequence[Robot], report: int) -> Motion:
+@record
+class TeamMotion(Motion):
     """The motion of the robot `report`, as a function of the controls (ΣU,) of the whole team."""
-    ends, _, _ = sizes(robots)
-    own = robots[report].motion
-    at = slice(ends[report] - len(own.controls), ends[report])
-    return Motion(
-        name="team",
-        controls=tuple(name for robot in robots for name in robot.motion.controls),
-        noises=own.noises,
-        step=lambda pose, u, w: own.step(pose, u[at], w),
-        noise_cov=lambda pose, u: own.noise_cov(pose, u[at]),
-    )
+
+    robots: tuple[Motion, ...]
+    report: int = static()
+
+    @property
+    def controls(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(name for robot in self.robots for name in robot.controls)
+
+    @property
+    def noises(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.robots[self.report].noises
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+        return self.robots[self.report].step(pose, self._own(u), w)
+
+    def noise_cov(self, pose: Pose, u: Control) -> Array:
+        cov: Array = self.robots[self.report].noise_cov(pose, self._own(u))
+        return cov
+
+    def _own(self, u: Control) -> Array:
+        begin = sum(len(robot.controls) for robot in self.robots[: self.report])
+        return u[begin : begin + len(self.robots[self.report].controls)]
 
 
 def sensors_of(robots: Sequence[Robot], report: int) -> Suite:
@@ -123,4 +136,4 @@ def sensors_of(robots: Sequence[Robot], report: int) -> Suite:
     for b, robot in enumerate(robots):
         for part in robot.sensors.parts:
             parts.append(part if b == report else Part(part.sensor, part.places, sees="robots"))
-    return suite(*parts)
+    return Suite(tuple(parts))

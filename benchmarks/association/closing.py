@@ -60,8 +60,8 @@ def world(seed=0):
     places = int((np.hypot(*(path[:, None] - points).transpose(2, 0, 1)) < 9.5).sum(axis=1).max())
     return Scenario(
         name="closing",
-        motion=motion.increment(np.diag([0.08, np.deg2rad(1.0)]) ** 2),
-        sensor=sensors.relative_position(0.1**2 * np.eye(2)),
+        motion=motion.Increment(np.diag([0.08, np.deg2rad(1.0)]) ** 2),
+        sensor=sensors.RelativePosition(0.1**2 * np.eye(2)),
         landmarks=points,
         controls=np.tile([STEP, 2 * np.pi / ROUND], (ROUND + MORE, 1)),
         visible=view,

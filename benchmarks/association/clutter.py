@@ -40,7 +40,7 @@ def world(clutter, noise):
     sigma = noise * np.diag([0.01, 0.02])
     return dataclasses.replace(
         plain,
-        motion=motion.increment(sigma**2),
+        motion=motion.Increment(sigma**2),
         visible=near(REACH),
         places=12,
         spurious=Spurious(clutter=clutter, missed=0.05, reach=REACH),

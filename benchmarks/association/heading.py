@@ -18,13 +18,13 @@ from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, titled
-from jaxslam.sensors import range_bearing
+from jaxslam.sensors import RangeBearing
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
 
 COUNT, SEEN, DRAWS = 14, 8, 500
 SIGMAS = np.array([0.5, 2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45])
-SENSOR = range_bearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2)
+SENSOR = RangeBearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2)
 GATE = chi2_quantile(0.99, 2)
 METHODS = {
     "nearest": association.nearest(GATE),

@@ -90,8 +90,8 @@ def corrected(p, control):
 
 def filter_of(capacity, method, odometry, measurement, **options):
     return ekf_slam(
-        motion.pose_increment(jnp.diag(jnp.asarray(odometry)) ** 2),
-        sensors.relative_position(measurement**2 * jnp.eye(2)),
+        motion.PoseIncrement(jnp.diag(jnp.asarray(odometry)) ** 2),
+        sensors.RelativePosition(measurement**2 * jnp.eye(2)),
         capacity,
         associate=method,
         chart=charts.right_invariant(),

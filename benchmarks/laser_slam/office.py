@@ -52,7 +52,7 @@ def campaign(records: list[tuple[np.ndarray, np.ndarray]]) -> Campaign:
 
     A row a keyframe; of all runs those that the shortest has. Poses are relative to the first.
     """
-    motion, sensor = laser_slam.match_motion(), sensors.range_bearing(np.eye(2))
+    motion, sensor = laser_slam.MatchMotion(), sensors.RangeBearing(np.eye(2))
     rows = min(len(control) for control, _ in records)
     nothing = Scan(np.zeros((rows, 1, 2)), np.full((rows, 1), -1), np.zeros((rows, 1), bool))
     world = recorded_world(

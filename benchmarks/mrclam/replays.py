@@ -14,9 +14,9 @@ from jaxslam import charts, datasets, linearize
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.filters import ekf_slam
 from jaxslam.math import se2
-from jaxslam.motion import pose_increment
+from jaxslam.motion import PoseIncrement
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.sensors import range_bearing
+from jaxslam.sensors import RangeBearing
 from jaxslam.types import Log, Scan, Truth
 
 RUNS = 300
@@ -74,7 +74,7 @@ def course(folder: Path, robot: int) -> Course:
     turn = np.hypot(own.turn_noise, own.turn_share * omega)
     density = np.stack([np.full(len(dt), own.forward_noise), 0 * turn, turn], axis=1)
     control = jnp.concatenate([increment, np.sqrt(dt)[:, None] * density], axis=1)
-    told = pose_increment(lambda pose, u: jnp.diag(u[3:] ** 2))
+    told = PoseIncrement(lambda pose, u: jnp.diag(u[3:] ** 2))
     motion = Motion(
         name="pose_increment_with_deviations",
         controls=(*told.controls, "σ forward [m]", "σ left [m]", "σ turn [rad]"),
@@ -82,7 +82,7 @@ def course(folder: Path, robot: int) -> Course:
         step=lambda pose, u, w: told.step(pose, u[:3], w),
         noise_cov=told.noise_cov,
     )
-    sensor = range_bearing(own.measurement_cov(), mount=own.mount)
+    sensor = RangeBearing(own.measurement_cov(), mount=own.mount)
     landmarks = jnp.asarray(data.landmarks)
     at = landmarks[jnp.maximum(scan.tag, 0)]
     z = jax.vmap(jax.vmap(sensor.observe, (None, 0)))(path, at)

@@ -4,9 +4,9 @@ import dataclasses
 
 import jax.numpy as jnp
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.protocols import Associate, Association, Pairs, Prediction
 from jaxslam.types import Scan
-from jaxslam.validation.numbers import is_concrete
 
 
 def certain(associate: Associate, spread: float) -> Associate:

@@ -8,9 +8,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.protocols import Pairs, Prediction
 from jaxslam.types import Scan
-from jaxslam.validation.numbers import is_concrete
 
 
 def check_gates(name: str, gate: float, new_gate: float | None) -> float:

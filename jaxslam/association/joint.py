@@ -9,11 +9,11 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.association.gates import check_gates, far_from_all
+from jaxslam.core.numbers import check_count
 from jaxslam.math import linalg
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Association, Pairs, Prediction
 from jaxslam.types import Scan
-from jaxslam.validation.numbers import check_count
 
 
 def joint(

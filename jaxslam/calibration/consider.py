@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
-from jaxslam.validation.numbers import is_concrete
+from jaxslam.core.numbers import is_concrete
 
 
 def consider_cov(

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
+from jaxslam.core.numbers import check_count
 from jaxslam.math import linalg
 from jaxslam.types import Info, Status
-from jaxslam.validation.numbers import check_count
 
 
 class Calibration(NamedTuple):

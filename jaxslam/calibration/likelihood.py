@@ -19,8 +19,8 @@ from jaxslam.calibration.errors import (
     standard_errors,
     upper_limit,
 )
+from jaxslam.core.numbers import check_count
 from jaxslam.types import Info, Log, Status
-from jaxslam.validation.numbers import check_count
 
 LOOSE = 1.0
 """Standard error of log σ above which a log does not determine σ: a factor e either way."""

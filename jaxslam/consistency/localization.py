@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from jaxslam import programs
 from jaxslam.consistency.intervals import Measure, interval, positive_interval
 from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.core.numbers import check_count, check_covariance, check_key
 from jaxslam.filters.particles.states.pose_state import PoseParticles
 from jaxslam.grids.localization.beam_log import beam_log
 from jaxslam.math.angles import wrap
@@ -20,7 +21,6 @@ from jaxslam.resampling.weights import at_points, weights_of
 from jaxslam.run import run
 from jaxslam.simulation.laser import LaserWorld, check_world, scan_world
 from jaxslam.types import JaxOrNumPy, Log
-from jaxslam.validation.numbers import check_count, check_covariance, check_key
 
 DRAWS = 199
 """Draws from the particles that represent them in a step; with the truth they are 200."""

@@ -7,9 +7,9 @@ import numpy as np
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.formats.lines import TextFile
 from jaxslam.logs.streams import as_recorded
-from jaxslam.motion import pose_increment
+from jaxslam.motion import PoseIncrement
 from jaxslam.noise import NoiseCov
-from jaxslam.sensors import range_bearing
+from jaxslam.sensors import RangeBearing
 from jaxslam.types import Log
 
 SOURCE = (
@@ -85,8 +85,8 @@ def bonn(
         name="bonn",
         log=Log.from_streams((time, controls), (time[rows], tags, z), as_recorded, time),
         time=time,
-        motion=pose_increment(odometry_cov),
-        sensor=range_bearing(measurement_cov),
+        motion=PoseIncrement(odometry_cov),
+        sensor=RangeBearing(measurement_cov),
         tags=names,
         filter_options={"update": "joint"},
         landmarks=landmarks,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
+from jaxslam.core.numbers import check_count
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.settings import EkfOptions
@@ -16,7 +17,6 @@ from jaxslam.math.stats import normal_quantile
 from jaxslam.protocols import Filter
 from jaxslam.run import run
 from jaxslam.types import Info, JaxOrNumPy, Log, Status
-from jaxslam.validation.numbers import check_count
 
 
 class DatasetFit(NamedTuple):

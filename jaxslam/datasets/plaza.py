@@ -11,9 +11,9 @@ from jaxtyping import Float
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.formats.mat_file import read_matrices
 from jaxslam.logs.streams import divide, interpolate_poses
-from jaxslam.motion import pose_increment
+from jaxslam.motion import PoseIncrement
 from jaxslam.noise import NoiseCov
-from jaxslam.sensors import range_only
+from jaxslam.sensors import RangeOnly
 from jaxslam.types import Log
 
 SOURCE = (
@@ -107,8 +107,8 @@ def plaza(
             times,
         ),
         time=times,
-        motion=pose_increment(_by_travel if odometry_cov is None else odometry_cov),
-        sensor=range_only(measurement_cov),
+        motion=PoseIncrement(_by_travel if odometry_cov is None else odometry_cov),
+        sensor=RangeOnly(measurement_cov),
         tags=names,
         landmarks=np.array([points[name] for name in names]),
         true_path=interpolate_poses(truth[:, 0], truth[:, 1:], times),

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxslam.core.numbers import check_covariance
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.formats.lines import TextFile
 from jaxslam.logs.streams import as_recorded
-from jaxslam.motion import pose_increment
+from jaxslam.motion import PoseIncrement
 from jaxslam.noise import NoiseCov
-from jaxslam.sensors import relative_position
+from jaxslam.sensors import RelativePosition
 from jaxslam.types import Log
-from jaxslam.validation.numbers import check_covariance
 
 SOURCE = (
     "Victoria Park: J. Guivant and E. Nebot, Optimization of the simultaneous localization and "
@@ -100,10 +100,8 @@ def victoria_park(
         name="victoria_park",
         log=Log.from_streams((time, controls), seen, as_recorded, time),
         time=time,
-        motion=pose_increment(odometry_file if odometry_cov is None else odometry_cov),
-        sensor=relative_position(
-            landmark_noise.cov if measurement_cov is None else measurement_cov
-        ),
+        motion=PoseIncrement(odometry_file if odometry_cov is None else odometry_cov),
+        sensor=RelativePosition(landmark_noise.cov if measurement_cov is None else measurement_cov),
         tags=names,
         filter_options={"update": "joint"},
         source=SOURCE,

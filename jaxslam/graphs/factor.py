@@ -128,7 +128,7 @@ def prior() -> Factor:
 
 def relative_position() -> Factor:
     """The factor of a point in the frame of a pose: e = z - R(θ)ᵀ(l - t), g2o's `EDGE_SE2_XY`."""
-    return replace(from_sensor(sensors.relative_position(np.eye(2))), chordal=RELATIVE_POSITION)
+    return replace(from_sensor(sensors.RelativePosition(np.eye(2))), chordal=RELATIVE_POSITION)
 
 
 def bearing() -> Factor:
@@ -136,7 +136,7 @@ def bearing() -> Factor:
 
     g2o's `EDGE_BEARING_SE2_XY`. `predict` places the point 10 m away.
     """
-    return from_sensor(sensors.bearing_only(np.eye(1)))
+    return from_sensor(sensors.BearingOnly(np.eye(1)))
 
 
 def from_sensor(sensor: Sensor) -> Factor:

@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import programs, validation
+from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor, from_motion, from_sensor, nominal_motion, of_files
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.linearize.derivatives import motion_jacobians
@@ -16,7 +17,6 @@ from jaxslam.math import linalg, se2
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.types import JaxOrNumPy, Log
-from jaxslam.validation.numbers import is_concrete
 
 _STILL = 1e-9
 """∂step/∂w with columns of length one and a determinant below this is singular."""

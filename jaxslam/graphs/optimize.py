@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxslam import programs
+from jaxslam.core.numbers import check_count, is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch, with_batch
@@ -22,7 +23,6 @@ from jaxslam.graphs.solver.padding import cut, own_number, padded_graph
 from jaxslam.graphs.solver.plan import Plan, plan_for
 from jaxslam.graphs.solver.search import METHODS, Solution, minimize
 from jaxslam.graphs.validation import check_graph
-from jaxslam.validation.numbers import check_count, is_concrete
 
 
 def optimize(

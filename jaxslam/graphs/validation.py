@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.types import JaxOrNumPy
-from jaxslam.validation.numbers import is_concrete
 
 INDEFINITE = 1e-6
 """An eigenvalue of an information above minus this share of its largest entry is one of rounding:

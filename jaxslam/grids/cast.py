@@ -10,11 +10,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
 from jaxslam import programs
+from jaxslam.core.numbers import check_real, is_concrete, shape_told
 from jaxslam.grids.distance import squared_distances
 from jaxslam.grids.grid import Grid, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolated
 from jaxslam.grids.traversal import MOST, OFF, STOP, march
-from jaxslam.validation.numbers import check_real, is_concrete, shape_told
 
 GRAZING = 0.05
 """Least |cos| of the angle between a ray and the normal of a wall in a derivative."""

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam import programs
+from jaxslam.core.numbers import check_real, is_concrete
 from jaxslam.grids.grid import Field, Grid, check_grid
 from jaxslam.types import JaxOrNumPy
-from jaxslam.validation.numbers import check_real, is_concrete
 
 
 def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None = None) -> Field:

@@ -13,9 +13,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.core.numbers import check_real, is_concrete, shape_told
 from jaxslam.math import se2
 from jaxslam.types import JaxOrNumPy
-from jaxslam.validation.numbers import check_real, is_concrete, shape_told
 
 
 class Grid(NamedTuple):

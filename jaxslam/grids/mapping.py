@@ -11,11 +11,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam import programs
+from jaxslam.core.numbers import check_mount, check_positive, is_concrete
 from jaxslam.grids.beam_models.beam_model import usable_beams
 from jaxslam.grids.grid import Grid, check_frame, to_cells
 from jaxslam.math import se2
 from jaxslam.types import Beams, JaxOrNumPy
-from jaxslam.validation.numbers import check_mount, check_positive, is_concrete
 
 FARTHEST = 2.0**29
 """An end of a beam farther off [cells] counts as this far, lest the number of cells overflow."""

@@ -5,10 +5,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import check_real, is_concrete
 from jaxslam.grids.grid import Field, Grid, centers, check_grid
 from jaxslam.grids.interpolation import interpolate
 from jaxslam.math import se2
-from jaxslam.validation.numbers import check_real, is_concrete
 
 
 def resample(grid: Grid, resolution: float) -> Grid:

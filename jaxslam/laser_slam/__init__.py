@@ -1,6 +1,6 @@
 """Laser SLAM: from the raw odometry and scans of a log to a path, a pose graph and a map."""
 
-from jaxslam.laser_slam.odometry.increments import match_controls, match_motion
+from jaxslam.laser_slam.odometry.increments import MatchMotion, match_controls
 from jaxslam.laser_slam.odometry.pieces import laser_odometry
 from jaxslam.laser_slam.odometry.raw import Steps, steps_of
 from jaxslam.laser_slam.odometry.tracking import Odometry
@@ -15,6 +15,7 @@ __all__ = [
     "ClosureScore",
     "LoopOutcome",
     "Loops",
+    "MatchMotion",
     "Odometry",
     "ScanLog",
     "Scans",
@@ -24,7 +25,6 @@ __all__ = [
     "closure_score",
     "laser_odometry",
     "match_controls",
-    "match_motion",
     "relation_covs",
     "relation_nees",
     "scans_of",

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from jaxslam.validation.numbers import check_count
+from jaxslam.core.numbers import check_count
 
 _MAY_BE_ZERO = "fewest", "loop_gap", "submap"
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
+from jaxslam.core.numbers import check_count
 from jaxslam.protocols import Life
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Status
-from jaxslam.validation.numbers import check_count
 
 _LARGEST = 10.0
 """bound of the log-odds, so that a landmark that was measured often is removed after some misses"""

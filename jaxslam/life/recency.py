@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
+from jaxslam.core.numbers import check_count
 from jaxslam.protocols import Life
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Status
-from jaxslam.validation.numbers import check_count
 
 
 class Recency(NamedTuple):

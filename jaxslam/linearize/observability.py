@@ -5,11 +5,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam.core.numbers import largest
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
-from jaxslam.validation.numbers import largest
 
 Array = jax.Array
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.math import linalg
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
-from jaxslam.validation.numbers import is_concrete
 
 Array = jax.Array
 

@@ -12,11 +12,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam import programs
+from jaxslam.core.numbers import is_concrete, shape_told
 from jaxslam.grids.grid import Grid, check_grid
 from jaxslam.matching.points import Points
 from jaxslam.matching.prior import Prior
 from jaxslam.math.arrays import in_dtype
-from jaxslam.validation.numbers import is_concrete, shape_told
 
 _T = TypeVar("_T")
 

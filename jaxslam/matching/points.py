@@ -7,10 +7,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.core.numbers import check_positive
 from jaxslam.grids.grid import Grid
 from jaxslam.math import se2
 from jaxslam.types import Beams
-from jaxslam.validation.numbers import check_positive
 
 
 class Points(NamedTuple):

@@ -15,6 +15,7 @@ import jax
 from jax.typing import DTypeLike
 
 from jaxslam.consistency import Summary, Tally, summarize
+from jaxslam.core.numbers import check_count, check_key
 from jaxslam.monte_carlo.blocks.block import BOUND, Glimpse
 from jaxslam.monte_carlo.blocks.blockwise import Library
 from jaxslam.monte_carlo.blocks.plan import CampaignPlan
@@ -34,7 +35,6 @@ from jaxslam.monte_carlo.work import Work, shown_progress
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario, with_positions
 from jaxslam.validation import check_record
-from jaxslam.validation.numbers import check_count, check_key
 
 
 def monte_carlo(

@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 from jaxslam import programs
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.consistency import monitor_of
+from jaxslam.core.numbers import check_covariance, is_concrete
 from jaxslam.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Log, Trace, Truth
-from jaxslam.validation.numbers import check_covariance, is_concrete
 
 _T = TypeVar("_T")
 

@@ -2,40 +2,40 @@
 
 from collections.abc import Callable
 
-from jaxslam.motion.ackermann import ackermann
-from jaxslam.motion.increment import increment
+from jaxslam.motion.ackermann import Ackermann
+from jaxslam.motion.increment import Increment
 from jaxslam.motion.odometry import (
-    odometry,
+    Odometry,
+    OdometryNoise,
     odometry_control,
     odometry_controls,
-    odometry_noise,
 )
-from jaxslam.motion.pose_increment import pose_increment
-from jaxslam.motion.substeps import substeps
-from jaxslam.motion.unicycle import unicycle
-from jaxslam.motion.velocity import velocity, velocity_noise
+from jaxslam.motion.pose_increment import PoseIncrement
+from jaxslam.motion.substeps import Substeps
+from jaxslam.motion.unicycle import Unicycle
+from jaxslam.motion.velocity import Velocity, VelocityNoise
 from jaxslam.protocols import Motion
 
 REGISTRY: dict[str, Callable[..., Motion]] = {
-    "ackermann": ackermann,
-    "increment": increment,
-    "odometry": odometry,
-    "pose_increment": pose_increment,
-    "unicycle": unicycle,
-    "velocity": velocity,
+    "ackermann": Ackermann,
+    "increment": Increment,
+    "odometry": Odometry,
+    "pose_increment": PoseIncrement,
+    "unicycle": Unicycle,
+    "velocity": Velocity,
 }
 
 __all__ = [
     "REGISTRY",
-    "ackermann",
-    "increment",
-    "odometry",
+    "Ackermann",
+    "Increment",
+    "Odometry",
+    "OdometryNoise",
+    "PoseIncrement",
+    "Substeps",
+    "Unicycle",
+    "Velocity",
+    "VelocityNoise",
     "odometry_control",
     "odometry_controls",
-    "odometry_noise",
-    "pose_increment",
-    "substeps",
-    "unicycle",
-    "velocity",
-    "velocity_noise",
 ]

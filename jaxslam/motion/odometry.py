@@ -1,22 +1,22 @@
 """The odometry motion model: a rotation, a translation and a rotation."""
 
-from collections.abc import Callable
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import check_alpha, held_array
+from jaxslam.core.record import record, set_field
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
-from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Motion
-from jaxslam.validation.numbers import check_alpha
 
 
-def odometry(noise_cov: NoiseCov) -> Motion:
+@record
+class Odometry(Motion):
     """The odometry motion model: Notes 3.
 
     u = (rot1 [rad], trans [m], rot2 [rad]), with additive noise.
@@ -26,24 +26,24 @@ def odometry(noise_cov: NoiseCov) -> Motion:
         pose ← (x + (trans+w2) cos h, y + (trans+w2) sin h, wrap(h + rot2 + w3)).
 
     `odometry_control` gives u between two poses, `odometry_controls` along a path, and
-    `odometry_noise` a covariance that grows with u.
+    `OdometryNoise` a covariance that grows with u.
     Thrun, Burgard & Fox, Probabilistic Robotics (2005), ch. 5.4.
-
-    Args:
-        noise_cov: (3, 3) covariance of w = (w1, w2, w3), or a function of (pose, u).
-    Raises:
-        ValueError: if noise_cov is not a (3, 3) covariance.
     """
 
-    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
-        rot1, trans, rot2 = perturb(u, w)
+    noise_cov: NoiseCov
+    """(3, 3) covariance of w = (w1, w2, w3), or a function of (pose, u)."""
+    controls = ("rot1 [rad]", "trans [m]", "rot2 [rad]")
+    noises = ("rot1 [rad]", "trans [m]", "rot2 [rad]")
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+        rot1, trans, rot2 = self.perturb(u, w)
         facing = jnp.stack([pose[0], pose[1], pose[2] + rot1])
         return se2.compose(facing, jnp.stack([trans, jnp.zeros_like(trans), rot2]))
 
-    def perturb(u: Control, w: ProcessNoise) -> Control:
+    def perturb(self, u: Control, w: ProcessNoise) -> Control:
         return u + w
 
-    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
+    def jacobians(self, pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         h, d = pose[2] + u[0] + w[0], u[1] + w[1]
         c, s = jnp.cos(h), jnp.sin(h)
         turned = jnp.stack([-d * s, d * c, jnp.ones_like(d)])  # by θ and by rot1 alike
@@ -52,36 +52,28 @@ def odometry(noise_cov: NoiseCov) -> Motion:
         by_noise = by_noise.at[0, 1].set(c).at[1, 1].set(s).at[2, 2].set(1)
         return by_pose, by_noise, by_noise
 
-    return Motion(
-        name="odometry",
-        controls=("rot1 [rad]", "trans [m]", "rot2 [rad]"),
-        noises=("rot1 [rad]", "trans [m]", "rot2 [rad]"),
-        step=step,
-        noise_cov=noise_model("odometry", noise_cov, 3),
-        perturb=perturb,
-        jacobians=jacobians,
-    )
 
-
-def odometry_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
-    """The function (pose, u) -> (3, 3), the diagonal covariance of `odometry`'s noise.
+@record
+class OdometryNoise:
+    """The diagonal covariance of the noise of `Odometry`, a function (pose, u) -> (3, 3).
 
         var rot1  = α1 rot1² + α2 trans²
         var trans = α3 trans² + α4 (rot1² + rot2²)
         var rot2  = α1 rot2² + α2 trans²
 
-    Units: α1, α3 none, α2 [rad²/m²], α4 [m²/rad²]. Variances, as in Probabilistic Robotics, Table
-    5.6. Backing up as rot1 = ±π counts as that much turning; (0, -d, 0) does not.
-
-    Args:
-        alpha: (4,) α1 … α4, not negative.
-    Raises:
-        ValueError: if alpha is not four finite numbers >= 0.
+    Variances, as in Probabilistic Robotics, Table 5.6. Backing up as rot1 = ±π counts as that much
+    turning; (0, -d, 0) does not.
     """
-    check_alpha("odometry_noise", alpha, 4)
 
-    def noise(pose: Pose, u: Control) -> ProcessNoiseCov:
-        a1, a2, a3, a4 = jnp.asarray(alpha, pose.dtype)
+    alpha: ArrayLike
+    """(4,) α1, α3 [1], α2 [rad²/m²], α4 [m²/rad²], not negative"""
+
+    def __post_init__(self) -> None:
+        check_alpha("OdometryNoise", self.alpha, 4)
+        set_field(self, "alpha", held_array(self.alpha))
+
+    def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
+        a1, a2, a3, a4 = jnp.asarray(self.alpha, pose.dtype)
         rot1, trans, rot2 = u[0] ** 2, u[1] ** 2, u[2] ** 2
         return jnp.diag(
             jnp.stack(
@@ -89,11 +81,9 @@ def odometry_noise(alpha: ArrayLike) -> Callable[[Array, Array], Array]:
             )
         )
 
-    return noise
-
 
 def odometry_control(before: Array, after: Array) -> Array:
-    """The control (rot1, trans, rot2) of `odometry` that leads from one pose to another: Notes 3.
+    """The control (rot1, trans, rot2) of `Odometry` that leads from one pose to another: Notes 3.
 
         rot1  = wrap(atan2(y' - y, x' - x) - θ)
         trans = √((x' - x)² + (y' - y)²)
@@ -111,11 +101,11 @@ def odometry_control(before: Array, after: Array) -> Array:
 
 
 def odometry_controls(path: ArrayLike) -> Float[np.ndarray, "T 3"]:
-    """The controls (T, 3) of `odometry` along a path of poses (T, 3), in NumPy; row 0 is no motion.
+    """The controls (T, 3) of `Odometry` along a path of poses (T, 3), in NumPy; row 0 is no motion.
 
     As `odometry_control` from pose to pose, but a robot that moves backward, with the translation
     in the half plane behind it, gets a negative trans in place of two turns by π, which
-    `odometry_noise` would count as turning.
+    `OdometryNoise` would count as turning.
 
     Raises ValueError unless the path is one of finite poses.
     """

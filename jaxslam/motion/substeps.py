@@ -1,18 +1,22 @@
 """Several controls between two scans, combined into one control."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core.numbers import check_count
+from jaxslam.core.record import record, static
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
 from jaxslam.protocols import Motion
-from jaxslam.validation.numbers import check_count
 
 _Rows = tuple[Array, Array]
 _Jacobians = tuple[Array, Array, Array]
 
 
-def substeps(motion: Motion, count: int) -> Motion:
+@record
+class Substeps(Motion):
     """The motion model of n = count steps of another model between two scans, u = (u_1, …, u_n).
 
     pose_k = motion.step(pose_{k-1}, u_k, w_k), from pose_0 = pose to pose_n. The noises are
@@ -26,64 +30,74 @@ def substeps(motion: Motion, count: int) -> Motion:
     the covariance to first order, G Q Gᵀ = Σ_k (F_n ⋯ F_{k+1} G_k) Q_k (F_n ⋯ F_{k+1} G_k)ᵀ. The
     loop is a scan: unrolled, it compiles and, on CPU, runs several times slower.
 
-    Args:
-        motion: the model, with U controls and W noises; the result has nU and nW, named after
-            theirs with the number of the substep before the unit. It perturbs controls, and has
-            hand-derived Jacobians, where the model does.
-        count: n.
-    Raises:
-        ValueError: if count is not an integer >= 1.
+    It has nU controls and nW noises, named after the model's with the number of the substep before
+    the unit. It perturbs controls, and has hand-derived Jacobians, where the model does.
     """
-    check_count("substeps: count", count)
-    size_u, size_w = len(motion.controls), len(motion.noises)
 
-    def rows(u: Control, w: ProcessNoise) -> _Rows:
-        return u.reshape(count, size_u), w.reshape(count, size_w)
+    motion: Motion
+    """the model, with U controls and W noises"""
+    count: int = static()
+    """n; ValueError unless it is an integer >= 1"""
 
-    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+    def __post_init__(self) -> None:
+        check_count("Substeps: count", self.count)
+        super().__post_init__()
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return f"{self.count} x {self.motion.name}"
+
+    @property
+    def controls(self) -> tuple[str, ...]:  # type: ignore[override]
+        return _numbered(self.motion.controls, self.count)
+
+    @property
+    def noises(self) -> tuple[str, ...]:  # type: ignore[override]
+        return _numbered(self.motion.noises, self.count)
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         def one(pose: Pose, row: _Rows) -> tuple[Array, None]:
-            return motion.step(pose, *row), None
+            return self.motion.step(pose, *row), None
 
-        return jax.lax.scan(one, pose, rows(u, w))[0]
+        return jax.lax.scan(one, pose, self._rows(u, w))[0]
 
-    def noise_cov(pose: Pose, u: Control) -> Array:
+    def noise_cov(self, pose: Pose, u: Control) -> Array:
+        size = self.count * len(self.motion.noises)
+
         def one(pose: Pose, row: _Rows) -> _Rows:
             u_k, none = row
-            return motion.step(pose, u_k, none), motion.noise_cov(pose, u_k)
+            return self.motion.step(pose, u_k, none), self.motion.noise_cov(pose, u_k)
 
-        _, blocks = jax.lax.scan(one, pose, rows(u, jnp.zeros(count * size_w, pose.dtype)))
-        own = jnp.eye(count, dtype=blocks.dtype)[:, None, :, None]
-        return (own * blocks[:, :, None, :]).reshape(count * size_w, count * size_w)
+        _, blocks = jax.lax.scan(one, pose, self._rows(u, jnp.zeros(size, pose.dtype)))
+        own = jnp.eye(self.count, dtype=blocks.dtype)[:, None, :, None]
+        return (own * blocks[:, :, None, :]).reshape(size, size)
 
-    def perturb(u: Control, w: ProcessNoise) -> Control:
-        assert motion.perturb is not None
-        return jax.vmap(motion.perturb)(*rows(u, w)).ravel()
+    @property
+    def perturb(self) -> Callable[[Array, Array], Array] | None:  # type: ignore[override]
+        return None if self.motion.perturb is None else self._perturb
 
-    def jacobians(pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
-        hand = motion.jacobians
-        assert hand is not None
+    @property
+    def jacobians(self) -> Callable[..., StepJacobians] | None:  # type: ignore[override]
+        return None if self.motion.jacobians is None else self._jacobians
 
+    def _rows(self, u: Control, w: ProcessNoise) -> _Rows:
+        return u.reshape(self.count, -1), w.reshape(self.count, -1)
+
+    def _perturb(self, u: Control, w: ProcessNoise) -> Control:
+        return jax.vmap(self.motion.perturb)(*self._rows(u, w)).ravel()
+
+    def _jacobians(self, pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         def forward(pose: Pose, row: _Rows) -> tuple[Array, _Jacobians]:
-            return motion.step(pose, *row), hand(pose, *row)
+            return self.motion.step(pose, *row), self.motion.jacobians(pose, *row)
 
         def backward(after: Array, own: _Jacobians) -> tuple[Array, _Rows]:
             by_pose, by_u, by_w = own
             return after @ by_pose, (after @ by_u, after @ by_w)  # after is F_n ⋯ F_{k+1}
 
-        _, along = jax.lax.scan(forward, pose, rows(u, w))
+        _, along = jax.lax.scan(forward, pose, self._rows(u, w))
         identity = jnp.eye(3, dtype=pose.dtype)
         by_pose, (by_u, by_w) = jax.lax.scan(backward, identity, along, reverse=True)
         return by_pose, jnp.concatenate(by_u, axis=1), jnp.concatenate(by_w, axis=1)
-
-    return Motion(
-        name=f"{count} x {motion.name}",
-        controls=_numbered(motion.controls, count),
-        noises=_numbered(motion.noises, count),
-        step=step,
-        noise_cov=noise_cov,
-        perturb=perturb if motion.perturb is not None else None,
-        jacobians=jacobians if motion.jacobians is not None else None,
-    )
 
 
 def _numbered(names: tuple[str, ...], count: int) -> tuple[str, ...]:

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.math.stats import normal_quantile
-from jaxslam.validation.numbers import is_concrete
 
 # Bins are counted in int32, and a pose may be anywhere.
 _FARTHEST = float(2**30)

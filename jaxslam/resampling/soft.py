@@ -5,10 +5,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.protocols import Differentiable, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import even, normalized
-from jaxslam.validation.numbers import is_concrete
 
 
 def soft(share: float, resample: Resample = systematic) -> Differentiable:

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import (
@@ -11,15 +12,16 @@ from jaxslam.math.arrays import (
     Landmark,
     Measurement,
     ObserveJacobians,
+    Point,
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
-def line(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
+@record
+class Line(Sensor):
     """The sensor of straight walls: a line by the distance and the direction of its normal.
 
     z = (distance [m], direction [rad]) of l = (r [m], alpha [rad]), the line n·p = r with the
@@ -39,54 +41,45 @@ def line(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
     give α + φ and r + n·t), `position` is the point n r nearest to the map's origin, and `embed`
     is the line of which that is the point. The covariance of that point is singular where r = 0, so
     a map frame through which no wall passes shows more.
-
-    Args:
-        noise_cov: (2, 2) covariance of z, or a function of z.
-        mount: (3,) pose of the sensor on the robot, Solà's S.
-    Raises:
-        ValueError: if noise_cov is not a (2, 2) covariance or mount not a finite (3,).
     """
-    sensor_pose, sensor_pose_jacobian = mounting("line", mount)
 
-    def observe(pose: Pose, landmark: Landmark) -> Measurement:
-        frame = sensor_pose(pose)
+    noise_cov: NoiseCov
+    """(2, 2) covariance of z, or a function of z."""
+    mount: ArrayLike | None = None
+    """(3,) pose of the sensor on the robot, Solà's S"""
+    measurements = ("distance [m]", "direction [rad]")
+    landmark = ("r [m]", "alpha [rad]")
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        frame = self.frame(pose)
         distance = landmark[0] - _along(landmark[1], frame)
         return jnp.stack([distance, wrap(landmark[1] - frame[2])])
 
-    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
-        return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1])])
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return line_from_frame(self.frame(pose), z)
 
-    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        return line_from_frame(sensor_pose(pose), z)
-
-    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
-        frame = sensor_pose(pose)
+    def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+        frame = self.frame(pose)
         c, s, across = _normal(landmark[1], frame)
         by_frame = jnp.stack([-c, -s, 0 * c, 0 * c, 0 * c, -jnp.ones_like(c)]).reshape(2, 3)
         by_line = jnp.eye(2, dtype=across.dtype).at[0, 1].set(-across)
-        return by_frame @ sensor_pose_jacobian(pose), by_line
+        return by_frame @ self.frame_jacobian(pose), by_line
 
-    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
-        frame = sensor_pose(pose)
+    def invert_jacobians(self, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+        frame = self.frame(pose)
         c, s_, across = _normal(z[1] + frame[2], frame)
         by_frame = jnp.stack([c, s_, across, 0 * c, 0 * c, jnp.ones_like(c)]).reshape(2, 3)
         by_z = jnp.eye(2, dtype=across.dtype).at[0, 1].set(across)
-        return by_frame @ sensor_pose_jacobian(pose), by_z, jnp.zeros((2, 0), pose.dtype)
+        return by_frame @ self.frame_jacobian(pose), by_z, jnp.zeros((2, 0), pose.dtype)
 
-    return Sensor(
-        name="line",
-        measurements=("distance [m]", "direction [rad]"),
-        landmark=("r [m]", "alpha [rad]"),
-        observe=observe,
-        residual=residual,
-        noise_cov=noise_model("line", noise_cov, 2),
-        invert=invert,
-        position=se2.rectangular,
-        embed=lambda pose, point: se2.polar(point),
-        carry=line_from_frame,
-        observe_jacobians=observe_jacobians,
-        invert_jacobians=invert_jacobians,
-    )
+    def position(self, landmark: Landmark) -> Point:
+        return se2.rectangular(landmark)
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        return se2.polar(point)
+
+    def carry(self, frame: Pose, landmark: Landmark) -> Landmark:
+        return line_from_frame(frame, landmark)
 
 
 def line_from_frame(frame: Pose, landmark: Landmark) -> Landmark:

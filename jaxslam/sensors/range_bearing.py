@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
+from jaxslam.core.record import record
 from jaxslam.math import se2
-from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import (
     InvertJacobians,
     Landmark,
@@ -13,56 +13,41 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
-def range_bearing(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
+@record
+class RangeBearing(Sensor):
     """The range-bearing sensor of point landmarks.
 
     z = (range [m], bearing [rad]) of l = (x, y): polar(to_frame(pose ∘ mount, l)), Solà (63).
 
     invert is (64), from_frame(pose ∘ mount, rectangular(z)) (in the sensor's frame, see ERRATA).
     A landmark exactly at the sensor gives z = 0 with zero derivative by l, not NaN.
-
-    Args:
-        noise_cov: (2, 2) covariance of (range, bearing), or a function of z.
-        mount: (3,) pose of the sensor on the robot, Solà's S.
-    Raises:
-        ValueError: if noise_cov is not a (2, 2) covariance or mount not a finite (3,).
     """
-    sensor_pose, sensor_pose_jacobian = mounting("range_bearing", mount)
 
-    def observe(pose: Pose, landmark: Landmark) -> Measurement:
-        return se2.polar_in_frame(sensor_pose(pose), landmark)
+    noise_cov: NoiseCov
+    """(2, 2) covariance of (range, bearing), or a function of z."""
+    mount: ArrayLike | None = None
+    """(3,) pose of the sensor on the robot, Solà's S"""
+    measurements = ("range [m]", "bearing [rad]")
 
-    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
-        return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1])])
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return se2.polar_in_frame(self.frame(pose), landmark)
 
-    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        return se2.from_frame(sensor_pose(pose), se2.rectangular(z))
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return se2.from_frame(self.frame(pose), se2.rectangular(z))
 
-    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
-        frame = sensor_pose(pose)
+    def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+        frame = self.frame(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
         (outer,) = se2.polar_jacobians(se2.to_frame(frame, landmark))
-        return outer @ by_frame @ sensor_pose_jacobian(pose), outer @ by_point
+        return outer @ by_frame @ self.frame_jacobian(pose), outer @ by_point
 
-    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
-        frame = sensor_pose(pose)
+    def invert_jacobians(self, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+        frame = self.frame(pose)
         by_frame, by_point = se2.from_frame_jacobians(frame, se2.rectangular(z))
         (inner,) = se2.rectangular_jacobians(z)
         by_s = jnp.zeros((2, 0), pose.dtype)
-        return by_frame @ sensor_pose_jacobian(pose), by_point @ inner, by_s
-
-    return Sensor(
-        name="range_bearing",
-        measurements=("range [m]", "bearing [rad]"),
-        observe=observe,
-        residual=residual,
-        noise_cov=noise_model("range_bearing", noise_cov, 2),
-        invert=invert,
-        observe_jacobians=observe_jacobians,
-        invert_jacobians=invert_jacobians,
-    )
+        return by_frame @ self.frame_jacobian(pose), by_point @ inner, by_s

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core.record import record
 from jaxslam.math import se2
-from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import (
     InvertJacobians,
     Landmark,
@@ -14,12 +14,12 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov, noise_model
+from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.mounting import NO_OFFSET, mounting
 
 
-def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -> Sensor:
+@record
+class RangeBearingSignature(Sensor):
     """The range-bearing sensor of landmarks with a signature.
 
     z = (range [m], bearing [rad], signature [1]) of l = (x, y, signature): D = 3 + 3N.
@@ -28,54 +28,37 @@ def range_bearing_signature(noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET) -
     landmarks with three parameters of Tacher. The signature is estimated like a coordinate; an
     association method may use it to recognize landmarks. embed gives a signature of 0. A landmark
     exactly at the sensor gives z = (0, 0, signature), not NaN.
-
-    Args:
-        noise_cov: (3, 3) covariance of (range, bearing, signature), or a function of z.
-        mount: (3,) pose of the sensor on the robot, Solà's S.
-    Raises:
-        ValueError: if noise_cov is not a (3, 3) covariance or mount not a finite (3,).
     """
-    sensor_pose, sensor_pose_jacobian = mounting("range_bearing_signature", mount)
 
-    def observe(pose: Pose, landmark: Landmark) -> Measurement:
-        seen = se2.polar(se2.to_frame(sensor_pose(pose), landmark[:2]))
+    noise_cov: NoiseCov
+    """(3, 3) covariance of (range, bearing, signature), or a function of z."""
+    mount: ArrayLike | None = None
+    """(3,) pose of the sensor on the robot, Solà's S"""
+    measurements = ("range [m]", "bearing [rad]", "signature [1]")
+    landmark = ("x [m]", "y [m]", "signature [1]")
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        seen = se2.polar(se2.to_frame(self.frame(pose), landmark[:2]))
         return jnp.concatenate([seen, landmark[2:]])
 
-    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
-        return jnp.stack([z[0] - z_hat[0], wrap(z[1] - z_hat[1]), z[2] - z_hat[2]])
-
-    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        point = se2.from_frame(sensor_pose(pose), se2.rectangular(z[:2]))
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        point = se2.from_frame(self.frame(pose), se2.rectangular(z[:2]))
         return jnp.concatenate([point, z[2:]])
 
-    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
-        frame = sensor_pose(pose)
+    def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+        frame = self.frame(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark[:2])
         (outer,) = se2.polar_jacobians(se2.to_frame(frame, landmark[:2]))
         by_pose = jnp.zeros((3, 3), pose.dtype)
-        by_pose = by_pose.at[:2].set(outer @ by_frame @ sensor_pose_jacobian(pose))
+        by_pose = by_pose.at[:2].set(outer @ by_frame @ self.frame_jacobian(pose))
         return by_pose, _beside_one(outer @ by_point)
 
-    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
-        by_frame, by_point = se2.from_frame_jacobians(sensor_pose(pose), se2.rectangular(z[:2]))
+    def invert_jacobians(self, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+        by_frame, by_point = se2.from_frame_jacobians(self.frame(pose), se2.rectangular(z[:2]))
         (inner,) = se2.rectangular_jacobians(z[:2])
         by_pose = jnp.zeros((3, 3), pose.dtype)
-        by_pose = by_pose.at[:2].set(by_frame @ sensor_pose_jacobian(pose))
+        by_pose = by_pose.at[:2].set(by_frame @ self.frame_jacobian(pose))
         return by_pose, _beside_one(by_point @ inner), jnp.zeros((3, 0), pose.dtype)
-
-    return Sensor(
-        name="range_bearing_signature",
-        measurements=("range [m]", "bearing [rad]", "signature [1]"),
-        landmark=("x [m]", "y [m]", "signature [1]"),
-        observe=observe,
-        residual=residual,
-        noise_cov=noise_model("range_bearing_signature", noise_cov, 3),
-        invert=invert,
-        position=lambda landmark: landmark[:2],
-        embed=lambda pose, point: jnp.concatenate([point, jnp.zeros_like(point[:1])]),
-        observe_jacobians=observe_jacobians,
-        invert_jacobians=invert_jacobians,
-    )
 
 
 def _beside_one(block: Array) -> Array:

@@ -2,48 +2,48 @@
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal, NoReturn
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core.numbers import check_count
+from jaxslam.core.record import record, set_field, static
 from jaxslam.math.arrays import Landmark, Measurement, Point, Pose, Unmeasured
-from jaxslam.protocols import Free, Sensor
+from jaxslam.protocols import Free, Reduced, Sensor
 from jaxslam.types import Scan
-from jaxslam.validation.numbers import check_count
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Part:
     """One sensor of a suite. Raises ValueError on places or every below 1, or an invalid start."""
 
     sensor: Sensor
-    places: int
+    places: int = static()
     """its measurement slots in a scan; 1 of an absolute sensor"""
-    every: int = 1
+    every: int = static(default=1)
     """in a simulation it measures every so many steps,"""
-    start: int = 0
+    start: int = static(default=0)
     """beginning with this one; a filter uses `Scan.valid` alone"""
-    visible: Callable[[Array, Array], Array] | None = None
+    visible: Callable[[Array, Array], Array] | None = static(default=None)
     """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
-    sees: Literal["landmarks", "robots"] = "landmarks"
+    sees: Literal["landmarks", "robots"] = static(default="landmarks")
     """what its slots measure in a simulation. A filter of one robot ignores measurements of
     robots (`Status.UNMATCHED`); that of a team uses the tags, and starts no landmark there."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.sensor, Sensor) or isinstance(self.sensor, Suite):
-            raise ValueError(f"suite: expected one Sensor in each Part, got {self.sensor!r}")
-        check_count(f"suite: places of {self.sensor.name}", self.places)
-        check_count(f"suite: every of {self.sensor.name}", self.every)
+            raise ValueError(f"Part: expected one Sensor, got {self.sensor!r}")
+        check_count(f"Part: places of {self.sensor.name}", self.places)
+        check_count(f"Part: every of {self.sensor.name}", self.every)
         if type(self.start) is not int or self.start < 0:
-            raise ValueError(f"suite: expected a start of at least 0, got {self.start!r}")
+            raise ValueError(f"Part: expected a start of at least 0, got {self.start!r}")
         if self.sees not in ("landmarks", "robots"):
-            raise ValueError(f'suite: expected sees "landmarks" or "robots", got {self.sees!r}')
+            raise ValueError(f'Part: expected sees "landmarks" or "robots", got {self.sees!r}')
         if not self.sensor.landmark and self.places != 1:
             raise ValueError(
-                f"suite: expected places=1 of the absolute sensor {self.sensor.name}, got "
+                f"Part: expected places=1 of the absolute sensor {self.sensor.name}, got "
                 f"{self.places}"
             )
 
@@ -53,74 +53,97 @@ class Part:
         return not self.sensor.landmark
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Suite(Sensor):
-    """A set of sensors with separate measurement slots; made by `suite`.
-
-    The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of
-    z are padded with zeros to the largest measurement. As a `Sensor` it only gives the sizes of
-    measurements and landmarks; the models are those of its parts.
-    """
-
-    parts: tuple[Part, ...] = ()
-
-    @property
-    def places(self) -> tuple[int, ...]:
-        """The number of measurement slots of each part."""
-        return tuple(part.places for part in self.parts)
-
-
-def suite(*parts: Part | tuple[Sensor, int]) -> Suite:
     """The sensors of one robot (Solà's loop over sensors), to be used where a `Sensor` is.
 
     A filter processes the parts one after the other: each corrects by its measurements of known
     landmarks, then starts its new ones, which the next part may correct in the same scan.
     A tag may occur once a part. Absent measurements are slots that are not valid.
 
-        eyes = suite((range_bearing(R, mount=front), 8), Part(compass(S), 1, every=10))
+        eyes = Suite([(RangeBearing(R, mount=front), 8), Part(Compass(S), 1, every=10)])
         filter = ekf_slam(motion, eyes, capacity)
 
-    Args:
-        parts: a `Part`, or (sensor, places), each.
-    Raises:
-        ValueError: without parts, on a part of another type, or if several sensors of landmarks do
-            not share landmarks (x, y): only a single one may have others.
+    The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of
+    z are padded with zeros to the largest measurement. As a `Sensor` it only gives the sizes of
+    measurements and landmarks; the models are those of its parts.
+
+    Raises ValueError without parts, on a part of another type, or if several sensors of landmarks
+    do not share landmarks (x, y): only a single one may have others.
     """
-    made = tuple(part if isinstance(part, Part) else _part(part) for part in parts)
-    if not made:
-        raise ValueError("suite: expected at least one sensor")
-    grounded = [part.sensor for part in made if not part.absolute]
-    first = grounded[0] if grounded else made[0].sensor
-    for sensor in grounded[1:]:
-        if sensor.landmark != first.landmark or not sensor.of_points:
-            raise ValueError(
-                f"suite: expected sensors that share landmarks (x, y), got {first.landmark} of "
-                f"{first.name} and {sensor.landmark} of {sensor.name}"
-            )
-    size = max(len(part.sensor.measurements) for part in made)
 
-    def not_one(*_: object) -> NoReturn:
-        raise ValueError("suite: a suite has no model of its own: call those of suite.parts")
+    parts: tuple[Part, ...]
+    """each given as a `Part` or (sensor, places)"""
 
-    return Suite(
-        name=" + ".join(part.sensor.name for part in made),
-        measurements=tuple(f"entry {i} of its sensor" for i in range(size)),
-        landmark=first.landmark,
-        observe=not_one,
-        residual=not_one,
-        noise_cov=not_one,
-        invert=not_one,
-        position=first.position,
-        embed=first.embed,
-        carry=first.carry,
-        reduced=first.reduced,
-        parts=made,
-    )
+    def __post_init__(self) -> None:
+        made = tuple(part if isinstance(part, Part) else _part(part) for part in self.parts)
+        if not made:
+            raise ValueError("Suite: expected at least one sensor")
+        grounded = [part.sensor for part in made if not part.absolute]
+        for sensor in grounded[1:]:
+            if sensor.landmark != grounded[0].landmark or not sensor.of_points:
+                raise ValueError(
+                    f"Suite: expected sensors that share landmarks (x, y), got "
+                    f"{grounded[0].landmark} of {grounded[0].name} and {sensor.landmark} of "
+                    f"{sensor.name}"
+                )
+        set_field(self, "parts", made)
+
+    @property
+    def first(self) -> Sensor:
+        """The first sensor of landmarks, whose kind of landmarks all have; or of all."""
+        grounded = [part.sensor for part in self.parts if not part.absolute]
+        return grounded[0] if grounded else self.parts[0].sensor
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The number of measurement slots of each part."""
+        return tuple(part.places for part in self.parts)
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return " + ".join(part.sensor.name for part in self.parts)
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        size = max(len(part.sensor.measurements) for part in self.parts)
+        return tuple(f"entry {i} of its sensor" for i in range(size))
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.first.landmark
+
+    @property
+    def carry(self) -> Callable[[Array, Array], Array] | None:  # type: ignore[override]
+        carry: Callable[[Array, Array], Array] | None = self.first.carry
+        return carry
+
+    @property
+    def reduced(self) -> Reduced | None:  # type: ignore[override]
+        return self.first.reduced
+
+    def position(self, landmark: Landmark) -> Point:
+        return self.first.position(landmark)
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        return self.first.embed(pose, point)
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        raise ValueError("Suite: a suite has no model of its own: call those of its parts")
+
+    def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
+        return self.observe(z, z_hat)
+
+    def noise_cov(self, z: Measurement) -> Array:
+        return self.observe(z, z)
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return self.observe(pose, z)
 
 
 def _part(given: object) -> Part:
     if not isinstance(given, tuple) or len(given) != 2:
-        raise ValueError(f"suite: expected a Part or (sensor, places), got {given!r}")
+        raise ValueError(f"Suite: expected a Part or (sensor, places), got {given!r}")
     return Part(*given)
 
 
@@ -142,36 +165,62 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
 
 
 def on_ground(sensor: Sensor, size: int) -> Sensor:
-    """The sensor for landmarks of `size` numbers, of which it uses the first.
+    """The sensor for landmarks of `size` numbers, of which it uses the first."""
+    return sensor if len(sensor.landmark) == size else OnGround(sensor, size)
+
+
+@record
+class OnGround(Sensor):
+    """A sensor for landmarks of more numbers than it uses.
 
     A measurement does not depend on the others: an absolute sensor ignores them all, and in a new
     landmark they have zero mean, unit variance and no correlation, as padding.
     """
-    own, spare = len(sensor.landmark), size - len(sensor.landmark)
-    if spare == 0:
-        return sensor
-    kept = sensor.free.mean.shape[0]
 
-    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        return jnp.concatenate([sensor.invert(pose, z, s[:kept]), s[kept:]])
+    sensor: Sensor
+    size: int = static()
 
-    def embed(pose: Pose, point: Point) -> Landmark:
-        return jnp.concatenate([sensor.embed(pose, point), jnp.zeros(spare, pose.dtype)])
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.sensor.name
 
-    dtype = jnp.asarray(sensor.free.mean).dtype
-    free = Free(
-        jnp.concatenate([sensor.free.mean, jnp.zeros(spare, dtype)]),
-        jnp.eye(kept + spare, dtype=dtype).at[:kept, :kept].set(sensor.free.cov),
-    )
-    return Sensor(
-        name=sensor.name,
-        measurements=sensor.measurements,
-        landmark=(*sensor.landmark, *("-",) * spare),
-        observe=lambda pose, landmark: sensor.observe(pose, landmark[:own]),
-        residual=sensor.residual,
-        noise_cov=sensor.noise_cov,
-        invert=invert,
-        position=lambda landmark: sensor.position(landmark[:own]),
-        embed=embed,
-        free=free,
-    )
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.measurements
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        own = self.sensor.landmark
+        return (*own, *("-",) * (self.size - len(own)))
+
+    @property
+    def free(self) -> Free:  # type: ignore[override]
+        own, spare = self.sensor.free, self.size - len(self.sensor.landmark)
+        mean = jnp.asarray(own.mean)
+        kept = mean.shape[0]
+        cov = jnp.eye(kept + spare, dtype=mean.dtype).at[:kept, :kept].set(own.cov)
+        return Free(jnp.concatenate([mean, jnp.zeros(spare, mean.dtype)]), cov)
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return self.sensor.observe(pose, self._own(landmark))
+
+    def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
+        return self.sensor.residual(z, z_hat)
+
+    def noise_cov(self, z: Measurement) -> Array:
+        cov: Array = self.sensor.noise_cov(z)
+        return cov
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        kept = self.sensor.free.mean.shape[0]
+        return jnp.concatenate([self.sensor.invert(pose, z, s[:kept]), s[kept:]])
+
+    def position(self, landmark: Landmark) -> Point:
+        return self.sensor.position(self._own(landmark))
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        own = self.sensor.embed(pose, point)
+        return jnp.concatenate([own, jnp.zeros(self.size - len(own), pose.dtype)])
+
+    def _own(self, landmark: Landmark) -> Array:
+        return landmark[: len(self.sensor.landmark)]

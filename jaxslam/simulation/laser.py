@@ -10,12 +10,12 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
+from jaxslam.core.numbers import check_key, check_positive
 from jaxslam.math import se2
 from jaxslam.protocols import Motion
 from jaxslam.simulation.walls import Walls, exact_ranges, wall_ranges
 from jaxslam.simulation.worlds import drive
 from jaxslam.types import Beams
-from jaxslam.validation.numbers import check_key, check_positive
 
 
 @dataclass(frozen=True, eq=False)

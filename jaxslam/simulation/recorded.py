@@ -7,13 +7,13 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import check_array
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Log, Truth
 from jaxslam.validation import check_log, check_record
-from jaxslam.validation.numbers import check_array
 
 
 class RecordedOptions(TypedDict, total=False):

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Sensor
 from jaxslam.types import Scan
-from jaxslam.validation.numbers import is_concrete
 
 
 @dataclass(frozen=True)

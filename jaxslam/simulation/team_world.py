@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from jaxslam.math import se2
 from jaxslam.simulation.scans import Visible, part_scan, side_by_side
 from jaxslam.simulation.worlds import Scenario, drawn_near, drive
-from jaxslam.team import Robot, check_team, motion_of, sensors_of, sizes
+from jaxslam.team import Robot, TeamMotion, check_team, sensors_of, sizes
 from jaxslam.types import Log, Scan, Truth
 
 
@@ -76,7 +76,7 @@ def team_world(
             raise ValueError(f"team_world: {what} is not supported")
     return Scenario(
         name=name,
-        motion=motion_of(robots, report),
+        motion=TeamMotion(tuple(robot.motion for robot in robots), report),
         sensor=sensors_of(robots, report),
         landmarks=landmarks,
         controls=controls,

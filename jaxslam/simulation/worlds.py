@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
+from jaxslam.core.numbers import check_covariance, check_key, is_concrete
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Motion, Sensor
@@ -29,7 +30,6 @@ from jaxslam.simulation.scans import (
 from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Log, Scan, Truth
 from jaxslam.validation import check_record
-from jaxslam.validation.numbers import check_covariance, check_key, is_concrete
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core.numbers import check_count, is_concrete
 from jaxslam.graphs.chain.elimination import Chain
 from jaxslam.graphs.chain.gauss_newton import Iterations, optimize_chain
 from jaxslam.graphs.chain.problem import Iterate, Problem
@@ -24,7 +25,6 @@ from jaxslam.smoothing.forward_pass import (
 from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
 from jaxslam.smoothing.smooth import solution, with_singular
 from jaxslam.types import Estimate, Info, Log, Trace
-from jaxslam.validation.numbers import check_count, is_concrete
 
 
 class BatchSolution(NamedTuple):

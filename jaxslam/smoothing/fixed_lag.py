@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam import validation
+from jaxslam.core.numbers import check_count
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.graphs.chain.window import (
     WindowIterate,
@@ -24,7 +25,6 @@ from jaxslam.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan, Status
-from jaxslam.validation.numbers import check_count
 
 POINT = ("x [m]", "y [m]")
 

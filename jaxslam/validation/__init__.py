@@ -1,5 +1,14 @@
 """Checks of arguments before tracing; each error is one line that states what was expected."""
 
+from jaxslam.core.numbers import (
+    check_alpha,
+    check_count,
+    check_covariance,
+    check_gate,
+    check_key,
+    is_concrete,
+    shape_told,
+)
 from jaxslam.validation.logs import check_log
 from jaxslam.validation.models import (
     check_associate,
@@ -8,15 +17,6 @@ from jaxslam.validation.models import (
     check_parts,
     check_record,
     check_sensor,
-)
-from jaxslam.validation.numbers import (
-    check_alpha,
-    check_count,
-    check_covariance,
-    check_gate,
-    check_key,
-    is_concrete,
-    shape_told,
 )
 from jaxslam.validation.returned import checked_estimate, same_state, state_and_info
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxslam.core.numbers import check_array, is_concrete, largest
 from jaxslam.types import Log, Scan
-from jaxslam.validation.numbers import check_array, is_concrete, largest
 
 
 def check_log(

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import check_array, shape_told
 from jaxslam.types import Estimate, Info, Scan
-from jaxslam.validation.numbers import check_array, shape_told
 
 _S = TypeVar("_S")
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import check_covariance, is_concrete
 from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.validation.numbers import check_covariance, is_concrete
 
 _DIRECTIONS = 64
 _RADII = (1.0, 0.5)

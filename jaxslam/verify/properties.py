@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import check_covariance
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.validation.numbers import check_covariance
 from jaxslam.verify.derivatives.differences import modulo_periods
 from jaxslam.verify.derivatives.jacobians import Evaluated
 from jaxslam.verify.errors import describe_error

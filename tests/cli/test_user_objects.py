@@ -4,6 +4,7 @@ import dataclasses
 import json
 
 import pytest
+from own_models import changed
 
 from jaxslam import catalog, cli, scenarios
 from jaxslam.cli.user_objects import UserObjects
@@ -122,7 +123,7 @@ def test_what_cannot_be_used_is_refused_in_a_line_and_nothing_written(
 def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(mine):
     files = UserObjects()
     world = scenarios.circle(3)
-    compass = dataclasses.replace(world.sensor, measurements=("heading [rad]",))
+    compass = changed(world.sensor, measurements=("heading [rad]",))
     with pytest.raises(ValueError, match="filter ready takes a measurement of size 2"):
         files.filters(f"{mine}:ready", dataclasses.replace(world, sensor=compass))
     mine.write_text(

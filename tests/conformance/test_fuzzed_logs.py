@@ -16,10 +16,10 @@ import worlds
 from hypothesis import given, settings
 
 from jaxslam import catalog, run
+from jaxslam.core.numbers import largest
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Scan, Status
 from jaxslam.validation.logs import check_log
-from jaxslam.validation.numbers import largest
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
 STEPS, PLACES, LANDMARKS, LOGS = 4, 3, 4, 48

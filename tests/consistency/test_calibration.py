@@ -26,7 +26,7 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
     scan = Scan(z[:, None], np.zeros((steps, 1), np.int32), np.ones((steps, 1), bool))
 
     def info(p):
-        filter = ekf_slam(motion.pose_increment(Q), sensors.relative_position(R), 1, update="joint")
+        filter = ekf_slam(motion.PoseIncrement(Q), sensors.RelativePosition(R), 1, update="joint")
         scaled = control * jnp.concatenate([1 + p, jnp.ones(1)])[None]
         return run(filter, Log(scaled, scan), np.zeros(3), np.zeros((3, 3)), KEY).info
 
@@ -53,7 +53,7 @@ def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimat
     scan = Scan(z[:, None], np.zeros((steps, 1), np.int32), np.ones((steps, 1), bool))
 
     def trace(p):
-        filter = ekf_slam(motion.pose_increment(Q), sensors.relative_position(R), 1, update="joint")
+        filter = ekf_slam(motion.PoseIncrement(Q), sensors.RelativePosition(R), 1, update="joint")
         scaled = control * jnp.concatenate([1 + p, jnp.ones(1)])[None]
         known = np.diag([start, start, 0.0])
         return run(filter, Log(scaled, scan), np.zeros(3), known, KEY)
@@ -140,7 +140,7 @@ PLACES, NOISE = 3, np.diag([0.01, 0.01, 0.002]) ** 2
 def test_odometry_is_calibrated_without_identities():
     logs = [drive(seed) for seed in range(4)]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *logs)
-    model, sensor = motion.pose_increment(NOISE), sensors.relative_position(R)
+    model, sensor = motion.PoseIncrement(NOISE), sensors.RelativePosition(R)
     near, local = association.nearest(11.8), recency(patience=20)
     filter = pruning(ekf_slam(model, sensor, 20, associate=near, update="joint"), local)
 

@@ -76,8 +76,8 @@ def around(noise=1.0):
     return draw(
         dataclasses.replace(
             world,
-            motion=motion.unicycle(np.diag([0.01, 0.03]) ** 2 * noise),
-            sensor=sensors.range_bearing(np.diag([0.1, 0.02]) ** 2 * noise),
+            motion=motion.Unicycle(np.diag([0.01, 0.03]) ** 2 * noise),
+            sensor=sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2 * noise),
             landmarks=world.landmarks[near],
             pose_cov=np.diag([0.01, 0.01, 0.003]) * noise,
         )
@@ -284,8 +284,8 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly(name, options):
 
     def cost(sigma, row):
         models = {
-            "motion": motion.increment(jnp.diag(sigma[:2]) ** 2),
-            "sensor": sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
+            "motion": motion.Increment(jnp.diag(sigma[:2]) ** 2),
+            "sensor": sensors.RangeBearing(sigma[2] ** 2 * jnp.eye(2)),
         }
         there = dataclasses.replace(world, **models)
         filter = catalog.FILTERS[name](there, update="joint", **options)
@@ -349,7 +349,7 @@ def test_the_square_root_filter_is_the_filter(name, options):
 
 def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
     """Sharp measurements of a vague map: P loses its definiteness to rounding, X cannot."""
-    sharp = sensors.range_bearing(np.diag([1e-4, 1e-4]) ** 2)
+    sharp = sensors.RangeBearing(np.diag([1e-4, 1e-4]) ** 2)
     world = dataclasses.replace(worlds.ring(steps=40), sensor=sharp, pose_cov=np.eye(3) * 4.0)
     single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, worlds.draw(world))
     smallest = {}

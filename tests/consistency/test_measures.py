@@ -209,8 +209,8 @@ def test_the_bounds_obey_tichavskys_recursion():
     base = worlds.ring(steps=15)
     world = dataclasses.replace(
         base,
-        motion=motion.pose_increment(q),
-        sensor=sensors.relative_position(r),
+        motion=motion.PoseIncrement(q),
+        sensor=sensors.RelativePosition(r),
         controls=np.tile([0.3, 0.05, 0.2], (15, 1)),
         pose_cov=np.diag([0.1, 0.2, 0.05]) ** 2,
         filter_options={"gate": 9.0, "births": 1},

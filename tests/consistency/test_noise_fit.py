@@ -134,7 +134,7 @@ KEY = jax.random.key(0)
 
 def models(p):
     cov = jnp.diag(jnp.asarray(p) ** 2)
-    return motion.increment(cov[:2, :2]), sensors.range_bearing(cov[2:, 2:])
+    return motion.Increment(cov[:2, :2]), sensors.RangeBearing(cov[2:, 2:])
 
 
 def world(steps=100):

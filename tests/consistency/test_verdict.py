@@ -15,7 +15,7 @@ from jaxslam.monte_carlo import monte_carlo
 from jaxslam.monte_carlo.candidates import check_noise
 from jaxslam.simulation.worlds import Scenario
 
-SENSOR = sensors.range_bearing(np.eye(2))
+SENSOR = sensors.RangeBearing(np.eye(2))
 
 COUNTS = {"runs": 20, "not_finite": 0, "divergent": 0}
 
@@ -179,13 +179,13 @@ def test_doubts_are_said():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sensor": sensors.range_bearing(lambda z: -0.1 * jnp.eye(2))}, "range_bearing.*negative"),
-        ({"sensor": sensors.compass(lambda z: jnp.array([[jnp.nan]]))}, "compass.*NaN"),
-        ({"motion": motion.increment(lambda pose, u: jnp.array([[1.0, 3], [3, 1]]))}, "increment"),
+        ({"sensor": sensors.RangeBearing(lambda z: -0.1 * jnp.eye(2))}, "range_bearing.*negative"),
+        ({"sensor": sensors.Compass(lambda z: jnp.array([[jnp.nan]]))}, "compass.*NaN"),
+        ({"motion": motion.Increment(lambda pose, u: jnp.array([[1.0, 3], [3, 1]]))}, "increment"),
     ],
 )
 def test_a_noise_that_is_no_covariance_is_refused_before_anything_runs(change, message):
-    fields = {"name": "bad", "motion": motion.increment(np.eye(2)), "sensor": SENSOR}
+    fields = {"name": "bad", "motion": motion.Increment(np.eye(2)), "sensor": SENSOR}
     fields |= change
     size = len(fields["sensor"].landmark)
     world = Scenario(**fields, landmarks=np.ones((2, size)), controls=np.ones((3, 2)))
@@ -199,8 +199,8 @@ def test_a_noise_that_zero_has_none_of_is_taken_where_it_is():
     for noise in (lambda z: jnp.eye(2) / z[0], lambda z: jnp.eye(2) * (z[0] - 0.5)):
         world = Scenario(
             name="odd",
-            motion=motion.increment(np.eye(2)),
-            sensor=sensors.range_bearing(noise),
+            motion=motion.Increment(np.eye(2)),
+            sensor=sensors.RangeBearing(noise),
             landmarks=np.ones((2, 2)),
             controls=np.ones((3, 2)),
         )

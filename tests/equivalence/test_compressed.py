@@ -119,7 +119,7 @@ def test_gradients_pass_through_a_change_of_area():
     log = jax.tree.map(lambda x: x[0, :40], logs)
 
     def loss(sigma):
-        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
+        sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
         filter = compressed_ekf_slam(world.motion, sensor, CAPACITY, area=PLACES, update="joint")
         trace = run(filter, log, world.pose, world.pose_cov, KEY, probe=lambda state: state.slot)
         points = (trace.estimate.points[-1] ** 2).sum()
@@ -139,7 +139,7 @@ def test_gradients_pass_through_a_change_of_area():
         ({"area": 4, "covariance": "square_root"}, "got 'square_root'"),
         ({"area": 4, "chart": charts.right_invariant()}, "right_invariant"),
         ({"area": 4, "linearize": linearize.first_estimate()}, "first_estimate"),
-        ({"area": 4, "sensor": sensors.compass(np.eye(1))}, "a sensor of landmarks, got compass"),
+        ({"area": 4, "sensor": sensors.Compass(np.eye(1))}, "a sensor of landmarks, got compass"),
         (
             {"area": PLACES - 1},
             f"area >= {PLACES}, the measurement slots of a scan, got {PLACES - 1}",

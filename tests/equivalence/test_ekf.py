@@ -1,6 +1,5 @@
 """What EKF-SLAM must equal: dense textbook updates in any chart, itself in other words, its limits."""
 
-import dataclasses
 import functools
 
 import chex
@@ -8,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_models import changed
 from worlds import narrow
 
 from jaxslam import charts, linearize, motion, sensors
@@ -19,7 +19,7 @@ from jaxslam.types import Scan, Status
 
 Q, R = np.diag([0.05, 0.03]) ** 2, np.array([[0.01, 0.001], [0.001, 0.0025]])
 MOUNT = (0.2, -0.1, 0.4)
-MOTION, SENSOR = motion.increment(Q), sensors.range_bearing(R, mount=MOUNT)
+MOTION, SENSOR = motion.Increment(Q), sensors.RangeBearing(R, mount=MOUNT)
 OBSERVE, INVERT, STEP = jax.jit(SENSOR.observe), jax.jit(SENSOR.invert), jax.jit(MOTION.step)
 OBSERVE_JACOBIANS = jax.jit(SENSOR.observe_jacobians)
 ROWS = 32
@@ -164,7 +164,7 @@ def sloping():
         moved = MOTION.step(pose, u, w)
         return moved.at[2].add(0.2 * jnp.sin(pose[0]) + 0.1 * pose[1] * w[0])
 
-    return dataclasses.replace(MOTION, step=step)
+    return changed(MOTION, step=step)
 
 
 SLOPING = sloping()

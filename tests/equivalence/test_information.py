@@ -90,7 +90,7 @@ def test_a_certain_start_gets_the_floor(dtype):
 
 def test_other_models_full_maps_unknown_tags_and_empty_scans():
     """Landmarks of three parameters, in the canonical form as in the other, in too small a map."""
-    sensor = sensors.range_bearing_signature(np.diag([0.1, 0.02, 0.1]) ** 2)
+    sensor = sensors.RangeBearingSignature(np.diag([0.1, 0.02, 0.1]) ** 2)
     points = np.concatenate([cloister().landmarks, np.arange(36)[:, None] * 0.3], axis=1)
     scene = world(15, sensor=sensor, landmarks=points)
     log = draw(scene, 3)[1]
@@ -137,7 +137,7 @@ def test_gradients_and_batches():
     log = jax.tree.map(lambda leaf: leaf[:6], drawn())
 
     def loss(sigma, z):
-        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, np.deg2rad(1.0)])) ** 2)
+        sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, np.deg2rad(1.0)])) ** 2)
         eif = filters.eif_slam(world().motion, sensor, 36, floor=1e-3)
         changed = log._replace(scan=log.scan._replace(z=z))
         return run(eif, changed, world().pose, P0, KEY).estimate.pose[-1, :2].sum()
@@ -159,7 +159,7 @@ def test_gradients_and_batches():
         ({"capacity": 0}, "capacity"),
         ({"gate": 0.0}, "gate above 0"),
         ({"floor": 0.0}, "floor above 0"),
-        ({"sensor": sensors.compass([[1e-4]])}, "a sensor of landmarks"),
+        ({"sensor": sensors.Compass([[1e-4]])}, "a sensor of landmarks"),
     ],
 )
 def test_refusals(changes, message):

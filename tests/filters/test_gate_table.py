@@ -1,6 +1,5 @@
 """One table from gate to status, for every family of filters."""
 
-import dataclasses
 import functools
 import itertools
 
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_models import changed
 
 from jaxslam import filters, motion, sensors
 from jaxslam.filters.delayed.settings import Hypotheses, StoredMeasurements
@@ -114,10 +114,10 @@ def seen_in_the_map():
         honest = jnp.diag(jnp.full(2, 0.01))
         return jnp.where(jnp.abs(z[0]) > WILD, jnp.diag(jnp.asarray([0.01, -1e4])), honest)
 
-    return sensors.relative_position(noise)
+    return sensors.RelativePosition(noise)
 
 
-MOVE = motion.pose_increment(np.diag([1e-4, 1e-4, 1e-6]))
+MOVE = motion.PoseIncrement(np.diag([1e-4, 1e-4, 1e-6]))
 KNOWN = np.concatenate([LANDMARKS[:3], np.full((2, 2), 77.0)])
 FAMILIES = {
     "ekf_slam": lambda s: filters.ekf_slam(MOVE, s, 5, gate=20.0),
@@ -232,9 +232,7 @@ def test_a_delayed_filter_reports_bearings_by_the_table():
     def noise(z):
         return jnp.where(jnp.abs(z[0]) > 3.0, -1e4, 1e-4)[None, None]
 
-    sensor = dataclasses.replace(
-        sensors.bearing_only(np.diag([1e-4])), noise_cov=noise, residual=lambda z, zh: z - zh
-    )
+    sensor = changed(sensors.BearingOnly(noise), residual=lambda z, zh: z - zh)
     filter = filters.delayed_slam(
         MOVE,
         sensor,

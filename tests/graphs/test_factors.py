@@ -42,12 +42,12 @@ def _by_measurement(factor):
 
 def test_what_is_predicted_has_no_residual():
     random = np.random.default_rng(1)
-    turning = motion.velocity(np.eye(3))
+    turning = motion.Velocity(np.eye(3))
     made = {
         "relative_pose": graphs.relative_pose(),
         "relative_position": graphs.relative_position(),
         "bearing": graphs.bearing(),
-        "sensor": graphs.from_sensor(sensors.range_bearing(np.eye(2), mount=(0.3, 0.1, 0.5))),
+        "sensor": graphs.from_sensor(sensors.RangeBearing(np.eye(2), mount=(0.3, 0.1, 0.5))),
         "motion": graphs.from_motion(turning),
     }
     pose = random.normal(size=3)
@@ -60,10 +60,10 @@ def test_what_is_predicted_has_no_residual():
     for kind, residual in left(pose, z).items():
         assert np.abs(residual).max() < 1e-12, kind
     assert graphs.prior().predict is None
-    assert graphs.from_sensor(sensors.compass([[1.0]])).variables == ("pose",)
+    assert graphs.from_sensor(sensors.Compass([[1.0]])).variables == ("pose",)
 
 
-@pytest.mark.parametrize("make", [motion.odometry, motion.velocity])
+@pytest.mark.parametrize("make", [motion.Odometry, motion.Velocity])
 def test_the_residual_of_a_motion_is_its_noise(make):
     """And its derivatives are those of w where step(x, u, w) = x'."""
     model, random = make(np.eye(3)), np.random.default_rng(2)
@@ -87,7 +87,7 @@ def test_the_residual_of_a_motion_is_its_noise(make):
 
 def test_the_noise_curves_as_the_motion_does():
     """The residual of a motion at the pose that w leads to is w, so its second derivative is 0."""
-    model = motion.odometry(np.eye(3))
+    model = motion.Odometry(np.eye(3))
     factor = graphs.from_motion(model)
     x, u, w = np.array([0.5, -1.0, 2.0]), np.array([0.4, 0.8, -0.3]), np.array([0.1, -0.1, 0.05])
 
@@ -103,7 +103,7 @@ def test_the_noise_curves_as_the_motion_does():
 
 
 def test_where_the_noise_does_not_move_the_pose_nothing_is_infinite():
-    factor = graphs.from_motion(motion.odometry(np.eye(3)))
+    factor = graphs.from_motion(motion.Odometry(np.eye(3)))
     x, still = np.ones(3), np.zeros(3)
     slopes = jax.jit(jax.jacrev(lambda a, b: factor.residual((a, b), still), argnums=(0, 1)))
     assert np.isfinite(slopes(x, x)).all()
@@ -118,4 +118,4 @@ def test_a_variable_is_a_pose_or_a_point():
 
 def test_a_motion_of_two_noises_is_refused():
     with pytest.raises(ValueError, match=r"3 components.*unicycle with 2: v"):
-        graphs.from_motion(motion.unicycle(np.eye(2)))
+        graphs.from_motion(motion.Unicycle(np.eye(2)))

@@ -29,8 +29,8 @@ def world():
     """Turning robot among six posts; a noise that bends (odometry), and P0 that is not diagonal."""
     return dataclasses.replace(
         worlds.ring(),
-        motion=motion.odometry(np.diag(SIGMA_W) ** 2),
-        sensor=sensors.range_bearing(np.diag(SIGMA_Z) ** 2),
+        motion=motion.Odometry(np.diag(SIGMA_W) ** 2),
+        sensor=sensors.RangeBearing(np.diag(SIGMA_Z) ** 2),
         controls=np.tile([0.2, 0.6, 0.2], (STEPS, 1)),
         pose=START,
         pose_cov=START_COV,
@@ -130,7 +130,7 @@ def test_derivatives_of_the_optimum_by_the_noises_are_differences():
         tangents.append((turn + turn.T) * np.outer(sigma, sigma) / 4)
 
     def seen(q, r):
-        models = motion.odometry(q), sensors.range_bearing(r)
+        models = motion.Odometry(q), sensors.RangeBearing(r)
         made, by_table = graphs.of_log(log, *models, START, START_COV)
         found = graphs.optimize(made, by_table, plan=plan, tolerance=1e-16)
         poses, points = found.graph.poses, found.graph.points
@@ -168,11 +168,11 @@ def test_a_motion_of_two_noises_is_a_soft_constraint():
 
 def test_more_noises_than_three_are_those_of_their_sum():
     """Of two substeps of a motion without turns, which are affine: e has the covariance of both."""
-    single = motion.pose_increment(np.diag([0.1, 0.2, 0.3]) ** 2)
-    twice = motion.substeps(single, 2)
+    single = motion.PoseIncrement(np.diag([0.1, 0.2, 0.3]) ** 2)
+    twice = motion.Substeps(single, 2)
     scan = Scan(np.full((1, 1, 1), 0.1), np.full((1, 1), -1), np.ones((1, 1), bool))
     log = Log(np.tile([0.5, 0.0, 0.0], (1, 2)), scan)
-    models = twice, sensors.compass([[0.01]])
+    models = twice, sensors.Compass([[0.01]])
     graph, factors = graphs.of_log(log, *models, np.zeros(3), np.zeros((3, 3)))
     by_heading = np.array(
         [[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]
@@ -240,7 +240,7 @@ def test_an_absolute_sensor_has_no_points():
     steps = 3
     scan = Scan(np.full((steps, 1, 1), 0.1), np.full((steps, 1), -1), np.ones((steps, 1), bool))
     log = Log(np.tile([0.5, 0.0, 0.1], (steps, 1)), scan)
-    models = motion.pose_increment(np.eye(3)), sensors.compass([[0.01]])
+    models = motion.PoseIncrement(np.eye(3)), sensors.Compass([[0.01]])
     graph, factors = graphs.of_log(log, *models, np.zeros(3), np.eye(3))
     assert graph.points.shape == (0, 0) and factors["sensor"].variables == ("pose",)
     np.testing.assert_array_equal(graph.tables["sensor"].who, [[1], [2], [3]])
@@ -254,11 +254,11 @@ def _log(**change):
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        ({"control": np.ones((STEPS, 2))}, {"motion": motion.increment(np.eye(2))}, "give slack"),
+        ({"control": np.ones((STEPS, 2))}, {"motion": motion.Increment(np.eye(2))}, "give slack"),
         ({}, {"slack": -1.0}, "expected slack to be a finite number >= 0, got -1.0"),
-        ({}, {"motion": motion.odometry(np.diag([1.0, 0, 1]))}, "odometry is singular at row 0"),
+        ({}, {"motion": motion.Odometry(np.diag([1.0, 0, 1]))}, "odometry is singular at row 0"),
         ({"control": np.tile([0.1, 0, 0.1], (STEPS, 1))}, {}, "all directions at row 0"),
-        ({}, {"sensor": sensors.range_bearing(np.diag([1.0, 0]))}, "range_bearing is singular"),
+        ({}, {"sensor": sensors.RangeBearing(np.diag([1.0, 0]))}, "range_bearing is singular"),
         ({}, {"pose_cov": np.diag([1.0, 0, 1])}, "pose_cov is singular; expected zero"),
         ({}, {"pose": np.zeros(2)}, r"expected a pose of shape \(3,\), got \(2,\)"),
         ({}, {"capacity": 3}, "expected tags below 3, the capacity, got 3"),
@@ -269,7 +269,7 @@ def _log(**change):
         ({"valid": np.zeros((STEPS, 6), bool)}, {}, "no measurement of a landmark"),
         (
             {},
-            {"sensor": sensors.suite((sensors.range_bearing(np.eye(2)), 6))},
+            {"sensor": sensors.Suite(((sensors.RangeBearing(np.eye(2)), 6),))},
             "expected one sensor",
         ),
     ],

@@ -17,7 +17,7 @@ ROOM = walls([[0, 0], [5, 0], [5, 2], [3, 2], [3, 3], [0, 3]])  # no two poses l
 GRID = rasterize(ROOM, 0.1)
 FAR = 8.0
 MODEL = grids.likelihood_field(0.1, max_range=FAR)
-MOVE = motion.unicycle(np.diag([0.1, 0.1]) ** 2)
+MOVE = motion.Unicycle(np.diag([0.1, 0.1]) ** 2)
 CONTROLS = np.tile([0.2, 0.3, 0.25], (60, 1))
 WORLD = LaserWorld(
     name="room",
@@ -219,7 +219,7 @@ def test_controls_of_a_path_lead_along_it_also_backward():
     controls = motion.odometry_controls(path)
     assert not controls[0].any() and (controls[:, 1] < 0).any()
     assert np.abs(controls[:, 0]).max() <= np.pi / 2
-    step = jax.jit(jax.vmap(lambda p, u: motion.odometry(np.eye(3)).step(p, u, np.zeros(3))))
+    step = jax.jit(jax.vmap(lambda p, u: motion.Odometry(np.eye(3)).step(p, u, np.zeros(3))))
     after = np.asarray(step(path[:-1], controls[1:]))
     np.testing.assert_allclose(after[:, :2], path[1:, :2], atol=1e-12)
     np.testing.assert_allclose(np.exp(1j * after[:, 2]), np.exp(1j * path[1:, 2]), atol=1e-12)

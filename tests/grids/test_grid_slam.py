@@ -9,7 +9,7 @@ from jaxslam import grids
 from jaxslam.grids.mapping import add_scan
 from jaxslam.grids.slam.particles import copied_rows, in_place
 from jaxslam.grids.slam.proposal import climbed, propose
-from jaxslam.motion import pose_increment
+from jaxslam.motion import PoseIncrement
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import rasterize
@@ -60,7 +60,7 @@ def test_candidates_give_the_evidence_and_the_posterior_of_a_gaussian(sharp):
     """x' = w with w ~ N(0, Q), a likelihood exp(-|x' - z|²/2S): both integrals have closed forms."""
     q, z = np.array([0.3, 0.2, 0.1]) ** 2, np.array([0.25, -0.2, 0.05])
     s = (sharp * np.array([0.3, 0.2, 0.1])) ** 2
-    motion = pose_increment(np.diag(q))
+    motion = PoseIncrement(np.diag(q))
 
     def draw(key):
         return propose(

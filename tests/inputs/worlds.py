@@ -22,8 +22,8 @@ def ring(steps: int = 100, seed: int = 3) -> Scenario:
     points = np.stack([radius * np.cos(around), 1.0 + radius * np.sin(around)], axis=1)
     return Scenario(
         name="ring",
-        motion=motion.increment(np.diag([0.01, 0.01]) ** 2),
-        sensor=sensors.range_bearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3)),
+        motion=motion.Increment(np.diag([0.01, 0.01]) ** 2),
+        sensor=sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3)),
         landmarks=points,
         controls=np.tile([0.125, 4 * np.pi / steps], (steps, 1)),
     )
@@ -34,8 +34,8 @@ def scaled(scale: float, steps: int = 20) -> Scenario:
     there = ring(steps)
     return dataclasses.replace(
         there,
-        motion=motion.increment(np.diag([0.01, 0.01]) ** 2 * scale),
-        sensor=sensors.range_bearing(
+        motion=motion.Increment(np.diag([0.01, 0.01]) ** 2 * scale),
+        sensor=sensors.RangeBearing(
             np.diag([0.05, 0.02]) ** 2 * scale, mount=(0.1 * scale, -0.05, 0.3)
         ),
         landmarks=np.asarray(there.landmarks) * scale,
@@ -49,7 +49,7 @@ def three_parameters():
     """A world whose landmarks are (x, y, signature)."""
     world = ring(steps=5)
     landmarks = np.concatenate([world.landmarks, np.ones((6, 1))], axis=1)
-    sensor = sensors.range_bearing_signature(np.eye(3) * 0.01)
+    sensor = sensors.RangeBearingSignature(np.eye(3) * 0.01)
     return dataclasses.replace(world, sensor=sensor, landmarks=landmarks)
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from jaxslam.logs import streams
-from jaxslam.motion import pose_increment, unicycle
-from jaxslam.sensors import compass, range_bearing
+from jaxslam.motion import PoseIncrement, Unicycle
+from jaxslam.sensors import Compass, RangeBearing
 from jaxslam.types import Log
 
-DRIVE, EYE = unicycle(np.eye(2)), range_bearing(np.eye(2))
+DRIVE, EYE = Unicycle(np.eye(2)), RangeBearing(np.eye(2))
 ODOMETRY = [[1.0, 0.5, 0.1], [2.0, 1.0, 0.0], [3.0, 0.0, 0.0]]
 SEEN = [
     (0.5, 7, 1.0, 0.0),
@@ -85,7 +85,7 @@ def test_a_path_of_poses_becomes_increments():
     """Composed again they give the path; between two poses it is straight."""
     path = [(0.0, 1.0, 1.0, np.pi / 2), (1.0, 1.0, 3.0, np.pi), (2.0, 0.0, 3.0, -np.pi / 2)]
     poses = columns(path, "t", "x", "y", "theta")
-    log, time, *_ = Log.from_records(poses, [(0.5, 1, 1, 0)], pose_increment(np.eye(3)), EYE)
+    log, time, *_ = Log.from_records(poses, [(0.5, 1, 1, 0)], PoseIncrement(np.eye(3)), EYE)
     np.testing.assert_array_equal(time, [0, 0.5, 1, 2])
     np.testing.assert_allclose(log.control[[0, 1, 3]], [[0, 0, 0], [1, 0, np.pi / 4], [1, 0, np.pi / 2]], atol=1e-15)  # fmt: skip
     at = np.array(path[0][1:])
@@ -96,7 +96,7 @@ def test_a_path_of_poses_becomes_increments():
 
 
 def test_a_sensor_of_no_landmark_needs_no_tag():
-    log, _, tags, _ = Log.from_records(ODOMETRY, [(2.0, 0.5)], DRIVE, compass(np.eye(1)))
+    log, _, tags, _ = Log.from_records(ODOMETRY, [(2.0, 0.5)], DRIVE, Compass(np.eye(1)))
     assert tags == ()
     np.testing.assert_array_equal(log.scan.valid[:, 0], [False, True, False])
 

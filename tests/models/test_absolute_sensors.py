@@ -94,7 +94,7 @@ def drive(name, mount, seed=1):
 def compiled(name, **options):
     def go(log, mount, gate, pose_cov, q, r):
         sensor = sensors.REGISTRY[name](r * R[name], mount=mount)
-        filter = ekf_slam(motion.increment(q * Q), sensor, 2, gate=gate, **options)
+        filter = ekf_slam(motion.Increment(q * Q), sensor, 2, gate=gate, **options)
         return run(filter, log, START, pose_cov, KEY, probe=lambda joint: joint.cov)
 
     return jax.jit(go)
@@ -195,7 +195,7 @@ RUNS = 200
 def world(name):
     return Scenario(
         name="absolute",
-        motion=motion.increment(Q),
+        motion=motion.Increment(Q),
         sensor=sensors.REGISTRY[name](R[name], mount=MOUNT),
         landmarks=np.zeros((1, 0)),
         controls=CONTROLS,
@@ -257,9 +257,9 @@ def test_unknown_tags_may_repeat_within_a_scan():
 def test_a_chart_of_landmarks_and_an_empty_capacity_are_refused(name):
     sensor = sensors.REGISTRY[name](R[name])
     with pytest.raises(ValueError, match=f"right_invariant.*absolute sensor {name} has none"):
-        ekf_slam(motion.increment(Q), sensor, 1, chart=charts.right_invariant())
+        ekf_slam(motion.Increment(Q), sensor, 1, chart=charts.right_invariant())
     with pytest.raises(ValueError, match="ekf_slam: capacity"):
-        ekf_slam(motion.increment(Q), sensor, 0)
+        ekf_slam(motion.Increment(Q), sensor, 0)
 
 
 @pytest.mark.parametrize("name", R)

@@ -16,8 +16,8 @@ from jaxslam.life.existence import Existence
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan, Status
 
-MOTION = motion.increment(np.diag([0.02, 0.01]) ** 2)
-SENSOR = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2)
+MOTION = motion.Increment(np.diag([0.02, 0.01]) ** 2)
+SENSOR = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2)
 POINTS = np.array([[2.0, 1.0], [3.0, -1.0], [1.0, 2.0], [-2.0, 0.5]])
 KEY = jax.random.key(0)
 
@@ -163,7 +163,7 @@ def test_gradients_pass_through_births_and_deaths():
     log = log_of(seen_by_turns({0: 1, 5: 2}, steps=8))
 
     def loss(sigma):
-        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
+        sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
         ekf = ekf_slam(MOTION, sensor, 3, update="joint")
         filter = pruning(ekf, life.existence(always))
         trace = run(filter, log, np.zeros(3), np.eye(3) * 1e-4, KEY)

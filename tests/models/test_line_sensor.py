@@ -12,7 +12,7 @@ from jaxslam.sensors.line import facing
 from jaxslam.types import Scan
 
 NOISE = np.diag([0.02, 0.02]) ** 2
-MOVES = motion.increment(1e-4 * np.eye(2))
+MOVES = motion.Increment(1e-4 * np.eye(2))
 
 
 def points_of(line, at):
@@ -29,7 +29,7 @@ def carried(frame, points):
 
 @pytest.mark.parametrize("line", [(2.0, 0.4), (-1.5, 3.0), (0.0, -2.0)])
 def test_a_measured_line_is_that_of_the_points_in_the_robots_frame(line):
-    sensor, pose = sensors.line(NOISE), np.array([0.7, -1.2, 2.8])
+    sensor, pose = sensors.Line(NOISE), np.array([0.7, -1.2, 2.8])
     z = np.asarray(sensor.observe(pose, np.array(line)))
     there = points_of(line, [-3.0, 0.0, 5.0])
     np.testing.assert_allclose(carried(pose, points_of(z, [-3, 0, 5])), there, atol=4.0)
@@ -41,7 +41,7 @@ def test_a_measured_line_is_that_of_the_points_in_the_robots_frame(line):
 
 
 def test_a_carried_line_goes_through_the_carried_points():
-    sensor, line, frame = sensors.line(NOISE), np.array([1.3, -2.9]), np.array([4.0, -2.0, 1.1])
+    sensor, line, frame = sensors.Line(NOISE), np.array([1.3, -2.9]), np.array([4.0, -2.0, 1.1])
     r, alpha = np.asarray(sensor.carried(frame, line))
     points = carried(frame, points_of(line, [-2.0, 0.0, 2.0]))
     np.testing.assert_allclose(points @ [np.cos(alpha), np.sin(alpha)], r, atol=1e-12)
@@ -50,7 +50,7 @@ def test_a_carried_line_goes_through_the_carried_points():
 
 
 def test_nothing_happens_where_the_robot_passes_the_line_or_the_map_the_origin():
-    sensor, pose = sensors.line(NOISE), jnp.zeros(3)
+    sensor, pose = sensors.Line(NOISE), jnp.zeros(3)
     near = np.array([[-1e-9, 0.5], [0.0, 0.5], [1e-9, 0.5]])
     z = np.asarray(jax.vmap(sensor.observe, (None, 0))(pose, near))
     np.testing.assert_allclose(z, near, atol=1e-15)
@@ -74,7 +74,7 @@ def test_both_signs_are_one_set_of_points():
         (lambda s: filters.ekf_slam(MOVES, s, 4, chart=charts.right_invariant()), "line"),
         (lambda s: filters.ekf_slam(MOVES, s, 4, chart=charts.robocentric()), "line"),
         (lambda s: filters.seif(MOVES, s, 4, active=2, links=2), "line"),
-        (lambda s: sensors.suite((s, 2), (s, 2)), r"share landmarks \(x, y\)"),
+        (lambda s: sensors.Suite(((s, 2), (s, 2))), r"share landmarks \(x, y\)"),
         (lambda s: filters.merging(filters.ekf_slam(MOVES, s, 4), 0.5), "cannot be merged"),
         (
             lambda s: seen_points(s, Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))),
@@ -84,11 +84,11 @@ def test_both_signs_are_one_set_of_points():
 )
 def test_what_is_for_points_refuses_lines(make, message):
     with pytest.raises(ValueError, match=message):
-        make(sensors.line(NOISE))
+        make(sensors.Line(NOISE))
 
 
 def test_a_line_may_stand_beside_a_compass():
-    both = sensors.suite((sensors.line(NOISE), 2), (sensors.compass([[1e-4]]), 1))
+    both = sensors.Suite(((sensors.Line(NOISE), 2), (sensors.Compass([[1e-4]]), 1)))
     assert not both.of_points
     filters.ekf_slam(MOVES, both, 4)
-    assert jaxslam.sensors.range_bearing(NOISE).of_points
+    assert jaxslam.sensors.RangeBearing(NOISE).of_points

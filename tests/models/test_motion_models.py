@@ -10,12 +10,12 @@ import pytest
 from reference.plane import assert_same_poses, matrix, pose_of, wrap
 
 from jaxslam.motion import (
-    ackermann,
-    odometry,
+    Ackermann,
+    Odometry,
+    OdometryNoise,
+    Velocity,
+    VelocityNoise,
     odometry_control,
-    odometry_noise,
-    velocity,
-    velocity_noise,
 )
 
 NO_NOISE = {2: np.zeros((2, 2)), 3: np.zeros((3, 3))}
@@ -31,7 +31,7 @@ def batched(function):
 
 # --- odometry -----------------------------------------------------------------------------------
 
-drive = batched(odometry(NO_NOISE[3]).step)
+drive = batched(Odometry(NO_NOISE[3]).step)
 control_between = batched(odometry_control)
 
 
@@ -122,8 +122,8 @@ def velocity_variances(alpha, u):
 
 # factory of the covariance, its plain form, the model it is made for, how many constants
 NOISES = {
-    "odometry": (odometry_noise, odometry_variances, odometry, 4),
-    "velocity": (velocity_noise, velocity_variances, velocity, 6),
+    "odometry": (OdometryNoise, odometry_variances, Odometry, 4),
+    "velocity": (VelocityNoise, velocity_variances, Velocity, 6),
 }
 
 
@@ -189,7 +189,7 @@ def test_bad_alphas_are_refused(name, spoil):
 
 # --- velocity -----------------------------------------------------------------------------------
 
-VELOCITY = velocity(NO_NOISE[3])
+VELOCITY = Velocity(NO_NOISE[3])
 move = batched(VELOCITY.step)
 
 
@@ -325,7 +325,7 @@ def test_value_and_two_derivatives_go_smoothly_through_zero_turn(dtype, noise):
 # --- ackermann ----------------------------------------------------------------------------------
 
 L, A, B, H = 2.83, 3.78, 0.5, 0.76
-steer = batched(ackermann(NO_NOISE[2]).step)
+steer = batched(Ackermann(NO_NOISE[2]).step)
 
 
 def rear_axle(pose, sensor=(A, B)):
@@ -377,7 +377,7 @@ def test_other_cars_too():
     car = {"wheelbase": 1.2, "sensor": (-0.4, -0.7), "encoder": -0.3}
     pose, u, w = car_cases(13, 50)
     expected = np.stack([car_on_an_arc(p, c, **car) for p, c in zip(pose, u, strict=True)])
-    actual = batched(ackermann(NO_NOISE[2], **car).step)(pose, u, w)
+    actual = batched(Ackermann(NO_NOISE[2], **car).step)(pose, u, w)
     assert_same_poses(actual, expected, 1e-11)
 
 
@@ -385,7 +385,7 @@ def test_its_euler_step_is_the_published_model():
     """The slope by Δt at Δt = 0 is Guivant & Nebot's, signs of a and b included."""
     pose, u, w = car_cases(14, 50)
     u[:, 2] = 0
-    slope = batched(jax.jacfwd(ackermann(NO_NOISE[2]).step, argnums=1))(pose, u, w)[:, :, 2]
+    slope = batched(jax.jacfwd(Ackermann(NO_NOISE[2]).step, argnums=1))(pose, u, w)[:, :, 2]
     expected = [guivant_nebot_rate(p, c) for p, c in zip(pose, u, strict=True)]
     np.testing.assert_allclose(slope, expected, rtol=1e-12, atol=1e-13)
 
@@ -419,7 +419,7 @@ def test_gradients_reach_the_cars_lengths():
     weights = np.array([1.0, -2.0, 0.5])
 
     def total(wheelbase, sensor, encoder):
-        return jnp.dot(ackermann(NO_NOISE[2], wheelbase, sensor, encoder).step(pose, u, w), weights)
+        return jnp.dot(Ackermann(NO_NOISE[2], wheelbase, sensor, encoder).step(pose, u, w), weights)
 
     slopes = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(L, np.array([A, B]), H)
     cars = [[L, A, B, H]]
@@ -459,12 +459,12 @@ def test_gradients_reach_the_cars_lengths():
 )
 def test_impossible_cars_are_refused(bad):
     with pytest.raises(ValueError, match=f"^ackermann: .*{next(iter(bad))}"):
-        ackermann(np.eye(2), **bad)
+        Ackermann(np.eye(2), **bad)
 
 
 def test_traced_lengths_are_checked_for_their_shape():
     def build(**lengths):
-        model = ackermann(NO_NOISE[2], **lengths)
+        model = Ackermann(NO_NOISE[2], **lengths)
         return model.step(np.zeros(3), np.ones(3), np.zeros(2))
 
     for name, shape in (("wheelbase", (1,)), ("sensor", (3,)), ("encoder", (2,))):

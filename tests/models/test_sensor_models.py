@@ -60,7 +60,7 @@ def same_angle(a, b, atol=1e-11):
 
 
 def test_range_only():
-    sensor = sensors.range_only(VARIANCE, mount=MOUNT)
+    sensor = sensors.RangeOnly(VARIANCE, mount=MOUNT)
     rng, pose, point = draw(0)
     at, theta = sensor_frame(pose)
     z = np.hypot(*(point - at).T)[:, None]
@@ -74,7 +74,7 @@ def test_range_only():
 
 
 def test_bearing_only():
-    sensor = sensors.bearing_only(VARIANCE, mount=MOUNT)
+    sensor = sensors.BearingOnly(VARIANCE, mount=MOUNT)
     rng, pose, point = draw(1)
     at, theta = sensor_frame(pose)
     z = bearing_of(point - at, theta)[:, None]
@@ -86,7 +86,7 @@ def test_bearing_only():
     np.testing.assert_allclose(residual_of(sensor, [3], [-3]), [6 - 2 * np.pi], atol=1e-14)
 
 
-@pytest.mark.parametrize("factory", [sensors.range_only, sensors.bearing_only])
+@pytest.mark.parametrize("factory", [sensors.RangeOnly, sensors.BearingOnly])
 def test_at_the_sensor_itself_a_partial_measurement_is_zero_with_zero_derivatives(factory):
     sensor = factory(VARIANCE)
     for leaf in jax.tree.leaves(all_slopes(sensor)([[1.0, 2.0, 0.5]], [[1.0, 2.0]])):
@@ -94,7 +94,7 @@ def test_at_the_sensor_itself_a_partial_measurement_is_zero_with_zero_derivative
 
 
 def test_range_bearing_signature():
-    sensor = sensors.range_bearing_signature(np.eye(3), mount=MOUNT)
+    sensor = sensors.RangeBearingSignature(np.eye(3), mount=MOUNT)
     rng, pose, point = draw(2)
     landmark = np.concatenate([point, rng.normal(size=(len(pose), 1)) * 7], axis=1)
     at, theta = sensor_frame(pose)
@@ -122,7 +122,7 @@ def test_range_bearing_signature():
 
 
 def test_compass():
-    sensor = sensors.compass(VARIANCE, mount=MOUNT)
+    sensor = sensors.Compass(VARIANCE, mount=MOUNT)
     pose = draw(3)[1]
     none = np.zeros((len(pose), 0))
     z = over(sensor.observe)(pose, none)
@@ -134,7 +134,7 @@ def test_compass():
 
 
 def test_position_fix():
-    sensor = sensors.position_fix(0.04 * np.eye(2), mount=MOUNT)
+    sensor = sensors.PositionFix(0.04 * np.eye(2), mount=MOUNT)
     pose = draw(4)[1]
     none = np.zeros((len(pose), 0))
     at, _ = sensor_frame(pose)
@@ -170,14 +170,14 @@ def line_of_sight(pose, landmark):
 
 def test_inverse_depth_at_through_and_beyond_infinity():
     """Its derivatives are held to those of this function by `verify`."""
-    sensor = sensors.bearing_inverse_depth(VARIANCE, mount=MOUNT)
+    sensor = sensors.BearingInverseDepth(VARIANCE, mount=MOUNT)
     pose, landmark = inverse_depth_world()
     v, _, _, theta = line_of_sight(pose, landmark)
     same_angle(over(sensor.observe)(pose, landmark)[:, 0], bearing_of(v, theta))
 
 
 def test_a_landmark_at_infinity_is_a_direction_and_the_bearing_is_smooth_through_it():
-    sensor = sensors.bearing_inverse_depth(VARIANCE, mount=MOUNT)
+    sensor = sensors.BearingInverseDepth(VARIANCE, mount=MOUNT)
     pose, landmark = inverse_depth_world(6)
     observe = over(sensor.observe)
 
@@ -197,8 +197,8 @@ def test_inverse_depth_sees_a_point_as_bearing_only_does_and_opposite_beyond_inf
     pose = pose[: len(landmark)]
     u = np.stack([np.cos(landmark[:, 2]), np.sin(landmark[:, 2])], axis=1)
     point = landmark[:, :2] + u / landmark[:, 3:]  # (48), also for ρ < 0
-    scaled = over(sensors.bearing_inverse_depth(VARIANCE, mount=MOUNT).observe)(pose, landmark)
-    direct = over(sensors.bearing_only(VARIANCE, mount=MOUNT).observe)(pose, point)
+    scaled = over(sensors.BearingInverseDepth(VARIANCE, mount=MOUNT).observe)(pose, landmark)
+    direct = over(sensors.BearingOnly(VARIANCE, mount=MOUNT).observe)(pose, point)
     beyond = landmark[:, 3] < 0
     assert beyond.any() and not beyond.all()
     same_angle(scaled[~beyond], direct[~beyond], atol=1e-10)
@@ -206,14 +206,14 @@ def test_inverse_depth_sees_a_point_as_bearing_only_does_and_opposite_beyond_inf
 
 
 def test_no_line_of_sight_gives_zero_with_zero_derivatives():
-    sensor = sensors.bearing_inverse_depth(VARIANCE)
+    sensor = sensors.BearingInverseDepth(VARIANCE)
     at = [[3.0, 5.0, 0.7]], [[2.0, 5.0, 0.0, 1.0]]  # v = 0 to the last bit
     for leaf in jax.tree.leaves(all_slopes(sensor)(*at)):
         assert not leaf.any()
 
 
 def test_inverse_depth_starts_where_the_sensor_is_whatever_the_depth():
-    sensor = sensors.bearing_inverse_depth(VARIANCE, mount=MOUNT)
+    sensor = sensors.BearingInverseDepth(VARIANCE, mount=MOUNT)
     rng, pose, _ = draw(8, 4 * len(DEPTHS))
     z, s = rng.uniform(-np.pi, np.pi, (len(pose), 1)), np.tile(DEPTHS, 4)[:, None]
     at, theta = sensor_frame(pose)
@@ -227,7 +227,7 @@ def test_inverse_depth_starts_where_the_sensor_is_whatever_the_depth():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_position_cuts_the_inverse_depth_off_but_not_its_slope(dtype):
-    sensor = sensors.bearing_inverse_depth(VARIANCE)
+    sensor = sensors.BearingInverseDepth(VARIANCE)
     depths = np.array([5.0, 0.1, 1e-3, 2e-6, 1e-6, 5e-7, 0.0, -1e-6, -0.3, -100.0])
     rows = np.tile(np.array([1.5, -2.0, 0.6, 0.0]), (len(depths), 1))
     rows[:, 3] = depths
@@ -256,7 +256,7 @@ def test_position_cuts_the_inverse_depth_off_but_not_its_slope(dtype):
 
 
 def test_embed_remembers_where_it_was_seen_from():
-    sensor = sensors.bearing_inverse_depth(VARIANCE, mount=MOUNT)
+    sensor = sensors.BearingInverseDepth(VARIANCE, mount=MOUNT)
     _, pose, point = draw(9)
     at, _ = sensor_frame(pose)
     point[0] = at[0] + 1e-8  # nearer than anything should be
@@ -272,27 +272,27 @@ def test_embed_remembers_where_it_was_seen_from():
 
 
 def test_default_priors():
-    free = sensors.range_only(VARIANCE).free
+    free = sensors.RangeOnly(VARIANCE).free
     everywhere = np.linspace(-np.pi, np.pi, 200001)
     np.testing.assert_array_equal(free.mean, [0.0])
     np.testing.assert_allclose(free.cov, [[np.var(everywhere)]], rtol=1e-4)
     np.testing.assert_allclose(free.cov, [[np.pi**2 / 3]], rtol=1e-15)
-    free = sensors.bearing_only(VARIANCE).free
+    free = sensors.BearingOnly(VARIANCE).free
     np.testing.assert_array_equal(free.mean, [10.0])
     np.testing.assert_array_equal(free.cov, [[25.0]])
     for distance in (1, 4.0, np.float32(0.5), jnp.asarray(2.0)):
-        free = sensors.bearing_inverse_depth(VARIANCE, min_distance=distance).free
+        free = sensors.BearingInverseDepth(VARIANCE, min_distance=distance).free
         np.testing.assert_allclose(free.mean, [0.5 / float(distance)], rtol=1e-15)
         np.testing.assert_allclose(free.cov, [[1 / (4 * float(distance)) ** 2]], rtol=1e-15)
-    np.testing.assert_array_equal(sensors.bearing_inverse_depth(VARIANCE).free.mean, [0.5])
-    given = sensors.bearing_inverse_depth(VARIANCE, min_distance=2.0, free=([0.1], [[0.3]])).free
+    np.testing.assert_array_equal(sensors.BearingInverseDepth(VARIANCE).free.mean, [0.5])
+    given = sensors.BearingInverseDepth(VARIANCE, min_distance=2.0, free=([0.1], [[0.3]])).free
     np.testing.assert_array_equal(given.mean, [0.1])
     np.testing.assert_array_equal(given.cov, [[0.3]])
 
 
 def test_gradients_reach_the_least_distance():
     def prior(distance):
-        return sensors.bearing_inverse_depth(VARIANCE, min_distance=distance).free
+        return sensors.BearingInverseDepth(VARIANCE, min_distance=distance).free
 
     by_mean, by_cov = jax.jit(jax.jacfwd(prior))(2.0)
     np.testing.assert_allclose(by_mean, [-1 / 8], rtol=1e-14)
@@ -304,7 +304,7 @@ def test_gradients_reach_the_least_distance():
 )
 def test_bad_least_distances_are_refused(distance):
     with pytest.raises(ValueError, match="bearing_inverse_depth: "):
-        sensors.bearing_inverse_depth(VARIANCE, min_distance=distance)
+        sensors.BearingInverseDepth(VARIANCE, min_distance=distance)
 
 
 # --- in a filter --------------------------------------------------------------------------------
@@ -313,11 +313,11 @@ def test_bad_least_distances_are_refused(distance):
 def test_inverse_depth_in_the_ekf_starts_from_the_prior_and_finds_the_distance():
     """Driving past landmarks 3 to 30 m away; one of five slots stays empty."""
     points = np.array([[3.0, 3.0], [6.0, -4.0], [10.0, 10.0], [4.0, 30.0]])
-    sensor = sensors.bearing_inverse_depth(np.array([[0.002**2]]), mount=MOUNT, min_distance=2.0)
+    sensor = sensors.BearingInverseDepth(np.array([[0.002**2]]), mount=MOUNT, min_distance=2.0)
     start = np.zeros(3)
     scenario = Scenario(
         name="passing",
-        motion=motion.increment(np.diag([1e-3, 1e-4]) ** 2),
+        motion=motion.Increment(np.diag([1e-3, 1e-4]) ** 2),
         sensor=sensor,
         landmarks=over(sensor.embed)(np.zeros((4, 3)), points),
         controls=np.tile([0.2, 0.0], (60, 1)),

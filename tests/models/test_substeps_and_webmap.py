@@ -1,16 +1,15 @@
 """substeps is its model in a loop; webmap is the car it says, on a closed path of its own."""
 
-import dataclasses
-
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_models import changed
 
 from jaxslam import motion, run
 from jaxslam.filters import ekf_slam
-from jaxslam.motion.substeps import substeps
+from jaxslam.motion.substeps import Substeps
 from jaxslam.simulation.scenarios.webmap import webmap
 from jaxslam.simulation.worlds import simulate
 
@@ -19,17 +18,17 @@ COUNT = 3
 # name: the model, and (n, U) controls of it
 MODELS = {
     "ackermann": (
-        motion.ackermann(Q, wheelbase=2.0, sensor=(1.0, 0.3), encoder=0.2),
+        motion.Ackermann(Q, wheelbase=2.0, sensor=(1.0, 0.3), encoder=0.2),
         [[1.0, 0.3, 0.4], [2.0, -0.5, 0.3], [1.5, 0.0, 0.7]],
     ),
     # its covariance depends on the control, and has another size than the control's
     "velocity": (
-        motion.velocity(motion.velocity_noise(np.full(6, 0.1))),
+        motion.Velocity(motion.VelocityNoise(np.full(6, 0.1))),
         [[1.0, 0.3, 0.4], [2.0, -0.5, 0.3], [1.5, 0.0, 0.7]],
     ),
     # its covariance depends on the pose
     "increment": (
-        motion.increment(lambda pose, u: jnp.diag(jnp.stack([1 + pose[0] ** 2, 0.1 + u[1] ** 2]))),
+        motion.Increment(lambda pose, u: jnp.diag(jnp.stack([1 + pose[0] ** 2, 0.1 + u[1] ** 2]))),
         [[1.0, 0.3], [2.0, -0.5], [1.5, 0.0]],
     ),
 }
@@ -40,7 +39,7 @@ def case(request):
     """The single model, the model of substeps, a pose, controls (n, U) and noises (n, W)."""
     single, u = MODELS[request.param]
     w = 0.1 * np.random.default_rng(0).normal(size=(COUNT, len(single.noises)))
-    return single, substeps(single, COUNT), np.array([1.0, -2.0, 3.0]), np.array(u), w
+    return single, Substeps(single, COUNT), np.array([1.0, -2.0, 3.0]), np.array(u), w
 
 
 def test_substeps_is_the_loop_of_single_steps_with_its_noise_and_jacobians(case):
@@ -69,7 +68,7 @@ def test_substeps_is_the_loop_of_single_steps_with_its_noise_and_jacobians(case)
 
 def test_perturbed_controls_move_as_the_noise_does():
     single, u = MODELS["ackermann"]
-    whole, pose, u = substeps(single, COUNT), np.array([1.0, -2.0, 3.0]), np.ravel(u)
+    whole, pose, u = Substeps(single, COUNT), np.array([1.0, -2.0, 3.0]), np.ravel(u)
     w = 0.1 * np.random.default_rng(1).normal(size=2 * COUNT)
     assert whole.perturb is not None
     moved = np.asarray(jax.jit(whole.perturb)(u, w))
@@ -79,10 +78,10 @@ def test_perturbed_controls_move_as_the_noise_does():
 
 
 def test_what_the_model_lacks_substeps_lack():
-    bare = dataclasses.replace(MODELS["ackermann"][0], perturb=None, jacobians=None)
-    whole = substeps(bare, 2)
+    bare = changed(MODELS["ackermann"][0], perturb=None, jacobians=None)
+    whole = Substeps(bare, 2)
     assert whole.perturb is None and whole.jacobians is None
-    assert substeps(motion.velocity(np.eye(3)), 2).perturb is None
+    assert Substeps(motion.Velocity(np.eye(3)), 2).perturb is None
 
 
 def test_names_are_numbered_and_keep_their_units(case):
@@ -91,7 +90,7 @@ def test_names_are_numbered_and_keep_their_units(case):
     assert len(set(whole.controls)) == u.size and len(set(whole.noises)) == w.size
     for one, many in ((single.controls, whole.controls), (single.noises, whole.noises)):
         assert [n.rpartition(" ")[2] for n in many] == [n.rpartition(" ")[2] for n in one] * COUNT
-    assert substeps(MODELS["ackermann"][0], 2).noises == (
+    assert Substeps(MODELS["ackermann"][0], 2).noises == (
         *("v_e 1 [m/s]", "steering 1 [rad]"),
         *("v_e 2 [m/s]", "steering 2 [rad]"),
     )
@@ -108,7 +107,7 @@ def test_float32_stays(case):
 
 def test_gradients_reach_the_models_parameters():
     def end(wheelbase):
-        model = substeps(motion.ackermann(Q, wheelbase=wheelbase), COUNT)
+        model = Substeps(motion.Ackermann(Q, wheelbase=wheelbase), COUNT)
         u = jnp.asarray(MODELS["ackermann"][1]).ravel()
         return jnp.sum(model.step(jnp.zeros(3), u, jnp.zeros(2 * COUNT)))
 
@@ -120,7 +119,7 @@ def test_gradients_reach_the_models_parameters():
 @pytest.mark.parametrize("count", [0, -1, 2.0, True, None])
 def test_a_bad_count_is_refused(count):
     with pytest.raises(ValueError, match="substeps: count"):
-        substeps(MODELS["ackermann"][0], count)
+        Substeps(MODELS["ackermann"][0], count)
 
 
 # --- webmap -------------------------------------------------------------------------------------

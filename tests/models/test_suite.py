@@ -13,25 +13,27 @@ from worlds import draw, ring
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
 from jaxslam.filters import ekf_slam
-from jaxslam.sensors import Part, suite
+from jaxslam.sensors import Part, Suite
 from jaxslam.simulation.scenarios import between_ranges
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Status
 
-EYES = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
-LASER = sensors.relative_position(np.diag([0.04, 0.06]) ** 2, mount=(-0.2, 0.0, 3.0))
-COMPASS = sensors.compass([[0.03**2]])
-FIX = sensors.position_fix(np.diag([0.1, 0.1]) ** 2)
+EYES = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
+LASER = sensors.RelativePosition(np.diag([0.04, 0.06]) ** 2, mount=(-0.2, 0.0, 3.0))
+COMPASS = sensors.Compass([[0.03**2]])
+FIX = sensors.PositionFix(np.diag([0.1, 0.1]) ** 2)
 
 
 def of_all(compass):
     """Three kinds of sensors, and two places for other robots."""
-    return suite(
-        Part(EYES, 4, visible=between_ranges(0.0, 4.0)),
-        Part(LASER, 6, every=3, start=1),
-        Part(compass, 1, every=5),
-        Part(EYES, 2, sees="robots"),
+    return Suite(
+        (
+            Part(EYES, 4, visible=between_ranges(0.0, 4.0)),
+            Part(LASER, 6, every=3, start=1),
+            Part(compass, 1, every=5),
+            Part(EYES, 2, sees="robots"),
+        )
     )
 
 
@@ -84,7 +86,7 @@ def places(scan, first, count, size=2):
 
 def test_a_suite_of_one_is_the_sensor():
     scenario, _ = estimated()
-    pair = [ekf_slam(scenario.motion, s, 6) for s in (EYES, suite((EYES, 4)))]
+    pair = [ekf_slam(scenario.motion, s, 6) for s in (EYES, Suite(((EYES, 4),)))]
 
     @jax.jit
     def both(state, scan):
@@ -172,7 +174,7 @@ def test_info_is_of_all_places():
 def test_campaigns_judge_a_suite():
     """An honest filter of all three, and one that believes its compass too much is found out."""
     scenario, honest = estimated()
-    proud = ekf_slam(scenario.motion, of_all(sensors.compass([[0.004**2]])), 6)
+    proud = ekf_slam(scenario.motion, of_all(sensors.Compass([[0.004**2]])), 6)
     tried = {"honest": honest, "proud": proud}
     options = {"block": 100, "devices": jax.devices()[:1]}
     campaign = jaxslam.monte_carlo(scenario, tried, 100, jax.random.key(1), **options)
@@ -194,10 +196,10 @@ def test_gradients_reach_every_part():
     _, (state, scan, _) = scans()
 
     def loss(theta, state, scan):
-        eyes = sensors.range_bearing(jnp.diag(theta[:2]) ** 2, mount=theta[4:7])
-        compass = sensors.compass(theta[2:3, None] ** 2)
-        laser = sensors.relative_position(jnp.eye(2) * theta[3] ** 2)
-        both = suite((eyes, 4), (laser, 6), (compass, 1), Part(EYES, 2, sees="robots"))
+        eyes = sensors.RangeBearing(jnp.diag(theta[:2]) ** 2, mount=theta[4:7])
+        compass = sensors.Compass(theta[2:3, None] ** 2)
+        laser = sensors.RelativePosition(jnp.eye(2) * theta[3] ** 2)
+        both = Suite(((eyes, 4), (laser, 6), (compass, 1), Part(EYES, 2, sees="robots")))
         ekf = ekf_slam(scenario.motion, both, 6, update="joint")
         return ekf.update(state, scan, jax.random.key(0))[1].log_likelihood
 
@@ -227,21 +229,21 @@ def test_a_scan_with_other_places_is_refused():
 
 
 def signature():
-    return sensors.range_bearing_signature(np.diag([0.1, 0.1, 0.1]) ** 2)
+    return sensors.RangeBearingSignature(np.diag([0.1, 0.1, 0.1]) ** 2)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: suite(), "at least one sensor"),
-        (lambda: suite(EYES), "expected a Part or"),
-        (lambda: suite((EYES, 0)), "places of range_bearing"),
-        (lambda: suite(Part(EYES, 1, every=0)), "every of range_bearing"),
-        (lambda: suite(Part(EYES, 1, start=-1)), "a start of at least 0"),
-        (lambda: suite(Part(EYES, 1, sees="birds")), 'sees "landmarks"'),
-        (lambda: suite((COMPASS, 2)), "expected places=1 of the absolute sensor compass, got 2"),
-        (lambda: suite((suite((EYES, 1)), 1)), "expected one Sensor in each Part"),
-        (lambda: suite((EYES, 1), (signature(), 1)), "expected sensors that share landmarks"),
+        (lambda: Suite(), "at least one sensor"),
+        (lambda: Suite((EYES,)), "expected a Part or"),
+        (lambda: Suite(((EYES, 0),)), "places of range_bearing"),
+        (lambda: Suite((Part(EYES, 1, every=0),)), "every of range_bearing"),
+        (lambda: Suite((Part(EYES, 1, start=-1),)), "a start of at least 0"),
+        (lambda: Suite((Part(EYES, 1, sees="birds"),)), 'sees "landmarks"'),
+        (lambda: Suite(((COMPASS, 2),)), "expected places=1 of the absolute sensor compass, got 2"),
+        (lambda: Suite(((Suite(((EYES, 1),)), 1),)), "expected one Sensor in each Part"),
+        (lambda: Suite(((EYES, 1), (signature(), 1))), "expected sensors that share landmarks"),
         (lambda: world(places=3), "each Part has its own places"),
         (lambda: world(spurious=Spurious()), "each Part has its own places"),
         (
@@ -253,7 +255,7 @@ def signature():
             "not a suite",
         ),
         (
-            lambda: suite((EYES, 1)).observe(jnp.zeros(3), jnp.zeros(2)),
+            lambda: Suite(((EYES, 1),)).observe(jnp.zeros(3), jnp.zeros(2)),
             "a suite has no model of its own",
         ),
     ],
@@ -267,8 +269,8 @@ def test_absolute_sensors_alone_in_both_precisions():
     """A compass and a position fix on a robot without a map."""
     scenario = Scenario(
         name="absolute",
-        motion=motion.increment(np.diag([0.01, 0.01]) ** 2),
-        sensor=suite((COMPASS, 1), (FIX, 1)),
+        motion=motion.Increment(np.diag([0.01, 0.01]) ** 2),
+        sensor=Suite(((COMPASS, 1), (FIX, 1))),
         landmarks=np.zeros((1, 0)),
         controls=np.tile([0.1, 0.05], (30, 1)),
     )

@@ -19,7 +19,7 @@ from jaxslam.monte_carlo.fingerprint import digest, fingerprint
 
 
 def world(steps=12, sigma=0.05, **changes):
-    sensor = sensors.range_bearing(np.diag([sigma, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
+    sensor = sensors.RangeBearing(np.diag([sigma, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
     return dataclasses.replace(worlds.ring(steps), sensor=sensor, **changes)
 
 

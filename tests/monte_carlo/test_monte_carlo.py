@@ -361,7 +361,7 @@ def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_
 def test_a_world_without_noise_does_not_diverge():
     still = dataclasses.replace(
         WORLD,
-        motion=motion.increment(np.zeros((2, 2))),
+        motion=motion.Increment(np.zeros((2, 2))),
     )
     campaign = worlds.campaign(still, {"ekf": worlds.ekf(still)}, 3)
     assert campaign.filters["ekf"].verdict == "undecided"
@@ -370,7 +370,7 @@ def test_a_world_without_noise_does_not_diverge():
 
 def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
     """Nothing is wrong with it in dead reckoning, which takes no measurements."""
-    exact = sensors.range_bearing(np.diag([0.1, 0.0]), mount=(0.1, -0.05, 0.3))
+    exact = sensors.RangeBearing(np.diag([0.1, 0.0]), mount=(0.1, -0.05, 0.3))
     still = dataclasses.replace(WORLD, sensor=exact)  # drawn by the program of WORLD
     reckoning = filters.dead_reckoning(still.motion, exact)
 
@@ -397,9 +397,9 @@ def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
     ],
 )
 def test_measurements_without_noise_are_named(noise, told):
-    there = dataclasses.replace(WORLD, sensor=sensors.range_bearing(noise))
+    there = dataclasses.replace(WORLD, sensor=sensors.RangeBearing(noise))
     assert without_noise(there) == told
-    eyes = sensors.suite((sensors.compass(np.eye(1)), 1), (there.sensor, 6))
+    eyes = sensors.Suite(((sensors.Compass(np.eye(1)), 1), (there.sensor, 6)))
     assert without_noise(dataclasses.replace(WORLD, sensor=eyes)) == told
 
 
@@ -444,7 +444,7 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"filters": catalog.FILTERS}, "ekf is a factory that was not called"),
         ({"filters": {"fej": catalog.FILTERS["fej"]}}, "what it returns, fej(world, …)"),
         (
-            {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), WORLD.sensor, 2)}},
+            {"filters": {"x": filters.ekf_slam(motion.Unicycle(np.eye(2)), WORLD.sensor, 2)}},
             "size 3",
         ),
     ],

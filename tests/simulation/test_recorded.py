@@ -14,8 +14,8 @@ from jaxslam.types import Log, Scan
 KEY = jax.random.key(3)
 DRAWN = Scenario(
     name="drawn",
-    motion=motion.unicycle(np.diag([0.05, 0.05]) ** 2),
-    sensor=sensors.range_bearing(np.diag([0.1, 0.05]) ** 2),
+    motion=motion.Unicycle(np.diag([0.05, 0.05]) ** 2),
+    sensor=sensors.RangeBearing(np.diag([0.1, 0.05]) ** 2),
     landmarks=((2.0, 1.0), (-1.0, 3.0)),
     controls=np.tile([0.5, 0.2, 0.1], (6, 1)),
     pose=(1.0, 0.0, 0.3),

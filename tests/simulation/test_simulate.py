@@ -35,8 +35,8 @@ MOUNT = np.array([0.3, -0.2, 0.5])
 def world(steps=300, **changes):
     options = {
         "name": "test",
-        "motion": motion.increment(Q),
-        "sensor": sensors.range_bearing(R, mount=MOUNT),
+        "motion": motion.Increment(Q),
+        "sensor": sensors.RangeBearing(R, mount=MOUNT),
         "landmarks": LANDMARKS,
         "controls": np.tile([[0.1, 0.05], [-0.05, 0.1]], (steps // 2, 1)),
         "pose": (1.0, -1.0, 3.0),
@@ -168,8 +168,8 @@ def test_noise_may_depend_on_control_and_measurement():
     controls = np.tile([[0.1, 0.05], [-0.4, 0.3]], (150, 1))
     scenario = world(
         controls=controls,
-        motion=motion.increment(lambda pose, u: jnp.diag(jnp.array([0.1, 0.2]) * u) ** 2),
-        sensor=sensors.range_bearing(
+        motion=motion.Increment(lambda pose, u: jnp.diag(jnp.array([0.1, 0.2]) * u) ** 2),
+        sensor=sensors.RangeBearing(
             lambda z: jnp.diag(jnp.stack([0.05 * z[0], 0.01 * jnp.ones_like(z[0])])) ** 2,
             mount=MOUNT,
         ),
@@ -186,8 +186,8 @@ def test_noise_may_depend_on_control_and_measurement():
 def test_no_noise_is_the_nominal_world(noise_on):
     scenario = world(
         40,
-        motion=motion.increment(np.zeros((2, 2))),
-        sensor=sensors.range_bearing(np.zeros((2, 2)), mount=MOUNT),
+        motion=motion.Increment(np.zeros((2, 2))),
+        sensor=sensors.RangeBearing(np.zeros((2, 2)), mount=MOUNT),
         noise_on=noise_on,
     )
     truth, log = draw(scenario)
@@ -283,7 +283,7 @@ def test_between_ranges_excludes_both_ends_and_reads_the_position_alone():
 
 # --- scenarios ----------------------------------------------------------------------------------
 
-BLIND = dataclasses.replace(motion.increment(Q), perturb=None)
+BLIND = dataclasses.replace(motion.Increment(Q), perturb=None)
 
 BAD = {
     "landmark size": ({"landmarks": np.zeros((3, 3))}, "landmarks: expected shape"),
@@ -370,7 +370,7 @@ def test_circle_has_a_place_for_every_landmark_in_view_at_any_length(steps):
     scenario = circle(steps)
     controls = np.asarray(scenario.controls)[:, :2]
     path = nominal_path(
-        dataclasses.replace(scenario, controls=controls, motion=motion.increment(Q))
+        dataclasses.replace(scenario, controls=controls, motion=motion.Increment(Q))
     )
     distance = np.linalg.norm(path[:, None, :2] - np.asarray(scenario.landmarks), axis=2)
     assert ((distance > 1) & (distance < 5)).sum(axis=1).max() == scenario.places

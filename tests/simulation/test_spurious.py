@@ -17,7 +17,7 @@ from jaxslam.protocols import Association
 from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Estimate, Info, Scan, Status, Trace
 
-SENSOR = sensors.range_bearing(np.diag([0.1, 0.02]) ** 2)
+SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2)
 M, RUNS = 12, 4000
 
 

@@ -90,8 +90,8 @@ def test_float32_and_gradients(short):
     def last(sigma, log):
         made = dataclasses.replace(
             world,
-            motion=motion.increment(jnp.diag(sigma[:2]) ** 2),
-            sensor=sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2)),
+            motion=motion.Increment(jnp.diag(sigma[:2]) ** 2),
+            sensor=sensors.RangeBearing(sigma[2] ** 2 * jnp.eye(2)),
         )
         filter = lag(made, window=1, iterations=1, first_estimates=True)
         pose = run(filter, log, world.pose, np.zeros((3, 3)), KEY).estimate.pose[-1]
@@ -112,10 +112,10 @@ def test_float32_and_gradients(short):
         ({"window": 0}, "window"),
         ({"iterations": 0}, "iterations"),
         ({"places": 0}, "places"),
-        ({"sensor": sensors.bearing_only(np.eye(1))}, "as many numbers"),
-        ({"sensor": sensors.compass(np.eye(1))}, "as many numbers"),
+        ({"sensor": sensors.BearingOnly(np.eye(1))}, "as many numbers"),
+        ({"sensor": sensors.Compass(np.eye(1))}, "as many numbers"),
         (
-            {"sensor": sensors.range_bearing_signature(np.eye(3)), "first_estimates": True},
+            {"sensor": sensors.RangeBearingSignature(np.eye(3)), "first_estimates": True},
             r"landmarks \(x, y\)",
         ),
     ],

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from own_models import motion_of, sensor_of
 from reference import ekf_slam as plain
 from worlds import ring
 
 from jaxslam import filters, motion, run, sensors, simulate
 from jaxslam.graphs import Ending
 from jaxslam.math.stats import chi2_band
-from jaxslam.protocols import Free, Motion, Sensor
+from jaxslam.protocols import Free
 from jaxslam.smoothing import batch_map, smooth
 from jaxslam.types import Log, Scan, Status
 
@@ -45,7 +46,7 @@ MARK = 5.0  # a measurement that begins so claims to be exact
 
 def linear_world():
     """Affine models; two noises for three coordinates; landmarks that come into view late."""
-    moves = Motion(
+    moves = motion_of(
         name="linear",
         controls=("a", "b", "c"),
         noises=("v", "w"),
@@ -54,7 +55,7 @@ def linear_world():
         ),
         noise_cov=lambda pose, u: jnp.asarray(Q, pose.dtype),
     )
-    sees = Sensor(
+    sees = sensor_of(
         name="linear",
         measurements=("p", "q"),
         landmark=("x [m]", "y [m]"),
@@ -197,7 +198,7 @@ def steady_ring(steps=12):
     """All six landmarks at every step, a start that is uncertain in every direction."""
     return dataclasses.replace(
         ring(steps),
-        sensor=sensors.range_bearing(np.diag([0.05, 0.02]) ** 2),
+        sensor=sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2),
         pose_cov=np.diag([0.02, 0.03, 0.01]) ** 2,
     )
 
@@ -263,13 +264,13 @@ def late_ring(steps=14, **other):
 
 def camera_ring(steps=14):
     """`ring` seen by a camera, with a prior of the range."""
-    camera = sensors.bearing_only(np.array([[0.02**2]]), free=(np.array([3.0]), np.array([[1.0]])))
+    camera = sensors.BearingOnly(np.array([[0.02**2]]), free=(np.array([3.0]), np.array([[1.0]])))
     return dataclasses.replace(ring(steps), sensor=camera)
 
 
 def fixed_ring(steps=14):
     """`ring` with a satellite receiver, and no landmark."""
-    receiver = sensors.position_fix(0.1**2 * np.eye(2))
+    receiver = sensors.PositionFix(0.1**2 * np.eye(2))
     return dataclasses.replace(ring(steps), sensor=receiver, landmarks=np.zeros((1, 0)))
 
 
@@ -313,8 +314,8 @@ def step_ring(steps=10):
     """`late_ring` with noise in all three coordinates of a motion, as GTSAM needs it."""
     return late_ring(
         steps,
-        motion=motion.pose_increment(np.diag(SIGMA_W) ** 2),
-        sensor=sensors.range_bearing(np.diag(SIGMA_Z) ** 2),
+        motion=motion.PoseIncrement(np.diag(SIGMA_W) ** 2),
+        sensor=sensors.RangeBearing(np.diag(SIGMA_Z) ** 2),
         controls=np.tile([0.6, 0.0, 0.4], (steps, 1)),
     )
 
@@ -476,14 +477,14 @@ def test_a_batch_of_runs_ends_where_each_does():
 EMPTY = Log(
     np.zeros((5, 2)), Scan(np.zeros((5, 1, 2)), np.zeros((5, 1), int), np.ones((5, 1), bool))
 )
-RAYS = sensors.bearing_inverse_depth(np.eye(1), min_distance=1.0)
+RAYS = sensors.BearingInverseDepth(np.eye(1), min_distance=1.0)
 
 
 @pytest.mark.parametrize("method", [smooth, batch_map])
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sensor": sensors.suite((ring(5).sensor, 2))}, "suite"),
+        ({"sensor": sensors.Suite(((ring(5).sensor, 2),))}, "suite"),
         ({"sensor": RAYS}, "measurement and prior determine"),
         ({"capacity": 0}, "capacity"),
         ({"gate": -1.0}, "gate"),

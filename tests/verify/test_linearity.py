@@ -157,8 +157,8 @@ def test_no_slope_to_compare_with_is_inf_not_nan():
 
 def test_whole_numbers_are_as_good_as_any():
     """A pose of integers does not round the control, the landmark or the noise."""
-    robot, u, cov = motion.velocity(np.diag([0.1, 0.05, 0.05]) ** 2), [1.5, 0.3, 0.5], np.eye(3) / 9
-    laser, wide = sensors.range_bearing(np.diag([0.1, 0.05]) ** 2), np.eye(5) / 100
+    robot, u, cov = motion.Velocity(np.diag([0.1, 0.05, 0.05]) ** 2), [1.5, 0.3, 0.5], np.eye(3) / 9
+    laser, wide = sensors.RangeBearing(np.diag([0.1, 0.05]) ** 2), np.eye(5) / 100
 
     @jax.jit
     def both(pose):
@@ -205,14 +205,14 @@ def test_rounding_is_no_bend(sigma):
 
 def test_angles_are_compared_on_the_circle():
     """A heading next to the seam bends no more than one far from it."""
-    robot = motion.velocity(np.diag([0.1, 0.05, 0.05]) ** 2)
+    robot = motion.Velocity(np.diag([0.1, 0.05, 0.05]) ** 2)
     u, cov = np.array([1.0, 0.3, 0.5]), np.diag([0.1, 0.1, 0.2]) ** 2
     of = jax.jit(jax.vmap(lambda pose: motion_linearity(robot, pose, u, cov)))
     assert (
         of(np.array([[1.0, 2.0, 0.5], [1.0, 2.0, np.pi - 1e-3]])).sampled_rows[:, 2] < 1e-12
     ).all()
 
-    laser = sensors.range_bearing(np.diag([0.1, 0.05]) ** 2)
+    laser = sensors.RangeBearing(np.diag([0.1, 0.05]) ** 2)
     pose, cov = np.zeros(3), np.diag([0.01, 0.01, 0.1, 0.01, 0.01]) ** 2
 
     @jax.jit
@@ -242,19 +242,19 @@ def from_the_side(baseline):
     prior, 1/(2 d_min) ± 1/(4 d_min); its range, the same to first order.
     """
     pose = jnp.stack([0.0, baseline, 0.0])
-    inverse = sensors.bearing_inverse_depth([[1e-4]], min_distance=NEAREST)
+    inverse = sensors.BearingInverseDepth([[1e-4]], min_distance=NEAREST)
     by_inverse = sensor_linearity(
         inverse, pose, np.array([0.0, 0, 0, RHO]), np.diag([0, 0, 0, 0, 0, 0, SIGMA**2])
     )
     cov = np.diag([0, 0, 0, (SIGMA / RHO**2) ** 2, 0])
     point = np.array([1 / RHO, 0.0])
-    return by_inverse, sensor_linearity(sensors.bearing_only([[1e-4]]), pose, point, cov)
+    return by_inverse, sensor_linearity(sensors.BearingOnly([[1e-4]]), pose, point, cov)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.25])
 def test_inverse_depth_is_near_linear_where_range_is_not(share):
     """f(ρ) = -atan(ρ b) has |f''/f'| = 2ρb²/(1 + ρ²b²), f(d) = -atan(b/d) has 2d/(d² + b²)."""
-    prior = sensors.bearing_inverse_depth([[1e-4]], min_distance=NEAREST).free
+    prior = sensors.BearingInverseDepth([[1e-4]], min_distance=NEAREST).free
     np.testing.assert_allclose([prior.mean[0], prior.cov[0, 0]], [RHO, SIGMA**2])
     b, d, sigma_d = share * NEAREST, 1 / RHO, SIGMA / RHO**2
     by_inverse, by_range = from_the_side(b)
@@ -302,6 +302,6 @@ def test_bad_input_is_refused(change, why):
 )
 def test_bad_shapes_of_a_models_input_are_refused(pose, other, why):
     with pytest.raises(ValueError, match=why):
-        motion_linearity(motion.velocity(np.eye(3)), pose, other, np.eye(3))
+        motion_linearity(motion.Velocity(np.eye(3)), pose, other, np.eye(3))
     with pytest.raises(ValueError, match=why):
-        sensor_linearity(sensors.range_bearing(np.eye(2)), pose, other, np.eye(5))
+        sensor_linearity(sensors.RangeBearing(np.eye(2)), pose, other, np.eye(5))

@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_models import sensor_of
 from verified import failed
 
 from jaxslam import motion, sensors
@@ -15,10 +16,10 @@ from jaxslam.verify import Check, Report, build, properties, verify_jacobians
 from jaxslam.verify.inputs import samples
 from jaxslam.verify.inputs.functions import motion_functions
 
-LASER = build(sensors.range_bearing)
-CAMERA = build(sensors.bearing_only)
-INCREMENT = build(motion.increment)
-UNMOUNTED = sensors.range_bearing(0.01 * np.eye(2))
+LASER = build(sensors.RangeBearing)
+CAMERA = build(sensors.BearingOnly)
+INCREMENT = build(motion.Increment)
+UNMOUNTED = sensors.RangeBearing(0.01 * np.eye(2))
 
 DIFFERENCE = "the residual is a difference, wrapped on the circle"
 OBSERVED = "invert undoes observe, within what is free"
@@ -165,7 +166,7 @@ def test_a_sensor_whose_embed_fails_is_still_looked_at():
 
 def test_a_factory_in_place_of_a_model_is_named():
     with pytest.raises(ValueError, match=r"got the factory range_bearing of one: call it"):
-        verify_jacobians(sensors.range_bearing)
+        verify_jacobians(sensors.RangeBearing)
 
 
 def test_the_first_line_of_a_report_counts_its_notes():
@@ -185,7 +186,7 @@ def mast_camera(invert_sign=1.0):
         polar = jnp.stack([1.5 / jnp.tan(z[1]), invert_sign * z[0]])
         return se2.from_frame(pose, se2.rectangular(polar))
 
-    return Sensor(
+    return sensor_of(
         name="mast_camera",
         measurements=("bearing [rad]", "depression [rad]"),
         observe=observe,

@@ -6,8 +6,8 @@ import numpy as np
 import jaxslam
 
 jax.config.update("jax_enable_x64", True)
-motion = jaxslam.motion.increment(np.diag([0.005, 0.003]) ** 2)
-radio = jaxslam.sensors.range_only([[0.1**2]])
+motion = jaxslam.motion.Increment(np.diag([0.005, 0.003]) ** 2)
+radio = jaxslam.sensors.RangeOnly([[0.1**2]])
 world = jaxslam.Scenario(
     name="beacons",
     motion=motion,

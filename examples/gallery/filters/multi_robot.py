@@ -7,9 +7,9 @@ import jaxslam
 from jaxslam import team
 
 jax.config.update("jax_enable_x64", True)
-motion = jaxslam.motion.increment(np.diag([0.02, 0.02]) ** 2)
-eye = jaxslam.sensors.range_bearing(np.diag([0.1, np.deg2rad(2.0)]) ** 2)
-sees = jaxslam.sensors.suite((eye, 6), jaxslam.sensors.Part(eye, 1, sees="robots"))
+motion = jaxslam.motion.Increment(np.diag([0.02, 0.02]) ** 2)
+eye = jaxslam.sensors.RangeBearing(np.diag([0.1, np.deg2rad(2.0)]) ** 2)
+sees = jaxslam.sensors.Suite(((eye, 6), jaxslam.sensors.Part(eye, 1, sees="robots")))
 start = (2.0, -1.0, 0.5), np.diag([0.05, 0.05, 0.02]) ** 2
 crew = [team.Robot(motion, sees), team.Robot(motion, sees, start=start)]
 posts = [[4.0, 5.0], [-3.0, 4.0], [5.0, -1.0], [0.0, 8.0], [-2.0, -1.0], [3.0, 1.5]]

@@ -9,7 +9,7 @@ import jaxslam
 jax.config.update("jax_enable_x64", True)
 world = jaxslam.scenarios.loop(steps=80)
 truth, log = jaxslam.simulate(world, jax.random.key(0))
-sensor = jaxslam.sensors.relative_position(0.5**2 * np.eye(2))  # wider than the world's
+sensor = jaxslam.sensors.RelativePosition(0.5**2 * np.eye(2))  # wider than the world's
 filter = jaxslam.filters.particle_localization(
     world.motion, sensor, truth.landmarks, 2000, box=[[-14, -6], [14, 26]], start="uniform"
 )

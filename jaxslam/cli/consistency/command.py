@@ -22,6 +22,7 @@ from jaxslam.cli.consistency.folder import (
 )
 from jaxslam.cli.runtime import devices, library
 from jaxslam.cli.user_objects import UserObjects
+from jaxslam.core.numbers import check_count
 from jaxslam.monte_carlo import Interrupted, Library, monte_carlo
 from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
 from jaxslam.monte_carlo.fingerprint import fingerprint
@@ -29,7 +30,6 @@ from jaxslam.protocols import Candidate
 from jaxslam.results import campaign_files, run_table, store
 from jaxslam.simulation.worlds import Scenario, run_keys, world_of_run
 from jaxslam.types import Estimate, Truth
-from jaxslam.validation.numbers import check_count
 
 
 def consistency(options: argparse.Namespace, command: str) -> int:

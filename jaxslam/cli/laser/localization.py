@@ -83,7 +83,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
     filter = grids.localize(
         grid,
         grids.likelihood_field(sigma, max_range=log.max_range, mount=log.mount),
-        motion.odometry(motion.odometry_noise(ODOMETRY_NOISE)),
+        motion.Odometry(motion.OdometryNoise(ODOMETRY_NOISE)),
         options.particles,
         start="uniform" if pose is None else "gaussian",
         **options_of,

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxslam.calibration import Calibration, calibrate
 from jaxslam.charts import right_invariant
+from jaxslam.core.numbers import is_concrete
 from jaxslam.datasets.mrclam.calibration import (
     MRCLAM_CALIBRATION,
     RobotCalibration,
@@ -18,12 +19,11 @@ from jaxslam.datasets.mrclam.calibration import (
 from jaxslam.datasets.mrclam.reader import mrclam
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.math.stats import sigma_gate
-from jaxslam.motion import unicycle
+from jaxslam.motion import Unicycle
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.run import run
-from jaxslam.sensors import range_bearing
+from jaxslam.sensors import RangeBearing
 from jaxslam.types import Info, Log
-from jaxslam.validation.numbers import is_concrete
 
 MRCLAM_FITTED = ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
 """What a log tells of a `RobotCalibration`; it does not tell `depth` beside `forward`."""
@@ -110,7 +110,7 @@ def mrclam_calibration(
         )
         ahead = scale * own.ahead
         mount = jnp.stack([ahead, 0.0 * ahead, own.yaw])
-        return log, unicycle(own.odometry_cov()), range_bearing(own.measurement_cov(), mount=mount)
+        return log, Unicycle(own.odometry_cov()), RangeBearing(own.measurement_cov(), mount=mount)
 
     def info(p: jax.Array) -> Info:
         log, motion, sensor = at(p)

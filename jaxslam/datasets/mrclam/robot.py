@@ -14,11 +14,10 @@ from jaxslam.datasets.mrclam.calibration import RobotCalibration, per_interval, 
 from jaxslam.datasets.mrclam.files import read_robot, read_truth
 from jaxslam.datasets.mrclam.truth import START_COV, cut_after, true_poses
 from jaxslam.logs.streams import hold
-from jaxslam.motion import unicycle
+from jaxslam.motion import Unicycle
 from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.sensors import range_bearing
-from jaxslam.sensors.mounting import NO_OFFSET
+from jaxslam.sensors import RangeBearing
 from jaxslam.types import Log
 
 SOURCE = (
@@ -74,13 +73,13 @@ def models_of(
     """The motion model and the sensor, with the noise that is given or the default."""
     default_moved: NoiseCov = white_noise(*ODOMETRY_DENSITY)
     default_seen: NoiseCov = MEASUREMENT_COV
-    mount: ArrayLike = NO_OFFSET
+    mount: ArrayLike | None = None
     if calibration is not None:
         default_moved, default_seen = calibration.odometry_cov(), calibration.measurement_cov()
         mount = calibration.mount
     moved = default_moved if odometry_cov is None else odometry_cov
     seen = default_seen if measurement_cov is None else measurement_cov
-    return unicycle(moved), range_bearing(seen, mount=mount)
+    return Unicycle(moved), RangeBearing(seen, mount=mount)
 
 
 def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> TrueFields:

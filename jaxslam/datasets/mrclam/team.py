@@ -21,8 +21,8 @@ from jaxslam.datasets.mrclam.robot import (
 )
 from jaxslam.logs.streams import Rows, hold
 from jaxslam.noise import NoiseCov
-from jaxslam.sensors import Part, suite
-from jaxslam.team import Robot, motion_of, sensors_of
+from jaxslam.sensors import Part, Suite
+from jaxslam.team import Robot, TeamMotion, sensors_of
 from jaxslam.types import Log
 
 
@@ -105,7 +105,7 @@ def mrclam_team(
                 sensor = sight if robots_seen else eye
                 parts.append(Part(sensor, scan.tag.shape[1], sees=sees))
                 scans.append(scan)
-        team.append(Robot(model, suite(*parts)))
+        team.append(Robot(model, Suite((*parts,))))
     return Dataset(
         name=f"mrclam robots {', '.join(map(str, asked))}",
         log=Log.from_rows(
@@ -116,7 +116,7 @@ def mrclam_team(
             )
         ),
         time=time,
-        motion=motion_of(team, 0),
+        motion=TeamMotion(tuple(robot.motion for robot in team), 0),
         sensor=sensors_of(team, 0),
         tags=names,
         filter_options={"update": "sequential"},

@@ -3,7 +3,6 @@
 import inspect
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam import motion, sensors
+from jaxslam.core.record import record, static
 from jaxslam.datasets.table.association import GATE, METHODS, association_options, is_number
 from jaxslam.datasets.table.models import Parametric, fitting_model, of_no_noise
 from jaxslam.datasets.table.settings_text import line_number
@@ -30,6 +30,50 @@ MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
 ROOM = 100
 """Default number of landmarks, where identities are unknown."""
 _FILTER = ("gate", "capacity", "associate", "update", "start", "start_noise")
+
+
+@record
+class _TableNoise:
+    """The noise of a line of odometry, whatever rows divide it; see `TableSettings.motion`."""
+
+    deviations: JaxOrNumPy
+    interval: float
+    per_time: bool = static()
+    """whether the last control is Δt"""
+    of_increments: bool = static()
+    """whether they grow with Δt; else velocities, whose noise shrinks"""
+
+    def __call__(self, pose: jax.Array, u: jax.Array) -> jax.Array:
+        cov = jnp.diag(jnp.asarray(self.deviations, u.dtype) ** 2)
+        if self.of_increments:
+            return cov * u[-1] / self.interval
+        if self.per_time:
+            moving = u[-1] > 0
+            return cov * jnp.where(moving, self.interval / jnp.where(moving, u[-1], 1.0), 0.0)
+        return cov
+
+
+@record
+class _WithInterval(Motion):
+    """A motion model with Δt as a last control, of which its noise alone depends."""
+
+    motion: Motion
+    noise_cov: _TableNoise
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.motion.name
+
+    @property
+    def controls(self) -> tuple[str, ...]:  # type: ignore[override]
+        return (*self.motion.controls, INTERVAL)
+
+    @property
+    def noises(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.motion.noises
+
+    def step(self, pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+        return self.motion.step(pose, u[:-1], w)
 
 
 class TableSettings:
@@ -77,26 +121,9 @@ class TableSettings:
         with_interval = INTERVAL in shell.controls
 
         def model(deviations: JaxOrNumPy, mount: ArrayLike | None = None) -> Motion:
-            def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
-                cov = jnp.diag(jnp.asarray(deviations, u.dtype) ** 2)
-                if from_poses:
-                    return cov * u[-1] / interval
-                if with_interval:
-                    moving = u[-1] > 0
-                    return cov * jnp.where(moving, interval / jnp.where(moving, u[-1], 1.0), 0.0)
-                return cov
-
-            plain = self._built("motion", factory, options, noise_cov)
-            if not from_poses:
-                return plain
-            return replace(
-                plain,
-                controls=(*plain.controls, INTERVAL),
-                step=lambda pose, u, w: plain.step(pose, u[:-1], w),
-                noise_cov=noise_cov,
-                perturb=None,
-                jacobians=None,
-            )
+            noise = _TableNoise(deviations, interval, from_poses or with_interval, from_poses)
+            plain = self._built("motion", factory, options, noise)
+            return _WithInterval(plain, noise) if from_poses else plain
 
         deviations = self._noise("motion", shell.noises, MOTION_NOISE)
         return Parametric(shell.noises, tuple(deviations), None, model)

@@ -5,12 +5,12 @@ from typing import Literal, get_args
 
 from jaxslam import validation
 from jaxslam.association.known import known
+from jaxslam.core.numbers import check_count, check_gate, is_concrete
 from jaxslam.filters.delayed.state import SIZE, TableLayout
 from jaxslam.filters.delayed.triangulation import Triangulation, triangulation_of
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Associate, Motion, Sensor
 from jaxslam.sensors.suite import on_ground
-from jaxslam.validation.numbers import check_count, check_gate, is_concrete
 
 Distance = Literal["mahalanobis", "bhattacharyya"]
 

@@ -13,10 +13,10 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Sensor
-from jaxslam.validation.numbers import is_concrete
 
 Stored = Float[Array, "3"]
 """a stored measurement s = (x, y, q)"""

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import slots, validation
+from jaxslam.core.numbers import check_count
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.settings import EkfOptions, check_covariance_form
 from jaxslam.math import linalg
@@ -13,7 +14,6 @@ from jaxslam.math.xla import where_any
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
-from jaxslam.validation.numbers import check_count
 
 # The tag of slots that are no landmark: not -1, which is the tag of a measurement without one.
 _NONE = -2

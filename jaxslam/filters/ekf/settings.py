@@ -9,10 +9,10 @@ from jaxtyping import PyTree
 
 from jaxslam.association.known import known
 from jaxslam.charts.euclidean import euclidean
+from jaxslam.core.numbers import check_count, check_gate
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.protocols import Associate, Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Suite
-from jaxslam.validation.numbers import check_count, check_gate
 
 Update = Literal["sequential", "joint"]
 

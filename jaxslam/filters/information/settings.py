@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 from jaxslam import validation
+from jaxslam.core.numbers import check_count, check_gate
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
-from jaxslam.validation.numbers import check_count, check_gate
 
 
 @dataclass(frozen=True, eq=False)

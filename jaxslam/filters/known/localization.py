@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
+from jaxslam.core.numbers import is_concrete
+from jaxslam.core.record import record
 from jaxslam.filters.ekf.settings import (
     Covariance,
     EkfSettings,
@@ -29,7 +31,6 @@ from jaxslam.protocols import (
     Basis,
     Chart,
     Filter,
-    Free,
     Here,
     Linearizer,
     Motion,
@@ -39,7 +40,6 @@ from jaxslam.protocols import (
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
-from jaxslam.validation.numbers import is_concrete
 
 Array = jax.Array
 
@@ -161,38 +161,57 @@ def localization(
 def _in_map(sensor: Sensor, points: PyTree, settings: EkfSettings) -> EkfSettings:
     """The settings for one sensor of known landmarks, or for an absolute sensor."""
     absolute = not sensor.landmark
-    linearize = settings.linearize if absolute else _on_map(settings.linearize, sensor, points)
+    linearize = settings.linearize if absolute else _on_map(settings.linearize, points)
     return dataclasses.replace(
-        settings, sensor=_without_landmark(sensor), linearize=linearize, absolute=absolute
+        settings, sensor=_OfRobot(sensor), linearize=linearize, absolute=absolute
     )
 
 
-def _on_map(linearize: Linearizer, sensor: Sensor, points: PyTree) -> Linearizer:
+def _on_map(linearize: Linearizer, points: PyTree) -> Linearizer:
     """The linearizer with the landmark of a slot as a constant of the sensor."""
 
-    def observe(flat: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+    def observe(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
         landmark = jnp.asarray(points, here.pose.dtype)[here.slot]
-        seen = dataclasses.replace(flat, observe=lambda pose, _: sensor.observe(pose, landmark))
-        return linearize.observe(seen, here)
+        return linearize.observe(dataclasses.replace(sensor, known=landmark), here)
 
     return dataclasses.replace(linearize, observe=observe)
 
 
-def _without_landmark(sensor: Sensor) -> Sensor:
-    """The sensor with landmarks without parameters."""
-    none = jnp.zeros(0)
-    return Sensor(
-        name=sensor.name,
-        measurements=sensor.measurements,
-        landmark=(),
-        observe=sensor.observe,
-        residual=sensor.residual,
-        noise_cov=sensor.noise_cov,
-        invert=lambda pose, z, s: jnp.zeros(0, pose.dtype),
-        position=lambda landmark: jnp.zeros(2, landmark.dtype),
-        embed=lambda pose, point: jnp.zeros(0, pose.dtype),
-        free=Free(none, jnp.zeros((0, 0))),
-    )
+@record
+class _OfRobot(Sensor):
+    """A sensor as one of the robot alone: the landmark that it measures is known."""
+
+    sensor: Sensor
+    known: PyTree = None
+    """(L,) the landmark; None of an absolute sensor"""
+    landmark = ()
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.sensor.name
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.measurements
+
+    def observe(self, pose: Array, landmark: Array) -> Array:
+        return self.sensor.observe(pose, landmark if self.known is None else self.known)
+
+    def residual(self, z: Array, z_hat: Array) -> Array:
+        return self.sensor.residual(z, z_hat)
+
+    def noise_cov(self, z: Array) -> Array:
+        cov: Array = self.sensor.noise_cov(z)
+        return cov
+
+    def invert(self, pose: Array, z: Array, s: Array) -> Array:
+        return jnp.zeros(0, pose.dtype)
+
+    def position(self, landmark: Array) -> Array:
+        return jnp.zeros(2, landmark.dtype)
+
+    def embed(self, pose: Array, point: Array) -> Array:
+        return jnp.zeros(0, pose.dtype)
 
 
 def _of_pose(chart: Chart) -> Chart:

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam import validation
+from jaxslam.core.numbers import check_count
 from jaxslam.filters.map_management.loop_closure import (
     Closing,
     LoopSettings,
@@ -19,7 +20,6 @@ from jaxslam.math.xla import change_where
 from jaxslam.protocols import Filter
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
-from jaxslam.validation.numbers import check_count
 
 
 def closing(

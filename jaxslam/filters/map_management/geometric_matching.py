@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core.numbers import check_count
 from jaxslam.filters.map_management.alignment import align_points
 from jaxslam.filters.map_management.point_pairs import (
     PointSets,
@@ -19,7 +20,6 @@ from jaxslam.filters.map_management.point_pairs import (
     longest_pairs,
 )
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.validation.numbers import check_count
 
 _BLOCK = 32  # candidates that are scored together; more cost memory
 _FINALISTS = 8  # hypotheses that are tried jointly

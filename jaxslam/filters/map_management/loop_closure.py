@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxslam.core.numbers import check_count
 from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.alignment import with_unit_blocks
 from jaxslam.filters.map_management.geometric_matching import (
@@ -24,7 +25,6 @@ from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
-from jaxslam.validation.numbers import check_count
 
 
 class Closing(NamedTuple):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots, validation
+from jaxslam.core.numbers import is_concrete
 from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
 from jaxslam.filters.map_management.wrapping import joint_of, managed
 from jaxslam.filters.reporting import with_extra
@@ -17,7 +18,6 @@ from jaxslam.math.xla import change_where
 from jaxslam.protocols import Chart, Filter
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan, Status
-from jaxslam.validation.numbers import is_concrete
 
 
 class Merged(NamedTuple):

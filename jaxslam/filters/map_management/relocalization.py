@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxslam.core.numbers import check_count, check_covariance
 from jaxslam.filters.ekf.coordinates.map_coordinates import (
     cov_of_coordinates,
     with_cov_of_coordinates,
@@ -22,7 +23,6 @@ from jaxslam.math import linalg
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
-from jaxslam.validation.numbers import check_count, check_covariance
 
 
 class Relocalization(NamedTuple):

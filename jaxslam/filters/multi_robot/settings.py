@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxslam.core.numbers import check_count, check_gate
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.scan import SensorTurn
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.team import Robot
-from jaxslam.validation.numbers import check_count, check_gate
 
 SIZE = 3
 """Numbers of a slot: x, y and the heading of a robot; of a landmark the third is padding."""

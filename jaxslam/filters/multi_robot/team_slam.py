@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam import slots, validation
 from jaxslam.association.known import known as known_association
 from jaxslam.charts.euclidean import euclidean
+from jaxslam.core.numbers import check_count
 from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance_form
 from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.ekf.steps.scan import SensorTurn, turn_of, update_by_scan
@@ -37,7 +38,6 @@ from jaxslam.sensors.suite import Part, split_scan
 from jaxslam.slots import Joint
 from jaxslam.team import Robot, check_team, poses, sizes
 from jaxslam.types import Estimate, Info, Scan, Status
-from jaxslam.validation.numbers import check_count
 
 
 def team_slam(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxslam import programs
+from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solution.chordal import PRIOR
@@ -21,7 +22,6 @@ from jaxslam.graphs.solver.plan import Plan, plan_for
 from jaxslam.graphs.solver.search import minimize
 from jaxslam.graphs.sparse.cholesky import factorize, substitute
 from jaxslam.graphs.validation import check_graph
-from jaxslam.validation.numbers import is_concrete
 
 SHARE = 1e-6
 """The gap that is tried first, relative to χ² + 1."""

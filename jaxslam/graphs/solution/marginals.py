@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
+from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
@@ -22,7 +23,6 @@ from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
 from jaxslam.graphs.sparse.inverse import selected_inverse
 from jaxslam.graphs.sparse.sweeps import padded_size
 from jaxslam.graphs.validation import check_graph, label
-from jaxslam.validation.numbers import is_concrete
 
 
 class Marginals(NamedTuple):

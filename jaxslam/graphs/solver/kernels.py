@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxslam.validation.numbers import check_positive
+from jaxslam.core.numbers import check_positive
 
 Array = jax.Array
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.model import factors_of
@@ -15,7 +16,6 @@ from jaxslam.graphs.sparse.gathered import Stages, stages
 from jaxslam.graphs.sparse.inverse import InverseTables, inverse_tables
 from jaxslam.graphs.sparse.sweeps import index_table
 from jaxslam.graphs.sparse.symbolic import factor_pattern
-from jaxslam.validation.numbers import is_concrete
 
 
 class Plan(NamedTuple):

@@ -8,9 +8,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxslam.core.numbers import check_count, is_concrete, shape_told
 from jaxslam.grids.grid import Grid
 from jaxslam.types import Beams, JaxOrNumPy
-from jaxslam.validation.numbers import check_count, is_concrete, shape_told
 
 
 @dataclass(frozen=True, eq=False)

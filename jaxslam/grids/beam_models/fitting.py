@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
 from jaxslam import programs
+from jaxslam.core.numbers import check_positive
 from jaxslam.grids.beam_models.ray_cast import Mixture, check_weights, mixture_log_density
-from jaxslam.validation.numbers import check_positive
 
 START = Mixture(0.6, 0.15, 0.1, 0.15, 0.2, 0.5)
 """Where the search begins."""

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxslam.core.numbers import check_mount, check_positive
 from jaxslam.grids.beam_models.beam_model import BeamModel
 from jaxslam.grids.beam_models.ray_cast import check_weights
 from jaxslam.grids.distance import distance_field
@@ -13,7 +14,6 @@ from jaxslam.grids.grid import Field, Grid
 from jaxslam.grids.interpolation import interpolate, slope
 from jaxslam.math import se2
 from jaxslam.types import Beams, JaxOrNumPy
-from jaxslam.validation.numbers import check_mount, check_positive
 
 
 def likelihood_field(

@@ -10,12 +10,12 @@ from jax.scipy.special import ndtr
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
+from jaxslam.core.numbers import check_mount, check_positive, is_concrete
 from jaxslam.grids.beam_models.beam_model import BeamModel
 from jaxslam.grids.cast import RayMap, cast, check_method, ray_map
 from jaxslam.grids.grid import Grid
 from jaxslam.math import se2
 from jaxslam.types import Beams
-from jaxslam.validation.numbers import check_mount, check_positive, is_concrete
 
 
 class Mixture(NamedTuple):

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.types import Beams, Log, Scan
-from jaxslam.validation.numbers import is_concrete
 
 NOTHING = 1e6
 """Range [m] in a log of a beam that met nothing and is infinite in the scan: a log is finite."""

@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, PyTree
 
 from jaxslam import validation
+from jaxslam.core.numbers import is_concrete
 from jaxslam.filters.particles.pose_steps import pose_filter, weigh_particles
 from jaxslam.filters.particles.settings import (
     MonteCarloSettings,
@@ -35,7 +36,6 @@ from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import normalized
 from jaxslam.types import Beams, Info, Scan
 from jaxslam.validation.models import check_motion
-from jaxslam.validation.numbers import is_concrete
 
 
 def localize(

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam import validation
 from jaxslam.charts.euclidean import euclidean
+from jaxslam.core.numbers import check_mount, check_positive
 from jaxslam.filters.particles.proposal import sample_motion
 from jaxslam.filters.particles.settings import check_resampling
 from jaxslam.filters.particles.states.moments import weighted_pose_moments
@@ -31,7 +32,6 @@ from jaxslam.protocols import Filter, Motion, Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import effective_size, normalized
 from jaxslam.types import Beams, Estimate, Info, Scan
-from jaxslam.validation.numbers import check_mount, check_positive
 
 
 def grid_slam(

@@ -9,9 +9,9 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.numbers import shape_told
 from jaxslam.grids.grid import Grid
 from jaxslam.grids.mapping import Counts, occupancy
-from jaxslam.validation.numbers import shape_told
 
 
 class GridParticles(NamedTuple):

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.core.record import record
 from jaxslam.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser_slam.records import Solved
 from jaxslam.math import se2
@@ -14,7 +15,8 @@ ENDS = ("x [m]", "y [m]", "θ [rad]")
 ROOTS = ("Lxx [m]", "Lyx [m]", "Lyy [m]", "Lθx [rad]", "Lθy [rad]", "Lθθ [rad]")
 
 
-def match_motion() -> Motion:
+@record
+class MatchMotion(Motion):
     """The motion model of a relative pose whose covariance is part of the control: pose ∘ z ∘ w.
 
     u = (z, L): z = (x [m], y [m], θ [rad]) in the robot's frame, and by rows the lower triangular
@@ -22,21 +24,22 @@ def match_motion() -> Motion:
     robot after z. `match_controls` makes u of the matches of laser odometry.
     """
 
-    def step(pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+    controls = (*ENDS, *ROOTS)
+    noises = ENDS
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         return se2.compose(se2.compose(pose, u[:3]), w)
 
-    def noise_cov(pose: Pose, u: Control) -> ProcessNoiseCov:
+    def noise_cov(self, pose: Pose, u: Control) -> ProcessNoiseCov:
         xx, yx, yy, tx, ty, tt = u[3:]
         zero = jnp.zeros_like(xx)
         rows = [xx, zero, zero], [yx, yy, zero], [tx, ty, tt]
         root = jnp.stack([jnp.stack(row) for row in rows])
         return root @ root.T
 
-    return Motion("match_motion", (*ENDS, *ROOTS), ENDS, step, noise_cov)
-
 
 def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
-    """The controls (N, 9) of `match_motion` along the N keyframes of laser odometry, in NumPy.
+    """The controls (N, 9) of `MatchMotion` along the N keyframes of laser odometry, in NumPy.
 
     Row n led to keyframe n, and row 0 is no motion: with the scans of `of.keyframe` they make a
     `Log`. Loops take no part. The filter takes noises of successive rows to be independent; matches

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxslam.core.numbers import check_positive
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
@@ -17,7 +18,6 @@ from jaxslam.matching.outcome import information_of
 from jaxslam.matching.points import Points
 from jaxslam.matching.surface import surface
 from jaxslam.math import se2
-from jaxslam.validation.numbers import check_positive
 
 
 def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> MatchCovariance:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxslam.core.numbers import check_positive
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
@@ -17,7 +18,6 @@ from jaxslam.matching.covariance.record import (
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
-from jaxslam.validation.numbers import check_positive
 
 
 def implicit(sigma: ArrayLike) -> MatchCovariance:

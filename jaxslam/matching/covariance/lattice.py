@@ -6,6 +6,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxslam.core.numbers import check_positive
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
@@ -16,7 +17,6 @@ from jaxslam.matching.covariance.record import (
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.math import linalg
-from jaxslam.validation.numbers import check_positive
 
 
 def lattice(

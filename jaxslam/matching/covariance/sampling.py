@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxslam.core.numbers import check_count, check_covariance, check_positive
 from jaxslam.matching.covariance.implicit import implicit
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
@@ -17,7 +18,6 @@ from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.validation.numbers import check_count, check_covariance, check_positive
 
 
 def unscented(sigma: ArrayLike, start_cov: ArrayLike) -> MatchCovariance:

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam.validation.numbers import check_count
+from jaxslam.core.numbers import check_count
 
 MOST = 250
 """default of the largest number of frames: 10 s at 25 frames a second"""

@@ -1,7 +1,7 @@
 """Sensors of the robot's own state in the map, without a landmark."""
 
-from jaxslam.sensors.absolute.absolute import absolute
-from jaxslam.sensors.absolute.compass import compass
-from jaxslam.sensors.absolute.position_fix import position_fix
+from jaxslam.sensors.absolute.absolute import Absolute
+from jaxslam.sensors.absolute.compass import Compass
+from jaxslam.sensors.absolute.position_fix import PositionFix
 
-__all__ = ["absolute", "compass", "position_fix"]
+__all__ = ["Absolute", "Compass", "PositionFix"]

@@ -6,6 +6,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import is_concrete
+from jaxslam.core.record import record, set_field
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import (
@@ -17,12 +19,10 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov, noise_model
-from jaxslam.protocols import Reduced, Sensor
-from jaxslam.sensors.mounting import NO_OFFSET, mounting
-from jaxslam.sensors.partial.bearing_only import bearing_only
+from jaxslam.noise import NoiseCov
+from jaxslam.protocols import Free, Reduced, Sensor
+from jaxslam.sensors.partial.bearing_only import BearingOnly
 from jaxslam.sensors.partial.prior import FreeLike, free_parameters
-from jaxslam.validation.numbers import is_concrete
 
 _FAR = 1e-6
 """[1/m] least inverse distance that `position` uses."""
@@ -31,13 +31,8 @@ _NEAR = 1e-6
 """[m] least distance with which `embed` starts a landmark."""
 
 
-def bearing_inverse_depth(
-    noise_cov: NoiseCov,
-    mount: ArrayLike = NO_OFFSET,
-    min_distance: ArrayLike = 1.0,
-    free: FreeLike | None = None,
-    to_point: float | None = None,
-) -> Sensor:
+@record
+class BearingInverseDepth(Sensor):
     """The bearing sensor with landmarks in inverse-depth parameters: Solà 2.3.6.
 
     z = (bearing [rad]) of l = (x0 [m], y0 [m], alpha [rad], rho [1/m]).
@@ -67,40 +62,64 @@ def bearing_inverse_depth(
 
     is below it; they take 0.1. A landmark with ρ <= 0 stays a ray.
 
-    Args:
-        noise_cov: (1, 1) covariance of the bearing, or a function of z.
-        mount: (3,) pose of the sensor on the robot, Solà's S.
-        min_distance: [m] the least distance of a landmark, Solà's d_min (47). The prior of s then
-            has mean 1/(2 d_min) and σ 1/(4 d_min), so that 2 σ span 0 to 1/d_min.
-        free: mean (1,) and covariance (1, 1) of s to use instead.
-        to_point: L_d below which landmarks become points; default never.
-    Raises:
-        ValueError: if noise_cov is not a (1, 1) covariance, mount not a finite (3,), min_distance
-            not positive and finite, free not a Gaussian of positive variance, or to_point not above
-            0.
+    Raises ValueError unless min_distance is positive and finite, inverse_distance a Gaussian of positive
+    variance, and to_point above 0.
     """
-    sensor_pose, sensor_pose_jacobian = mounting("bearing_inverse_depth", mount)
-    by_distance = _bounded_by(min_distance)
-    if to_point is not None and is_concrete(to_point) and not to_point > 0:
-        raise ValueError(f"bearing_inverse_depth: expected to_point above 0, got {to_point}")
 
-    def sight(frame: Array, landmark: Landmark) -> tuple[Array, Array]:
+    noise_cov: NoiseCov
+    """(1, 1) covariance of the bearing, or a function of z."""
+    mount: ArrayLike | None = None
+    """(3,) pose of the sensor on the robot, Solà's S"""
+    min_distance: ArrayLike = 1.0
+    """[m] the least distance of a landmark, Solà's d_min (47)"""
+    inverse_distance: FreeLike | None = None
+    """mean (1,) and covariance (1, 1) of s. By default mean 1/(2 d_min) and σ 1/(4 d_min), so that
+    2 σ span 0 to 1/d_min."""
+    to_point: ArrayLike | None = None
+    """L_d below which landmarks become points; None: never"""
+    measurements = ("bearing [rad]",)
+    landmark = ("x0 [m]", "y0 [m]", "alpha [rad]", "rho [1/m]")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        name, to_point = type(self).__name__, self.to_point
+        _check_distance(name, self.min_distance)
+        if to_point is not None and is_concrete(to_point) and not to_point > 0:
+            raise ValueError(f"{name}: expected to_point above 0, got {to_point}")
+        if self.inverse_distance is not None:
+            given = free_parameters(name, self.inverse_distance, 1)
+            set_field(self, "inverse_distance", given)
+
+    @property
+    def free(self) -> Free:  # type: ignore[override]
+        """The prior of s, an inverse distance in [0, 1/min_distance]."""
+        if isinstance(self.inverse_distance, Free):
+            return self.inverse_distance
+        sigma = 0.25 / jnp.asarray(self.min_distance)
+        return Free((2 * sigma)[None], (sigma**2)[None, None])
+
+    @property
+    def reduced(self) -> Reduced | None:  # type: ignore[override]
+        """The points that landmarks become, with to_point."""
+        if self.to_point is None:
+            return None
+        points = BearingOnly(self.noise_cov, self.mount, free=((1.0,), ((1.0,),)))
+        return Reduced(points, self._ready)
+
+    def _sight(self, frame: Array, landmark: Landmark) -> tuple[Array, Array]:
         """The vector v, and the sensor's frame moved to the map's origin."""
         v = landmark[3] * (landmark[:2] - frame[:2]) + _direction(landmark[2])
         return v, frame.at[:2].set(0.0)
 
-    def observe(pose: Pose, landmark: Landmark) -> Measurement:
-        v, axes = sight(sensor_pose(pose), landmark)
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        v, axes = self._sight(self.frame(pose), landmark)
         return se2.polar(se2.to_frame(axes, v))[1:]
 
-    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
-        return wrap(z - z_hat)
-
-    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        frame = sensor_pose(pose)
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        frame = self.frame(pose)
         return jnp.concatenate([frame[:2], wrap(frame[2:] + z), s])
 
-    def position(landmark: Landmark) -> Point:
+    def position(self, landmark: Landmark) -> Point:
         # max(ρ, _FAR) with derivative 1 everywhere. Added to the clipped value, not to ρ, the term
         # is an exact zero: in float32 ρ + (_FAR - ρ) could be 0.
         inverse = landmark[3]
@@ -108,15 +127,15 @@ def bearing_inverse_depth(
         inverse = cut + (inverse - jax.lax.stop_gradient(inverse))
         return landmark[:2] + _direction(landmark[2]) / inverse
 
-    def embed(pose: Pose, point: Point) -> Landmark:
-        origin = sensor_pose(pose)[:2]
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        origin = self.frame(pose)[:2]
         distance, alpha = se2.polar(point - origin)
         inverse = 1.0 / jnp.maximum(distance, _NEAR)
         return jnp.stack([origin[0], origin[1], alpha, inverse])
 
-    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
-        frame = sensor_pose(pose)
-        v, axes = sight(frame, landmark)
+    def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+        frame = self.frame(pose)
+        v, axes = self._sight(frame, landmark)
         by_axes, by_v = se2.to_frame_jacobians(axes, v)
         outer = se2.polar_jacobians(se2.to_frame(axes, v))[0][1:]
         c, s = _direction(landmark[2])
@@ -126,58 +145,31 @@ def bearing_inverse_depth(
         by_landmark = jnp.concatenate(
             [landmark[3] * by_v, by_alpha[:, None], by_inverse[:, None]], axis=1
         )
-        return outer @ by_frame.T @ sensor_pose_jacobian(pose), outer @ by_landmark
+        return outer @ by_frame.T @ self.frame_jacobian(pose), outer @ by_landmark
 
-    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+    def invert_jacobians(self, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
         eye = jnp.eye(4, dtype=pose.dtype)
-        return eye[:, :3] @ sensor_pose_jacobian(pose), eye[:, 2:3], eye[:, 3:]
+        return eye[:, :3] @ self.frame_jacobian(pose), eye[:, 2:3], eye[:, 3:]
 
-    def ready(pose: Pose, landmark: Landmark, cov: Array) -> Array:
+    def _ready(self, pose: Pose, landmark: Landmark, cov: Array) -> Array:
         inverse = jnp.where(landmark[3] > 0, landmark[3], 1.0)
         # v is along the line of sight, scaled by ρ: d = |v|/ρ, cos γ = v·(cos α, sin α)/|v|.
-        v = landmark[3] * (landmark[:2] - sensor_pose(pose)[:2]) + _direction(landmark[2])
+        v = landmark[3] * (landmark[:2] - self.frame(pose)[:2]) + _direction(landmark[2])
         square = v @ v
         along = jnp.abs(v @ _direction(landmark[2])) / jnp.where(square > 0, square, 1.0)
         index = 4 * jnp.sqrt(jnp.maximum(cov[3, 3], 0.0)) / inverse * along
-        return (landmark[3] > 0) & (square > 0) & (index < jnp.asarray(to_point))
-
-    reduced = None
-    if to_point is not None:
-        reduced = Reduced(bearing_only(noise_cov, mount, free=((1.0,), ((1.0,),))), ready)
-
-    return Sensor(
-        name="bearing_inverse_depth",
-        measurements=("bearing [rad]",),
-        landmark=("x0 [m]", "y0 [m]", "alpha [rad]", "rho [1/m]"),
-        observe=observe,
-        residual=residual,
-        noise_cov=noise_model("bearing_inverse_depth", noise_cov, 1),
-        invert=invert,
-        position=position,
-        embed=embed,
-        free=free_parameters("bearing_inverse_depth", by_distance if free is None else free, 1),
-        observe_jacobians=observe_jacobians,
-        invert_jacobians=invert_jacobians,
-        reduced=reduced,
-    )
+        return (landmark[3] > 0) & (square > 0) & (index < jnp.asarray(self.to_point))
 
 
 def _direction(alpha: Array) -> Array:
     return jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])
 
 
-def _bounded_by(min_distance: ArrayLike) -> FreeLike:
-    """The prior of an inverse distance in [0, 1/min_distance]."""
+def _check_distance(name: str, min_distance: ArrayLike) -> None:
     if np.ndim(min_distance) != 0:
-        raise ValueError("bearing_inverse_depth: expected one min_distance, got an array")
+        raise ValueError(f"{name}: expected one min_distance, got an array")
     if is_concrete(min_distance):
         value = np.asarray(min_distance)
         real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
         if not (real and np.isfinite(value) and value > 0):
-            raise ValueError(
-                f"bearing_inverse_depth: expected 0 < min_distance < inf, got {min_distance!r}"
-            )
-        sigma = 0.25 / float(value)
-        return (2 * sigma,), ((sigma * sigma,),)
-    spread = 0.25 / jnp.asarray(min_distance)
-    return (2 * spread)[None], (spread**2)[None, None]
+            raise ValueError(f"{name}: expected 0 < min_distance < inf, got {min_distance!r}")

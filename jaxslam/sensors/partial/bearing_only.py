@@ -2,19 +2,17 @@
 
 from numpy.typing import ArrayLike
 
+from jaxslam.core.record import record
 from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Sensor
-from jaxslam.sensors.mounting import NO_OFFSET
-from jaxslam.sensors.partial.polar_coordinate import polar_coordinate
+from jaxslam.sensors.partial.polar_coordinate import PolarCoordinate
 from jaxslam.sensors.partial.prior import FreeLike
 
 TEN_METRES = ((10.0,), ((25.0,),))
 """Range 10 m, σ 5 m: a placeholder for the actual prior knowledge."""
 
 
-def bearing_only(
-    noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET, free: FreeLike = TEN_METRES
-) -> Sensor:
+@record
+class BearingOnly(PolarCoordinate):
     """The bearing-only sensor of point landmarks.
 
     z = (bearing [rad]) of l = (x, y): the direction of R(θ_S)ᵀ(l - t_S), S = pose ∘ mount.
@@ -27,13 +25,13 @@ def bearing_only(
     nonlinear in it, and an EKF linearizes once over the whole prior. A narrow prior may be wrong;
     with a wide one the linearization error makes the filter diverge (Solà 2.3.5). Landmarks
     initialized by inverse distance avoid this conflict: see `bearing_inverse_depth`.
-
-    Args:
-        noise_cov: (1, 1) covariance of the bearing, or a function of z.
-        mount: (3,) pose of the sensor on the robot, Solà's S.
-        free: mean (1,) and covariance (1, 1) of the range [m], Solà (39).
-    Raises:
-        ValueError: if noise_cov is not a (1, 1) covariance, mount not a finite (3,) or free not a
-            Gaussian of positive variance.
     """
-    return polar_coordinate("bearing_only", "bearing [rad]", noise_cov, mount, free)
+
+    noise_cov: NoiseCov
+    """(1, 1) covariance of the bearing, or a function of z."""
+    mount: ArrayLike | None = None
+    """(3,) pose of the sensor on the robot, Solà's S"""
+    free: FreeLike = TEN_METRES
+    """mean (1,) and covariance (1, 1) of the range [m], Solà (39)"""
+    measurements = ("bearing [rad]",)
+    _own, _other = slice(1, 2), slice(0, 1)

@@ -1,11 +1,10 @@
-"""A sensor of one polar coordinate of a point landmark: `range_only` and `bearing_only`."""
+"""A sensor of one polar coordinate of a point landmark: `RangeOnly` and `BearingOnly`."""
 
 import jax.numpy as jnp
 from jax import Array
-from numpy.typing import ArrayLike
 
+from jaxslam.core.record import set_field
 from jaxslam.math import se2
-from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import (
     InvertJacobians,
     Landmark,
@@ -14,61 +13,44 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov, noise_model
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.mounting import mounting
-from jaxslam.sensors.partial.prior import FreeLike, free_parameters
+from jaxslam.sensors.partial.prior import free_parameters
 
 
-def polar_coordinate(
-    name: str, measurement: str, noise_cov: NoiseCov, mount: ArrayLike, free: FreeLike
-) -> Sensor:
+class PolarCoordinate(Sensor):
     """The sensor of one row of z = polar(to_frame(pose ∘ mount, l)), the other row being free.
 
-    Args:
-        measurement: the name with the unit; [m] is the first row of Solà (63), [rad] the second.
-        noise_cov: (1, 1) covariance of z, or a function of z.
-        mount: (3,) pose of the sensor on the robot.
-        free: mean (1,) and covariance (1, 1) of the other row.
-    Raises:
-        ValueError: if noise_cov, mount or free is none.
+    A subclass has a field `free`, mean (1,) and covariance (1, 1) of the other row.
     """
-    sensor_pose, sensor_pose_jacobian = mounting(name, mount)
-    angle = measurement.endswith("[rad]")
-    own, other = (slice(1, 2), slice(0, 1)) if angle else (slice(0, 1), slice(1, 2))
 
-    def polar(z: Measurement, s: Unmeasured) -> Array:
-        return jnp.concatenate([s, z] if angle else [z, s])
+    _own: slice
+    _other: slice
 
-    def observe(pose: Pose, landmark: Landmark) -> Measurement:
-        return se2.polar_in_frame(sensor_pose(pose), landmark)[own]
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        set_field(self, "free", free_parameters(type(self).__name__, self.free, 1))
 
-    def residual(z: Measurement, z_hat: Measurement) -> Measurement:
-        return wrap(z - z_hat) if angle else z - z_hat
+    def _polar(self, z: Measurement, s: Unmeasured) -> Array:
+        return jnp.concatenate([s, z] if self._own.start else [z, s])
 
-    def invert(pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        return se2.from_frame(sensor_pose(pose), se2.rectangular(polar(z, s)))
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return se2.polar_in_frame(self.frame(pose), landmark)[self._own]
 
-    def observe_jacobians(pose: Pose, landmark: Landmark) -> ObserveJacobians:
-        frame = sensor_pose(pose)
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return se2.from_frame(self.frame(pose), se2.rectangular(self._polar(z, s)))
+
+    def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+        frame = self.frame(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
-        outer = se2.polar_jacobians(se2.to_frame(frame, landmark))[0][own]
-        return outer @ by_frame @ sensor_pose_jacobian(pose), outer @ by_point
+        outer = se2.polar_jacobians(se2.to_frame(frame, landmark))[0][self._own]
+        return outer @ by_frame @ self.frame_jacobian(pose), outer @ by_point
 
-    def invert_jacobians(pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
-        seen = polar(z, s)
-        by_frame, by_point = se2.from_frame_jacobians(sensor_pose(pose), se2.rectangular(seen))
+    def invert_jacobians(self, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+        seen = self._polar(z, s)
+        by_frame, by_point = se2.from_frame_jacobians(self.frame(pose), se2.rectangular(seen))
         by_polar = by_point @ se2.rectangular_jacobians(seen)[0]
-        return by_frame @ sensor_pose_jacobian(pose), by_polar[:, own], by_polar[:, other]
-
-    return Sensor(
-        name=name,
-        measurements=(measurement,),
-        observe=observe,
-        residual=residual,
-        noise_cov=noise_model(name, noise_cov, 1),
-        invert=invert,
-        free=free_parameters(name, free, 1),
-        observe_jacobians=observe_jacobians,
-        invert_jacobians=invert_jacobians,
-    )
+        return (
+            by_frame @ self.frame_jacobian(pose),
+            by_polar[:, self._own],
+            by_polar[:, self._other],
+        )

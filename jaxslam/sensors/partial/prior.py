@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.core.numbers import check_covariance, is_concrete
 from jaxslam.protocols import Free
 from jaxslam.types import JaxOrNumPy
-from jaxslam.validation.numbers import check_covariance, is_concrete
 
 FreeLike = Free | tuple[ArrayLike, ArrayLike]
 

@@ -3,19 +3,17 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.core.record import record
 from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Sensor
-from jaxslam.sensors.mounting import NO_OFFSET
-from jaxslam.sensors.partial.polar_coordinate import polar_coordinate
+from jaxslam.sensors.partial.polar_coordinate import PolarCoordinate
 from jaxslam.sensors.partial.prior import FreeLike
 
 ANY_DIRECTION = ((0.0,), ((np.pi**2 / 3,),))
 """The Gaussian with the mean and the variance of a direction uniform on (-π, π]."""
 
 
-def range_only(
-    noise_cov: NoiseCov, mount: ArrayLike = NO_OFFSET, free: FreeLike = ANY_DIRECTION
-) -> Sensor:
+@record
+class RangeOnly(PolarCoordinate):
     """The range-only sensor of point landmarks.
 
     z = (range [m]) of l = (x, y): |l - t_S| with S = pose ∘ mount, the first row of Solà (63).
@@ -27,13 +25,13 @@ def range_only(
     One Gaussian in x and y cannot represent a ring. With the default prior the linearized landmark
     is an ellipse along the ring's tangent ahead of the sensor, and a filter that starts from it is
     inconsistent; give a narrower prior where one is known.
-
-    Args:
-        noise_cov: (1, 1) covariance of the range, or a function of z.
-        mount: (3,) pose of the sensor on the robot, Solà's S.
-        free: mean (1,) and covariance (1, 1) of the bearing [rad], Solà (39).
-    Raises:
-        ValueError: if noise_cov is not a (1, 1) covariance, mount not a finite (3,) or free not a
-            Gaussian of positive variance.
     """
-    return polar_coordinate("range_only", "range [m]", noise_cov, mount, free)
+
+    noise_cov: NoiseCov
+    """(1, 1) covariance of the range, or a function of z."""
+    mount: ArrayLike | None = None
+    """(3,) pose of the sensor on the robot, Solà's S"""
+    free: FreeLike = ANY_DIRECTION
+    """mean (1,) and covariance (1, 1) of the bearing [rad], Solà (39)"""
+    measurements = ("range [m]",)
+    _own, _other = slice(0, 1), slice(1, 2)

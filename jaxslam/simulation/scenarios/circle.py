@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from jaxslam.motion.unicycle import unicycle
-from jaxslam.sensors.relative_position import relative_position
+from jaxslam.core.numbers import check_count
+from jaxslam.motion.unicycle import Unicycle
+from jaxslam.sensors.relative_position import RelativePosition
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.validation.numbers import check_count
 
 
 def circle(steps: int = 2500) -> Scenario:
@@ -41,8 +41,8 @@ def circle(steps: int = 2500) -> Scenario:
     fullest = int(((distance > 1) & (distance < 5)).sum(axis=1).max())
     return Scenario(
         name="circle",
-        motion=unicycle(np.diag([0.05 * v / np.sqrt(2), 0.05 * v * 2 * np.sqrt(2)]) ** 2),
-        sensor=relative_position(0.1**2 * np.eye(2)),
+        motion=Unicycle(np.diag([0.05 * v / np.sqrt(2), 0.05 * v * 2 * np.sqrt(2)]) ** 2),
+        sensor=RelativePosition(0.1**2 * np.eye(2)),
         landmarks=landmarks,
         controls=np.tile([v, omega, 1.0], (steps, 1)),
         noise_on="odometry",

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 
+from jaxslam.core.numbers import check_count
 from jaxslam.math.stats import sigma_gate
-from jaxslam.motion.increment import increment
-from jaxslam.sensors.range_bearing import range_bearing
+from jaxslam.motion.increment import Increment
+from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.validation.numbers import check_count
 
 
 def cloister(steps: int = 200) -> Scenario:
@@ -23,8 +23,8 @@ def cloister(steps: int = 200) -> Scenario:
     check_count("cloister: steps", steps)
     return Scenario(
         name="cloister",
-        motion=increment(np.diag([0.01, 0.02]) ** 2),
-        sensor=range_bearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2),
+        motion=Increment(np.diag([0.01, 0.02]) ** 2),
+        sensor=RangeBearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2),
         landmarks=cloister_landmarks(-4.0, 4.0, 7),
         controls=np.tile([0.1, 0.05], (steps, 1)),
         pose=(0.0, -2.0, 0.0),
@@ -60,8 +60,8 @@ def cloister_noisy(steps: int = 400) -> Scenario:
     return dataclasses.replace(
         cloister(steps),
         name="cloister_noisy",
-        motion=increment(np.diag([0.05, np.deg2rad(3.0)]) ** 2),
-        sensor=range_bearing(np.diag([0.1, np.deg2rad(3.0)]) ** 2),
+        motion=Increment(np.diag([0.05, np.deg2rad(3.0)]) ** 2),
+        sensor=RangeBearing(np.diag([0.1, np.deg2rad(3.0)]) ** 2),
         visible=between_ranges(0.0, 3.0),
         places=14,
         filter_options={"update": "sequential"},

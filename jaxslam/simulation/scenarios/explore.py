@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from jaxslam.motion.increment import increment
-from jaxslam.sensors.range_bearing import range_bearing
+from jaxslam.core.numbers import check_count
+from jaxslam.motion.increment import Increment
+from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.validation.numbers import check_count
 
 
 def explore(steps: int = 100) -> Scenario:
@@ -21,8 +21,8 @@ def explore(steps: int = 100) -> Scenario:
     right = np.stack([along + 2.5, np.full_like(along, -4.0)], axis=1)
     return Scenario(
         name="explore",
-        motion=increment(np.diag([0.05, np.deg2rad(1.0)]) ** 2),
-        sensor=range_bearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2),
+        motion=Increment(np.diag([0.05, np.deg2rad(1.0)]) ** 2),
+        sensor=RangeBearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2),
         landmarks=np.concatenate([left, right]),
         controls=np.tile([1.0, 0.0], (steps, 1)),
         visible=between_ranges(0.0, 12.0),

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.sensors.line import line
+from jaxslam.core.numbers import check_count
+from jaxslam.sensors.line import Line
 from jaxslam.simulation.laser import LaserWorld
 from jaxslam.simulation.scenarios.rooms import office, square
 from jaxslam.simulation.walls import Walls, exact_ranges, wall_lines
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.validation.numbers import check_count
 
 BEAMS, HITS, SLANT = 120, 5, np.sin(np.deg2rad(10.0))
 """A wall is measured where at least `HITS` of so many beams all around meet it within the laser's
@@ -49,7 +49,7 @@ def _lines(name: str, world: LaserWorld, steps: int | None, places: int) -> Scen
     return Scenario(
         name=name,
         motion=world.motion,
-        sensor=line(NOISE),
+        sensor=Line(NOISE),
         landmarks=wall_lines(walls)[0],
         controls=controls,
         noise_on="odometry",

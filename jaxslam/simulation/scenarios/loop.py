@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.motion.unicycle import unicycle
+from jaxslam.core.numbers import check_count
+from jaxslam.motion.unicycle import Unicycle
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.range_bearing import range_bearing
-from jaxslam.sensors.relative_position import relative_position
+from jaxslam.sensors.range_bearing import RangeBearing
+from jaxslam.sensors.relative_position import RelativePosition
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.validation.numbers import check_count
 
 SPEED, TURN = 0.25, 0.025
 SOURCE = (
@@ -33,7 +33,7 @@ def loop(steps: int = 2500, map_seed: int = 0) -> Scenario:
         steps: T.
         map_seed: of the landmarks, by NumPy's default generator.
     """
-    return _loop("loop", relative_position(0.1**2 * np.eye(2)), steps, map_seed)
+    return _loop("loop", RelativePosition(0.1**2 * np.eye(2)), steps, map_seed)
 
 
 def loop_bearing(steps: int = 2500, map_seed: int = 0) -> Scenario:
@@ -42,7 +42,7 @@ def loop_bearing(steps: int = 2500, map_seed: int = 0) -> Scenario:
     def noise_cov(z: jax.Array) -> jax.Array:
         return jnp.diag(jnp.stack([0.1 * z[0], jnp.full_like(z[0], np.deg2rad(10.0))]) ** 2)
 
-    return _loop("loop_bearing", range_bearing(noise_cov), steps, map_seed)
+    return _loop("loop_bearing", RangeBearing(noise_cov), steps, map_seed)
 
 
 def loop_landmarks(map_seed: int) -> np.ndarray:
@@ -66,7 +66,7 @@ def _loop(name: str, sensor: Sensor, steps: int, map_seed: int) -> Scenario:
     sigma = 0.05 * SPEED
     return Scenario(
         name=name,
-        motion=unicycle(np.diag([sigma / np.sqrt(2), 2 * np.sqrt(2) * sigma]) ** 2),
+        motion=Unicycle(np.diag([sigma / np.sqrt(2), 2 * np.sqrt(2) * sigma]) ** 2),
         sensor=sensor,
         landmarks=landmarks,
         controls=np.tile([SPEED, TURN, 1.0], (steps, 1)),

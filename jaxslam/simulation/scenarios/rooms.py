@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxslam.motion.unicycle import unicycle
+from jaxslam.motion.unicycle import Unicycle
 from jaxslam.simulation.laser import Laser, LaserWorld
 from jaxslam.simulation.walls import Walls, walls
 
@@ -82,7 +82,7 @@ def _world(
         name=name,
         walls=of,
         laser=Laser(turns, sigma=0.02, max_range=max_range, dropout=0.02),
-        motion=unicycle(np.diag([0.05, np.deg2rad(3.0)]) ** 2),
+        motion=Unicycle(np.diag([0.05, np.deg2rad(3.0)]) ** 2),
         controls=controls,
         pose=pose,
     )

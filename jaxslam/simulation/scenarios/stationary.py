@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from jaxslam.motion.unicycle import unicycle
-from jaxslam.sensors.range_bearing import range_bearing
+from jaxslam.core.numbers import check_count
+from jaxslam.motion.unicycle import Unicycle
+from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.validation.numbers import check_count
 
 
 def stationary(steps: int = 300) -> Scenario:
@@ -19,8 +19,8 @@ def stationary(steps: int = 300) -> Scenario:
     check_count("stationary: steps", steps)
     return Scenario(
         name="stationary",
-        motion=unicycle(np.zeros((2, 2))),
-        sensor=range_bearing(np.diag([0.5, np.deg2rad(5.0)]) ** 2),
+        motion=Unicycle(np.zeros((2, 2))),
+        sensor=RangeBearing(np.diag([0.5, np.deg2rad(5.0)]) ** 2),
         landmarks=[[8.0, 6.0]],
         controls=np.tile([0.0, 0.0, 1.0], (steps, 1)),
         pose_cov=np.diag([0.5, 0.5, np.deg2rad(5.0)]) ** 2,

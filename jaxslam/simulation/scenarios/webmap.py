@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.motion.ackermann import ackermann
-from jaxslam.motion.substeps import substeps
-from jaxslam.sensors.range_bearing import range_bearing
+from jaxslam.core.numbers import check_count
+from jaxslam.motion.ackermann import Ackermann
+from jaxslam.motion.substeps import Substeps
+from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.validation.numbers import check_count
 
 _SPEED, _WHEELBASE = 3.0, 4.0
 _INTERVAL, _SUBSTEPS = 0.025, 8
@@ -65,7 +65,7 @@ def webmap(steps: int | None = None, loops: int = 2) -> Scenario:
     offset = landmarks - scans[:, None, :2]
     ahead = offset[..., 0] * np.cos(scans[:, 2:]) + offset[..., 1] * np.sin(scans[:, 2:]) > 0
     fullest = int((ahead & (np.hypot(offset[..., 0], offset[..., 1]) < _FARTHEST)).sum(1).max())
-    car = ackermann(
+    car = Ackermann(
         np.diag([0.3, math.radians(3)]) ** 2,
         wheelbase=_WHEELBASE,
         sensor=(0.0, 0.0),
@@ -73,8 +73,8 @@ def webmap(steps: int | None = None, loops: int = 2) -> Scenario:
     )
     return Scenario(
         name="webmap",
-        motion=substeps(car, _SUBSTEPS),
-        sensor=range_bearing(np.diag([0.1, math.radians(1)]) ** 2),
+        motion=Substeps(car, _SUBSTEPS),
+        sensor=RangeBearing(np.diag([0.1, math.radians(1)]) ** 2),
         landmarks=landmarks,
         controls=controls.reshape(len(scans), -1),
         pose=path[0],

@@ -24,8 +24,8 @@ from jaxslam.filters.delayed.triangulation import circles, rays, triangulation_o
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Status
 
-CAMERA = sensors.bearing_only([[0.01**2]])
-BEACON = sensors.range_only([[0.05**2]])
+CAMERA = sensors.BearingOnly([[0.01**2]])
+BEACON = sensors.RangeOnly([[0.05**2]])
 KINDS = {"rays": rays(CAMERA), "circles": circles(BEACON)}
 RESIDUAL = {kind: jax.jit(jax.vmap(model.residual)) for kind, model in KINDS.items()}
 
@@ -99,7 +99,7 @@ def test_what_does_not_intersect_is_not_ok_and_finite(kind, a, b):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_measurement_is_stored_where_the_sensor_is_mounted(kind):
     mount = (0.3, -0.2, 0.7)
-    factory = sensors.bearing_only if kind == "rays" else sensors.range_only
+    factory = sensors.BearingOnly if kind == "rays" else sensors.RangeOnly
     sensor = factory([[1e-4]], mount=mount)
     pose, point = np.array([1.0, 2.0, 2.5]), np.array([-3.0, 4.0])
     c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -307,7 +307,7 @@ def world(kind, steps=120, **options):
     sensor = CAMERA if kind == "rays" else BEACON
     return Scenario(
         name=f"five, {kind}",
-        motion=motion.increment(np.diag([0.005, 0.003]) ** 2),
+        motion=motion.Increment(np.diag([0.005, 0.003]) ** 2),
         sensor=sensor,
         landmarks=landmarks,
         controls=np.tile([0.2, 0.08], (steps, 1)),
@@ -476,7 +476,7 @@ def test_derivatives_reach_the_noise_and_are_finite():
     _, log = draw(scenario, 1)
 
     def likelihood(sigma):
-        sensor = sensors.range_only(sigma[None, None] ** 2)
+        sensor = sensors.RangeOnly(sigma[None, None] ** 2)
         filter = delayed_slam(scenario.motion, sensor, 3, **SMALL)
         trace = jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
         return trace.info.log_likelihood.sum()
@@ -563,7 +563,7 @@ def test_without_names_intersections_find_the_landmarks():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"sensor": sensors.range_bearing(np.eye(2))}, "one bearing or one range"),
+        ({"sensor": sensors.RangeBearing(np.eye(2))}, "one bearing or one range"),
         ({"capacity": 0}, "delayed_slam: capacity"),
         ({"gate": 0}, "delayed_slam: expected a gate above 0"),
         ({"triangulation": 3}, "delayed_slam: expected triangulation to be a Triangulation"),
@@ -576,7 +576,7 @@ def test_without_names_intersections_find_the_landmarks():
 def test_bad_arguments_are_refused(options, message):
     options = {"sensor": CAMERA, "capacity": 3} | options
     with pytest.raises(ValueError, match=message):
-        delayed_slam(motion.increment(np.eye(2)), **options)
+        delayed_slam(motion.Increment(np.eye(2)), **options)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Log, Scan, Status
 
 Q, R = np.diag([0.05, 0.03]) ** 2, np.diag([0.1, 0.05]) ** 2
-MOTION, SENSOR = motion.increment(Q), sensors.range_bearing(R)
+MOTION, SENSOR = motion.Increment(Q), sensors.RangeBearing(R)
 KEY = jax.random.key(0)
 CAPACITY, PLACES = 3, 3
 OBSERVE = jax.jit(SENSOR.observe)
@@ -33,7 +33,7 @@ def scan_of(*measured):
 @functools.cache
 def compiled_update(**options):
     def update(joint, scan, noise):
-        filter = ekf_slam(MOTION, sensors.range_bearing(noise), CAPACITY, **options)
+        filter = ekf_slam(MOTION, sensors.RangeBearing(noise), CAPACITY, **options)
         return filter.update(joint, scan, KEY)
 
     return jax.jit(update)
@@ -271,8 +271,8 @@ def likelihood():
 
     def total(parameters, log):
         p = parameters
-        robot = motion.increment(jnp.diag(p[:2]) ** 2)
-        sensor = sensors.range_bearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
+        robot = motion.Increment(jnp.diag(p[:2]) ** 2)
+        sensor = sensors.RangeBearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
         filter = ekf_slam(robot, sensor, 36, births=4, update="joint")
         trace = run(filter, log, p[7:10], jnp.zeros((3, 3)), KEY)
         return trace.info.log_likelihood.sum() + trace.final.pose.sum()
@@ -405,7 +405,7 @@ def test_a_log_without_rows_is_a_log():
         np.full((steps, places), -1, np.int32),
         np.zeros((steps, places), bool),
     )
-    filter = ekf_slam(MOTION, sensors.range_bearing(R), 1, update="joint")
+    filter = ekf_slam(MOTION, sensors.RangeBearing(R), 1, update="joint")
     trace = run(filter, Log(np.zeros((steps, 2)), scan), np.zeros(3), np.zeros((3, 3)), KEY)
     assert trace.estimate.pose.shape == (steps, 3)
     assert not trace.info.log_likelihood.any()

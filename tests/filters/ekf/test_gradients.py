@@ -37,8 +37,8 @@ AT = np.array(list(PARAMETERS.values()))
 
 def models(p):
     """A small car without offsets, and a mounted sensor, from the parameters."""
-    car = motion.ackermann(jnp.diag(p[:2]) ** 2, wheelbase=p[7], sensor=(0.0, 0.0), encoder=0.0)
-    return car, sensors.range_bearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
+    car = motion.Ackermann(jnp.diag(p[:2]) ** 2, wheelbase=p[7], sensor=(0.0, 0.0), encoder=0.0)
+    return car, sensors.RangeBearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
 
 
 def world():
@@ -150,9 +150,9 @@ def test_in_reverse_through_a_motion_and_corrections_in_turn(name):
     z = np.array([[1.9, 0.1], [2.2, -1.5], [1.8, 0.12]])
 
     def cost(sigma, joint):
-        sensor = sensors.range_bearing(jnp.diag(sigma[2:]) ** 2)
+        sensor = sensors.RangeBearing(jnp.diag(sigma[2:]) ** 2)
         settings = EkfSettings(sensor, **FORMS[name])
-        robot = motion.increment(jnp.diag(sigma[:2]) ** 2)
+        robot = motion.Increment(jnp.diag(sigma[:2]) ** 2)
         joint, _ = propagate(joint, jnp.array([0.2, 0.1]), robot, settings)
         joint, done = correct_in_turn(joint, z, slot, np.ones(3, bool), settings)
         return done.log_likelihood.sum() + joint.pose.sum() + (joint.cov**2).sum()

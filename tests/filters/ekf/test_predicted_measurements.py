@@ -14,7 +14,7 @@ from jaxslam.filters.ekf.steps.update import correct
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
 
-SENSOR = sensors.range_bearing(np.diag([0.1, 0.02]) ** 2, mount=(0.2, -0.1, 0.4))
+SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2, mount=(0.2, -0.1, 0.4))
 COUNT = 4
 OBSERVE = jax.jit(jax.vmap(SENSOR.observe, (None, 0)))
 RESIDUAL = jax.jit(jax.vmap(SENSOR.residual, (None, 0)))

@@ -14,13 +14,13 @@ from jaxslam.filters.ekf.steps.scan import linear_corrections
 from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
 from jaxslam.types import Scan
 
-SEES = sensors.range_bearing(np.diag([0.04, 0.01]))
+SEES = sensors.RangeBearing(np.diag([0.04, 0.01]))
 POINTS = np.array([[4.0, 1.0], [3.0, -2.0], [-1.0, 3.0]])
 
 
 def test_corrections_in_turn_are_those_one_by_one():
     chart = charts.robocentric()
-    ekf = filters.ekf_slam(motion.pose_increment(np.diag([0.04, 0.02, 0.01])), SEES, 4, chart=chart)
+    ekf = filters.ekf_slam(motion.PoseIncrement(np.diag([0.04, 0.02, 0.01])), SEES, 4, chart=chart)
     ekf = filters.monitored(ekf)
     settings = EkfSettings(SEES, chart, gate=60.0)
     seen = jax.vmap(SEES.observe, (None, 0))

@@ -17,13 +17,13 @@ from jaxslam.linearize import unscented
 from jaxslam.protocols import Basis
 from jaxslam.types import Log, Scan, Status
 
-MOTION = motion.increment(np.diag([0.02, 0.02]) ** 2)
+MOTION = motion.Increment(np.diag([0.02, 0.02]) ** 2)
 NOISE = np.array([[0.01**2]])
 POINTS = np.array([[4.0, 2.0], [3.0, -3.0], [7.0, 4.0]])
 
 
 def camera(**options):
-    return sensors.bearing_inverse_depth(NOISE, min_distance=1.0, **options)
+    return sensors.BearingInverseDepth(NOISE, min_distance=1.0, **options)
 
 
 SENSOR = camera(to_point=0.1)
@@ -35,7 +35,7 @@ READY = jax.jit(ready, static_argnums=(1, 2))
 def a_log(steps=40, seed=0, dtype=np.float64):
     """A robot on a bend that sees the direction of POINTS."""
     rng = np.random.default_rng(seed)
-    sensor, pose, rows = sensors.bearing_only(NOISE, free=((1.0,), ((1.0,),))), np.zeros(3), []
+    sensor, pose, rows = sensors.BearingOnly(NOISE, free=((1.0,), ((1.0,),))), np.zeros(3), []
     move, see = jax.jit(MOTION.step), jax.jit(jax.vmap(sensor.observe, (None, 0)))
     for _ in range(steps):
         pose = np.asarray(move(pose, np.array([0.2, 0.05]), rng.normal(size=2) * 0.02))
@@ -138,7 +138,7 @@ def test_a_reduced_map_is_filtered_as_one_of_points(options):
         start.tag,
         start.lin,
     )
-    of_points = sensors.bearing_only(NOISE, free=((1.0,), ((1.0,),)))
+    of_points = sensors.BearingOnly(NOISE, free=((1.0,), ((1.0,),)))
     finals = []
     for state, model in ((start, SENSOR), (point, of_points)):
         filter = ekf_slam(MOTION, model, 4, **options)
@@ -231,7 +231,7 @@ def test_gradients_and_float32():
     log = a_log(12, dtype=np.float32)
 
     def last(sigma):
-        sensor = sensors.bearing_inverse_depth(sigma[None, None] ** 2, to_point=1.0)
+        sensor = sensors.BearingInverseDepth(sigma[None, None] ** 2, to_point=1.0)
         trace = driven(ekf_slam(MOTION, sensor, 3), log)
         return trace.estimate.pose[-1].sum() + trace.estimate.points.sum(), trace
 
@@ -252,6 +252,6 @@ def test_refusals():
     with pytest.raises(ValueError, match="does not act on the 4-parameter"):
         ekf_slam(MOTION, camera(), 4, chart=right_invariant())
     with pytest.raises(ValueError, match="does not act on the 2-parameter"):
-        ekf_slam(MOTION, sensors.range_bearing(np.eye(2)), 4, chart=right_invariant(rays=True))
+        ekf_slam(MOTION, sensors.RangeBearing(np.eye(2)), 4, chart=right_invariant(rays=True))
     with pytest.raises(ValueError, match="converted to points"):
         compressed_ekf_slam(MOTION, camera(to_point=0.1), 8, area=4)

@@ -17,8 +17,8 @@ from jaxslam.protocols import Association
 from jaxslam.types import Log, Scan, Status
 
 STEPS, PLACES = 400, 4
-MOTION = motion.increment(np.diag([0.01, 0.01]) ** 2)
-SENSOR = sensors.range_bearing(np.diag([0.05, 0.02]) ** 2)
+MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)
+SENSOR = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2)
 GATE, NEW = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
 MAKERS = {
     "nearest": association.nearest,

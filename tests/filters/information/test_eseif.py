@@ -34,7 +34,7 @@ P0 = np.diag([0.01, 0.01, 0.005]) ** 2
 STEPS, RUNS = 60, 12
 ODOMETRY = np.diag([0.002, 0.004]) ** 2  # good, so that the robot's links last
 NOISE = np.diag([0.1, np.deg2rad(2.0)]) ** 2
-MODELS = motion.increment(ODOMETRY), sensors.range_bearing(NOISE), COUNT
+MODELS = motion.Increment(ODOMETRY), sensors.RangeBearing(NOISE), COUNT
 AREA = {"active": 9, "links": COUNT - 1, "passive": 5}
 
 
@@ -51,8 +51,8 @@ def logs():
     )
     silent = dataclasses.replace(
         scene,
-        motion=motion.increment(1e-30 * np.eye(2)),
-        sensor=sensors.range_bearing(1e-30 * np.eye(2)),
+        motion=motion.Increment(1e-30 * np.eye(2)),
+        sensor=sensors.RangeBearing(1e-30 * np.eye(2)),
         pose_cov=1e-30 * np.eye(3),
     )
     keys = jax.random.split(jax.random.key(2), RUNS)
@@ -312,7 +312,7 @@ def test_float32_gradients_and_a_lost_area():
     )
 
     def loss(sigma, before):
-        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, 0.03])) ** 2)
+        sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, 0.03])) ** 2)
         other = filters.eseif(MODELS[0], sensor, COUNT, active=9, links=COUNT - 1, passive=1)
         u, scan = jax.tree.map(jnp.asarray, row)
         scan = scan._replace(z=scan.z + 0.01)

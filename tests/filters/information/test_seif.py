@@ -325,7 +325,7 @@ def test_gradients_and_batches():
     row = list(rows(12))[-1]
 
     def loss(sigma, state):
-        sensor = sensors.range_bearing(jnp.diag(jnp.stack([sigma, np.deg2rad(1.0)])) ** 2)
+        sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, np.deg2rad(1.0)])) ** 2)
         options = {"active": 10, "links": COUNT - 1, "passive": 5}
         f = filters.seif(world()[0].motion, sensor, COUNT, **options)
         return f.update(f.predict(state, row[0], KEY), row[1], KEY)[0].pose.sum()
@@ -345,7 +345,7 @@ def test_gradients_and_batches():
         ({"sweeps": 0}, "sweeps"),
         ({"capacity": 0}, "capacity"),
         ({"floor": -1.0}, "floor"),
-        ({"sensor": sensors.range_bearing_signature(0.01 * np.eye(3))}, r"landmarks \(x, y\)"),
+        ({"sensor": sensors.RangeBearingSignature(0.01 * np.eye(3))}, r"landmarks \(x, y\)"),
     ],
 )
 def test_refusals(changes, message):

@@ -12,7 +12,7 @@ from worlds import draw, judged, nameless, narrow, ring
 from jaxslam import association, charts, linearize, run, sensors, simulate
 from jaxslam.filters import dead_reckoning, ekf_slam, localization
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.sensors import Part, suite
+from jaxslam.sensors import Part, Suite
 from jaxslam.types import Log, Status
 
 KEY = jax.random.key(0)
@@ -124,7 +124,7 @@ def test_it_is_the_textbooks_filter_with_absolute_sensors_too(with_compass):
     if with_compass:
         rng = np.random.default_rng(4)
         angles = np.asarray(truth.pose[:, 2]) + 0.1 * rng.normal(size=scenario.steps)
-        sensor = suite((scenario.sensor, 6), Part(sensors.compass(np.array([[0.01]])), 1))
+        sensor = Suite(((scenario.sensor, 6), Part(sensors.Compass(np.array([[0.01]])), 1)))
         z, tag, valid = (np.asarray(part) for part in log.scan)
         extra = np.stack([angles, 0 * angles], axis=1)[:, None]
         log = Log(

@@ -37,7 +37,7 @@ def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     capacity = 8
     # A motion without noise whose control is the pose: P_RR stays zero, and P block-diagonal.
     exact = dataclasses.replace(
-        motion.pose_increment(np.zeros((3, 3))), step=lambda pose, u, w: u + 0 * w
+        motion.PoseIncrement(np.zeros((3, 3))), step=lambda pose, u, w: u + 0 * w
     )
     slam = ekf_slam(exact, scenario.sensor, capacity, update="joint", **options)
     expected = on_poses(slam, truth, log)
@@ -114,7 +114,7 @@ def test_refusals():
         with pytest.raises(ValueError, match=f"mapping: .*{message}"):
             mapping(sensor, **({"capacity": 3} | options))
     with pytest.raises(ValueError, match="absolute"):
-        mapping(sensors.compass(np.eye(1)), 3)
+        mapping(sensors.Compass(np.eye(1)), 3)
     final = jax.eval_shape(mapping(sensor, 2).init, np.zeros(3), np.eye(3))
 
     def prior(slam, pose):

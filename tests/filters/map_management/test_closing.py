@@ -109,8 +109,8 @@ def test_a_symmetric_old_map_is_ambiguous():
 
 
 def test_recency_remembers():
-    model = motion.pose_increment(1e-4 * np.eye(3))
-    plain = ekf_slam(model, sensors.relative_position(0.01 * np.eye(2)), 4)
+    model = motion.PoseIncrement(1e-4 * np.eye(3))
+    plain = ekf_slam(model, sensors.RelativePosition(0.01 * np.eye(2)), 4)
     filter = pruning(plain, recency())
     state = jax.jit(filter.init)(np.zeros(3), np.zeros((3, 3)))
     update = jax.jit(filter.update)
@@ -168,8 +168,8 @@ def test_a_whole_run_ends_with_each_landmark_once():
     filter = closing(
         pruning(
             ekf_slam(
-                motion.pose_increment(np.diag([0.05, 0.05, 0.008]) ** 2),
-                sensors.relative_position(0.05**2 * np.eye(2)),
+                motion.PoseIncrement(np.diag([0.05, 0.05, 0.008]) ** 2),
+                sensors.RelativePosition(0.05**2 * np.eye(2)),
                 20,
                 chart=charts.right_invariant(),
                 update="joint",
@@ -221,14 +221,14 @@ def test_refusals():
         close_loop(joint._replace(life=None), EUCLIDEAN, LoopSettings())
     with pytest.raises(ValueError, match="spread"):
         association.certain(association.nearest(9.0), 0.0)
-    plain = ekf_slam(motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2)), 3)
+    plain = ekf_slam(motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2)), 3)
     with pytest.raises(ValueError, match="every"):
         closing(plain, every=0)
     with pytest.raises(ValueError, match="reach"):
         closing(plain, reach=-1.0)
     with pytest.raises(ValueError, match="recency"):
         closing(plain).init(jnp.zeros(3), jnp.eye(3))
-    models = motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2)), 3
+    models = motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2)), 3
     with pytest.raises(ValueError, match="root"):
         closing(pruning(ekf_slam(*models, covariance="square_root"), recency()))
     with pytest.raises(ValueError, match="Joint"):
@@ -236,7 +236,7 @@ def test_refusals():
 
 
 def test_a_filter_of_several_sensors_keeps_its_places():
-    one = sensors.relative_position(np.eye(2))
-    both = sensors.suite((one, 2), (one, 2))
-    filter = pruning(ekf_slam(motion.pose_increment(np.eye(3)), both, 4), recency())
+    one = sensors.RelativePosition(np.eye(2))
+    both = sensors.Suite(((one, 2), (one, 2)))
+    filter = pruning(ekf_slam(motion.PoseIncrement(np.eye(3)), both, 4), recency())
     assert closing(filter).places == filter.places == (2, 2)

@@ -16,8 +16,8 @@ from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
 
 EUCLIDEAN = charts.euclidean()
-MOTION = motion.pose_increment(np.diag([0.1, 0.1, 0.05]) ** 2)
-SENSOR = sensors.relative_position(0.1**2 * np.eye(2))
+MOTION = motion.PoseIncrement(np.diag([0.1, 0.1, 0.05]) ** 2)
+SENSOR = sensors.RelativePosition(0.1**2 * np.eye(2))
 KEY = jax.random.key(0)
 
 
@@ -104,7 +104,7 @@ def test_two_sightings_merged_are_one_landmark_seen_twice(chart):
         return Scan(np.array([z]), np.array([tag]), np.array([True]))
 
     # The heading is known: the model is linear, and order does not matter.
-    still = ekf_slam(motion.pose_increment(np.diag([0.1, 0.1, 0.0]) ** 2), SENSOR, 3, chart=chart)
+    still = ekf_slam(motion.PoseIncrement(np.diag([0.1, 0.1, 0.0]) ** 2), SENSOR, 3, chart=chart)
     update, predict = jax.jit(still.update), jax.jit(still.predict)
     start = jax.jit(still.init)(np.zeros(3), np.diag([0.2, 0.3, 0.0]) ** 2)
     joint = update(start, scan(0, [2.0, 1.0]), KEY)[0]
@@ -240,8 +240,8 @@ def test_refusals_of_merging():
     for bad in ({"reach": 0.0}, {"reach": 1.0, "probability": 1.0}):
         with pytest.raises(ValueError, match="merging: expected"):
             merging(plain, **bad)
-    rays = sensors.bearing_inverse_depth(np.eye(1))
-    for sensor in (rays, sensors.compass(np.eye(1))):
+    rays = sensors.BearingInverseDepth(np.eye(1))
+    for sensor in (rays, sensors.Compass(np.eye(1))):
         with pytest.raises(ValueError, match="cannot be merged"):
             merging(ekf_slam(MOTION, sensor, 3), 0.5)
     other = dataclasses.replace(plain, init=lambda pose, pose_cov: pose)
@@ -256,7 +256,7 @@ def test_landmarks_that_differ_stay_two():
 
     In square roots, whose closest pair is that of the covariance (above).
     """
-    sensor = sensors.range_bearing(np.diag([0.02, 0.01]) ** 2)
+    sensor = sensors.RangeBearing(np.diag([0.02, 0.01]) ** 2)
     filter = merging(ekf_slam(MOTION, sensor, 4, covariance="square_root", update="joint"), 0.5)
     z = np.array([[[2.0, 0.0]], [[2.0, 0.225]]] * 5)
     scan = Scan(z, np.array([[0], [1]] * 5, np.int32), np.ones((10, 1), bool))

@@ -25,7 +25,7 @@ from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.slots import Joint
 from jaxslam.types import Scan, Status
 
-SENSOR = sensors.range_bearing(np.diag([0.05, 0.01]) ** 2, mount=(0.2, 0.1, 0.3))
+SENSOR = sensors.RangeBearing(np.diag([0.05, 0.01]) ** 2, mount=(0.2, 0.1, 0.3))
 FIND, ALIGN = jax.jit(relocalize), jax.jit(se2.align)
 LOST = jax.jit(lost, static_argnums=1, static_argnames="square_root")
 MAP_OF = jax.jit(points_of_map, static_argnums=1, static_argnames="square_root")
@@ -252,7 +252,7 @@ def test_a_scan_as_points():
     with pytest.raises(
         ValueError, match="expected a sensor that measures points, got bearing_only"
     ):
-        seen_points(sensors.bearing_only(0.1 * np.eye(1)), scan)
+        seen_points(sensors.BearingOnly(0.1 * np.eye(1)), scan)
 
 
 def some_joint(seed=0, count=6):
@@ -303,7 +303,7 @@ def test_lost_forgets_the_pose_and_nothing_else(name, square_root):
 @pytest.mark.parametrize("name", ["euclidean", "right_invariant"])
 def test_relocated_is_the_limit_of_an_update_from_a_large_covariance(name):
     chart = charts.REGISTRY[name]()
-    sensor = sensors.relative_position(0.1**2 * np.eye(2))
+    sensor = sensors.RelativePosition(0.1**2 * np.eye(2))
     rng = np.random.default_rng(5)
     joint = some_joint()
     slot = np.array([0, 4, -1, 5, 1])
@@ -374,8 +374,8 @@ def test_a_kidnapped_robot_finds_itself_and_goes_on():
     rng = np.random.default_rng(11)
     move = jax.jit(se2.compose)
     landmarks = rng.uniform(-12, 12, (25, 2))
-    model = motion.pose_increment(np.diag([0.02, 0.02, 0.01]) ** 2)
-    sensor = sensors.range_bearing(np.diag([0.05, 0.01]) ** 2)
+    model = motion.PoseIncrement(np.diag([0.02, 0.02, 0.01]) ** 2)
+    sensor = sensors.RangeBearing(np.diag([0.05, 0.01]) ** 2)
     filter = ekf_slam(model, sensor, 25, chart=chart, gate=chi2_quantile(0.9999, 2), update="joint")
     predict, update = jax.jit(filter.predict), jax.jit(filter.update)
     look = jax.jit(jax.vmap(sensor.observe, (None, 0)))

@@ -31,7 +31,7 @@ ORDERS = [
 @pytest.mark.parametrize("order", ORDERS)
 def test_managers_compose_in_any_order(order):
     """Each keeps the state's structure, reports under its own name, and leaves the rest alone."""
-    models = motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2))
+    models = motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2))
     plain = filter = ekf_slam(*models, 4, chart=charts.right_invariant())
     for name in order:
         filter = MANAGERS[name](filter)
@@ -48,7 +48,7 @@ def test_managers_compose_in_any_order(order):
 
 
 def test_closing_takes_times():
-    models = motion.pose_increment(np.eye(3)), sensors.relative_position(np.eye(2))
+    models = motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2))
     for filter in (
         closing(ekf_slam(*models, 4)),
         MANAGERS["pruning"](closing(ekf_slam(*models, 4))),

@@ -15,7 +15,7 @@ import jaxslam
 from jaxslam import charts, filters, motion, sensors, team
 from jaxslam.filters import ekf_slam, team_slam
 from jaxslam.filters.multi_robot import pose_initialization
-from jaxslam.sensors import Part, suite
+from jaxslam.sensors import Part, Suite
 from jaxslam.simulation import team_world
 from jaxslam.simulation.scenarios import between_ranges
 from jaxslam.simulation.worlds import simulate
@@ -33,14 +33,14 @@ NOTHING = np.zeros((3, 3))
 
 
 def crew(count=2, mutual=True, reach=3.2):
-    eyes = sensors.range_bearing(R1, mount=MOUNT)
-    back = sensors.range_bearing(R2, mount=(0.0, 0.0, 3.0))
+    eyes = sensors.RangeBearing(R1, mount=MOUNT)
+    back = sensors.RangeBearing(R2, mount=(0.0, 0.0, 3.0))
     parts = [Part(eyes, 4, visible=between_ranges(0.0, reach))]
     if count < 3:  # three robots of three sensors would compile for long
         parts.append(Part(back, 2, every=3))
     if mutual and count > 1:
         parts.append(Part(eyes, count - 1, every=2, sees="robots"))
-    return [team.Robot(motion.increment(Q), suite(*parts), start) for start in STARTS[:count]]
+    return [team.Robot(motion.Increment(Q), Suite((*parts,)), start) for start in STARTS[:count]]
 
 
 def unknown(robots):
@@ -116,7 +116,7 @@ def reference_of(robots, tags, scenario):
 def test_a_team_of_one_is_ekf_slam():
     alone = ring(60)
     log = draw(alone, 0)[1]
-    one = team_slam([team.Robot(alone.motion, suite((alone.sensor, 6)))], 6)
+    one = team_slam([team.Robot(alone.motion, Suite(((alone.sensor, 6),)))], 6)
     a, b = (go(f, alone, log) for f in (ekf_slam(alone.motion, alone.sensor, 6), one))
     chex.assert_trees_all_close((a.estimate, a.info), (b.estimate, b.info), rtol=0, atol=1e-12)
 
@@ -260,11 +260,13 @@ RUNS = 100
 @cache
 def hundred(report, first):
     """Truth of one of two robots and logs of 100 runs; robot 1 sees landmarks from a step on."""
-    eyes = sensors.range_bearing(R1, mount=MOUNT)
+    eyes = sensors.RangeBearing(R1, mount=MOUNT)
     sight = between_ranges(0.0, 3.2)
     other = Part(eyes, 1, every=2, sees="robots")
     robots = [
-        team.Robot(motion.increment(Q), suite(Part(eyes, 6, start=start, visible=sight), other), at)
+        team.Robot(
+            motion.Increment(Q), Suite((Part(eyes, 6, start=start, visible=sight), other)), at
+        )
         for start, at in ((0, None), (first, STARTS[1]))
     ]
     scenario = world(robots, 30, report=report)
@@ -341,17 +343,17 @@ def test_a_world_is_the_same_whatever_is_reported():
 
 def driven_by(theta, log):
     """A run of two robots, one from an unknown place, by all parameters of their models."""
-    eyes = sensors.range_bearing(jnp.diag(theta[:2]) ** 2, mount=theta[2:5])
-    robot = team.Robot(motion.increment(jnp.diag(theta[5:7]) ** 2), suite((eyes, 3)))
+    eyes = sensors.RangeBearing(jnp.diag(theta[:2]) ** 2, mount=theta[2:5])
+    robot = team.Robot(motion.Increment(jnp.diag(theta[5:7]) ** 2), Suite(((eyes, 3),)))
     filter = team_slam([robot, robot], 8, update="joint")
     return jaxslam.run(filter, log, np.zeros(3), NOTHING, jax.random.key(0))
 
 
 def test_gradients_are_finite_and_float32_is_near():
     """Through births, corrections and the way in by two landmarks."""
-    eyes = sensors.range_bearing(R1, mount=MOUNT)
-    sight = suite(Part(eyes, 3, visible=between_ranges(0.0, 3.2)))
-    scenario = world([team.Robot(motion.increment(Q), sight, at) for at in STARTS[:2]], 4)
+    eyes = sensors.RangeBearing(R1, mount=MOUNT)
+    sight = Suite((Part(eyes, 3, visible=between_ranges(0.0, 3.2)),))
+    scenario = world([team.Robot(motion.Increment(Q), sight, at) for at in STARTS[:2]], 4)
     _, log = draw(scenario, 0)
 
     def loss(theta):
@@ -370,12 +372,12 @@ def test_gradients_are_finite_and_float32_is_near():
 
 
 def compass_only():
-    return team.Robot(motion.increment(Q), suite((sensors.compass([[0.01]]), 1)))
+    return team.Robot(motion.Increment(Q), Suite(((sensors.Compass([[0.01]]), 1),)))
 
 
 def signs():
-    sensor = sensors.range_bearing_signature(np.eye(3) * 0.01)
-    return team.Robot(motion.increment(Q), suite((sensor, 1)))
+    sensor = sensors.RangeBearingSignature(np.eye(3) * 0.01)
+    return team.Robot(motion.Increment(Q), Suite(((sensor, 1),)))
 
 
 @pytest.mark.parametrize(
@@ -394,7 +396,7 @@ def signs():
         (lambda: team_slam(crew(2), 3, update="at once"), "expected update"),
         (lambda: team_slam([signs()], 3), "expected landmarks \\(x, y\\)"),
         (lambda: team_slam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
-        (lambda: team.Robot(motion.increment(Q), ring().sensor), "a motion and a sensors.suite"),
+        (lambda: team.Robot(motion.Increment(Q), ring().sensor), "a motion and a sensors.suite"),
         (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
         (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
         (lambda: world(unknown(crew(2))), "expected a start of every robot"),

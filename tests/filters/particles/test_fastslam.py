@@ -30,7 +30,7 @@ RING = dataclasses.replace(
     RING, controls=RING.controls[:STEPS], pose_cov=np.diag([0.05, 0.05, 0.02]) ** 2
 )
 STILL = dataclasses.replace(
-    RING, motion=motion.increment(np.zeros((2, 2))), pose_cov=np.zeros((3, 3))
+    RING, motion=motion.Increment(np.zeros((2, 2))), pose_cov=np.zeros((3, 3))
 )
 """with a robot that moves exactly as told"""
 
@@ -427,8 +427,8 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
 
     def cost(sigma):
         models = {
-            "motion": motion.increment(jnp.diag(sigma[:2]) ** 2),
-            "sensor": sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2), mount=MOUNT),
+            "motion": motion.Increment(jnp.diag(sigma[:2]) ** 2),
+            "sensor": sensors.RangeBearing(sigma[2] ** 2 * jnp.eye(2), mount=MOUNT),
         }
         world = dataclasses.replace(RING, **models)
         filter = of(world, 4, capacity=4, proposal=proposal, resample=method, threshold=1.0)
@@ -455,9 +455,9 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
         ({"gate": 0.0}, "gate above 0"),
         ({"resample": "systematic"}, "resample to be a function"),
         ({"life": "existence"}, "life to be a Life"),
-        ({"sensor": sensors.compass(np.eye(1))}, "not a suite"),
+        ({"sensor": sensors.Compass(np.eye(1))}, "not a suite"),
         (
-            {"sensor": sensors.bearing_inverse_depth(np.eye(1), min_distance=1.0, to_point=0.1)},
+            {"sensor": sensors.BearingInverseDepth(np.eye(1), min_distance=1.0, to_point=0.1)},
             "converted to points",
         ),
     ],

@@ -10,17 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from own_models import changed
 
 from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.filters import fastslam, localization, particle_localization
 from jaxslam.filters.particles.states import region
-from jaxslam.sensors import Part, suite
+from jaxslam.sensors import Part, Suite
 from jaxslam.types import Scan, Status
 
 KEY = jax.random.key(5)
 WORLD = worlds.ring(100)
 MOUNT = (0.1, -0.05, 0.3)
-BLUNT = sensors.range_bearing(np.diag([0.3, 0.1]) ** 2, mount=MOUNT)
+BLUNT = sensors.RangeBearing(np.diag([0.3, 0.1]) ** 2, mount=MOUNT)
 MOVE = jax.jit(WORLD.motion.step)
 BOX = np.array([[-4.0, -3.0], [4.0, 5.0]])
 
@@ -144,7 +145,7 @@ def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
 
 
 def test_absolute_sensors_of_a_suite_weigh_too():
-    eyes = suite((BLUNT, 6), Part(sensors.compass(np.array([[0.04]])), 1))
+    eyes = Suite(((BLUNT, 6), Part(sensors.Compass(np.array([[0.04]])), 1)))
     scan, filter = one_scan(), of(20, eyes)
     whole = Scan(
         np.concatenate([scan.z, [[0.3, 0.0]]]),
@@ -243,7 +244,7 @@ def breaking(level):
         moved = WORLD.motion.step(pose, u, w)
         return jnp.where(w[0] > level, jnp.nan, moved)
 
-    return dataclasses.replace(WORLD.motion, step=step)
+    return changed(WORLD.motion, step=step)
 
 
 @pytest.mark.parametrize("kind", ["localization", "fastslam"])
@@ -287,7 +288,7 @@ def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
 def test_without_any_noise_or_with_one_particle_it_is_dead_reckoning(count):
     """A proposal without spread, from a start without any: all particles are one."""
     _, log = history(5)
-    trace = drive(of(count, BLUNT, motion.increment(np.zeros((2, 2)))), log)
+    trace = drive(of(count, BLUNT, motion.Increment(np.zeros((2, 2)))), log)
     pose = np.zeros(3)
     for u, ours in zip(np.asarray(log.control), np.asarray(trace.estimate.pose), strict=True):
         pose = np.asarray(MOVE(pose, u, np.zeros(2)))
@@ -333,8 +334,8 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     _, log = history(3)
 
     def cost(sigma):
-        move = motion.increment(jnp.diag(sigma[:2]) ** 2)
-        sensor = sensors.range_bearing(sigma[2] ** 2 * jnp.eye(2), mount=MOUNT)
+        move = motion.Increment(jnp.diag(sigma[:2]) ** 2)
+        sensor = sensors.RangeBearing(sigma[2] ** 2 * jnp.eye(2), mount=MOUNT)
         filter = of(12, sensor, move, resample=resampling.stop_gradient(), box=BOX)
         trace = run(filter, log, np.zeros(3), np.zeros((3, 3)), KEY)
         return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()

@@ -27,6 +27,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
+from jaxslam.core.numbers import check_count
 from jaxslam.results.film import Film
 from jaxslam.results.film.timing import pace
 from jaxslam.results.plot.style import (
@@ -41,7 +42,6 @@ from jaxslam.results.plot.style import (
     panels_of,
     titled,
 )
-from jaxslam.validation.numbers import check_count
 
 Draw: TypeAlias = Callable[[int], object]
 """Sets what a layer has made to frame k."""

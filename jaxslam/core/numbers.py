@@ -85,6 +85,15 @@ def check_mount(name: str, mount: ArrayLike) -> None:
         raise ValueError(f"{name}: the mounting pose is not finite")
 
 
+def held_array(values: ArrayLike) -> ArrayLike:
+    """An array as given; numbers in lists or tuples as one, in float64 whatever JAX's default."""
+    if hasattr(values, "dtype"):
+        return values
+    if not is_concrete(values):
+        return jnp.asarray(values)
+    return np.asarray(values, np.float64)
+
+
 def check_count(name: str, value: object) -> None:
     """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:

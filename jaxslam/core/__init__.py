@@ -1,0 +1,1 @@
+"""What models, filters and worlds are made of."""

@@ -1,0 +1,104 @@
+"""Records: frozen dataclasses that JAX knows as pytrees."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+import numpy as np
+
+T = TypeVar("T")
+
+
+def static(**options: Any) -> Any:
+    """A field of a record that is part of the program: a size, a name, a choice, a function.
+
+    Two records whose static fields differ are compiled apart, so a value is hashable and compared
+    by ==, a function by identity. options: those of `dataclasses.field`.
+    """
+    return dataclasses.field(**options, metadata={"static": True})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
+def record(cls: type[T]) -> type[T]:
+    """The class as a frozen dataclass and a pytree, whose fields are its children.
+
+    A field is a number, an array, None, another record, or a tuple of these; one that is declared
+    by `static()` is part of the structure instead. What `jax.grad`, `jax.vmap` and `jax.tree.map`
+    return of a record is one of its class. `dataclasses.replace` changes fields.
+
+    Fields are checked where a record is made by its class: values in a method `__post_init__`,
+    where the class has one, and then kinds here. JAX rebuilds records without any check, since it fills
+    them with whatever a transformation needs: tracers, stacks, derivatives.
+
+    Raises ValueError, at construction, on a field of another kind.
+    """
+    given = cls.__dict__.get("__post_init__") or getattr(cls, "__post_init__", None)
+
+    def __post_init__(self: Any) -> None:
+        if given is not None:
+            given(self)
+        _check_kinds(self)
+
+    cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
+    made = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    fields = dataclasses.fields(made)  # type: ignore[arg-type]
+    leaves = tuple(field.name for field in fields if not field.metadata.get("static"))
+    statics = tuple(field.name for field in fields if field.metadata.get("static"))
+    keys = tuple(jax.tree_util.GetAttrKey(name) for name in leaves)
+
+    def flatten(of: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        held = of.__dict__
+        return tuple([held[name] for name in leaves]), tuple([held[name] for name in statics])
+
+    def flatten_with_keys(of: Any) -> tuple[Iterable[tuple[Any, Any]], tuple[Any, ...]]:
+        children, structure = flatten(of)
+        return zip(keys, children, strict=True), structure
+
+    def unflatten(structure: tuple[Any, ...], children: Iterable[Any]) -> Any:
+        rebuilt = object.__new__(made)
+        rebuilt.__dict__.update(zip(leaves, children, strict=True))
+        rebuilt.__dict__.update(zip(statics, structure, strict=True))
+        return rebuilt
+
+    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    return made
+
+
+def is_record(value: object) -> bool:
+    """Whether a value is a record."""
+    return dataclasses.is_dataclass(value) and not jax.tree_util.all_leaves([value])
+
+
+def set_field(of: Any, name: str, value: Any) -> None:
+    """Set a field in `__post_init__`, for one that is given in another form."""
+    object.__setattr__(of, name, value)
+
+
+def _check_kinds(of: Any) -> None:
+    for field in dataclasses.fields(of):
+        value, where = getattr(of, field.name), f"{type(of).__name__}: {field.name}"
+        if not field.metadata.get("static"):
+            _check_child(where, value)
+        elif isinstance(value, np.ndarray | jax.Array):
+            raise ValueError(f"{where}: expected a value that is compared by ==, got an array")
+
+
+def _check_child(where: str, value: Any) -> None:
+    if isinstance(value, tuple) and type(value) is tuple:
+        for k, each in enumerate(value):
+            _check_child(f"{where}[{k}]", each)
+    elif isinstance(value, str | Sequence | set) and not isinstance(value, tuple):
+        wanted = "an array, as of numpy.asarray" if isinstance(value, list) else _WANTED
+        raise ValueError(f"{where}: expected {wanted}, got {type(value).__name__} {value!r}")
+    elif jax.tree_util.all_leaves([value]) and not _is_number(value):
+        raise ValueError(f"{where}: expected {_WANTED}, got {type(value).__name__}")
+
+
+_WANTED = "a number, an array or a record (a choice or a function is a static() field)"
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, bool | int | float | complex | np.generic | jax.Array):
+        return True
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biufcV"

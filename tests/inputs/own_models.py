@@ -1,0 +1,34 @@
+"""Motion models and sensors of functions, and with some of their functions changed."""
+
+import dataclasses
+
+from jaxslam.core.record import record
+from jaxslam.protocols import Motion, Sensor
+
+
+def _method(value):
+    return staticmethod(value) if callable(value) else value
+
+
+def motion_of(**parts):
+    """A motion model without leaves, of functions and names."""
+    return made(Motion, **parts)
+
+
+def sensor_of(**parts):
+    """A sensor without leaves, of functions and names."""
+    return made(Sensor, **parts)
+
+
+def made(base, **parts):
+    return record(type("Own", (base,), {name: _method(part) for name, part in parts.items()}))()
+
+
+def changed(model, **parts):
+    """The model with some functions or names in place of its own; its fields stay."""
+    fields = {field.name: getattr(model, field.name) for field in dataclasses.fields(model)}
+    kind = type(model)
+    body = {name: _method(part) for name, part in parts.items()} | {"name": model.name}
+    return record(type(kind.__name__, (kind,), body))(
+        **{name: value for name, value in fields.items() if name not in parts}
+    )
