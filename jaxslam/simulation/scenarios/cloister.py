@@ -29,7 +29,7 @@ def cloister(steps: int = 200) -> Scenario:
         controls=np.tile([0.1, 0.05], (steps, 1)),
         pose=(0.0, -2.0, 0.0),
         filter_options={"update": "sequential", "gate": sigma_gate(3), "births": 1},
-        source="Solà, Simultaneous localization and mapping with the EKF, 2014, appendix C.3",
+        source="Solà, EKF-SLAM guide, 2014, appendix C.3",
     )
 
 
@@ -65,5 +65,5 @@ def cloister_noisy(steps: int = 400) -> Scenario:
         visible=between_ranges(0.0, 3.0),
         places=14,
         filter_options={"update": "sequential"},
-        source="the world of Solà, Simultaneous localization and mapping with the EKF, 2014, C.3; noise ours",
+        source="the world of Solà, EKF-SLAM guide, 2014, appendix C.3; noise ours",
     )
