@@ -41,11 +41,11 @@ COLOURS, DOTS = 64, 110
 
 HEAD = """# Gallery
 
-Every scenario, family of filters and data set, and some methods, with one picture and the lines that made it. Each
-script is a file of `examples/gallery/`, and runs alone: the picture is its `figure`, which
-`figure.savefig("picture.png")` writes. `python -m benchmarks.gallery` makes all pictures and this
-page again, `python -m benchmarks.gallery circle` one picture. Those of data sets need the
-[files](guide/real_data.md).
+Every scenario, family of filters and data set, and a method of the sources, with one picture and
+the lines that made it. Each script is a file of `examples/gallery/`, and runs alone: the picture is
+its `figure`, which `figure.savefig("picture.png")` writes. `python -m benchmarks.gallery` makes all
+pictures and this page again, `python -m benchmarks.gallery circle` one picture. Those of data sets
+need the [files](guide/real_data.md).
 """
 
 PARTS = {
@@ -61,8 +61,8 @@ has the families that run in every scenario.
 """,
     "methods": """## Methods
 
-[Bearings and ranges](methods/bearings_and_ranges.md#delayed-initialization) says what the library does
-in place of this.
+[Bearings and ranges](methods/bearings_and_ranges.md#delayed-initialization) says what the library
+does in place of this.
 """,
     "datasets": """## Data sets
 

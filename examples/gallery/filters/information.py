@@ -15,7 +15,11 @@ exact = jaxslam.filters.eif_slam(world.motion, world.sensor, 20)
 sparse = jaxslam.filters.seif(world.motion, world.sensor, 20, active=6, links=6)
 dense = np.asarray(jaxslam.run(exact, log, *start).final.omega)
 links = whole_information(jaxslam.run(sparse, log, *start).final).toarray()
-shown = {"EIF: covariance": np.linalg.inv(dense), "EIF: information": dense, "SEIF: information": links}
+shown = {
+    "EIF: covariance": np.linalg.inv(dense),
+    "EIF: information": dense,
+    "SEIF: information": links,
+}
 figure = Figure(figsize=(7.2, 2.9), layout="constrained")
 for axes, (name, matrix) in zip(figure.subplots(1, 3), shown.items(), strict=True):
     scale = np.sqrt(np.diagonal(matrix))
