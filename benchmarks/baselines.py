@@ -1,4 +1,4 @@
-"""Localization and mapping: what SLAM lies between, and is nearly linear (Williams).
+"""Localization and mapping: the two problems that Williams calls easy.
 
     python -m benchmarks.baselines [--runs 1000]
 

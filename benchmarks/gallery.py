@@ -32,17 +32,20 @@ FOLDERS = {
 }
 """The folder of recorded data that a script takes, by its name."""
 
+TITLED = ("filters", "methods")
+"""Folders of scripts whose names are words, not names of code."""
+
 COLOURS, DOTS = 64, 110
 """Colours of a picture, and dots an inch."""
 
 
 HEAD = """# Gallery
 
-Every scenario, family of filters and data set, with one picture and the lines that made it. Each
-script is a file of `examples/gallery/`, and runs alone: the picture is its `figure`, which
-`figure.savefig("picture.png")` writes. `python -m benchmarks.gallery` makes all pictures and this
-page again, `python -m benchmarks.gallery circle` one picture. Those of data sets need the
-[files](guide/real_data.md).
+Every scenario, family of filters and data set, and a method of the sources, with one picture and
+the lines that made it. Each script is a file of `examples/gallery/`, and runs alone: the picture is
+its `figure`, which `figure.savefig("picture.png")` writes. `python -m benchmarks.gallery` makes all
+pictures and this page again, `python -m benchmarks.gallery circle` one picture. Those of data sets
+need the [files](guide/real_data.md).
 """
 
 PARTS = {
@@ -55,6 +58,11 @@ experiments.
 
 [Choosing a filter](guide/choosing_a_filter.md) says which is for what. {py:mod}`jaxslam.catalog`
 has the families that run in every scenario.
+""",
+    "methods": """## Methods
+
+[Bearings and ranges](methods/bearings_and_ranges.md#delayed-initialization) says what the library
+does in place of this.
 """,
     "datasets": """## Data sets
 
@@ -72,7 +80,7 @@ def page() -> str:
         parts.append(said)
         for path in sorted((SCRIPTS / kind).glob("*.py")):
             name = path.stem
-            title = name.replace("_", " ").capitalize() if kind == "filters" else f"`{name}`"
+            title = name.replace("_", " ").capitalize() if kind in TITLED else f"`{name}`"
             about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
             argument = f"<!-- run: argument=data/{FOLDERS[name]} -->\n" if name in FOLDERS else ""
             parts.append(

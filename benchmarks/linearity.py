@@ -1,8 +1,9 @@
 """Why inverse depth: the bearing's linearity index, `python -m benchmarks.linearity [--out PNG]`.
 
-A landmark is seen first from the origin, straight ahead, with the prior of the guide (Solà 2.3.6):
-inverse distance 1/(2 d_min) ± 1/(4 d_min), or the same as a range, to first order. How far does the
-second bearing, from a robot that went a baseline sideways, bend within 3 σ of that prior?
+A landmark is seen first from the origin, straight ahead, with a Gaussian on the guide's interval of
+inverse distance, 0 to 1/d_min (Solà (47)): 1/(2 d_min) ± 1/(4 d_min), or the same as a range, to
+first order. How far does the second bearing, from a robot that went a baseline sideways, bend
+within 3 σ of that prior?
 """
 
 import argparse

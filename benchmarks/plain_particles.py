@@ -2,10 +2,11 @@
 
     python -m benchmarks.plain_particles [--runs 20] [--particles 500]
 
-Williams's point for Rao-Blackwellization: particles of the joint state (x, y, θ, l_1 … l_N) must
-fill 3 + 2N dimensions, so with any number of them the effective number collapses as N grows.
-FastSLAM samples the pose alone and keeps each landmark as a Gaussian given the path. Same draws,
-same number of particles, a robot on a circle inside N landmarks that it always sees.
+Williams's reason for Rao-Blackwellization: the number of particles that a posterior needs grows
+exponentially with its dimension, 3 + 2N for the joint state (x, y, θ, l_1 … l_N). What is measured
+here is less: at a fixed number of particles the error grows with N. How the number needed grows is
+not measured. FastSLAM samples the pose alone and keeps each landmark as a Gaussian given the path.
+Same draws, same number of particles, a robot on a circle inside N landmarks that it always sees.
 """
 
 import jax

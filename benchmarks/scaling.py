@@ -1,9 +1,10 @@
 """What a step costs as the map grows, 10 landmarks of it in view: `python -m benchmarks.scaling`.
 
-The claims of the sources, as measured exponents: a step of EKF-SLAM is O(N²) (Solà's table; Tacher
-§1), of SEIF, ESEIF and localization O(1) but for the look-up of tags, of FastSLAM O(P log N) where
-maps are shared in trees (Montemerlo et al. 2002); here they are arrays, copied by resampling,
-O(P·N).
+Claims of the sources, as measured exponents: a step of EKF-SLAM is O(N²) (Solà 2.3.3; Tacher 1 has
+O(N^ω), of a dense product), of localization O(M) in the measurements of a scan (Tacher 1 has O(N),
+for a scan of all landmarks) but for the look-up of tags, of SEIF and ESEIF O(1) (Notes; Walter et
+al. 2007), of FastSLAM O(P log N) where maps are shared in trees (Montemerlo et al. 2002); here they
+are arrays, copied by resampling, O(P·N).
 
 A robot drives along a ring of landmarks 1 m apart that all are in its map. Prediction and update
 are timed in a scan whose carry is donated, without estimates, which are O(N) by themselves. Each

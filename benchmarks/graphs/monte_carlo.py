@@ -1,4 +1,8 @@
-"""Many draws of one graph: NEES of the marginals, χ² of the optimum, RMSE over its bound.
+"""Many draws of one graph: NEES of the marginals, χ² of the optimum, RMSE over what they claim.
+
+The "bound" is the trace of the marginals of one draw at the true poses. It approximates the
+Cramér-Rao bound to first order, and draws that did not converge are left out of the RMSE, so the
+ratio may lie below 1.
 
 Where does honesty end as the noise grows, by linearization or by wrong minima? Every draw is solved
 from the truth and from a chordal start. A χ² of the chordal one that is larger is a wrong minimum.
@@ -41,7 +45,7 @@ class Draws(NamedTuple):
     square: np.ndarray
     """(runs, N - 1): squared position errors"""
     bound: np.ndarray
-    """(N - 1,): their least expected values"""
+    """(N - 1,): their traces by the marginals of one draw"""
     wrong: np.ndarray
     """whether the chordal start ends in a larger χ²"""
     certified: np.ndarray

@@ -9,8 +9,8 @@ def maximum_likelihood(gate: float, new_gate: float | None = None) -> Associate:
     """Maximum-likelihood association: as `nearest`, by the least d² + log |S|.
 
     d² + log |S| is -2 log N(ν; 0, S) up to a constant. The determinant matters: a landmark of large
-    covariance has small d² to all measurements, but a low likelihood (Notes, EKF-SLAM with unknown
-    correspondences; Tacher). The gates are of d², as those of `nearest`.
+    covariance has small d² to all measurements, but a low likelihood (Thrun, Burgard &
+    Fox, Probabilistic Robotics, Table 7.3). The gates are of d², as those of `nearest`.
 
     Raises:
         ValueError: on a negative gate, or a new_gate below it.

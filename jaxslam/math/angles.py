@@ -27,7 +27,7 @@ def wrap(angle: ArrayLike) -> jax.Array:
 
     Any shape, radians. An angle already inside is returned unchanged, bit for bit. The derivative
     is 1 everywhere, also at the seam. Of an angle so large (10¹⁶ in float64) that rounding leaves
-    nothing of it modulo 2π the result is 0. (Solà's code corrects by one turn only; see ERRATA.)
+    nothing of it modulo 2π the result is 0. (Solà's code corrects by one turn only; errata.)
     """
     a = jnp.asarray(angle)
     w = a - 2 * np.pi * jnp.ceil((a - np.pi) / (2 * np.pi))

@@ -175,7 +175,7 @@ def polar_in_frame(frame: Pose, point: Point) -> Point:
 
 
 def polar_jacobians(point: Point) -> tuple[PointMatrix]:
-    """Derivative of `polar`, (2, 2): [x/r, y/r; -y/r², x/r²] (ERRATA, Solà C.1.2); 0 at r = 0."""
+    """Derivative of `polar`, (2, 2): [x/r, y/r; -y/r², x/r²] (errata, Solà C.1.2); 0 at r = 0."""
     x, y, away = _away_from_origin(point)
     r2 = x * x + y * y
     r = jnp.sqrt(r2)

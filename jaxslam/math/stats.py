@@ -38,7 +38,8 @@ def sigma_gate(n_sigma: float) -> float:
     """The squared Mahalanobis distance n² of an n-σ gate; the guide gates at 3 σ, so at 9.
 
     Which probability that holds depends on the dimension: 3 σ hold 98.89 % in 2-D, 97.07 % in 3-D
-    (Solà B.3.1, see ERRATA). For a gate by probability use `chi2_quantile(0.99, dof)`.
+    (Solà, Table 3; the text beside it is wrong, see the errata). For a gate by probability use
+    `chi2_quantile(0.99, dof)`.
     """
     if not n_sigma > 0:
         raise ValueError(f"sigma_gate: expected n_sigma above 0, got {n_sigma}")

@@ -22,7 +22,7 @@ class Velocity(Motion):
 
         pose ← pose ∘ exp(v̂Δt, 0, ω̂Δt),  θ ← wrap(θ + w_γ Δt).
 
-    That is x + (v̂/ω̂)(sin(θ+ω̂Δt) - sin θ), y + (v̂/ω̂)(cos θ - cos(θ+ω̂Δt)), θ + (ω̂+w_γ)Δt (ERRATA:
+    That is x + (v̂/ω̂)(sin(θ+ω̂Δt) - sin θ), y + (v̂/ω̂)(cos θ - cos(θ+ω̂Δt)), θ + (ω̂+w_γ)Δt (errata:
     the Notes mix v/r into it), but smooth through ω̂ = 0. Without w_γ the three coordinates would
     have noise in two directions only. Probabilistic Robotics, ch. 5.3; `VelocityNoise` is its
     covariance.

@@ -19,10 +19,10 @@ PAGE, RESULT, CURVES = "report.html", "consistency.json", "consistency.csv"
 FORMATS = ("png", "pdf", "svg")
 """Formats of the files of figures."""
 
-FIGURES = ("nees", "bound", "cost", "coverage", "whiteness", "gained", "errors", "map")
+FIGURES = ("nees", "rmse", "cost", "coverage", "whiteness", "gained", "errors", "map")
 """The figures, by the names of their files; the last two are of run 0."""
 
-_IN_NOTEBOOK = ("nees", "bound")
+_IN_NOTEBOOK = ("nees", "rmse")
 
 
 def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list[str]:
@@ -137,9 +137,9 @@ def _drawings(
     bound = any("bound_position" in found.curves for found in campaign.filters.values())
     found = {
         "nees": ("NEES against time, with its 95 % band", partial(plot.nees_figure, campaign)),
-        "bound": (
+        "rmse": (
             "RMSE, and the conditional Cramér-Rao bound" if bound else "RMSE",
-            partial(plot.bound_figure, campaign),
+            partial(plot.rmse_figure, campaign),
         ),
         "cost": (
             "Error and NEES against the time of a step",

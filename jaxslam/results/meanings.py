@@ -39,6 +39,40 @@ COUNTS = {
 """Counts, by their names in `Summary.counts`."""
 
 
+MEASURES = {
+    "autocorrelation": (
+        "innovation autocorrelation",
+        "correlation of whitened innovations with those of the same landmark one step later; 0 "
+        "where the filter uses all that measurements say",
+    ),
+    "noncredibility": (
+        "noncredibility",
+        "mean of 10 |log10 ρ|, with ρ the NEES over that by the actual covariance of the errors; "
+        "a covariance wrong by a factor of 2 has 3 dB",
+    ),
+    "inclination": (
+        "inclination",
+        "mean of 10 log10 ρ; above 0 where covariances are claimed too small, below 0 where too "
+        "large",
+    ),
+    "bound_ratio_position": (
+        "conditional bound",
+        "the Cramér-Rao bound of an RMSE, given the true path",
+    ),
+    "unobservable": (
+        "unobservable directions",
+        "dimension of what the filter's own linearized system leaves open; 3 in SLAM, two of "
+        "position and one of rotation of robot and map together",
+    ),
+    "rotation_information": (
+        "rotation information",
+        "what the filter has learnt of a rotation of robot and map together, which no measurement "
+        "contains",
+    ),
+}
+"""Measures that their names do not explain: term and sentence, by key in `Summary.measures`."""
+
+
 def count_label(name: str) -> str:
     """The name of a count, as a user reads it."""
     return "initialized" if name == "born" else name.replace("_", " ")
@@ -46,8 +80,9 @@ def count_label(name: str) -> str:
 
 def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
     """What a reader of the measures must know of this campaign: terms, each with a sentence."""
-    out = []
     summaries = campaign.filters
+    known = {key for summary in summaries.values() for key in summary.measures}
+    out = [note for key, note in MEASURES.items() if key in known]
     lowest: dict[str, list[str]] = {}
     for name, summary in summaries.items():
         if summary.honest_nis < 1:

@@ -23,7 +23,7 @@ class RangeBearing(Sensor):
 
     z = (range [m], bearing [rad]) of l = (x, y): polar(to_frame(pose ∘ mount, l)), Solà (63).
 
-    invert is (64), from_frame(pose ∘ mount, rectangular(z)) (in the sensor's frame, see ERRATA).
+    invert is (64), from_frame(pose ∘ mount, rectangular(z)) (in the sensor's frame: errata).
     A landmark exactly at the sensor gives z = 0 with zero derivative by l, not NaN.
     """
 

@@ -49,7 +49,7 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
         "report.html",
         "consistency.json",
         "consistency.csv",
-        *(f"{n}.png" for n in ("nees", "bound", "cost", "coverage", "whiteness", "gained")),
+        *(f"{n}.png" for n in ("nees", "rmse", "cost", "coverage", "whiteness", "gained")),
         *(f"{n}.png" for n in ("errors", "map")),
     }
     found = json.loads((out / "consistency.json").read_text())

@@ -32,11 +32,12 @@ def families():
 
 
 def test_every_scenario_family_and_data_set_has_a_script():
-    kinds = {kind: set() for kind in ("scenarios", "filters", "datasets")}
+    kinds = {kind: set() for kind in gallery.PARTS}
     for name, path in SCRIPTS.items():
         kinds[path.parent.name].add(name)
     assert kinds["scenarios"] == set(SCENARIOS)
     assert kinds["filters"] == families()
+    assert kinds["methods"]
     assert kinds["datasets"] == set(datasets.READERS) | {"carmen", "carmen_freiburg", "mrclam_team"}
 
 

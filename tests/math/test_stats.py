@@ -49,7 +49,7 @@ def test_quantile_undoes_the_tail(dof):
 
 
 def test_sigma_ellipses_hold_what_solas_table_says():
-    """Solà B.3.1 with the figures of ERRATA, per cent."""
+    """Solà B.3.1 Table 3, with the digits of the errata, per cent."""
     for dof, table in ((2, [39.35, 86.47, 98.89, 99.97]), (3, [19.87, 73.85, 97.07, 99.89])):
         held = [100 * (1 - float(stats.chi2_tail(stats.sigma_gate(n), dof))) for n in (1, 2, 3, 4)]
         np.testing.assert_allclose(held, table, atol=0.005)

@@ -194,7 +194,7 @@ move = batched(VELOCITY.step)
 
 
 def arc(pose, v, omega, dt, gamma=0.0):
-    """ERRATA's form of the Notes' velocity model, ω ≠ 0."""
+    """The Notes' velocity model as the errata have it, ω ≠ 0."""
     x, y, theta = pose.T
     turned = theta + omega * dt
     return np.stack(

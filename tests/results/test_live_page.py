@@ -67,7 +67,7 @@ def html():
     world = dataclasses.replace(campaign(**filters), steps=STEPS)
     figures = {
         "nees": ("NEES", plot.nees_figure(world)),
-        "bound": ("RMSE", plot.bound_figure(world)),
+        "rmse": ("RMSE", plot.rmse_figure(world)),
         "cost": ("Cost", plot.cost_figure(world)),
     }
     return page(world, report.ROWS, f"jaxslam {EVIL}", 1, {}, figures)

@@ -11,6 +11,7 @@ import worlds
 
 from jaxslam import report
 from jaxslam.catalog import BASELINES
+from jaxslam.consistency import Measure
 from jaxslam.results import files
 from jaxslam.types import Estimate
 
@@ -49,6 +50,16 @@ def test_the_notes_explain_the_gate_the_likelihood_and_the_counts(campaign):
     assert "born" not in text
     alone = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf}))
     assert "gate:" not in alone and "log-likelihood:" not in alone
+
+
+def test_measures_that_their_names_do_not_explain_have_a_note(campaign):
+    ekf = campaign.filters["ekf"]
+    of_many_runs = dict.fromkeys(("noncredibility", "inclination"), Measure(1.0, 0.5, 1.5))
+    filters = {"a": dataclasses.replace(ekf, measures=ekf.measures | of_many_runs)}
+    table = report.campaign_table(dataclasses.replace(campaign, filters=filters))
+    terms = {line.split(": ")[0] for line in table.splitlines()}
+    assert {"noncredibility", "inclination", "innovation autocorrelation"} <= terms
+    assert "rotation information" not in terms  # this filter has none
 
 
 def test_filters_of_which_the_same_is_said_share_a_sentence(campaign):

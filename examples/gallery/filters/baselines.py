@@ -9,4 +9,4 @@ jax.config.update("jax_enable_x64", True)
 world = jaxslam.scenarios.circle(steps=300)
 filters = {name: ALL[name](world) for name in ("dead_reckoning", "localization", "ekf")}
 campaign = jaxslam.monte_carlo(world, filters, runs=20, key=jax.random.key(0))
-figure = jaxslam.plot.bound_figure(campaign)
+figure = jaxslam.plot.rmse_figure(campaign)

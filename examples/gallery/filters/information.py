@@ -1,4 +1,4 @@
-"""Information: the normalized matrix of the information filter, and of SEIF, which cuts links."""
+"""Information: covariance and information of one filter, normalized; and SEIF, which cuts links."""
 
 import jax
 import numpy as np
@@ -15,11 +15,15 @@ exact = jaxslam.filters.eif_slam(world.motion, world.sensor, 20)
 sparse = jaxslam.filters.seif(world.motion, world.sensor, 20, active=6, links=6)
 dense = np.asarray(jaxslam.run(exact, log, *start).final.omega)
 links = whole_information(jaxslam.run(sparse, log, *start).final).toarray()
-figure = Figure(figsize=(7.2, 3.6), layout="constrained")
-panels = zip(figure.subplots(1, 2), ("EIF", "SEIF"), (dense, links), strict=True)
-for axes, name, omega in panels:
-    scale = np.sqrt(np.diagonal(omega))
-    shown = np.log10(np.maximum(np.abs(omega) / np.outer(scale, scale), 1e-6))
-    image = axes.imshow(shown, cmap="Blues", vmin=-6, vmax=0)
+shown = {
+    "EIF: covariance": np.linalg.inv(dense),
+    "EIF: information": dense,
+    "SEIF: information": links,
+}
+figure = Figure(figsize=(7.2, 2.9), layout="constrained")
+for axes, (name, matrix) in zip(figure.subplots(1, 3), shown.items(), strict=True):
+    scale = np.sqrt(np.diagonal(matrix))
+    shares = np.log10(np.maximum(np.abs(matrix) / np.outer(scale, scale), 1e-6))
+    image = axes.imshow(shares, cmap="Blues", vmin=-6, vmax=0)
     axes.set(title=name, xlabel="entry of the state")
-figure.colorbar(image, ax=figure.axes, label="log₁₀ of the normalized information")
+figure.colorbar(image, ax=figure.axes, shrink=0.75, label="log₁₀, normalized")

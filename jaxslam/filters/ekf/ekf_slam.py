@@ -69,8 +69,9 @@ def ekf_slam(
         covariance: "plain"; "joseph", Joseph's form of the update, which costs more and is safer in
             float32; or "square_root", a root X of P = X Xᵀ instead of P, as accurate in float32 as
             P is in float64, at a higher cost (the prediction is O(N³)).
-        births: at most so many new landmarks a scan, the rest `Status.DEFERRED`; the guide starts
-            one. Default no limit.
+        births: at most so many new landmarks a scan, the first ones in its order (that of tags in
+            simulated scans), the rest `Status.DEFERRED`. The guide starts one, picked at random.
+            Default no limit.
         make_room: a `Life` that removes landmarks from a full map before new ones enter it; only
             for filters wrapped as `map_management.pruning(filter, make_room)`, which keeps its
             memory. Default: none is removed.

@@ -8,7 +8,7 @@ mean (sparsification: ξ̃ = ξ + (Ω̃ - Ω) μ) keep ρ.
 
 Padding, an index without a landmark: zero mean, zero links, unit diagonal of Ω, zero of ρ.
 Sources: Thrun et al., "Simultaneous localization and mapping with sparse extended information
-filters", IJRR 23(7-8), 2004; the Notes, with the corrections of ERRATA.
+filters", IJRR 23(7-8), 2004; the Notes, with the corrections of the errata.
 """
 
 import math

@@ -44,7 +44,7 @@ def seif(
     gate: float | None = None,
     floor: float = 1e-4,
 ) -> Filter:
-    """Sparse extended information filter (Thrun et al. 2004; the Notes, corrected by ERRATA).
+    """Sparse extended information filter (Thrun et al. 2004; the Notes, corrected by the errata).
 
     The robot is linked to at most `active` landmarks, the most recent ones, each landmark to at
     most `links` others. Four steps, none of which touches the rest of the map:
@@ -55,6 +55,10 @@ def seif(
     3. measurement update and new landmarks (`canonical`);
     4. mean recovery (`mean_recovery`), one block at a time: the block of robot and active
        landmarks, and `passive` landmarks in rotation.
+
+    The sources sparsify last, after measurement and mean. Here sparsification comes before the
+    measurement, and only makes the room that the scan needs, so that a scan without another
+    landmark drops nothing.
 
     With active = capacity it is `eif_slam`. `sparsification` documents what is dropped, and
     `SparseState.counts` counts it. NIS, gate and, unless `whole`, `estimate` use covariances of

@@ -19,7 +19,7 @@ def dead_reckoning(
     chart: Chart | None = None,
     linearize: Linearizer | None = None,
 ) -> Filter:
-    """The predicted pose alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (16)).
+    """The predicted pose alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (15)).
 
     Every measurement is `Status.UNMATCHED`, and the map stays empty. The sensor only gives the size
     of measurements; chart and linearize are those of `ekf_slam`, with the same errors.

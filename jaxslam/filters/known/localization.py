@@ -58,7 +58,7 @@ def localization(
     iterations: int = 1,
     covariance: Covariance = "plain",
 ) -> Filter:
-    """Extended Kalman filter of the pose in a known map without errors (Williams; the Notes).
+    """Extended Kalman filter of the pose in a known map without errors (Williams, localization).
 
     The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the pose only, P (3, 3). A step
     costs O(M), plus the search for tags among N (0.09 ms a step with 10,000); association other

@@ -63,7 +63,9 @@ def team_slam(
 
     The control of a step is (u_0, …, u_{R-1}); the measurement slots of a scan are those of robot
     0's sensors in order, then robot 1's, and so on. All robots move; then each in turn (those
-    without start last) corrects the map sensor by sensor, and initializes its new landmarks. Info
+    without start last) corrects the map sensor by sensor, and initializes its new landmarks. (In
+    Solà 2.4 a robot moves and measures before the next one moves: all controls and measurements of
+    a step here are of one time, and a robot that is measured must be where it was then.) Info
     of a robot that was measured has that robot's slot. The tag of a measurement identifies the
     robot; in slots of a `Part` that sees "robots" no landmark is initialized (`Status.DEFERRED`).
 

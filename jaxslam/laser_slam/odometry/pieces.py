@@ -23,7 +23,7 @@ from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.math import numpy_poses as poses
 
-PIECE = 600
+PIECE = 400
 """Scans of a piece of a log, at least."""
 AROUND = 5
 """Scans to either side of the first of a piece in which raw odometry is right."""

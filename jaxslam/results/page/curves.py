@@ -57,7 +57,7 @@ def embedded_curves(campaign: Campaign) -> Curves:
             + [make.panel("NIS / dof", "log", "nis_per_dof", reference=("honest", 1))],
         ),
         _chart(
-            "bound",
+            "rmse",
             "step",
             [
                 make.panel("position RMSE [m]", "zero", "rmse_position", bound="bound_position"),

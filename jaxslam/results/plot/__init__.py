@@ -8,9 +8,9 @@ column of a paper, with letters of the same size.
 from jaxslam.results.plot.campaigns.cost import cost_figure
 from jaxslam.results.plot.campaigns.errors import errors_figure, run_errors_figure
 from jaxslam.results.plot.campaigns.measures import (
-    bound_figure,
     coverage_figure,
     gained_figure,
+    rmse_figure,
     whiteness_figure,
 )
 from jaxslam.results.plot.campaigns.nees import nees_figure
@@ -48,7 +48,6 @@ __all__ = [
     "Scene",
     "animate",
     "animate_world",
-    "bound_figure",
     "cost_figure",
     "coverage_figure",
     "describe",
@@ -67,6 +66,7 @@ __all__ = [
     "png",
     "probe",
     "render",
+    "rmse_figure",
     "run_errors_figure",
     "run_map_figure",
     "run_scene",

@@ -18,7 +18,7 @@ def cloister(steps: int = 200) -> Scenario:
     Control (0.1 m, 0.05 rad), σ_u = (0.01 m, 0.02 rad), σ_z = (0.1 m, 1°), every landmark measured
     every step, a 3 σ gate, one landmark initialized a step, start at (0, -2, 0) with P0 = 0.
     The noise is on the robot; `dataclasses.replace(…, noise_on="odometry")` gives the guide's way,
-    which disturbs the estimator instead (see ERRATA).
+    which disturbs the estimator instead (see the errata).
     """
     check_count("cloister: steps", steps)
     return Scenario(
@@ -29,7 +29,7 @@ def cloister(steps: int = 200) -> Scenario:
         controls=np.tile([0.1, 0.05], (steps, 1)),
         pose=(0.0, -2.0, 0.0),
         filter_options={"update": "sequential", "gate": sigma_gate(3), "births": 1},
-        source="Solà, SLAM with the extended Kalman filter, 2014, appendix C.3",
+        source="Solà, EKF-SLAM guide, 2014, appendix C.3",
     )
 
 
@@ -65,5 +65,5 @@ def cloister_noisy(steps: int = 400) -> Scenario:
         visible=between_ranges(0.0, 3.0),
         places=14,
         filter_options={"update": "sequential"},
-        source="the world of Solà, SLAM with the EKF, 2014, C.3; noise ours",
+        source="the world of Solà, EKF-SLAM guide, 2014, appendix C.3; noise ours",
     )

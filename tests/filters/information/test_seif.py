@@ -71,7 +71,7 @@ def projected(omega, f):
 
 
 def sparsified(omega, plus, zero):
-    """ERRATA's formula, by projections."""
+    """The formula of the errata, by projections."""
     f0 = picks([*plus, *zero], robot=True)
     conditioned = f0 @ f0.T @ omega @ f0 @ f0.T
     robot = picks([], robot=True)
@@ -181,7 +181,7 @@ def test_whole_map_and_markov_blankets():
 
 
 def test_sparsification_is_overconfident():
-    """Tacher's counter-example: Ω - Ω̃ is not positive semi-definite."""
+    """A counter-example: Ω - Ω̃ is not positive semi-definite."""
     rng = np.random.default_rng(2)
     root = rng.normal(size=(9, 9))
     omega = root @ root.T + 0.1 * np.eye(9)

@@ -23,7 +23,7 @@ FIVE = ("dead_reckoning", "ekf", "fej", "right_invariant", "fastslam1")
 TWELVE = (*FIVE, "localization", "ideal", "oc", "ukf", "seif", "batch_map", "fastslam2")
 OVER_STEPS = (
     plot.nees_figure,
-    plot.bound_figure,
+    plot.rmse_figure,
     plot.coverage_figure,
     plot.whiteness_figure,
     plot.gained_figure,
@@ -212,7 +212,7 @@ def test_low_panels_of_nees_have_the_powers_of_ten_and_the_honest_one(every):
 
 
 def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
-    figure = plot.bound_figure(five)
+    figure = plot.rmse_figure(five)
     assert named(figure)[-1] == "conditional Cramér-Rao bound"
     for axes, unit in zip(figure.axes, (1, 2), strict=True):
         others = max(line(axes, name).get_ydata().max() for name in FIVE[1:])
@@ -223,13 +223,13 @@ def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
         assert marks.get_color() == reckoned.get_color()
         assert axes.get_title("right") == f"↑ to {40 * unit}"
     # Alone, it does; and so does a filter that is merely worse than another.
-    alone = plot.bound_figure(drawn.campaign(["dead_reckoning"])).axes[0]
+    alone = plot.rmse_figure(drawn.campaign(["dead_reckoning"])).axes[0]
     assert alone.get_ylim()[1] > 40 and not beyond(alone)
     pair = drawn.campaign(["localization", "ekf"])
-    assert not beyond(plot.bound_figure(pair).axes[0])
+    assert not beyond(plot.rmse_figure(pair).axes[0])
     bare = {name: c for name, c in five.filters["ekf"].curves.items() if name[:5] != "bound"}
     without = dataclasses.replace(five.filters["ekf"], curves=bare)
-    assert named(plot.bound_figure(drawn.campaign("a", filters={"a": without}))) == ["a"]
+    assert named(plot.rmse_figure(drawn.campaign("a", filters={"a": without}))) == ["a"]
 
 
 def test_coverage_is_drawn_about_the_diagonal(five):

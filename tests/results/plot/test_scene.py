@@ -12,11 +12,12 @@ import worlds
 from PIL import Image
 
 from jaxslam import catalog, plot
+from jaxslam.filters.delayed.state import TableLayout, empty_state
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.sparse.sparse_state import empty_map
 from jaxslam.filters.particles.states.slam_state import initial_slam_particles
 from jaxslam.results.film import MOST
-from jaxslam.results.plot.scene import Cloud, Links, history_of, layers
+from jaxslam.results.plot.scene import Cloud, Hypotheses, Links, history_of, layers
 from jaxslam.results.plot.style import panels_of
 from jaxslam.types import Info, Log, Scan, Status, Trace
 
@@ -213,6 +214,23 @@ def test_links_appear_and_are_cut():
     assert between.get_linewidth()[0] == 3.0
 
 
+def test_hypotheses_are_drawn_until_they_are_landmarks():
+    points = np.arange(STEPS * 4.0).reshape(STEPS, 2, 2)
+    covs = np.tile(0.04 * np.eye(2), (STEPS, 2, 1, 1))
+    seen = Hypotheses(points, covs, np.array([[0.0, 0.0], [1.0, 3.0], [0.0, 1.5]]))
+    scene, *_ = scene_of(seen=seen)
+    axes, draw = staged(scene.main)
+    (marked,) = [each for each in axes.lines if each.get_marker() == "D"]
+    for k, shown in enumerate([[], [0, 1], [1]]):
+        draw(k)
+        np.testing.assert_array_equal(marked.get_xydata(), points[k, shown])
+        rings = line(axes, "hypothesis, 3 σ").reshape(len(shown), 50, 2)[:, :-1]
+        away = np.linalg.norm(rings - points[k, shown][:, None], axis=2)
+        np.testing.assert_allclose(away, 0.6)
+    counts = [scene.said(k).rpartition(" · ")[2] for k in range(STEPS)]
+    assert counts == ["0 hypotheses", "2 hypotheses", "1 hypothesis"]
+
+
 # --- frames -------------------------------------------------------------------------------------
 
 
@@ -336,6 +354,22 @@ def test_of_information_the_links_are_seen_dense_and_sparse():
         ),
     )
     np.testing.assert_allclose(find(sparse).strength, expected, rtol=1e-5)
+
+
+def test_of_delayed_initialization_the_hypotheses_are_seen():
+    layout = TableLayout(landmarks=2, hypotheses=3, stored=4)
+    state = empty_state(layout, jnp.zeros(3), jnp.zeros((3, 3)))
+    rng = np.random.default_rng(2)
+    cov = np.cov(rng.normal(size=(30, 60)))
+    table = rng.normal(size=(layout.slots, 3))
+    alive = np.array([1, 1, 1, 0, 1, 1, 1, 0, 0], bool)
+    joint = state.joint._replace(landmarks=table, cov=cov, alive=alive)
+    seen = jax.jit(plot.probe)(state._replace(joint=joint, persistence=jnp.array([1.0, 5.0, 2.5])))
+    np.testing.assert_array_equal(seen.persistence, [1.0, 0.0, 2.5])
+    np.testing.assert_allclose(seen.points, table[2:5, :2])
+    for slot, block in zip((2, 3, 4), seen.covs, strict=True):
+        rows = slice(3 + 3 * slot, 5 + 3 * slot)
+        np.testing.assert_allclose(block, cov[rows, rows])
 
 
 def test_a_filter_is_filmed_in_a_world_by_itself():

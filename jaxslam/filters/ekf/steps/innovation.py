@@ -121,7 +121,7 @@ def innovate(
     memory: tuple[Joint, Int[Array, "m"]],
     settings: EkfSettings,
 ) -> Innovation:
-    """The innovation of m measurements at once, from their view of P: Solà (26)-(29).
+    """The innovation of m measurements at once, from their view of P: Solà (26)-(28).
 
         view of P        H                       H P          S = H P Hᵀ + R
         robot (3, D)     by pose (m, Z, 3)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ

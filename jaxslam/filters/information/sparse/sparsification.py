@@ -30,8 +30,8 @@ def sparsify(
 ) -> tuple[Float[Array, "D D"], Float[Array, ""]]:
     """Ω̃ of the active block without links from the robot to leaving landmarks; the nats dropped.
 
-    x and m0 are made independent given the other active landmarks m+ (ERRATA's formula, Ω⁰ being
-    the active block: passive landmarks are held at their means there):
+    x and m0 are made independent given the other active landmarks m+ (the Notes' formula as the
+    errata have it, Ω⁰ being the active block: passive landmarks are held at their means there):
 
         Ω̃ = Ω - Ω F_m0 (..)⁻¹ F_m0ᵀ Ω + Ω F_x,m0 (..)⁻¹ F_x,m0ᵀ Ω - Ω F_x (..)⁻¹ F_xᵀ Ω,
 

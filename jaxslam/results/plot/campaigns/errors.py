@@ -54,7 +54,7 @@ def run_errors_figure(
     """Errors of run 0 of every filter of `Campaign.first`, a row each, as `errors_figure`.
 
     The scales are the same, but for panels that would fill less than a tenth of theirs: these have
-    their own, in bold figures. Filters that would set them alone (`bound_figure`) leave the panels
+    their own, in bold figures. Filters that would set them alone (`rmse_figure`) leave the panels
     at an arrow. Raises ValueError if the campaign has no run 0.
     """
     check_record("run_errors_figure", "the first argument", campaign, Campaign)

@@ -21,7 +21,7 @@ _ASIDE = 0.12
 """Distance of two filters at the same lag [steps]."""
 
 
-def bound_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
+def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """RMSE of position and heading over the steps, with the conditional Cramér-Rao bound if known.
 
     More than five filters are drawn by kind. Filters that fuse no measurement, that diverge, or

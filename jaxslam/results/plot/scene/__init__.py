@@ -4,7 +4,7 @@ from jaxslam.results.plot.scene.animate import animate, animate_world
 from jaxslam.results.plot.scene.graph_scene import graph_scene
 from jaxslam.results.plot.scene.history import History, history_of
 from jaxslam.results.plot.scene.map_scene import map_scene
-from jaxslam.results.plot.scene.probe import Cloud, Links, probe
+from jaxslam.results.plot.scene.probe import Cloud, Hypotheses, Links, probe
 from jaxslam.results.plot.scene.render import Draw, Layer, Panel, Scene, render
 from jaxslam.results.plot.scene.run_scene import run_scene
 
@@ -12,6 +12,7 @@ __all__ = [
     "Cloud",
     "Draw",
     "History",
+    "Hypotheses",
     "Layer",
     "Links",
     "Panel",

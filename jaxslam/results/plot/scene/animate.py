@@ -44,8 +44,9 @@ def animate(
         film.save("slam.mp4")  # or .gif, .html
 
     With a trace of `run(…, probe=jaxslam.plot.probe)` it shows the particles of a particle filter,
-    and the links of an information filter. Of more than `frames` steps so many are shown, evenly in
-    time; a frame has the beams of the steps since the one before. `Film.note` says so.
+    the links of an information filter, and the hypotheses of `delayed_slam`. Of more than `frames`
+    steps so many are shown, evenly in time; a frame has the beams of the steps since the one
+    before. `Film.note` says so.
 
     Args:
         trace, log: of `run`, T steps.
@@ -83,7 +84,7 @@ def animate_world(
     dtype: DTypeLike | None = None,
     **options: Any,
 ) -> Film:
-    """The film of a filter in a simulated world, with its particles or links.
+    """The film of a filter in a simulated world, with what `probe` has of its state.
 
         world = jaxslam.scenarios.cloister()
         jaxslam.plot.animate_world(world, jaxslam.catalog.variant(world), jax.random.key(0))

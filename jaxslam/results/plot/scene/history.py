@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.results.film import MOST, frame_steps
-from jaxslam.results.plot.scene.probe import Cloud, Links
+from jaxslam.results.plot.scene.probe import Cloud, Hypotheses, Links
 from jaxslam.types import Estimate, Log, Status, Trace
 from jaxslam.validation import check_record
 
@@ -25,7 +25,7 @@ class History(NamedTuple):
     """of the measurements"""
     status: Int[np.ndarray, "T M"]
     slot: Int[np.ndarray, "T M"]
-    seen: Cloud | Links | None = None
+    seen: Cloud | Links | Hypotheses | None = None
     """with leading F"""
 
 

@@ -1,4 +1,4 @@
-"""What a film shows of a filter's own state: particles, or links of an information matrix."""
+"""What a film shows of a filter's own state: particles, links, or hypotheses."""
 
 from typing import NamedTuple
 
@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxslam.filters.delayed.state import DelayedState, covariance_blocks
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.sparse.marginals import local_information
 from jaxslam.filters.information.sparse.sparse_state import SparseState
@@ -28,8 +29,17 @@ class Links(NamedTuple):
     """‖Ω_ij‖ / √(‖Ω_ii‖ ‖Ω_jj‖) of the blocks of positions, at most 1; 0 without link"""
 
 
-def probe(state: PyTree) -> Cloud | Links | None:
-    """What `animate` shows of the state of FastSLAM, of a particle filter or an information filter.
+class Hypotheses(NamedTuple):
+    """Points where stored measurements intersect, with leading T in a trace."""
+
+    points: Float[Array, "*T C 2"]
+    covs: Float[Array, "*T C 2 2"]
+    persistence: Float[Array, "*T C"]
+    """0 where not in use"""
+
+
+def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
+    """What `animate` shows of the state of a particle filter, information filter or `delayed_slam`.
 
         trace = jaxslam.run(filter, log, pose, pose_cov, key, probe=jaxslam.plot.probe)
 
@@ -42,7 +52,19 @@ def probe(state: PyTree) -> Cloud | Links | None:
         return _links(local_information(state, every), 2)
     if isinstance(state, CanonicalState):
         return _links(state.omega, state.landmarks.shape[1])
+    if isinstance(state, DelayedState):
+        return _hypotheses(state)
     return None
+
+
+def _hypotheses(state: DelayedState) -> Hypotheses:
+    """The hypotheses of a state, whose slots follow those of the landmarks."""
+    joint, count = state.joint, state.persistence.shape[0]
+    first = joint.alive.shape[0] - state.taken_at.shape[0] - count
+    slot = first + np.arange(count)
+    covs = covariance_blocks(joint)[slot, :2, slot, :2]
+    persistence = jnp.where(joint.alive[slot], state.persistence, 0.0)
+    return Hypotheses(joint.landmarks[slot, :2], covs, persistence)
 
 
 def _links(omega: Float[Array, "D D"], size: int) -> Links:

@@ -16,7 +16,7 @@ from jaxslam.results.plot.scene.layers import (
     triangle,
 )
 from jaxslam.results.plot.scene.links import link_layers
-from jaxslam.results.plot.scene.probe import Cloud
+from jaxslam.results.plot.scene.probe import Cloud, Hypotheses
 from jaxslam.results.plot.scene.render import Layer, Panel, Scene
 from jaxslam.results.plot.style import COLORS, FAINT, INK, Look
 
@@ -48,9 +48,9 @@ def run_scene(
 ) -> Scene:
     """The scene of a run: robot, beams, landmarks with n σ ellipses, and the truth in grey.
 
-    A history with particles or links shows these, too. Beside the map is the error of the robot's
-    position within its ellipse, on a fixed scale. The limits are those of the truth, or of the
-    estimate where there is none.
+    A history with particles, links or hypotheses shows these, too. Beside the map is the error of
+    the robot's position within its ellipse, on a fixed scale. The limits are those of the truth, or
+    of the estimate where there is none.
 
     Args:
         true_points: (N, 2) landmarks [m], in the frame of the map.
@@ -75,6 +75,7 @@ def run_scene(
         *_truth(history, true_points, true, _ROBOT * side),
         *link_layers(history),
         *_beams(found),
+        *_hypotheses(history, n_sigma),
         *_map(history, n_sigma),
         *_robot(history, n_sigma, _ROBOT * side),
     ]
@@ -143,6 +144,20 @@ def _map(history: History, n_sigma: float) -> list[Layer]:
     return [
         marks(points, alive, label="_", **dots),
         rings(points, covs, alive, n_sigma, label=f"landmark, {n_sigma:g} σ", **ring),
+    ]
+
+
+def _hypotheses(history: History, n_sigma: float) -> list[Layer]:
+    """The layers of points that may become landmarks, with their ellipses."""
+    if not isinstance(history.seen, Hypotheses):
+        return []
+    points, covs, persistence = map(np.asarray, history.seen)
+    shown = persistence > 0
+    ring: Look = {"color": COLORS[3], "lw": 0.9, "ls": (0, (2, 1.2)), "zorder": 3.8}
+    dots: Look = {"color": COLORS[3], "marker": "D", "mfc": "white", "ms": 3.5, "zorder": 3.9}
+    return [
+        rings(points, covs, shown, n_sigma, label=f"hypothesis, {n_sigma:g} σ", **ring),
+        marks(points, shown, label="_", **dots),
     ]
 
 
@@ -222,6 +237,9 @@ def _text(history: History, found: Measured, n_sigma: float) -> Callable[[int], 
         parts = [f"step {history.step[k] + 1:,} of {total:,}"]
         many = sum(counts.values())
         parts.append(f"{many} measurement{'s' * (many != 1)}: {', '.join(shown)}")
+        if isinstance(history.seen, Hypotheses):
+            count = int((np.asarray(history.seen.persistence[k]) > 0).sum())
+            parts.append(f"{count} hypothes{'is' if count == 1 else 'es'}")
         parts += [f"{lost[k]} without ellipse"] if lost[k] else []
         parts += [] if np.isfinite(history.estimate.pose[k]).all() else ["pose not finite"]
         return " · ".join(parts)
