@@ -28,8 +28,8 @@ def record(cls: type[T]) -> type[T]:
     return of a record is one of its class. `dataclasses.replace` changes fields.
 
     Fields are checked where a record is made by its class: values in a method `__post_init__`,
-    where the class has one, and then kinds here. JAX rebuilds records without any check, since it fills
-    them with whatever a transformation needs: tracers, stacks, derivatives.
+    where the class has one, and then kinds here. JAX rebuilds records without any check, since it
+    fills them with whatever a transformation needs: tracers, stacks, derivatives.
 
     Raises ValueError, at construction, on a field of another kind.
     """

@@ -73,18 +73,19 @@ class Substeps(Motion):
         return (own * blocks[:, :, None, :]).reshape(size, size)
 
     @property
-    def perturb(self) -> Callable[[Array, Array], Array] | None:  # type: ignore[override]
+    def perturb(self) -> Callable[[Array, Array], Array] | None:
         return None if self.motion.perturb is None else self._perturb
 
     @property
-    def jacobians(self) -> Callable[..., StepJacobians] | None:  # type: ignore[override]
+    def jacobians(self) -> Callable[..., StepJacobians] | None:
         return None if self.motion.jacobians is None else self._jacobians
 
     def _rows(self, u: Control, w: ProcessNoise) -> _Rows:
         return u.reshape(self.count, -1), w.reshape(self.count, -1)
 
     def _perturb(self, u: Control, w: ProcessNoise) -> Control:
-        return jax.vmap(self.motion.perturb)(*self._rows(u, w)).ravel()
+        perturbed: Array = jax.vmap(self.motion.perturb)(*self._rows(u, w))
+        return perturbed.ravel()
 
     def _jacobians(self, pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         def forward(pose: Pose, row: _Rows) -> tuple[Array, _Jacobians]:

@@ -12,6 +12,7 @@ from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, set_field, static
 from jaxslam.math.arrays import Landmark, Measurement, Point, Pose, Unmeasured
 from jaxslam.protocols import Free, Reduced, Sensor
+from jaxslam.sensors.wrapped import Wrapped
 from jaxslam.types import Scan
 
 
@@ -114,7 +115,7 @@ class Suite(Sensor):
         return self.first.landmark
 
     @property
-    def carry(self) -> Callable[[Array, Array], Array] | None:  # type: ignore[override]
+    def carry(self) -> Callable[[Array, Array], Array] | None:
         carry: Callable[[Array, Array], Array] | None = self.first.carry
         return carry
 
@@ -170,7 +171,7 @@ def on_ground(sensor: Sensor, size: int) -> Sensor:
 
 
 @record
-class OnGround(Sensor):
+class OnGround(Wrapped):
     """A sensor for landmarks of more numbers than it uses.
 
     A measurement does not depend on the others: an absolute sensor ignores them all, and in a new
@@ -179,14 +180,6 @@ class OnGround(Sensor):
 
     sensor: Sensor
     size: int = static()
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return self.sensor.name
-
-    @property
-    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.sensor.measurements
 
     @property
     def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -203,13 +196,6 @@ class OnGround(Sensor):
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         return self.sensor.observe(pose, self._own(landmark))
-
-    def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
-        return self.sensor.residual(z, z_hat)
-
-    def noise_cov(self, z: Measurement) -> Array:
-        cov: Array = self.sensor.noise_cov(z)
-        return cov
 
     def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
         kept = self.sensor.free.mean.shape[0]

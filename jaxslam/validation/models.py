@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.protocols import Chart, Linearizer, Motion, Sensor, unfit_signature
 
 _Shape = tuple[int, ...]
 _Record = TypeVar("_Record")
@@ -93,8 +93,9 @@ def check_record(name: str, what: str, value: object, kind: type[_Record]) -> _R
     what = f"{what} to be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
     if callable(value):
         factory = getattr(value, "__name__", repr(value))
+        is_a = "class" if isinstance(value, type) else "function"
         raise ValueError(
-            f"{name}: expected {what}, got the function {factory}: call it, {factory}(…)"
+            f"{name}: expected {what}, got the {is_a} {factory}: call it, {factory}(…)"
         )
     fields = getattr(value, "_fields", ())
     held = next((field for field in fields if isinstance(getattr(value, field), kind)), None)
@@ -126,19 +127,6 @@ def check_associate(name: str, associate: object) -> None:
         ) from None
     except ValueError:  # a builtin, which has no signature
         return
-
-
-def unfit_signature(function: Callable[..., object], count: int) -> str | None:
-    """The parameters of a function that does not take `count` arguments; None of one that does."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # a builtin has none
-        return None
-    try:
-        signature.bind(*[None] * count)
-    except TypeError:
-        return f"({', '.join(signature.parameters)})"
-    return None
 
 
 def _numbers(*shape: int) -> jax.ShapeDtypeStruct:

@@ -113,10 +113,11 @@ def verify_jacobians(
         and makes_a_model(model)
     ):
         factory = getattr(model, "__name__", "factory")
+        what = "class" if isinstance(model, type) else "factory"
         parameters = inspect.signature(model).parameters.values()
         noise = "noise_cov" if any(p.default is p.empty for p in parameters) else ""
         raise ValueError(
-            "verify_jacobians: expected a Motion, a Sensor or a Factor, got the factory "
+            f"verify_jacobians: expected a Motion, a Sensor or a Factor, got the {what} "
             f"{factory} of one: call it, as in {factory}({noise}), or use "
             f"jaxslam.verify.build({factory})"
         )
@@ -182,8 +183,9 @@ def notes_of(evaluated: Evaluated, kind: str) -> Iterator[str]:
 def build(
     factory: Callable[..., Motion | Sensor | BeamModel | Factor],
 ) -> Motion | Sensor | BeamModel | Factor:
-    """A model made by a factory like those of the registries: with noise 0.01 I, or, of a beam
-    model, with the maximum range of the trial; a factor with nothing.
+    """A model made by a class or factory like those of the registries: with noise 0.01 I unless
+    noise has a default, or, of a beam model, with the maximum range of the trial; a factor with
+    nothing.
 
     A sensor, and a laser, is mounted off the robot's centre. Raises ValueError where the factory
     returns none of these.
@@ -195,8 +197,8 @@ def build(
         if isinstance(made, BeamModel):
             return made
     if all(p.default is not p.empty for p in parameters.values()):
-        made = factory()
-        if isinstance(made, Factor):
+        made = factory(**mounted)
+        if isinstance(made, Factor | Motion | Sensor):
             return made
     probe = factory(lambda *_: None)
     if not isinstance(probe, Motion | Sensor):

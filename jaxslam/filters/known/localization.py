@@ -26,6 +26,7 @@ from jaxslam.filters.ekf.steps.scan import SensorTurn, update_by_scan
 from jaxslam.linearize.at_estimate import at_estimate
 from jaxslam.math import linalg
 from jaxslam.protocols import (
+    NOTHING_FREE,
     Associate,
     Association,
     Basis,
@@ -38,6 +39,7 @@ from jaxslam.protocols import (
     Sensor,
 )
 from jaxslam.sensors.suite import Suite
+from jaxslam.sensors.wrapped import Wrapped
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 
@@ -147,8 +149,8 @@ def localization(
 
     return Filter(
         name="localization",
-        control_size=len(motion.controls),
-        measurement_size=len(sensor.measurements),
+        controls=motion.controls,
+        measurements=sensor.measurements,
         init=init,
         predict=predict,
         update=update_pose,
@@ -178,31 +180,17 @@ def _on_map(linearize: Linearizer, points: PyTree) -> Linearizer:
 
 
 @record
-class _OfRobot(Sensor):
+class _OfRobot(Wrapped):
     """A sensor as one of the robot alone: the landmark that it measures is known."""
 
     sensor: Sensor
     known: PyTree = None
     """(L,) the landmark; None of an absolute sensor"""
     landmark = ()
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return self.sensor.name
-
-    @property
-    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self.sensor.measurements
+    free = NOTHING_FREE
 
     def observe(self, pose: Array, landmark: Array) -> Array:
         return self.sensor.observe(pose, landmark if self.known is None else self.known)
-
-    def residual(self, z: Array, z_hat: Array) -> Array:
-        return self.sensor.residual(z, z_hat)
-
-    def noise_cov(self, z: Array) -> Array:
-        cov: Array = self.sensor.noise_cov(z)
-        return cov
 
     def invert(self, pose: Array, z: Array, s: Array) -> Array:
         return jnp.zeros(0, pose.dtype)

@@ -158,8 +158,8 @@ def team_slam(
 
     return Filter(
         name="team_slam",
-        control_size=control_ends[-1],
-        measurement_size=size_z,
+        controls=tuple(name for robot in robots for name in robot.motion.controls),
+        measurements=tuple(f"entry {i} of its sensor" for i in range(size_z)),
         init=init,
         predict=predict,
         update=update_map,

@@ -62,8 +62,8 @@ class BearingInverseDepth(Sensor):
 
     is below it; they take 0.1. A landmark with ρ <= 0 stays a ray.
 
-    Raises ValueError unless min_distance is positive and finite, inverse_distance a Gaussian of positive
-    variance, and to_point above 0.
+    Raises ValueError unless min_distance is positive and finite, inverse_distance a Gaussian of
+    positive variance, and to_point above 0.
     """
 
     noise_cov: NoiseCov
@@ -84,7 +84,7 @@ class BearingInverseDepth(Sensor):
         super().__post_init__()
         name, to_point = type(self).__name__, self.to_point
         _check_distance(name, self.min_distance)
-        if to_point is not None and is_concrete(to_point) and not to_point > 0:
+        if to_point is not None and is_concrete(to_point) and not np.asarray(to_point) > 0:
             raise ValueError(f"{name}: expected to_point above 0, got {to_point}")
         if self.inverse_distance is not None:
             given = free_parameters(name, self.inverse_distance, 1)

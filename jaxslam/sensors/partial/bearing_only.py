@@ -31,7 +31,7 @@ class BearingOnly(PolarCoordinate):
     """(1, 1) covariance of the bearing, or a function of z."""
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
-    free: FreeLike = TEN_METRES
+    free: FreeLike = TEN_METRES  # type: ignore[assignment]
     """mean (1,) and covariance (1, 1) of the range [m], Solà (39)"""
     measurements = ("bearing [rad]",)
     _own, _other = slice(1, 2), slice(0, 1)

@@ -31,7 +31,7 @@ class RangeOnly(PolarCoordinate):
     """(1, 1) covariance of the range, or a function of z."""
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
-    free: FreeLike = ANY_DIRECTION
+    free: FreeLike = ANY_DIRECTION  # type: ignore[assignment]
     """mean (1,) and covariance (1, 1) of the bearing [rad], Solà (39)"""
     measurements = ("range [m]",)
     _own, _other = slice(0, 1), slice(1, 2)

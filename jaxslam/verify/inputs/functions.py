@@ -1,18 +1,18 @@
 """Functions to verify, with names and units of their arguments and outputs."""
 
+import copy
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import jax
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.record import set_field
 from jaxslam.graphs import Factor
-from jaxslam.protocols import Motion, Sensor
-from jaxslam.validation.models import unfit_signature
+from jaxslam.protocols import Motion, Sensor, unfit_signature
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.lengths import LONGEST, MOST_UNKNOWN, Deduced, deduce_lengths
 
@@ -86,7 +86,7 @@ def motion_functions(motion: Motion) -> tuple[Function]:
 
 
 def told_signatures(model: Motion | Sensor) -> Motion | Sensor:
-    """The model, with functions that cannot take their arguments replaced by ones that say so."""
+    """The model, with methods that cannot take their arguments replaced by ones that say so."""
     names = (
         {"step": "pose, u, w"}
         if isinstance(model, Motion)
@@ -99,12 +99,11 @@ def told_signatures(model: Motion | Sensor) -> Motion | Sensor:
 
         return refuse
 
-    wrong: dict[str, Any] = {
-        field: refusing(f"{field} takes ({taken}), got a function of {got}")
-        for field, taken in names.items()
-        if (got := unfit_signature(getattr(model, field), taken.count(",") + 1)) is not None
-    }
-    return replace(model, **wrong) if wrong else model
+    told = copy.copy(model)
+    for field, taken in names.items():
+        if (got := unfit_signature(getattr(model, field), taken.count(",") + 1)) is not None:
+            set_field(told, field, refusing(f"{field} takes ({taken}), got a function of {got}"))
+    return told
 
 
 def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
@@ -273,14 +272,17 @@ def _has_signature(call: Callable[..., object]) -> bool:
 
 
 def makes_a_model(factory: Callable[..., object]) -> bool:
-    """Whether a function is annotated as a factory: `def mine(noise_cov, mount=…) -> Sensor`,
-    or, without required parameters, `def mine() -> Factor`."""
+    """Whether `build` makes a model of this: a class of motion models or sensors whose fields have
+    defaults, except noise_cov; a function annotated as a factory, `def mine(noise_cov, mount=…) ->
+    Sensor`, or, without required parameters, `def mine() -> Factor`."""
     try:
         signature = inspect.signature(factory)
     except (TypeError, ValueError):
         return False
+    required = [p.name for p in signature.parameters.values() if p.default is p.empty]
+    if isinstance(factory, type):
+        return issubclass(factory, Motion | Sensor) and required in ([], ["noise_cov"])
     returns = signature.return_annotation
-    required = [p for p in signature.parameters.values() if p.default is p.empty]
     named = returns if isinstance(returns, str) else getattr(returns, "__name__", "")
     wanted = {"Motion": 1, "Sensor": 1, "Factor": 0}
     return wanted.get(named.rpartition(".")[2]) == len(required)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
 from jaxslam.grids.beam_models import BeamModel
-from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
@@ -42,6 +42,8 @@ class Target:
     arguments: Mapping[str, Sequence[str] | int] | None = None
     outputs: Sequence[str] | None = None
     states: Sequence[ArrayLike] | None = None
+    notes: tuple[str, ...] = ()
+    """for the report"""
 
 
 class PrintRecorder(io.TextIOBase):
@@ -74,9 +76,10 @@ def load(target: str) -> list[Target]:
     """The models and functions that `file.py` or `file.py:name` defines, in the order of the file.
 
     These are objects of the types `Motion`, `Sensor`, `graphs.Factor` and `grids.BeamModel`;
-    factories annotated to return a motion or a sensor, whose only required parameter is a noise
-    covariance, or a factor, without required parameters; and functions f with a function
-    f_jacobian (or f_jacobians), whose entries may be named as
+    classes of motion models and sensors whose only required field is noise_cov; factories annotated
+    to return one, whose only required parameter is a noise covariance, or a factor, without
+    required parameters; and functions f with a function f_jacobian (or f_jacobians), whose entries
+    may be named as
     f_arguments = {"pose": ("x [m]", …), …} and f_outputs = ("range [m]", …), and their states given
     as f_states = (array (S, n), …).
 
@@ -87,20 +90,25 @@ def load(target: str) -> list[Target]:
     module = import_file(path)
     keys = [key for key in vars(module) if name in ("", key)]
     found = [t for key in keys if (t := _target(module, key)) is not None]
+    skipped = [key for key in keys if isinstance(vars(module)[key], Chart | Linearizer)]
+    if found and skipped:
+        note = f"not verified: {', '.join(skipped)} (no chart and no linearizer is)"
+        found[0] = dataclasses.replace(found[0], notes=(note,))
     if name:
         if not found and keys:
             raise UnusableFile(
-                f"{path.name}: expected {name} to be a Motion, a Sensor, a factory of one, a "
-                f"Factor, a BeamModel, or a function with its Jacobian: define {name}{CLAIMS[0]}, "
-                f"or call jaxslam.verify_jacobians({name}) from Python, which needs none"
+                f"{path.name}: expected {name} to be a Motion, a Sensor, a class of one whose only "
+                "required field is noise_cov, a factory of one, a Factor, a BeamModel, or a "
+                f"function with its Jacobian: define {name}{CLAIMS[0]}, or call "
+                f"jaxslam.verify_jacobians({name}) from Python, which needs none"
             )
         if not found:
             raise UnusableFile(f"{path.name}: there is no {name!r} to verify{names_in(module)}")
     if not found:
         raise UnusableFile(
-            f"{path.name}: defines nothing to verify: no Motion, no Sensor, no Factor, no "
-            "BeamModel, no function f with an f_jacobian, no factory whose result is annotated as "
-            "-> Motion, -> Sensor or -> Factor"
+            f"{path.name}: defines nothing to verify: no Motion, no Sensor, no class of one whose "
+            "only required field is noise_cov, no Factor, no BeamModel, no function f with an "
+            "f_jacobian, no factory whose result is annotated as -> Motion, -> Sensor or -> Factor"
         )
     return found
 
@@ -141,7 +149,12 @@ def _verified(target: Target, verify_one: Callable[..., Report]) -> Report:
         )
     where = ", ".join(printed.lines)
     quiet = Check("prints nothing", not where, f"{where} prints" if where else "")
-    return dataclasses.replace(report, model=target.name, checks=(*report.checks, quiet))
+    return dataclasses.replace(
+        report,
+        model=target.name,
+        checks=(*report.checks, quiet),
+        notes=(*target.notes, *report.notes),
+    )
 
 
 def split_target(target: str) -> tuple[Path, str]:
@@ -189,7 +202,7 @@ def names_in(module: ModuleType) -> str:
         name
         for name, value in vars(module).items()
         if not name.startswith("_")
-        and not isinstance(value, type)
+        and not (isinstance(value, type) and not issubclass(value, Motion | Sensor))
         and (
             isinstance(value, Motion | Sensor | Factor | BeamModel | Filter | Scenario)
             or (callable(value) and getattr(value, "__module__", "") == module.__name__)
@@ -203,17 +216,18 @@ def _target(module: ModuleType, name: str) -> Target | None:
     value = getattr(module, name)
     if isinstance(value, Motion | Sensor | Factor | BeamModel):
         return Target(name, value)
-    if not callable(value) or isinstance(value, type):
+    if not callable(value):
         return None
     claims = [getattr(module, name + end) for end in CLAIMS if hasattr(module, name + end)]
     if len(claims) > 1:
         raise UnusableFile(f"expected {name}_jacobian or {name}_jacobians, got both")
     if claims:
-        about = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
-        return Target(name, value, claims[0], *about)
+        arguments, outputs, states = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
+        return Target(name, value, claims[0], arguments, outputs, states)
     if getattr(value, "__module__", "") == module.__name__ and makes_a_model(value):
         try:
             return Target(name, build(value))
         except Exception as error:
-            raise UnusableFile(f"the factory {name}: {describe_error(error)}") from error
+            what = "class" if isinstance(value, type) else "factory"
+            raise UnusableFile(f"the {what} {name}: {describe_error(error)}") from error
     return None

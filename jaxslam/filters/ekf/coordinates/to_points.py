@@ -1,18 +1,20 @@
 """Reduction of inverse-depth landmarks to points, once first-order linearization is accurate."""
 
-import dataclasses
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from jaxslam import slots
+from jaxslam.core.record import record
 from jaxslam.filters.ekf.coordinates.linear_system import Transition
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Landmark, Measurement, Point, Pose
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Sensor
+from jaxslam.sensors.wrapped import Wrapped
 from jaxslam.slots import Joint
 
 
@@ -27,16 +29,23 @@ def seen_as(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
     """The sensor for a landmark that may be a point (x, y, padding); None: no landmark is one."""
     if sensor.reduced is None or reduced is None:
         return sensor
-    of_points = sensor.reduced.sensor
+    return _MaybePoint(sensor, sensor.reduced.sensor, reduced)
 
-    def observe(pose: Float[Array, "3"], landmark: Float[Array, "L"]) -> Float[Array, "Z"]:
-        as_point = of_points.observe(pose, landmark[:2])
-        return jnp.where(reduced, as_point, sensor.observe(pose, landmark))
 
-    def position(landmark: Float[Array, "L"]) -> Float[Array, "2"]:
-        return jnp.where(reduced, landmark[:2], sensor.position(landmark))
+@record
+class _MaybePoint(Wrapped):
+    """A sensor of a landmark that may be a point (x, y, padding)."""
 
-    return dataclasses.replace(sensor, observe=observe, position=position)
+    sensor: Sensor
+    as_points: Sensor
+    is_point: Bool[Array, ""]
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        as_point = self.as_points.observe(pose, landmark[:2])
+        return jnp.where(self.is_point, as_point, self.sensor.observe(pose, landmark))
+
+    def position(self, landmark: Landmark) -> Point:
+        return jnp.where(self.is_point, landmark[:2], self.sensor.position(landmark))
 
 
 def at_slot(sensor: Sensor, joint: Joint, slot: Int[Array, ""]) -> Sensor:
