@@ -206,6 +206,10 @@ class Sensor(Model):
 
     def __post_init__(self) -> None:
         self._check(Sensor, ("observe", "invert"), ("measurements", "landmark"), "measurements")
+        free = self.__dict__.get("free", type(self).free)
+        if not isinstance(free, Free | property):
+            what = f"{type(self).__name__}: expected free to be a Free(mean, cov)"
+            raise ValueError(f"{what}, got {type(free).__name__}")
         if self.mount is not None and "mount" in self.__dict__:
             check_mount(type(self).__name__, self.mount)
             set_field(self, "mount", held_array(self.mount))

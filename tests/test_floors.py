@@ -15,7 +15,7 @@ PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
     "math programs",
-    "types protocols slots validation noise logs",
+    "core types protocols slots validation noise logs",
     "motion sensors charts linearize association resampling life team",
     "run filters smoothing graphs grids matching simulation features topology",
     "consistency monte_carlo verify catalog calibration metrics laser_slam",

@@ -58,7 +58,7 @@ def test_swapped_models_are_told_by_the_factory_that_got_them(name):
 @pytest.mark.parametrize("name", FACTORIES)
 def test_a_model_that_was_not_called_or_is_none_is_told(name):
     with pytest.raises(
-        ValueError, match=rf"^{name}: expected motion to be a Motion.*call it, velo"
+        ValueError, match=rf"^{name}: expected motion to be a Motion.*call it, Velo"
     ):
         FACTORIES[name](motion.Velocity, SEES)
     with pytest.raises(ValueError, match=rf"^{name}: expected sensor to be a Sensor, got int"):
@@ -150,7 +150,7 @@ def test_a_model_of_ones_own_is_evaluated_on_shapes(field, wrong, told):
     [
         ("step", lambda pose, u: pose, r"expected pose_increment.step to take \(pose, u, w\), got \(pose, u\)"),
         ("step", lambda pose, u, w: pose[:2], r"to return shape \(3,\), got shape \(2,\)"),
-        ("noise_cov", lambda pose, u: jnp.eye(2), r"to return shape \(3, 3\), got shape \(2, 2\)"),
+        ("noise_cov", lambda pose, u: jnp.eye(2), r"noise_cov: expected a covariance of shape \(3, 3\), got \(2, 2\)"),
     ],
 )  # fmt: skip
 def test_a_motion_of_ones_own_is_evaluated_on_shapes(field, wrong, told):
@@ -167,7 +167,7 @@ def test_what_has_been_found_sound_is_not_looked_at_again():
 
 
 def test_fields_and_methods_that_are_missing_or_none_are_named():
-    with pytest.raises(ValueError, match=r"^RelativePosition: noise_cov: expected a covar.*None"):
+    with pytest.raises(ValueError, match=r"^RangeBearing: noise_cov: expected a covar.*None"):
         dataclasses.replace(SEES, noise_cov=None)
     with pytest.raises(ValueError, match=r"^Own: expected a method observe"):
         sensor_of(noise_cov=lambda z: jnp.eye(2), measurements=("x [m]",))

@@ -12,9 +12,9 @@ import jaxslam
 from benchmarks.mrclam import fit as fitting
 from jaxslam import charts, datasets, linearize
 from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.core.record import record
 from jaxslam.filters import ekf_slam
 from jaxslam.math import se2
-from jaxslam.motion import PoseIncrement
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors import RangeBearing
 from jaxslam.types import Log, Scan, Truth
@@ -26,6 +26,20 @@ START = np.diag([1e-3, 1e-3, 1e-3]) ** 2
 """Of the simulated start, which is taken to be known, too [m, m, rad]."""
 LONGEST = 0.5
 """Between rows of a simulated log [s]."""
+
+
+@record
+class PoseIncrementWithDeviations(Motion):
+    """Relative poses, whose standard deviations are the last three controls."""
+
+    controls = (*PoseIncrement.controls, "σ forward [m]", "σ left [m]", "σ turn [rad]")
+    noises = PoseIncrement.noises
+
+    def step(self, pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+        return se2.compose(pose, u[:3] + w)
+
+    def noise_cov(self, pose: jax.Array, u: jax.Array) -> jax.Array:
+        return jnp.diag(u[3:] ** 2)
 
 
 class Course(NamedTuple):
@@ -74,14 +88,7 @@ def course(folder: Path, robot: int) -> Course:
     turn = np.hypot(own.turn_noise, own.turn_share * omega)
     density = np.stack([np.full(len(dt), own.forward_noise), 0 * turn, turn], axis=1)
     control = jnp.concatenate([increment, np.sqrt(dt)[:, None] * density], axis=1)
-    told = PoseIncrement(lambda pose, u: jnp.diag(u[3:] ** 2))
-    motion = Motion(
-        name="pose_increment_with_deviations",
-        controls=(*told.controls, "σ forward [m]", "σ left [m]", "σ turn [rad]"),
-        noises=told.noises,
-        step=lambda pose, u, w: told.step(pose, u[:3], w),
-        noise_cov=told.noise_cov,
-    )
+    motion = PoseIncrementWithDeviations()
     sensor = RangeBearing(own.measurement_cov(), mount=own.mount)
     landmarks = jnp.asarray(data.landmarks)
     at = landmarks[jnp.maximum(scan.tag, 0)]

@@ -27,8 +27,7 @@ def made(base, **parts):
 def changed(model, **parts):
     """The model with some functions or names in place of its own; its fields stay."""
     fields = {field.name: getattr(model, field.name) for field in dataclasses.fields(model)}
+    own = {name: _method(part) for name, part in parts.items() if name not in fields}
     kind = type(model)
-    body = {name: _method(part) for name, part in parts.items()} | {"name": model.name}
-    return record(type(kind.__name__, (kind,), body))(
-        **{name: value for name, value in fields.items() if name not in parts}
-    )
+    made = record(type(kind.__name__, (kind,), own | {"name": model.name}))
+    return made(**{name: parts.get(name, value) for name, value in fields.items()})

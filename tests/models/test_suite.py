@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_models import changed
 from worlds import draw, ring
 
 import jaxslam
@@ -107,7 +108,7 @@ def test_sensors_in_turn_are_filters_in_turn():
     whole = ekf_slam(scenario.motion, scenario.sensor, 6, chart=chart)
     eyes, laser = (ekf_slam(scenario.motion, s, 6, chart=chart) for s in (EYES, LASER))
     # A compass among landmarks by hand: a sensor of points that ignores them.
-    blind = dataclasses.replace(
+    blind = changed(
         COMPASS,
         landmark=EYES.landmark,
         observe=lambda pose, point: COMPASS.observe(pose, point[:0]),

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from own_models import changed
 
 from jaxslam import catalog, filters, grids, motion, run, sensors, simulate, store
 from jaxslam.filters import reporting
@@ -281,7 +282,7 @@ def test_blocks_share_one_trace():
         traces.append(1)
         return WORLD.motion.step(pose, u, w)
 
-    watched = dataclasses.replace(WORLD.motion, step=counted)
+    watched = changed(WORLD.motion, step=counted)
     ekf = filters.ekf_slam(watched, WORLD.sensor, 6)
     counts = []
     for runs in (4, 10):

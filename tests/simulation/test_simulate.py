@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from own_models import changed
 from reference.plane import mounted, wrap
 
 from jaxslam import motion, sensors
@@ -283,7 +284,7 @@ def test_between_ranges_excludes_both_ends_and_reads_the_position_alone():
 
 # --- scenarios ----------------------------------------------------------------------------------
 
-BLIND = dataclasses.replace(motion.Increment(Q), perturb=None)
+BLIND = changed(motion.Increment(Q), perturb=None)
 
 BAD = {
     "landmark size": ({"landmarks": np.zeros((3, 3))}, "landmarks: expected shape"),

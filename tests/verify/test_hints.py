@@ -1,11 +1,10 @@
 """What `verify` adds to its verdict: lengths deduced from shapes, angles not named, and cures."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_models import changed
 from verified import by_name, failed
 
 from jaxslam import sensors
@@ -114,7 +113,7 @@ def test_lengths_that_are_not_determined_are_asked_for(function, claim, whys):
 
 
 def test_a_function_of_other_arguments_is_told():
-    sensor = dataclasses.replace(build(sensors.BearingOnly), invert=lambda pose, z: z)
+    sensor = changed(build(sensors.BearingOnly), invert=lambda pose, z: z)
     assert "invert can be called: invert takes (pose, z, s), got a function of (pose, z)" in str(
         verify_jacobians(sensor)
     )
@@ -165,7 +164,7 @@ def test_only_jumps_by_a_turn_are_noted():
 
 
 def test_of_a_sensor_the_measurements_are_named():
-    sensor = dataclasses.replace(build(sensors.BearingOnly), measurements=("bearing",))
+    sensor = changed(build(sensors.BearingOnly), measurements=("bearing",))
     function = sensor_functions(sensor)[0]
     jump = Jump(0, "[rad]", (np.zeros(3), np.ones(2)))
     evaluated = Evaluated(function, Samples((), ()), None, (), (), (jump,))

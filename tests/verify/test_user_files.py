@@ -121,10 +121,10 @@ import numpy as np
 import jaxslam
 from jaxslam.protocols import Motion, Sensor
 
-robot = jaxslam.motion.unicycle(0.01 * np.eye(2))
+robot = jaxslam.motion.Unicycle(0.01 * np.eye(2))
 
-def laser(noise_cov, mount=(0.0, 0.0, 0.0)) -> Sensor:
-    return jaxslam.sensors.range_bearing(noise_cov, mount)
+def laser(noise_cov, mount=None) -> Sensor:
+    return jaxslam.sensors.RangeBearing(noise_cov, mount)
 
 def helper(x):
     return x
@@ -238,7 +238,7 @@ FACTORIES = """
 from jaxslam import sensors
 from jaxslam.protocols import Sensor
 
-good = sensors.range_bearing([[0.1, 0.0], [0.0, 0.1]])
+good = sensors.RangeBearing([[0.1, 0.0], [0.0, 0.1]])
 
 def bad(noise_cov) -> Sensor:
     raise RuntimeError("not finished")
@@ -246,6 +246,44 @@ def bad(noise_cov) -> Sensor:
 def number(noise_cov) -> Sensor:
     return 3
 """
+
+
+CLASSES = """
+import jax.numpy as jnp
+from jaxslam.core.record import record
+from jaxslam.motion import Unicycle
+from jaxslam.protocols import Motion, Sensor
+
+class Shared(Motion):
+    controls = noises = ("dx [m]",)
+
+    def step(self, pose, u, w):
+        return pose.at[0].add(u[0] + w[0])
+
+@record
+class Cart(Shared):
+    noise_cov: object
+
+@record
+class Fixed(Shared):
+    def noise_cov(self, pose, u):
+        return jnp.eye(1)
+
+@record
+class Scaled(Shared):
+    noise_cov: object
+    scale: float
+
+mine = Scaled([[0.1]], 2.0)
+"""
+
+
+def test_classes_are_built_where_their_noise_alone_is_missing(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(CLASSES, encoding="utf-8")
+    assert [t.name for t in user_files.load(str(path))] == ["Cart", "Fixed", "mine"]
+    with pytest.raises(user_files.UnusableFile, match="a class of one whose only required field"):
+        user_files.load(f"{path}:Scaled")
 
 
 def test_only_the_named_factory_is_built(tmp_path):

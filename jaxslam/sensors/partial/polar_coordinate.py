@@ -27,8 +27,8 @@ class PolarCoordinate(Sensor):
     _other: slice
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         set_field(self, "free", free_parameters(type(self).__name__, self.free, 1))
+        super().__post_init__()
 
     def _polar(self, z: Measurement, s: Unmeasured) -> Array:
         return jnp.concatenate([s, z] if self._own.start else [z, s])

@@ -1,6 +1,5 @@
 """Mapping from known poses is EKF-SLAM of a robot that knows where it is."""
 
-import dataclasses
 from functools import cache
 
 import chex
@@ -8,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_models import changed
 from worlds import draw, nameless, ring
 
 from jaxslam import association, charts, linearize, motion, run, sensors, simulate
@@ -36,9 +36,7 @@ def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     scenario, truth, log = world()
     capacity = 8
     # A motion without noise whose control is the pose: P_RR stays zero, and P block-diagonal.
-    exact = dataclasses.replace(
-        motion.PoseIncrement(np.zeros((3, 3))), step=lambda pose, u, w: u + 0 * w
-    )
+    exact = changed(motion.PoseIncrement(np.zeros((3, 3))), step=lambda pose, u, w: u + 0 * w)
     slam = ekf_slam(exact, scenario.sensor, capacity, update="joint", **options)
     expected = on_poses(slam, truth, log)
     trace = on_poses(mapping(scenario.sensor, capacity, **options), truth, log)
