@@ -15,6 +15,7 @@ from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.core.record import record
 from jaxslam.filters import ekf_slam
 from jaxslam.math import se2
+from jaxslam.motion import PoseIncrement
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors import RangeBearing
 from jaxslam.types import Log, Scan, Truth
