@@ -48,7 +48,7 @@ def worlds():
     camera = sensors.BearingOnly(cov, free=RANGE)
     rays = sensors.BearingInverseDepth(cov, min_distance=MIN_DISTANCE)
     to_points = sensors.BearingInverseDepth(cov, min_distance=MIN_DISTANCE, to_point=TO_POINT)
-    matched = sensors.BearingInverseDepth(cov, free=MATCHED, to_point=TO_POINT)
+    matched = sensors.BearingInverseDepth(cov, inverse_distance=MATCHED, to_point=TO_POINT)
     for world in (cloister(), circle()):
         scenario = dataclasses.replace(
             world, name=f"{world.name}, bearings", sensor=camera, filter_options={}, published={}

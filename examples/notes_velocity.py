@@ -1,7 +1,7 @@
 """The Notes' velocity motion and its Jacobian as they stand: `jaxslam verify` finds what is wrong.
 
 Row 2 has a sign wrong, and the matrix after "I +" has a 1 at (3, 3) where a 0 belongs. The motion
-itself divides by ω, so it has no value at ω = 0; `jaxslam.motion.velocity` has.
+itself divides by ω, so it has no value at ω = 0; `jaxslam.motion.Velocity` has.
 """
 
 import jax.numpy as jnp

@@ -77,7 +77,6 @@ def _check_fields(
             got, wanted = type(value).__name__, "a function"
             if hasattr(value, "shape"):
                 got, wanted = f"an array of shape {value.shape}", "a function that returns one"
-                wanted += ", as noise.noise_model makes" * (field == "noise_cov")
             raise ValueError(f"{what}: expected {field} to be {wanted}, got {got}")
     for field, taken in functions.items() if isinstance(functions, Mapping) else ():
         unfit = unfit_signature(getattr(record, field), taken.count(",") + 1)

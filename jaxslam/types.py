@@ -105,7 +105,7 @@ class Log(NamedTuple):
         what the sensor measures (no tag for a sensor of no landmark, as a compass). Either is a
         sequence of rows in this order (lists, a NumPy array), or has columns with names: a mapping,
         a structured array, a data frame. A name may have a unit, as "bearing [deg]"; else it is the
-        model's. With `pose_increment` columns named t, x, y, theta may be a path of poses. Of a
+        model's. With `PoseIncrement` columns named t, x, y, theta may be a path of poses. Of a
         `sensors.Suite` measurements are one such table a part, in order: (of_laser, of_compass).
 
         There is a row at every time of either. A velocity holds until the next; poses are

@@ -18,6 +18,7 @@ FOLDER = Path(__file__).parents[1] / "reference" / "api"
 
 INTRODUCED = {
     "jaxslam": "The driver, the harness and the verifier",
+    "jaxslam.core": "Records, and checks of numbers",
     "jaxslam.types": "Records of data",
     "jaxslam.protocols": "Protocols",
     "jaxslam.motion": "Motion models",
@@ -170,7 +171,7 @@ def section(module: str, names: list[Name], top: bool) -> str:
 
 
 def hidden(module: str) -> bool:
-    """Whether the package has a function of the module's name, as `jaxslam.motion.unicycle` is."""
+    """Whether the package has a function of the module's name, as `jaxslam.charts.euclidean` is."""
     package, _, name = module.rpartition(".")
     return bool(package) and not inspect.ismodule(getattr(importlib.import_module(package), name))
 

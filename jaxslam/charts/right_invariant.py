@@ -16,7 +16,7 @@ def right_invariant(rays: bool = False) -> Chart:
     depend on the estimate, and the filter cannot gain information along them (Barrau & Bonnabel
     2015, arXiv:1510.06263; Zhang et al. 2017). For point landmarks l = (x, y), or with
 
-    rays: for l = (x0, y0, α, ρ), as of `sensors.bearing_inverse_depth`: (x0, y0) changes as a point
+    rays: for l = (x0, y0, α, ρ), as of `sensors.BearingInverseDepth`: (x0, y0) changes as a point
     does, the direction rotates with the map, α ← α + φ + dα, and ρ ← ρ + dρ.
 
     Raises ValueError where `retract` gets a landmark of another size.

@@ -90,7 +90,8 @@ def _check_child(where: str, value: Any) -> None:
             _check_child(f"{where}[{k}]", each)
     elif isinstance(value, str | Sequence | set) and not isinstance(value, tuple):
         wanted = "an array, as of numpy.asarray" if isinstance(value, list) else _WANTED
-        raise ValueError(f"{where}: expected {wanted}, got {type(value).__name__} {value!r}")
+        got = repr(value) if isinstance(value, str) else f"a {type(value).__name__}"
+        raise ValueError(f"{where}: expected {wanted}, got {got}")
     elif jax.tree_util.all_leaves([value]) and not _is_number(value):
         raise ValueError(f"{where}: expected {_WANTED}, got {type(value).__name__}")
 

@@ -20,7 +20,7 @@ class Segments(NamedTuple):
     """The straight segments of a scan, in the frame of the laser, in the order of its beams."""
 
     line: Float[np.ndarray, "K 2"]
-    """(r [m], α [rad]) as `sensors.line` measures; the normal points into the wall"""
+    """(r [m], α [rad]) as `sensors.Line` measures; the normal points into the wall"""
     cov: Float[np.ndarray, "K 2 2"]
     """of the line"""
     ends: Float[np.ndarray, "K 2 2"]

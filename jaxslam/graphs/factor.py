@@ -169,7 +169,7 @@ def from_motion(motion: Motion) -> Factor:
     where step is affine in w; its optimum is another elsewhere. w is found by Newton's method from
     w = 0: ten steps without derivatives, then two with them, whose error is of the fourth order in
     a change of the poses, so derivatives up to the third are those of w. Where ∂step/∂w is
-    singular (a robot that stands still, with `odometry`) a step is not taken.
+    singular (a robot that stands still, with `Odometry`) a step is not taken.
 
     Raises ValueError unless the noise has three components, which the two poses determine; see
     `nominal_motion`.
@@ -211,7 +211,7 @@ def nominal_motion(motion: Motion) -> Factor:
         e = step(x, u, 0)⁻¹ ∘ x', z = u
 
     Its covariance is G Q Gᵀ to first order in the noise, G = ∂e/∂w, which a table must have as its
-    information (`of_log`): exactly where e is affine in w, as for `unicycle` and `increment`.
+    information (`of_log`): exactly where e is affine in w, as for `Unicycle` and `Increment`.
     """
 
     def residual(variables: tuple[Array, ...], z: Array) -> Array:

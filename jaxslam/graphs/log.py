@@ -47,7 +47,7 @@ def of_log(
 
     A noise of other than three components is not determined by two poses. Then, and where `slack` s
     is given, the factor of the motion is `nominal_motion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
-    components (`unicycle`, `increment`, `ackermann`) the motion is a constraint, which s > 0, the
+    components (`Unicycle`, `Increment`, `Ackermann`) the motion is a constraint, which s > 0, the
     standard deviation of each coordinate [m, m, rad], makes soft: the optimum differs from that of
     `batch_map` by the order of s², and the condition of the problem is worse by s⁻².
 
@@ -69,7 +69,7 @@ def of_log(
     Raises:
         ValueError: on models, a log or a covariance that do not fit, and at the row where a motion
             or a measurement has a singular noise, or a noise does not move the pose in all
-            directions (a robot that stands still, with `odometry`).
+            directions (a robot that stands still, with `Odometry`).
     """
     name = "graphs.of_log"
     validation.check_models(name, motion, sensor)

@@ -24,7 +24,7 @@ class RangeBearingSignature(Sensor):
 
     z = (range [m], bearing [rad], signature [1]) of l = (x, y, signature): D = 3 + 3N.
 
-    polar(to_frame(pose ∘ mount, (x, y))) as in `range_bearing`, and the signature unchanged: the
+    polar(to_frame(pose ∘ mount, (x, y))) as in `RangeBearing`, and the signature unchanged: the
     landmarks with three parameters of Tacher. The signature is estimated like a coordinate; an
     association method may use it to recognize landmarks. embed gives a signature of 0. A landmark
     exactly at the sensor gives z = (0, 0, signature), not NaN.

@@ -35,7 +35,7 @@ class Part:
 
     def __post_init__(self) -> None:
         if not isinstance(self.sensor, Sensor) or isinstance(self.sensor, Suite):
-            raise ValueError(f"Part: expected one Sensor, got {self.sensor!r}")
+            raise ValueError(f"Part: expected one Sensor, got {type(self.sensor).__name__}")
         check_count(f"Part: places of {self.sensor.name}", self.places)
         check_count(f"Part: every of {self.sensor.name}", self.every)
         if type(self.start) is not int or self.start < 0:

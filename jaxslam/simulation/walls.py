@@ -150,7 +150,7 @@ def is_free(world: Walls, points: ArrayLike) -> Bool[np.ndarray, "..."]:
 def wall_lines(
     world: Walls,
 ) -> tuple[Float[np.ndarray, "N 2"], Int[np.ndarray, "K"]]:
-    """The distinct lines (r, α) of the segments, as `sensors.line` has them, and each one's index.
+    """The distinct lines (r, α) of the segments, as `sensors.Line` has them, and each one's index.
 
     The normal (cos α, sin α) points into the wall, so a line has the side that it is seen from.
     Segments on one line with free space on the same side share it. Raises ValueError without a

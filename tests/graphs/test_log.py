@@ -54,7 +54,7 @@ def solved(known=False):
 
 
 def turned(pose, u):
-    """`motion.odometry`, from its equation."""
+    """`motion.Odometry`, from its equation."""
     h = pose[2] + u[0]
     return np.array([pose[0] + u[1] * np.cos(h), pose[1] + u[1] * np.sin(h), h + u[2]])
 

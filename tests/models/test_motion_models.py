@@ -180,10 +180,10 @@ def test_gradients_reach_alpha(name):
 def test_bad_alphas_are_refused(name, spoil):
     noise, _, _, count = NOISES[name]
     bad = spoil(np.full(count, 0.1))
-    with pytest.raises(ValueError, match=f"^{name}_noise: .*alpha"):
+    with pytest.raises(ValueError, match=f"^{name.title()}Noise: .*alpha"):
         noise(bad)
     if np.shape(bad) != (count,) and bad is not None:
-        with pytest.raises(ValueError, match=f"^{name}_noise: .*alpha"):
+        with pytest.raises(ValueError, match=f"^{name.title()}Noise: .*alpha"):
             jax.eval_shape(lambda a: noise(a)(np.zeros(3), np.zeros(3)), np.asarray(bad))
 
 
@@ -458,7 +458,7 @@ def test_gradients_reach_the_cars_lengths():
     ids=str,
 )
 def test_impossible_cars_are_refused(bad):
-    with pytest.raises(ValueError, match=f"^ackermann: .*{next(iter(bad))}"):
+    with pytest.raises(ValueError, match=f"^Ackermann: .*{next(iter(bad))}"):
         Ackermann(np.eye(2), **bad)
 
 
@@ -468,5 +468,5 @@ def test_traced_lengths_are_checked_for_their_shape():
         return model.step(np.zeros(3), np.ones(3), np.zeros(2))
 
     for name, shape in (("wheelbase", (1,)), ("sensor", (3,)), ("encoder", (2,))):
-        with pytest.raises(ValueError, match=f"^ackermann: .*{name}"):
+        with pytest.raises(ValueError, match=f"^Ackermann: .*{name}"):
             jax.eval_shape(build, **{name: np.zeros(shape)})

@@ -285,7 +285,9 @@ def test_default_priors():
         np.testing.assert_allclose(free.mean, [0.5 / float(distance)], rtol=1e-15)
         np.testing.assert_allclose(free.cov, [[1 / (4 * float(distance)) ** 2]], rtol=1e-15)
     np.testing.assert_array_equal(sensors.BearingInverseDepth(VARIANCE).free.mean, [0.5])
-    given = sensors.BearingInverseDepth(VARIANCE, min_distance=2.0, free=([0.1], [[0.3]])).free
+    given = sensors.BearingInverseDepth(
+        VARIANCE, min_distance=2.0, inverse_distance=([0.1], [[0.3]])
+    ).free
     np.testing.assert_array_equal(given.mean, [0.1])
     np.testing.assert_array_equal(given.cov, [[0.3]])
 
@@ -303,7 +305,7 @@ def test_gradients_reach_the_least_distance():
     "distance", [0.0, -1.0, np.nan, np.inf, "far", True, None, 1j, [1.0], 1e-320, 1e200]
 )
 def test_bad_least_distances_are_refused(distance):
-    with pytest.raises(ValueError, match="bearing_inverse_depth: "):
+    with pytest.raises(ValueError, match=r"^BearingInverseDepth: "):
         sensors.BearingInverseDepth(VARIANCE, min_distance=distance)
 
 

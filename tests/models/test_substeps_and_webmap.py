@@ -118,7 +118,7 @@ def test_gradients_reach_the_models_parameters():
 
 @pytest.mark.parametrize("count", [0, -1, 2.0, True, None])
 def test_a_bad_count_is_refused(count):
-    with pytest.raises(ValueError, match="substeps: count"):
+    with pytest.raises(ValueError, match="Substeps: count"):
         Substeps(MODELS["ackermann"][0], count)
 
 

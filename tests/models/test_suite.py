@@ -236,14 +236,14 @@ def signature():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Suite(), "at least one sensor"),
+        (lambda: Suite(()), "at least one sensor"),
         (lambda: Suite((EYES,)), "expected a Part or"),
         (lambda: Suite(((EYES, 0),)), "places of range_bearing"),
         (lambda: Suite((Part(EYES, 1, every=0),)), "every of range_bearing"),
         (lambda: Suite((Part(EYES, 1, start=-1),)), "a start of at least 0"),
         (lambda: Suite((Part(EYES, 1, sees="birds"),)), 'sees "landmarks"'),
         (lambda: Suite(((COMPASS, 2),)), "expected places=1 of the absolute sensor compass, got 2"),
-        (lambda: Suite(((Suite(((EYES, 1),)), 1),)), "expected one Sensor in each Part"),
+        (lambda: Suite(((Suite(((EYES, 1),)), 1),)), "Part: expected one Sensor, got Suite"),
         (lambda: Suite(((EYES, 1), (signature(), 1))), "expected sensors that share landmarks"),
         (lambda: world(places=3), "each Part has its own places"),
         (lambda: world(spurious=Spurious()), "each Part has its own places"),

@@ -24,7 +24,7 @@ START_DEVIATION = np.array([0.2, 0.2, np.deg2rad(10.0)])
 """Standard deviations of the pose at the start [m, m, rad]."""
 
 ODOMETRY_NOISE = (0.05, 0.03, 0.02, 0.01)
-"""α of `motion.odometry_noise`: for a straight step of 0.7 m 10 cm ahead and 7° of each turn. Raw
+"""α of `motion.OdometryNoise`: for a straight step of 0.7 m 10 cm ahead and 7° of each turn. Raw
 odometry of intel, freiburg-101 and edmonton differs from the corrected poses by 4 cm, 5 cm and 1.7°
 to 3.5° (RMS) a step of 0.5 m to 1 m; the rest is for robots with worse wheels."""
 

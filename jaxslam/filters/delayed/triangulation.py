@@ -51,7 +51,7 @@ def rays(sensor: Sensor, *, parallax: float = 0.1) -> Triangulation:
     `parallax`.
 
     Args:
-        sensor: a bearing z (1,) of points, as `sensors.bearing_only`; its mounting is computed
+        sensor: a bearing z (1,) of points, as `sensors.BearingOnly`; its mounting is computed
             from its `invert`, whatever the prior of the range.
         parallax: [rad] in (0, π/2).
     Raises:
@@ -92,7 +92,7 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
     `angle` from tangency, where h is undetermined.
 
     Args:
-        sensor: a range z (1,) of points, as `sensors.range_only`.
+        sensor: a range z (1,) of points, as `sensors.RangeOnly`.
         angle: [rad] in (0, π/2).
     Raises:
         ValueError: on another sensor, or an angle out of range.

@@ -52,7 +52,7 @@ def ekf_slam(
     Every valid measurement of an absolute sensor (L = 0: compass, position fix) corrects the robot,
     whatever its tag, and has slot -1; `associate` and `births` do not apply, and the map is empty.
 
-    Several sensors are one `sensors.suite`, whose parts are processed one after the other.
+    Several sensors are one `sensors.Suite`, whose parts are processed one after the other.
 
     Args:
         motion, sensor: the models; Jacobians come from `jax.jacfwd`.

@@ -64,7 +64,7 @@ def localization(
 
     The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the pose only, P (3, 3). A step
     costs O(M), plus the search for tags among N (0.09 ms a step with 10,000); association other
-    than by tags compares all landmarks. With a `sensors.suite`, absolute sensors (compass, position
+    than by tags compares all landmarks. With a `sensors.Suite`, absolute sensors (compass, position
     fix) correct in the same update.
 
     The state is a `slots.Joint` whose landmarks have no parameters. A measurement without a

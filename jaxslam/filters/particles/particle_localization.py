@@ -90,7 +90,7 @@ def particle_localization(
     customary; the estimate is then conservative.
 
     Args:
-        motion, sensor: any; with a `sensors.suite`, absolute sensors enter the weights too.
+        motion, sensor: any; with a `sensors.Suite`, absolute sensors enter the weights too.
         landmarks: (N, L) the map, in the sensor's parameters.
         particles: the capacity P, at least 1.
         tags: (N,) int, different; default the row numbers.

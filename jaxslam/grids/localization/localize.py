@@ -87,7 +87,7 @@ def localize(
     Args:
         grid: a map with a free cell, outside a trace.
         model: as `likelihood_field` or `ray_cast`.
-        motion: any; for odometry `motion.odometry` with `odometry_controls`.
+        motion: any; for odometry `motion.Odometry` with `odometry_controls`.
         particles: the capacity P, at least 1. Its cost is that of P · B/every look-ups a step.
         start: "gaussian", the pose and covariance given to `run` (the latter may be zero), or
             "uniform", anywhere free, whatever is given.

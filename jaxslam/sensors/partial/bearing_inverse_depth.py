@@ -173,3 +173,6 @@ def _check_distance(name: str, min_distance: ArrayLike) -> None:
         real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
         if not (real and np.isfinite(value) and value > 0):
             raise ValueError(f"{name}: expected 0 < min_distance < inf, got {min_distance!r}")
+        with np.errstate(all="ignore"):  # the square of 1/min_distance may be 0 or infinite
+            sigma = 0.25 / value.astype(np.float64)
+            free_parameters(name, ([2 * sigma], [[sigma**2]]), 1)

@@ -24,7 +24,7 @@ class BearingOnly(PolarCoordinate):
     Choose the prior for your application. The range has no upper bound, the bearing is strongly
     nonlinear in it, and an EKF linearizes once over the whole prior. A narrow prior may be wrong;
     with a wide one the linearization error makes the filter diverge (Solà 2.3.5). Landmarks
-    initialized by inverse distance avoid this conflict: see `bearing_inverse_depth`.
+    initialized by inverse distance avoid this conflict: see `BearingInverseDepth`.
     """
 
     noise_cov: NoiseCov

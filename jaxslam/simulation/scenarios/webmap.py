@@ -42,7 +42,7 @@ def webmap(steps: int | None = None, loops: int = 2) -> Scenario:
 
     The map is **ours**, in the style of theirs, which the paper draws and does not list: 36
     landmarks and 16 waypoints in 150 m by 90 m. So is the car in one respect: the pose is that of
-    its rear axle, moved along exact arcs (`motion.ackermann`), where theirs takes Euler steps
+    its rear axle, moved along exact arcs (`motion.Ackermann`), where theirs takes Euler steps
     along the steered front wheel. Hence `published` is empty.
 
     Args:

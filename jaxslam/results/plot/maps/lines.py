@@ -19,7 +19,7 @@ def walls_figure(
     title: str = "",
     width: float = PAGE,
 ) -> Figure:
-    """The map of an EKF of `sensors.line`: each true wall where its estimated line has it.
+    """The map of an EKF of `sensors.Line`: each true wall where its estimated line has it.
 
     A segment of the walls is projected onto the line with its tag, and drawn with the band of the
     line's n_sigma across it. Walls that were not measured are the true ones alone.

@@ -1,0 +1,168 @@
+"""Records: what is a leaf, what JAX and the standard library make of them, what is refused."""
+
+import copy
+import dataclasses
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+from own_models import motion_of, sensor_of
+
+from jaxslam import filters, motion, run, sensors, simulate
+from jaxslam.core.record import is_record, record, static
+from jaxslam.motion import OdometryNoise
+from jaxslam.protocols import Motion, Sensor
+
+R = np.diag([0.04, 0.01])
+MOUNT = np.array([0.3, 0.0, 0.1])
+
+
+@record
+class Pair:
+    """Two fields of data, and one of the program."""
+
+    first: object
+    second: object = None
+    count: object = static(default=1)
+
+
+def test_numbers_are_leaves_and_static_fields_are_structure():
+    assert jax.tree.leaves(Pair(2.0, (np.ones(3), Pair(1))))[0] == 2.0
+    assert len(jax.tree.leaves(Pair(2.0, (np.ones(3), Pair(1))))) == 3
+    assert jax.tree.structure(Pair(2.0)) == jax.tree.structure(Pair(3.0))
+    assert jax.tree.structure(Pair(2.0)) != jax.tree.structure(Pair(2.0, 1.0))
+    assert jax.tree.structure(Pair(2.0)) != jax.tree.structure(Pair(2.0, count=2))
+    paths = [
+        jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(Pair(Pair(1.0), 2))
+    ]
+    assert paths == [".first.first", ".second"]
+    assert is_record(Pair(1)) and not is_record(np.ones(2)) and not is_record(lambda z: z)
+
+
+def test_models_of_the_package_hold_their_numbers_as_leaves():
+    suite = sensors.Suite(
+        [(sensors.RangeBearing(R, MOUNT), 2), sensors.Part(sensors.Compass([[0.1]]), 1)]
+    )
+    assert [np.shape(leaf) for leaf in jax.tree.leaves(suite)] == [(2, 2), (3,), (1, 1)]
+    drive = motion.Odometry(OdometryNoise((0.1, 0.2, 0.3, 0.4)))
+    np.testing.assert_array_equal(jax.tree.leaves(drive), [[0.1, 0.2, 0.3, 0.4]])
+    assert jax.tree.leaves(sensors.RangeBearing(lambda z: jnp.eye(2))) == []
+
+
+def test_what_transformations_return_is_of_the_class():
+    sensor = sensors.RangeBearing(R, MOUNT)
+    slope = jax.grad(lambda s: jnp.sum(s.observe(jnp.zeros(3), jnp.ones(2)) ** 2))(sensor)
+    assert type(slope) is sensors.RangeBearing
+    # Of a range alone, 2 r ∂r/∂mount = -2 (l - mount), by hand; the bearing is atan2(1, 0.7) - 0.1.
+    away, bearing = np.array([0.7, 1.0]), np.arctan2(1, 0.7) - 0.1
+    by_mount = -2 * away + 2 * bearing * np.array([away[1], -away[0]]) / (away @ away)
+    np.testing.assert_allclose(slope.mount, [*by_mount, -2 * bearing])
+    many = jax.vmap(lambda scale: jax.tree.map(lambda leaf: scale * leaf, sensor))(jnp.arange(3.0))
+    assert type(many) is sensors.RangeBearing and many.mount.shape == (3, 3)
+    noises = jax.jit(jax.vmap(lambda s: s.noise_cov(jnp.zeros(2))))(many)
+    np.testing.assert_allclose(noises, np.arange(3.0)[:, None, None] * R)
+
+
+def test_two_that_differ_in_a_number_share_a_program():
+    traced = []
+
+    @jax.jit
+    def observe(sensor):
+        traced.append(1)
+        return sensor.observe(jnp.zeros(3), jnp.ones(2))
+
+    near, far = sensors.RangeBearing(R, MOUNT), sensors.RangeBearing(2 * R, 2 * MOUNT)
+    assert jax.tree.structure(near) == jax.tree.structure(far)
+    assert not np.allclose(observe(near), observe(far))
+    assert len(traced) == 1
+
+
+def test_copies_and_pickles_have_the_structure_and_the_numbers():
+    sensor = sensors.BearingInverseDepth([[0.01]], MOUNT, to_point=0.1)
+    changed = dataclasses.replace(sensor, mount=2 * MOUNT)
+    for made in (copy.deepcopy(sensor), pickle.loads(pickle.dumps(sensor)), changed):
+        assert type(made) is type(sensor)
+        assert jax.tree.structure(made) == jax.tree.structure(sensor)
+        np.testing.assert_array_equal(made.noise_cov(jnp.zeros(1)), [[0.01]])
+    np.testing.assert_array_equal(changed.mount, 2 * MOUNT)
+    assert repr(Pair(1.0, count=3)) == "Pair(first=1.0, second=None, count=3)"
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        sensor.mount = MOUNT
+
+
+class Bare(Motion):
+    """A motion model that is no record."""
+
+    controls = noises = ("dx [m]",)
+
+    def step(self, pose, u, w):
+        return pose
+
+    def noise_cov(self, pose, u):
+        return jnp.eye(1)
+
+
+class Later(sensors.RangeBearing):
+    """A class of a record that is none."""
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Pair("near"), "Pair: first: expected a number, an array or a record .* got 'near'"),
+        (lambda: Pair([1.0, 2.0]), "Pair: first: expected an array, as of numpy.asarray, got a list"),
+        (lambda: Pair((1.0, jnp.sin)), r"Pair: first\[1\]: expected a number, .* static\(\) field"),
+        (lambda: Pair(np.array(["a"])), "Pair: first: expected a number, .* got ndarray"),
+        (lambda: Pair(1, count=R), "Pair: count: expected a value that is compared by ==, got an"),
+        (lambda: sensors.RangeBearing(np.eye(3)), r"RangeBearing: noise_cov: .* \(2, 2\), got \(3, 3\)"),
+        (lambda: sensors.RangeBearing(-R), "RangeBearing: noise_cov: .* not positive semi-definite"),
+        (lambda: sensors.RangeBearing("R"), "RangeBearing: noise_cov: expected a covariance"),
+        (lambda: motion.Unicycle(None), "Unicycle: noise_cov: expected a covariance .* got None"),
+        (lambda: sensors.RangeBearing(R, MOUNT[:2]), r"RangeBearing: .* of shape \(3,\), got \(2,\)"),
+        (lambda: sensors.RangeBearing(R, np.nan * MOUNT), "RangeBearing: .* not finite"),
+        (lambda: sensor_of(noise_cov=R, measurements=("x [m]",)), "Own: expected a method observe"),
+        (lambda: motion_of(step=min, controls=("x",), noises="w"), "Own: expected noises to be a tup"),
+        (Bare, "Bare: expected @record above the class"),
+        (lambda: Later(R), "Later: expected @record above the class"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_that_names_the_class(make, message):
+    with pytest.raises(ValueError, match=f"^{message}") as error:
+        make()
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_field_is_named():
+    with pytest.raises(TypeError, match=r"^RangeBearing.__init__\(\) missing .* 'noise_cov'$"):
+        sensors.RangeBearing()
+
+
+def test_placeholders_and_tracers_do_not_raise():
+    for model in (sensors.RangeBearing(R, MOUNT), motion.Odometry(OdometryNoise((1, 2, 3, 4)))):
+        leaves, structure = jax.tree.flatten(model)
+        for filler in (object(), None, np.zeros(7), jax.ShapeDtypeStruct((2,), "f4")):
+            made = jax.tree.unflatten(structure, [filler] * len(leaves))
+            assert type(made) is type(model)
+    both = jax.jit(lambda cov, mount: sensors.RangeBearing(cov, mount).frame(mount))(-R, MOUNT)
+    assert both.shape == (3,)
+
+
+def test_a_gradient_by_a_sensor_through_a_filter_is_that_by_its_covariance():
+    scenario = worlds.ring(3)
+    truth, log = simulate(scenario, jax.random.key(0))
+
+    def loss(sensor: Sensor):
+        ekf = filters.ekf_slam(scenario.motion, sensor, 6)
+        trace = run(ekf, log, scenario.pose, scenario.pose_cov, jax.random.key(1))
+        return trace.info.log_likelihood.sum()
+
+    cov = scenario.sensor.noise_cov(log.scan.z[0, 0])
+    sensor = sensors.RangeBearing(cov)
+    expected = jax.grad(lambda cov: loss(sensors.RangeBearing(cov)))(cov)
+    slope = jax.grad(loss)(sensor)
+    assert type(slope) is sensors.RangeBearing
+    np.testing.assert_allclose(slope.noise_cov.cov, expected, rtol=1e-12)
+    assert np.all(np.isfinite(expected)) and np.any(expected != 0)
