@@ -7,7 +7,7 @@ from typing import Any, TypeVar, dataclass_transform
 import jax
 import numpy as np
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 def static(**options: Any) -> Any:
@@ -20,7 +20,7 @@ def static(**options: Any) -> Any:
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
-def record(cls: type[T]) -> type[T]:
+def record(cls: type[_T]) -> type[_T]:
     """The class as a frozen dataclass and a pytree, whose fields are its children.
 
     A field is a number, an array, None, another record, or a tuple of these; one that is declared
