@@ -74,11 +74,11 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
             )
             seconds, compiling = clock.seconds, clock.compiling
     found = jax.tree.map(np.asarray, solution.graph)
-    squared = {k: np.asarray(s) for k, s in graphs.squared_residuals(found, factors).items()}
+    squared = _squared(found, factors)
     converged = int(solution.status) == Ending.CONVERGED
     costs = (
-        json_number(graphs.chi2(begun, factors)),
-        json_number(sum(s.sum() for s in squared.values())),
+        json_number(_sum(_squared(begun, factors))),
+        json_number(_sum(squared)),
     )
     status = _status(solution, found)
     summary = {
@@ -94,7 +94,9 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "start": options.start,
         "method": options.method,
         "kernel": options.kernel or "none",
-        "chi2 of the file": json_number(graphs.chi2(given, factors)),
+        "chi2 of the file": costs[0]
+        if begun is given
+        else json_number(_sum(_squared(given, factors))),
         "chi2 at the start": costs[0],
         "chi2": costs[1],
         "degrees of freedom": graphs.degrees_of_freedom(found, factors),
@@ -113,7 +115,9 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
             summary | {"worst residuals": worst, "versions": versions()},
         ),
         "poses.csv": _csv(("x", "y", "theta"), found.pose_id, found.poses, found.fixed_pose),
-        "optimized.g2o": g2o.text_of(found),
+        "optimized.g2o": g2o.text_of(
+            found._replace(fixed_pose=loaded.graph.fixed_pose, fixed_point=loaded.graph.fixed_point)
+        ),
         "graph.png": figure_writer(options, begun, found, squared, costs, status),
     }
     if options.animate:
@@ -126,6 +130,15 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         return 0
     print(f"jaxslam: {status}", file=sys.stderr)
     return NOT_CONVERGED
+
+
+def _squared(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, np.ndarray]:
+    """eᵀ Ω e of each row; one program for the file, the start and the optimum."""
+    return {k: np.asarray(s) for k, s in graphs.squared_residuals(graph, factors).items()}
+
+
+def _sum(squared: Mapping[str, np.ndarray]) -> float:
+    return float(sum(s.sum() for s in squared.values()))
 
 
 def _gauge(read: Graph, given: Graph) -> str:

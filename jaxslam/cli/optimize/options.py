@@ -30,9 +30,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--certificate",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
+        action="store_true",
+        help="also prove, where it can be, that no poses have a lower chordal cost",
     )
     parser.add_argument(
         "--animate",
