@@ -1,8 +1,12 @@
-# Each target makes its own .venv and installs what it needs; only make and a Python >= 3.11 with
-# venv must be there. Choose one with `make PYTHON=python3.12 …`.
+# Each target makes its own .venv and installs what it needs; only make and a Python 3.11 to 3.13
+# with venv must be there. Choose one with `make PYTHON=python3.12 …`.
 
-PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
-	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+# The newest one on the path, of pyenv or of uv. Each is run: a shim of pyenv may lead nowhere.
+PYTHON ?= $(shell for v in 3.13 3.12 3.11; do \
+	for p in python$$v "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/$$v*/bin/python$$v \
+	$$(uv python find --system $$v 2>/dev/null) python3 python; do \
+	"$$p" -c "import sys, venv, ensurepip; sys.exit('%d.%d' % sys.version_info[:2] != '$$v')" \
+	2>/dev/null && echo "$$p" && exit; done; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
 ARGS ?=
@@ -44,8 +48,9 @@ links: $(VENV)/.dev
 	$(BIN)/sphinx-build --builder linkcheck --jobs auto --quiet docs docs/_build/links $(ARGS)
 
 $(VENV)/bin/python:
-	@test -n "$(PYTHON)" || { echo "jaxslam needs Python >= 3.11 with the venv module"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@python="$(PYTHON)"; \
+	test -n "$$python" || { echo "jaxslam needs Python 3.11 to 3.13 with the venv module"; exit 1; }; \
+	echo "$(VENV): $$("$$python" --version) ($$python)"; "$$python" -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 
 $(VENV)/.run: pyproject.toml | $(VENV)/bin/python

@@ -2,7 +2,7 @@
 
 They are computed on the host with NumPy and SciPy, for concrete graphs. Fixed variables stay where
 they are. A part of the graph without a fixed pose is held at the pose of its first prior (a table
-"prior"), or else at its first pose as it is. The start decides which minimum is found; it has no
+"prior"), or else at the pose of its lowest id. The start decides which minimum is found; it has no
 other influence on the optimum.
 """
 
