@@ -133,6 +133,17 @@ def test_chordal_lies_close_to_the_optimum_of_real_graphs(name, best, share):
     assert best < found < share * best
 
 
+@pytest.mark.parametrize("name", PLACING)
+def test_a_row_without_information_places_nothing(name):
+    truth = small_graphs.only(small_graphs.drawn(), "relative_pose")
+    table = truth.tables["relative_pose"]
+    false = graphs.Table(
+        np.array([[0, 4]]), np.full((1, 3), 9.0), np.zeros((1, 3, 3)), np.array([True])
+    )
+    both = graphs.Table(*map(np.concatenate, zip(table, false, strict=True)))
+    assert_close(starts.STARTS[name](truth._replace(tables={"relative_pose": both})), truth)
+
+
 def shuffled(graph):
     """The graph with its poses, its points and the rows of each table in another order."""
     random = np.random.default_rng(4)

@@ -32,13 +32,16 @@ class Relative(NamedTuple):
 
 
 def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
-    """The relative poses that valid rows between two poses measure, of all tables, by id."""
+    """The relative poses that valid rows between two poses measure, of all tables, by id.
+
+    A row of zero information measures none.
+    """
     found, known = [], factors_of("graphs.starts", graph, factors)
     for key, table in graph.tables.items():
         factor = known[key]
         if factor.variables != ("pose", "pose") or factor.predict is None:
             continue
-        valid = np.asarray(table.valid)
+        valid = np.asarray(table.valid) & np.asarray(table.information).any(axis=(1, 2))
         who, z, information = (
             np.asarray(part)[valid] for part in (table.who, table.z, table.information)
         )
