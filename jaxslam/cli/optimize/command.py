@@ -1,7 +1,9 @@
 """The command `jaxslam optimize`: the optimum of a graph in a file."""
 
 import argparse
+import importlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -60,6 +62,8 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     factors = {key: known[key.split("/")[0]] for key in given.tables}
     begun = start(given, factors)
     doubted = {key: kernel for key in given.tables if key not in TRUSTED} if kernel else None
+    # Matplotlib loads while XLA compiles.
+    threading.Thread(target=importlib.import_module, args=["jaxslam.results.plot"]).start()
     with Progress(Path(options.path).name, "steps") as progress:
         progress.say("compiling and solving …")
         with CompileClock() as clock:
@@ -103,7 +107,9 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         **({} if kernel is None else {"robust cost": json_number(solution.chi2)}),
         "status": status,
         "iterations": int(solution.iterations),
-        "gradient / at the start": json_number(solution.gradient / solution.gradient_start),
+        "gradient / at the start": json_number(
+            float(solution.gradient) / (float(solution.gradient_start) or 1.0)
+        ),
         "seconds to compile": round(compiling, 3),
         "seconds to run": round(seconds - compiling, 3),
         **(_certificate(found, converged, kernel is None) if options.certificate else {}),

@@ -97,9 +97,8 @@ def minimize(
     """The solutions of graphs with a last axis B."""
     data = data_of(graph, plan.column)
     start = variables_of(graph)
-    unknown = jax.eval_shape(lambda v: linearize(model, plan, v, data), start)
-    unsolved = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unknown)
-    batch, dtype = unknown.chi2.shape, unknown.chi2.dtype
+    width, batch, dtype = data.free.shape[1], start.poses.shape[-1:], start.poses.dtype
+    blocks = jnp.zeros((*plan.block_column.shape, width, width, *batch), dtype)
     eps = float(jnp.finfo(dtype).eps)
     none, no = jnp.zeros(batch, jnp.int32), jnp.zeros(batch, bool)
     zero = jnp.zeros(batch, dtype)
@@ -109,7 +108,7 @@ def minimize(
         length=zero,
         stepped=~no,
         variables=start,
-        system=unsolved._replace(chi2=zero + jnp.inf),
+        system=System(zero + jnp.inf, jnp.zeros(data.free.shape, dtype), blocks),
         bound=zero + (jnp.inf if method == "dogleg" else 0.0),
         going=~no,
         ending=none + Ending.EXHAUSTED,

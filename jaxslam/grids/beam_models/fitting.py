@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from scipy.optimize import minimize
 
 from jaxslam import programs
 from jaxslam.grids.beam_models.ray_cast import Mixture, check_weights, mixture_log_density
@@ -59,6 +58,8 @@ def fit(
         for _ in range(iterations):
             mixture = _em_step(mixture, ranges, stars, max_range)
         return mixture
+
+    from scipy.optimize import minimize  # slow to load
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = programs.call(_cost_and_slope, (), x, ranges, stars, max_range)
