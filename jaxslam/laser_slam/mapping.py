@@ -80,11 +80,17 @@ def _count(
             part = Beams(*(each[:, begin : begin + WIDTH] for each in beams))
             _count(counts, origin, resolution, laser, part, settings)
         return
+    if len(laser) > ROWS:
+        for begin in range(0, len(laser), ROWS):
+            rows = slice(begin, begin + ROWS)
+            part = Beams(*(each[rows] for each in beams))
+            _count(counts, origin, resolution, laser[rows], part, settings)
+        return
     corner, ends = _boxes(laser, beams)
     first = np.floor((corner.min(axis=0) - origin[:2]) / resolution).astype(int) - 1
     size = np.ceil((ends.max(axis=0) - origin[:2]) / resolution).astype(int) + 2 - first
-    if len(laser) > ROWS or ((size > WINDOW).any() and len(laser) > 1):
-        half = ROWS if len(laser) > ROWS else len(laser) // 2
+    if (size > WINDOW).any() and len(laser) > 1:
+        half = len(laser) // 2
         for rows in (slice(half), slice(half, None)):
             part = Beams(*(each[rows] for each in beams))
             _count(counts, origin, resolution, laser[rows], part, settings)
