@@ -9,6 +9,8 @@ from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.math import numpy_poses as poses
 
+PART = 2048
+"""Pairs whose covariances are computed at once."""
 ROOM = 4096
 """Poses of a graph: smaller graphs are filled up to it, so that all logs share their programs."""
 
@@ -55,7 +57,8 @@ def relative_covs(graph: Graph, pairs: Int[np.ndarray, "Q 2"]) -> Float[np.ndarr
 
     From the joint marginals of both, by the Jacobians of x_i⁻¹ ∘ x_j.
     """
-    parts = [pairs[begin : begin + 4 * ROOM] for begin in range(0, len(pairs), 4 * ROOM)]
+    # Each pair fills the factor, so that time and memory grow with the pairs of a part.
+    parts = [pairs[begin : begin + PART] for begin in range(0, len(pairs), PART)]
     found = [np.asarray(graphs.marginals(graph, pairs=of, room=ROOM).pairs) for of in parts]
     joint = np.concatenate(found).astype(np.float64)
     at = np.asarray(graph.poses, np.float64)
