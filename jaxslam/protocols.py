@@ -326,8 +326,10 @@ class Filter:
     """A recursive estimator, as `run` and `monte_carlo` take it."""
 
     name: str
-    control_size: int
-    measurement_size: int
+    controls: tuple[str, ...]
+    """What u holds, with units, as `Motion.controls`."""
+    measurements: tuple[str, ...]
+    """What z holds, with units, as `Sensor.measurements`."""
     init: Callable[[Array, Array], PyTree]
     """(pose, pose_cov (3, 3)) -> S."""
     predict: Callable[[PyTree, Array, Array], PyTree]
@@ -346,7 +348,8 @@ class Filter:
     state is none."""
 
     def __post_init__(self) -> None:
-        _check_fields(self, ("init", "predict", "update", "estimate"))
+        functions = ("init", "predict", "update", "estimate")
+        _check_fields(self, functions, ("controls", "measurements"))
 
 
 Estimator = Callable[[Log, Array], Trace]

@@ -68,8 +68,8 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
     check_log(
         name,
         log,
-        control_size=filter.control_size,
-        measurement_size=filter.measurement_size,
+        control_size=len(filter.controls),
+        measurement_size=len(filter.measurements),
         parts=filter.places,
     )
     if (got := shape_told(pose)) != "(3,)":
