@@ -114,7 +114,7 @@ def _drive(
         state, info = state_and_info(name, state, scan, found)
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        estimate = checked_estimate(name, filter.estimate(state))
+        estimate = checked_estimate(name, filter.estimate(state), dtype)
         return state, (estimate, info, None if probe is None else probe(state))
 
     # XLA cannot merge the body of a scan with its recomputation, so no barrier is needed.

@@ -123,7 +123,10 @@ def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(min
     files = UserObjects()
     world = scenarios.circle(3)
     compass = dataclasses.replace(world.sensor, measurements=("heading [rad]",))
-    with pytest.raises(ValueError, match=r"ready takes measurements \(ahead \[m\], left \[m\]\), .* gives \(heading"):
+    with pytest.raises(
+        ValueError,
+        match=r"ready takes measurements \(ahead \[m\], left \[m\]\), .* gives \(heading",
+    ):
         files.filters(f"{mine}:ready", dataclasses.replace(world, sensor=compass))
     mine.write_text(
         MINE + "noisy = dataclasses.replace(world, motion=dataclasses.replace(world.motion,"

@@ -453,7 +453,10 @@ def test_wrong_filters_are_found_out(lineup, name):
             {"filters": {"x": worlds.ekf(BESIDE)}},
             "filter x takes measurements (ahead [m], left [m]), the scenario ring gives (range [m], ",
         ),
-        ({"filters": {"x": lambda truth: worlds.ekf(BESIDE)}}, "filter ekf_slam takes measurements (ahead [m]"),
+        (
+            {"filters": {"x": lambda truth: worlds.ekf(BESIDE)}},
+            "filter ekf_slam takes measurements (ahead [m]",
+        ),
     ],
 )
 def test_bad_arguments_are_refused(change, message):
