@@ -35,6 +35,7 @@ def blind(scenario):
 ready = blind(world)
 alike = lambda scenario: lambda truth: blind(scenario)
 wrong = lambda scenario: scenario.nothing
+named = dataclasses.replace(ready, name="my filter")
 of_two = lambda scenario, capacity: ready
 untraceable = lambda scenario: dataclasses.replace(ready, update=lambda s, scan, key: undefined(s))
 """
@@ -51,9 +52,9 @@ def test_filters_of_a_file_stand_beside_those_of_the_catalog(mine, capsys):
     files = UserObjects()
     world = scenarios.circle(3)
     assert not files.used
-    asked = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike"
+    asked = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike,{mine}:named"
     found = files.filters(asked, world)
-    assert list(found) == ["ekf", "blind", "ready", "alike"]
+    assert list(found) == ["ekf", "blind", "ready", "alike", "my filter"]
     assert all(isinstance(found[name], Filter) for name in ("ekf", "blind", "ready"))
     assert isinstance(found["alike"](None), Filter)
     assert files.used
