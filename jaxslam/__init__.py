@@ -33,6 +33,7 @@ from jaxslam import (
     team,
     topology,
 )
+from jaxslam._field_docs import attach_field_docs
 from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.run import run
@@ -97,5 +98,10 @@ def __getattr__(name: str) -> ModuleType | Callable[..., Campaign]:
 
         return load
     if name in _ON_DEMAND:
-        return importlib.import_module(_ON_DEMAND[name])
+        module = importlib.import_module(_ON_DEMAND[name])
+        attach_field_docs()
+        return module
     raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
+
+
+attach_field_docs()
