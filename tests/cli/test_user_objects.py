@@ -35,9 +35,9 @@ def blind(scenario):
 ready = blind(world)
 alike = lambda scenario: lambda truth: blind(scenario)
 wrong = lambda scenario: scenario.nothing
-named = dataclasses.replace(ready, name="my filter")
 of_two = lambda scenario, capacity: ready
 untraceable = lambda scenario: dataclasses.replace(ready, update=lambda s, scan, key: undefined(s))
+named = dataclasses.replace(ready, name="my filter")
 """
 
 
