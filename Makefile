@@ -19,7 +19,7 @@ unexport PYTHONDONTWRITEBYTECODE
 JEMALLOC := $(firstword $(wildcard /usr/lib/*/libjemalloc.so.2 /usr/lib64/libjemalloc.so.2))
 
 .DELETE_ON_ERROR:
-.PHONY: consistency test check bench docs links clean
+.PHONY: consistency test check bench docs api links clean
 
 ## The main job: is EKF-SLAM honest? 100 simulated runs; results in out/.
 consistency: $(VENV)/.run
@@ -42,6 +42,10 @@ bench: $(VENV)/.dev
 ## The documentation, in docs/_build/html; its code and commands are run, what they gave kept in .cache/. Warnings are errors.
 docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --builder html --jobs auto --fail-on-warning --keep-going --quiet docs docs/_build/html $(ARGS)
+
+## The reference and the text of all pages, in docs/_build/api: none of their code is run.
+api: $(VENV)/.dev
+	$(BIN)/sphinx-build --builder html --tag api --jobs auto --quiet docs docs/_build/api $(ARGS)
 
 ## Whether the documentation's links to other sites are alive; needs the network.
 links: $(VENV)/.dev

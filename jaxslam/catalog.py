@@ -8,6 +8,7 @@ line run them side by side.
 from collections.abc import Callable
 from typing import Literal, Unpack
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.charts.left_invariant import left_invariant
@@ -22,6 +23,7 @@ from jaxslam.filters.information.in_pieces import in_pieces
 from jaxslam.filters.information.seif import seif
 from jaxslam.filters.known.dead_reckoning import dead_reckoning
 from jaxslam.filters.known.localization import localization
+from jaxslam.filters.known.mapping import mapping
 from jaxslam.filters.particles.fastslam import fastslam
 from jaxslam.filters.particles.particle_localization import particle_localization
 from jaxslam.linearize.at_truth import at_truth
@@ -29,6 +31,7 @@ from jaxslam.linearize.first_estimate import first_estimate
 from jaxslam.linearize.observability import observability
 from jaxslam.linearize.unscented import unscented
 from jaxslam.protocols import Candidate, Estimator, Filter
+from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.smoothing.batch_map import batch_map
 from jaxslam.smoothing.fixed_lag import fixed_lag
@@ -69,6 +72,32 @@ def in_a_known_map(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callabl
         gate=asked.get("gate"),
         iterations=asked.get("iterations", 1),
     )
+
+
+def on_given_poses(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
+    """Mapping, whose controls are the poses, with those options of `ekf_slam` that it has."""
+    asked = scenario.filter_options | options
+    return mapping(
+        scenario.sensor,
+        int(np.shape(scenario.landmarks)[0]),
+        gate=asked.get("gate"),
+        associate=asked.get("associate"),
+        births=asked.get("births"),
+    )
+
+
+def on_the_true_path(
+    scenario: Scenario, **options: Unpack[EkfOptions]
+) -> Callable[[Truth], Estimator]:
+    """Mapping from the true path; options as above. Its pose has no NEES: it is exact."""
+    filter = on_given_poses(scenario, **options)
+    start = np.asarray(scenario.pose), np.zeros((3, 3))
+
+    def estimator(truth: Truth) -> Estimator:
+        poses = jnp.asarray(truth.pose)
+        return lambda log, key: run(filter, log._replace(control=poses), *start, key)
+
+    return estimator
 
 
 def by_particles(
@@ -218,9 +247,11 @@ BASELINES: Named[Callable[..., Candidate]] = Named(
     {
         "dead_reckoning": without_measurements,
         "localization": in_a_known_map,
+        "mapping": on_the_true_path,
     }
 )
-"""The worst and the best case of a SLAM filter: no measurements, and a known map; as FILTERS."""
+"""The worst and the best cases of a SLAM filter: no measurements, a known map, and a known path; as
+FILTERS."""
 
 PARTICLES: Named[Callable[..., Candidate]] = Named(
     {
@@ -258,7 +289,7 @@ KINDS: Named[tuple[str, ...]] = Named(
         "smoothing": ("fixed_lag", "fixed_lag_fej", "batch_map"),
         "information": ("eif_slam", "seif", "eseif"),
         "particles": ("fastslam1", "fastslam2", "particle_localization"),
-        "baselines": ("dead_reckoning", "localization"),
+        "baselines": ("dead_reckoning", "localization", "mapping"),
     }
 )
 """The names by kind of filter; figures of many filters are divided so."""

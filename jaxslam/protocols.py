@@ -8,7 +8,8 @@ Shapes: pose (3,); u (U,) control; w (W,) process noise; z (Z,) measurement; l (
 parameters; s (K,) landmark parameters that z does not determine (K = 0 if none).
 """
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,13 +26,30 @@ from jaxslam.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace, Truth
 Array = jax.Array
 
 
+def unfit_signature(function: Callable[..., object], count: int) -> str | None:
+    """The parameters of a function that does not take `count` arguments; None of one that does."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # a builtin has none
+        return None
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        return f"({', '.join(signature.parameters)})"
+    return None
+
+
 def _check_fields(
     record: PyTree,
-    functions: tuple[str, ...],
+    functions: Iterable[str] | Mapping[str, str],
     names: tuple[str, ...] = (),
     optional: tuple[str, ...] = (),
 ) -> None:
-    """Raise ValueError unless functions are functions, and names tuples of str."""
+    """Raise ValueError unless functions are functions, of the parameters that a mapping gives, and
+    names tuples of str.
+
+    Those of models are not of fixed parameters here: the verifier reports them.
+    """
     what = f"{type(record).__name__} {record.name!r}"
     if not isinstance(record.name, str):
         raise ValueError(f"{what}: expected a name, got {type(record.name).__name__}")
@@ -49,6 +67,10 @@ def _check_fields(
                 got, wanted = f"an array of shape {value.shape}", "a function that returns one"
                 wanted += ", as noise.noise_model makes" * (field == "noise_cov")
             raise ValueError(f"{what}: expected {field} to be {wanted}, got {got}")
+    for field, taken in functions.items() if isinstance(functions, Mapping) else ():
+        unfit = unfit_signature(getattr(record, field), taken.count(",") + 1)
+        if unfit is not None:
+            raise ValueError(f"{what}: expected {field} to take ({taken}), got {unfit}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +219,11 @@ class Chart:
     """numbers L of the landmarks it acts on; None where any."""
 
     def __post_init__(self) -> None:
-        _check_fields(self, ("retract", "local"), optional=("basis",))
+        _check_fields(
+            self,
+            {"retract": "pose, l, dx, dl", "local": "pose0, l0, pose, l"},
+            optional=("basis",),
+        )
 
 
 class Here(NamedTuple):
@@ -247,7 +273,16 @@ class Linearizer:
     """whether it linearizes at landmarks other than the estimates; not for known maps then."""
 
     def __post_init__(self) -> None:
-        _check_fields(self, ("init", "motion", "observe", "invert", "born"))
+        _check_fields(
+            self,
+            {
+                "init": "pose, landmarks",
+                "motion": "motion, u, here",
+                "observe": "sensor, here",
+                "invert": "sensor, z, tag, here",
+                "born": "joint, born",
+            },
+        )
 
 
 class Pairs(NamedTuple):
@@ -326,8 +361,10 @@ class Filter:
     """A recursive estimator, as `run` and `monte_carlo` take it."""
 
     name: str
-    control_size: int
-    measurement_size: int
+    controls: tuple[str, ...]
+    """What u holds, with units, as `Motion.controls`."""
+    measurements: tuple[str, ...]
+    """What z holds, with units, as `Sensor.measurements`."""
     init: Callable[[Array, Array], PyTree]
     """(pose, pose_cov (3, 3)) -> S."""
     predict: Callable[[PyTree, Array, Array], PyTree]
@@ -346,7 +383,16 @@ class Filter:
     state is none."""
 
     def __post_init__(self) -> None:
-        _check_fields(self, ("init", "predict", "update", "estimate"))
+        _check_fields(
+            self,
+            {
+                "init": "pose, pose_cov",
+                "predict": "S, u, key",
+                "update": "S, scan, key",
+                "estimate": "S",
+            },
+            ("controls", "measurements"),
+        )
 
 
 Estimator = Callable[[Log, Array], Trace]

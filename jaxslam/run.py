@@ -68,8 +68,8 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
     check_log(
         name,
         log,
-        control_size=filter.control_size,
-        measurement_size=filter.measurement_size,
+        control_size=len(filter.controls),
+        measurement_size=len(filter.measurements),
         parts=filter.places,
     )
     if (got := shape_told(pose)) != "(3,)":
@@ -114,7 +114,7 @@ def _drive(
         state, info = state_and_info(name, state, scan, found)
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        estimate = checked_estimate(name, filter.estimate(state))
+        estimate = checked_estimate(name, filter.estimate(state), dtype)
         return state, (estimate, info, None if probe is None else probe(state))
 
     # XLA cannot merge the body of a scan with its recomputation, so no barrier is needed.

@@ -5,6 +5,7 @@ T steps, M measurement slots a step, N landmark slots, Z measurement size, L lan
 Masks and status codes, never NaN, mark absent data.
 """
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
@@ -90,7 +91,11 @@ class Log(NamedTuple):
 
     @classmethod
     def from_records(
-        cls, odometry: tables.Tabular, measurements: tables.Tabular, motion: PyTree, sensor: PyTree
+        cls,
+        odometry: tables.Tabular,
+        measurements: tables.Tabular | Sequence[tables.Tabular],
+        motion: PyTree,
+        sensor: PyTree,
     ) -> "Recording":
         """The log of lines of odometry and measurements, each with times of its own.
 
@@ -100,7 +105,8 @@ class Log(NamedTuple):
         what the sensor measures (no tag for a sensor of no landmark, as a compass). Either is a
         sequence of rows in this order (lists, a NumPy array), or has columns with names: a mapping,
         a structured array, a data frame. A name may have a unit, as "bearing [deg]"; else it is the
-        model's. With `pose_increment` columns named t, x, y, theta may be a path of poses.
+        model's. With `pose_increment` columns named t, x, y, theta may be a path of poses. Of a
+        `sensors.Suite` measurements are one such table a part, in order: (of_laser, of_compass).
 
         There is a row at every time of either. A velocity holds until the next; poses are
         interpolated; other controls stand as they are, and measurements must be at their times.
@@ -112,17 +118,46 @@ class Log(NamedTuple):
             motion, sensor: the models.
         Raises:
             ValueError: with row and column, on a missing column, a value that is no finite number,
-                times that go back (of odometry: or repeat), or a tag twice at a time.
+                times that go back (of odometry: or repeat), a tag twice at a time, or more
+                measurements at a time than the suite has slots.
         """
-        name, controls, measured = "Log.from_records", motion.controls, sensor.measurements
+        name, controls = "Log.from_records", motion.controls
         moved = tables.columns_of(
             f"{name}: odometry",
             odometry,
             lambda given: (tables.TIME, *tables.odometry_columns(controls, given)),
         )
-        columns = tables.measurement_columns(measured, sensor.landmark)
-        seen = tables.columns_of(f"{name}: measurements", measurements, lambda _: columns)
-        rows, tags, dropped = tables.align_tables(moved, seen, controls, measured)
+        parts = getattr(sensor, "parts", None)  # of a suite
+        given: list[tuple[str, PyTree, PyTree, int | None]] = []
+        if parts is None:
+            given = [(f"{name}: measurements", sensor, measurements, None)]
+        else:
+            if not isinstance(measurements, Sequence) or len(measurements) != len(parts):
+                each = ", ".join(part.sensor.name for part in parts)
+                raise ValueError(
+                    f"{name}: measurements: expected a table for each of the {len(parts)} sensors "
+                    f"of the suite, ({each}), got {type(measurements).__name__}"
+                )
+            if any(part.sees == "robots" for part in parts):
+                raise ValueError(
+                    f"{name}: expected sensors of landmarks; of a team make the log of each robot "
+                    "by Log.from_streams, with the rows of all, and put them side by side"
+                )
+            given = [
+                (
+                    f"{name}: measurements[{i}] of {part.sensor.name}",
+                    part.sensor,
+                    table,
+                    part.places,
+                )
+                for i, (part, table) in enumerate(zip(parts, measurements, strict=True))
+            ]
+        seen = []
+        for what, model, table, places in given:
+            columns = tables.measurement_columns(model.measurements, model.landmark)
+            made = tables.columns_of(what, table, lambda _, own=columns: own)  # type: ignore[misc]
+            seen.append(tables.Seen(made, model.measurements, places))
+        rows, tags, dropped = tables.align_tables(moved, seen, controls)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)
 
 

@@ -14,7 +14,7 @@ import jaxslam
 PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
-    "math programs",
+    "math programs _field_docs",
     "types protocols slots validation noise logs",
     "motion sensors charts linearize association resampling life team",
     "run filters smoothing graphs grids matching simulation features topology",

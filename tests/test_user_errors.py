@@ -199,6 +199,19 @@ def test_charts_linearizers_and_filters_hold_functions():
         dataclasses.replace(FACTORIES["ekf_slam"](MOVE, SEES), predict="predict")
 
 
+def test_the_functions_of_a_filter_take_its_arguments():
+    ekf = FACTORIES["ekf_slam"](MOVE, SEES)
+    with pytest.raises(
+        ValueError,
+        match=r"^Filter 'ekf_slam': expected predict to take \(S, u, key\), got \(s, u\)$",
+    ):
+        dataclasses.replace(ekf, predict=lambda s, u: s)
+    with pytest.raises(
+        ValueError, match=r"^Chart 'euclidean': expected retract to take \(pose, l, dx, d"
+    ):
+        dataclasses.replace(charts.euclidean(), retract=lambda pose, dx: pose)
+
+
 def test_what_a_filter_of_ones_own_returns_is_told():
     scan = jaxslam.types.Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))
     info, state = reporting.nothing_of(scan), jnp.zeros(3)
@@ -222,6 +235,10 @@ def test_what_a_filter_of_ones_own_returns_is_told():
             r"update: Info.nis: expected shape \(1,\), got \(2,\)",
         ),
         (
+            (state, info._replace(nis=jnp.zeros(1, jnp.float16))),
+            r"update: Info.nis: expected float\d\d values, got float16",
+        ),
+        (
             (state, info._replace(status=jnp.zeros(1))),
             "update: Info.status: expected integer values, got float",
         ),
@@ -231,16 +248,21 @@ def test_what_a_filter_of_ones_own_returns_is_told():
     believed = jaxslam.types.Estimate(
         *(jnp.zeros(shape) for shape in [(3,), (3, 3), (2, 2), (2, 2, 2), (2,), (2,)])
     )
-    assert checked_estimate("run: mine", believed) is believed
+    real = jnp.zeros(0).dtype
+    assert checked_estimate("run: mine", believed, real) is believed
     for wrong, told in (
         (
             believed._replace(points=jnp.zeros((2, 3))),
             r"Estimate.points: expected shape \(2, 2\), got \(2, 3\)",
         ),
+        (
+            believed._replace(points=jnp.zeros((2, 2), jnp.float16)),
+            r"Estimate.points: expected float\d\d values, got float16",
+        ),
         (state, "expected estimate to return an Estimate, got"),
     ):
         with pytest.raises(ValueError, match=rf"^run: mine: {told}"):
-            checked_estimate("run: mine", wrong)
+            checked_estimate("run: mine", wrong, real)
 
 
 def test_localization_is_named_by_its_own_name():

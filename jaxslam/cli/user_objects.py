@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
+from jaxslam import filters
 from jaxslam.catalog import ALL
 from jaxslam.cli.common import pick
 from jaxslam.monte_carlo.candidates import check_fits, check_noise
@@ -105,7 +106,10 @@ class UserObjects:
         return name, getattr(module, name)
 
     def _own(self, asked: str, scenario: Scenario) -> tuple[str, Candidate]:
-        """The name of a user's filter, and the filter for the scenario."""
+        """The name of a user's filter, and the filter for the scenario.
+
+        It is the filter's own, or NAME for one that still has that of a filter of the library.
+        """
         name, own = self._find("--filters", asked)
         made = own
         if not isinstance(made, Filter) and callable(made):
@@ -115,6 +119,8 @@ class UserObjects:
                 f"{asked}: expected a Filter, or a function of the scenario that returns one, "
                 f"{_got(own, made)}"
             )
+        if isinstance(made, Filter) and not (made.name in ALL or hasattr(filters, made.name)):
+            name = made.name
         check_fits(name, made, scenario)
         return name, made
 

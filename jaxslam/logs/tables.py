@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxslam.logs import streams
 
@@ -52,8 +52,18 @@ class Columns(NamedTuple, Generic[_Name]):
         return np.column_stack([self.columns[name] for name in names])
 
 
+class Seen(NamedTuple, Generic[_Name]):
+    """The measurements of one sensor."""
+
+    table: Columns[_Name]
+    measured: tuple[str, ...]
+    """the names of z, with units"""
+    places: int | None = None
+    """its measurement slots in a scan; None for as many as its largest scan has"""
+
+
 class Aligned(NamedTuple, Generic[_Name]):
-    """The rows of two tables, and what became of their names and measurements."""
+    """The rows of all tables, and what became of their names and measurements."""
 
     rows: streams.Rows
     tags: tuple[_Name, ...]
@@ -89,64 +99,105 @@ def measurement_columns(measured: tuple[str, ...], landmark: tuple[str, ...]) ->
 
 def align_tables(
     odometry: Columns[_Name],
-    measurements: Columns[_Name],
+    sensors: Sequence[Seen[_Name]],
     controls: tuple[str, ...],
-    measured: tuple[str, ...],
     names: Sequence[_Name] = (),
 ) -> Aligned[_Name]:
-    """The rows of two tables: a row at every time of odometry, and of measurements within it.
+    """The rows of odometry and of sensors with rates of their own (Solà 2.4): a row at every time
+    of odometry, and of measurements within it.
 
     Velocities (controls with an interval) hold until the next line; poses are interpolated; other
     controls stand as they are, and measurements must then be at their times. Measurements before
     the first or after the last odometry are dropped and counted; the last velocity holds as long as
-    the longest interval between lines.
+    the longest interval between lines. In a scan the slots of the sensors stand in their order.
 
     Args:
-        controls, measured: the names of the models, with units.
+        controls: the names of the motion model, with units.
         names: of landmarks that have a tag though none may be measured; else those measured.
     Raises:
         ValueError: with the place, on times that do not rise (equal ones are a scan), a tag that
-            occurs twice in a scan, or a measurement without odometry at its time.
+            occurs twice in a scan of a sensor, more measurements than slots, or a measurement
+            without odometry at its time.
     """
-    clock, when = odometry.columns[TIME], measurements.columns[TIME]
-    for table, least in ((odometry, True), (measurements, False)):
-        check_times(table, strict=least)
-    named = measurements.tags or [None] * len(when)
+    clock = odometry.columns[TIME]
+    check_times(odometry, strict=True)
+    named = {name for seen in sensors for name in seen.table.tags or ()}
     tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
-    tag = np.array([-1 if name is None else tag_of[name] for name in named], np.int64)
-    seen: set[tuple[float, int]] = set()
-    for row, pair in enumerate(zip(when.tolist(), tag.tolist(), strict=True)):
-        if pair[1] >= 0 and pair in seen:
-            raise ValueError(
-                f"{measurements.at(row, TAG)}: expected a tag once at a time, got "
-                f"{named[row]!r} twice at t = {pair[0]:.12g}"
-            )
-        seen.add(pair)
+    tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
     columns = odometry_columns(controls, tuple(odometry.columns))
     last = clock[-1]
     rule: streams.Rule = streams.relative_poses if columns == POSE else streams.as_recorded
     if columns != POSE and INTERVAL in controls and controls[:3] != _INCREMENT:
         rule = streams.hold
         last += np.max(np.diff(clock), initial=0.0)
-    inside = (when >= clock[0]) & (when <= last)
-    if rule is streams.as_recorded:
+    kept, outside = [], 0
+    for seen, tag in zip(sensors, tags, strict=True):
+        when = seen.table.columns[TIME]
+        inside = (when >= clock[0]) & (when <= last)
         lost = np.flatnonzero(inside & ~np.isin(when, clock))
-        if lost.size:
+        if lost.size and rule is streams.as_recorded:
             raise ValueError(
-                f"{measurements.at(int(lost[0]), TIME)}: expected a time of the odometry, since "
+                f"{seen.table.at(int(lost[0]), TIME)}: expected a time of the odometry, since "
                 f"{', '.join(columns)} cannot be divided, got {when[lost[0]]:.12g}; poses can: "
                 f"{TIME}, {', '.join(POSE)}"
             )
-    rows = streams.align_streams(
-        (clock, odometry.values(columns)),
-        (when[inside], tag[inside], measurements.values(measured)[inside]),
-        rule,
-    )
+        kept.append((when[inside], tag[inside], seen.table.values(seen.measured)[inside]))
+        outside += int((~inside).sum())
+    times = np.unique(np.concatenate([clock, *(when for when, *_ in kept)]))
+    moved = clock, odometry.values(columns)
+    places = [seen.places for seen in sensors]
+    rows = _side_by_side([streams.align_streams(moved, one, rule, times) for one in kept], places)
     if INTERVAL in controls and rule is not streams.hold:
         interval = np.diff(rows.time, prepend=rows.time[:1])
         rows = rows._replace(control=np.column_stack([rows.control, interval]))
-    dropped = {"measurements outside the odometry": int((~inside).sum())}
-    return Aligned(rows, tuple(tag_of), dropped)
+    return Aligned(rows, tuple(tag_of), {"measurements outside the odometry": outside})
+
+
+def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarray, "J"]:
+    """The tag of each measurement of a sensor, -1 where unknown; ValueError as `align_tables`."""
+    table, when = seen.table, seen.table.columns[TIME]
+    check_times(table, strict=False)
+    named = table.tags or [None] * len(when)
+    tags = [-1 if name is None else tag_of[name] for name in named]
+    scan: set[tuple[float, int]] = set()
+    for row, pair in enumerate(zip(when.tolist(), tags, strict=True)):
+        if pair[1] >= 0 and pair in scan:
+            raise ValueError(
+                f"{table.at(row, TAG)}: expected a tag once at a time, got "
+                f"{named[row]!r} twice at t = {pair[0]:.12g}"
+            )
+        scan.add(pair)
+    if (
+        seen.places is not None
+        and (late := np.flatnonzero(when[seen.places :] == when[: -seen.places])).size
+    ):
+        raise ValueError(
+            f"{table.at(int(late[0]) + seen.places, TIME)}: expected at most {seen.places} "
+            f"measurement{'s' * (seen.places > 1)} at a time, the slots of the sensor, got more"
+        )
+    return np.array(tags, np.int64)
+
+
+def _side_by_side(scans: Sequence[streams.Rows], places: Sequence[int | None]) -> streams.Rows:
+    """Rows at the same times with the slots of several sensors, each padded to its places, and z to
+    the longest."""
+    size = max(rows.z.shape[2] for rows in scans)
+
+    def padded(rows: streams.Rows, count: int | None) -> streams.Rows:
+        spare = 0 if count is None else count - rows.tag.shape[1]
+        slots = (0, 0), (0, spare)
+        return rows._replace(
+            z=np.pad(rows.z, (*slots, (0, size - rows.z.shape[2]))),
+            tag=np.pad(rows.tag, slots, constant_values=-1),
+            valid=np.pad(rows.valid, slots),
+        )
+
+    each = [padded(*pair) for pair in zip(scans, places, strict=True)]
+    z, tag, valid = (
+        np.concatenate([getattr(rows, name) for rows in each], axis=1)
+        for name in ("z", "tag", "valid")
+    )
+    return streams.Rows(scans[0].time, scans[0].control, z, tag, valid)
 
 
 def check_times(table: Columns[_Name], *, strict: bool) -> None:

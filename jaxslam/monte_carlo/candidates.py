@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from jaxslam import programs
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.consistency import monitor_of
+from jaxslam.logs.tables import split_unit
 from jaxslam.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
@@ -155,20 +156,31 @@ def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
         try:
             inspect.signature(candidate).bind(None)
         except TypeError:
+            parameters = ", ".join(inspect.signature(candidate).parameters)
+            if parameters != "log, key":
+                raise ValueError(
+                    f"monte_carlo: {name!r} is a factory: call it, {name}({parameters})"
+                ) from None
             raise ValueError(
                 f"monte_carlo: expected {name} to be a function of the truth alone; an estimator "
                 "of (log, key), as from smoothing.smooth, is given as lambda truth: estimator"
             ) from None
         return
-    for what, has, needs in (
-        ("control", candidate.control_size, len(scenario.motion.controls)),
-        ("measurement", candidate.measurement_size, len(scenario.sensor.measurements)),
+    for what, taken, given in (
+        ("controls", candidate.controls, scenario.motion.controls),
+        ("measurements", candidate.measurements, scenario.sensor.measurements),
     ):
-        if has != needs:
+        if len(taken) != len(given) or not all(map(_one_unit, taken, given)):
             raise ValueError(
-                f"monte_carlo: filter {name} takes a {what} of size {has}, "
-                f"the scenario {scenario.name} gives {needs}"
+                f"monte_carlo: filter {name} takes {what} ({', '.join(taken)}), "
+                f"the scenario {scenario.name} gives ({', '.join(given)})"
             )
+
+
+def _one_unit(name: str, other: str) -> bool:
+    """Whether two names have the same unit; True where either has none."""
+    units = {split_unit(each)[1] for each in (name, other)}
+    return len(units) == 1 or None in units
 
 
 def check_called(name: str, candidate: Callable[..., object]) -> None:
@@ -179,10 +191,7 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
     ours = getattr(candidate, "__module__", "").startswith("jaxslam.")
     named = first.name in ("motion", "sensor", "robots", "scenario", "world")
     if (ours and named) or first.annotation in (Motion, Sensor, Scenario):
-        raise ValueError(
-            f"monte_carlo: {name} is a factory that was not called: expected what it returns, "
-            f"{name}({first.name}, …)"
-        )
+        raise ValueError(f"monte_carlo: {name!r} is a factory: call it, {name}({first.name}, …)")
 
 
 def _of_truth(candidate: Callable[[Truth], Estimator | Filter], truth: Truth) -> Estimator | Filter:
@@ -205,6 +214,7 @@ def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tupl
     method = candidate if isinstance(candidate, Filter) else _of_truth(candidate, truth)
     if not isinstance(method, Filter):
         return method, euclidean()
+    check_fits(method.name, method, scenario)
 
     def gained(state: PyTree) -> jax.Array | None:
         monitor = monitor_of(state)

@@ -10,7 +10,8 @@ VERDICTS = {
     "covariances are claimed too large",
     "diverged": "over half of the runs diverged or were not finite",
     "incomplete": "not rejected, but over half of the measurements were dropped",
-    "undecided": "too few runs, or too unequal, to reject even a pose NEES of 6: take more runs",
+    "undecided": "too few runs, or too unequal, to reject even a pose NEES of 6: take more "
+    "runs; a pose that is known exactly, as by mapping, has no NEES",
 }
 """Verdicts."""
 

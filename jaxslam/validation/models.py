@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.protocols import Chart, Linearizer, Motion, Sensor
+from jaxslam.protocols import Chart, Linearizer, Motion, Sensor, unfit_signature
 
 _Shape = tuple[int, ...]
 _Record = TypeVar("_Record")
@@ -126,19 +126,6 @@ def check_associate(name: str, associate: object) -> None:
         ) from None
     except ValueError:  # a builtin, which has no signature
         return
-
-
-def unfit_signature(function: Callable[..., object], count: int) -> str | None:
-    """The parameters of a function that does not take `count` arguments; None of one that does."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # a builtin has none
-        return None
-    try:
-        signature.bind(*[None] * count)
-    except TypeError:
-        return f"({', '.join(signature.parameters)})"
-    return None
 
 
 def _numbers(*shape: int) -> jax.ShapeDtypeStruct:

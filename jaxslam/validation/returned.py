@@ -13,6 +13,9 @@ from jaxslam.validation.numbers import check_array, shape_told
 
 _S = TypeVar("_S")
 
+_REAL = ("nis", "innovation", "innovation_cov", "log_likelihood")
+"""Fields of `Info` in the dtype of the measurements."""
+
 
 def same_state(name: str, before: _S, after: PyTree) -> _S:
     """The state that a filter's function returned; ValueError unless its structure is that before.
@@ -53,7 +56,7 @@ def state_and_info(name: str, state: _S, scan: Scan, found: object) -> tuple[_S,
             got = "(" + ", ".join(type(part).__name__ for part in found) + ")"
         raise ValueError(f"{name}: expected update to return (state, Info), got {got}")
     info: Info = found[1]
-    m = scan.tag.shape[0]
+    m, real = scan.tag.shape[0], scan.z.dtype.type
     for field, shape in {
         "nis": (m,),
         "dof": (m,),
@@ -63,13 +66,14 @@ def state_and_info(name: str, state: _S, scan: Scan, found: object) -> tuple[_S,
         "innovation_cov": (m, "Z", "Z"),
         "log_likelihood": (),
     }.items():
-        kind = np.integer if field == "status" else np.generic
+        kind = real if field in _REAL else np.integer if field == "status" else np.generic
         check_array(f"{name}: update: Info.{field}", getattr(info, field), shape, kind)
     return same_state(f"{name}: update", state, found[0]), info
 
 
-def checked_estimate(name: str, estimate: object) -> Estimate:
-    """The result of a filter's estimate; ValueError unless it is an `Estimate` of N landmarks."""
+def checked_estimate(name: str, estimate: object, dtype: np.dtype) -> Estimate:
+    """The result of a filter's estimate; ValueError unless it is an `Estimate` of N landmarks, with
+    numbers of this dtype."""
     if not isinstance(estimate, Estimate):
         raise ValueError(
             f"{name}: expected estimate to return an Estimate, got {type(estimate).__name__}"
@@ -77,5 +81,6 @@ def checked_estimate(name: str, estimate: object) -> Estimate:
     n = np.shape(estimate.alive)[0] if np.ndim(estimate.alive) == 1 else -1
     shapes = {"pose": (3,), "pose_cov": (3, 3), "points": (n, 2), "point_covs": (n, 2, 2)}
     for field, shape in (shapes | {"alive": (n,), "tag": (n,)}).items():
-        check_array(f"{name}: Estimate.{field}", getattr(estimate, field), shape)
+        kind = dtype.type if field in shapes else np.generic
+        check_array(f"{name}: Estimate.{field}", getattr(estimate, field), shape, kind)
     return estimate

@@ -27,6 +27,7 @@ def compare_methods(
     """One finding for each argument: the methods compared entry by entry.
 
     States at which the function has no finite value are left out; another check reports them.
+    A Jacobian without entries, as by a landmark of no numbers, has no finding.
     """
     if evaluated.values is None:
         return []
@@ -35,6 +36,7 @@ def compare_methods(
     return [
         _finding(evaluated, k, tolerance, float32_tolerance)
         for k, evaluation in enumerate(evaluated.by_argument)
+        if evaluated.function.outputs and evaluated.function.arguments[k].entries
         if evaluation.methods and len(evaluation.methods) + (evaluation.quotient is not None) > 1
     ]
 

@@ -1,5 +1,6 @@
 """`jaxslam run`: results of a data set on disk, checks of the covariance, and bad input."""
 
+import csv
 import json
 
 import jax
@@ -121,6 +122,28 @@ def write_table(tmp_path):
     (tmp_path / "landmarks.csv").write_text("tag,x [m],y [m]\n7,5,0.5\n")
     (tmp_path / "dataset.toml").write_text("[filter]\ncapacity = 3\n")
     return tmp_path
+
+
+def test_mapping_takes_the_true_path(tmp_path, capsys):
+    """And leaves out, and counts, what was measured where the path is not known."""
+    write_table(tmp_path)
+    (tmp_path / "truth.csv").write_text("t [s],x [m],y [m],theta [deg]\n0,2,1,90\n0.9,1,0,6\n")
+    out = tmp_path / "out"
+    asked = ["run", "--dataset", "table", str(tmp_path), "--filters", "mapping", "--out", str(out)]
+    assert cli.main(asked) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["measurements without a true pose, left out"] == 2
+    assert summary["status"]["born"] == 1
+    rows = (out / "map.csv").read_text().splitlines()
+    (point,) = csv.DictReader(rows)
+    np.testing.assert_allclose(
+        [float(point["x"]), float(point["y"])],
+        [2 + 5 * np.cos(np.pi / 2 + 0.1), 1 + 5 * np.sin(np.pi / 2 + 0.1)],
+        rtol=1e-5,
+    )
+    (tmp_path / "truth.csv").unlink()
+    assert cli.main(asked) == 2
+    assert "--filters: mapping needs the true path of the robot" in capsys.readouterr().err
 
 
 def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):

@@ -34,8 +34,8 @@ def toy(traced):
 
     return Filter(
         name="toy",
-        control_size=3,
-        measurement_size=2,
+        controls=("x", "y", "theta"),
+        measurements=("x", "y"),
         init=lambda pose, pose_cov: pose,
         predict=predict,
         update=lambda pose, scan, key: (pose, nothing_of(scan)._replace(log_likelihood=pose[0])),

@@ -37,6 +37,7 @@ alike = lambda scenario: lambda truth: blind(scenario)
 wrong = lambda scenario: scenario.nothing
 of_two = lambda scenario, capacity: ready
 untraceable = lambda scenario: dataclasses.replace(ready, update=lambda s, scan, key: undefined(s))
+named = dataclasses.replace(ready, name="my filter")
 """
 
 
@@ -51,9 +52,9 @@ def test_filters_of_a_file_stand_beside_those_of_the_catalog(mine, capsys):
     files = UserObjects()
     world = scenarios.circle(3)
     assert not files.used
-    asked = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike"
+    asked = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike,{mine}:named"
     found = files.filters(asked, world)
-    assert list(found) == ["ekf", "blind", "ready", "alike"]
+    assert list(found) == ["ekf", "blind", "ready", "alike", "my filter"]
     assert all(isinstance(found[name], Filter) for name in ("ekf", "blind", "ready"))
     assert isinstance(found["alike"](None), Filter)
     assert files.used
@@ -123,7 +124,10 @@ def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(min
     files = UserObjects()
     world = scenarios.circle(3)
     compass = dataclasses.replace(world.sensor, measurements=("heading [rad]",))
-    with pytest.raises(ValueError, match="filter ready takes a measurement of size 2"):
+    with pytest.raises(
+        ValueError,
+        match=r"ready takes measurements \(ahead \[m\], left \[m\]\), .* gives \(heading",
+    ):
         files.filters(f"{mine}:ready", dataclasses.replace(world, sensor=compass))
     mine.write_text(
         MINE + "noisy = dataclasses.replace(world, motion=dataclasses.replace(world.motion,"

@@ -70,8 +70,8 @@ def test_hand_is_autodiff_at_every_sample(made):
     """
     far = getattr(made.model, "carry", None) is not None
     double, single = (1e5 * 2**-53, 1e5 * 2**-24) if far else (1e-12, 1e-5)
-    functions = [e.function for e in made.evaluated]
-    assert len(made.findings) == sum(len(f.arguments) for f in functions)
+    functions = [e.function for e in made.evaluated if e.function.outputs]
+    assert len(made.findings) == sum(bool(a.entries) for f in functions for a in f.arguments)
     for finding in made.findings:
         assert finding.methods == ("jacfwd", "jacrev", "hand", "differences")
         assert finding.relative <= double

@@ -2,13 +2,16 @@
 
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
+from jaxslam import run
+from jaxslam.filters import ekf_slam
 from jaxslam.logs import streams
 from jaxslam.motion import pose_increment, unicycle
-from jaxslam.sensors import compass, range_bearing
-from jaxslam.types import Log
+from jaxslam.sensors import Part, compass, range_bearing, suite
+from jaxslam.types import Log, Status
 
 DRIVE, EYE = unicycle(np.eye(2)), range_bearing(np.eye(2))
 ODOMETRY = [[1.0, 0.5, 0.1], [2.0, 1.0, 0.0], [3.0, 0.0, 0.0]]
@@ -99,6 +102,45 @@ def test_a_sensor_of_no_landmark_needs_no_tag():
     log, _, tags, _ = Log.from_records(ODOMETRY, [(2.0, 0.5)], DRIVE, compass(np.eye(1)))
     assert tags == ()
     np.testing.assert_array_equal(log.scan.valid[:, 0], [False, True, False])
+
+
+EYES = suite((EYE, 3), (compass(np.eye(1)), 1))
+NORTH = [(1.5, 0.3), (2.5, 0.2)]
+
+
+def test_sensors_with_rates_of_their_own_are_one_log():
+    """Rows at the times of any; slots by sensor, as the suite has them (Solà 2.4)."""
+    log, time, tags, dropped = Log.from_records(ODOMETRY, (SEEN, NORTH), DRIVE, EYES)
+    np.testing.assert_allclose(time, [1.0, 1.5, 2.0, 2.5, 3.0])
+    np.testing.assert_allclose(log.control[3:], [[1, 0, 0.5], [1, 0, 0.5]])
+    assert (tags, dropped) == ((3, 7), {"measurements outside the odometry": 2})
+    valid = [[0, 0, 0, 0], [1, 1, 0, 1], [0, 0, 0, 0], [0, 0, 0, 1], [1, 0, 0, 0]]
+    np.testing.assert_array_equal(log.scan.valid, valid)
+    np.testing.assert_array_equal(log.scan.tag[1], [1, 0, -1, -1])
+    np.testing.assert_allclose(log.scan.z[1], [[2, 0.25], [3, -0.5], [0, 0], [0.3, 0]])
+    start = np.zeros(3), np.eye(3)
+    trace = run(ekf_slam(DRIVE, EYES, 2), log, *start, jax.random.key(0))
+    assert int(trace.info.tally(Status.FUSED)[3]) == 1
+
+
+def test_tables_that_are_not_those_of_the_suite_are_refused():
+    for seen, message in (
+        (
+            SEEN,
+            r"a table for each of the 2 sensors of the suite, \(range_bearing, compass\), got list",
+        ),
+        (
+            (SEEN, [(1.5, 0.3)] * 2),
+            r"measurements\[1\] of compass, row 1, .*at most 1 measurement at a",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Log.from_records(ODOMETRY, seen, DRIVE, EYES)
+    team = suite(Part(EYE, 1, sees="robots"))
+    with pytest.raises(
+        ValueError, match=r"of a team make the log of each robot by Log.from_streams"
+    ):
+        Log.from_records(ODOMETRY, (SEEN,), DRIVE, team)
 
 
 BAD = {

@@ -22,6 +22,7 @@ from jaxslam.simulation.scenarios import square
 from jaxslam.types import Status, Truth
 
 WORLD = worlds.ring()
+BESIDE = dataclasses.replace(WORLD, sensor=sensors.relative_position(np.eye(2)))
 EKF = worlds.ekf(WORLD)
 LARGE = 100
 """A block as large as those of `lineup`, whose programs it shares; the others are of four runs."""
@@ -439,13 +440,22 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"filters": {}}, "at least one"),
         ({"filters": {"x": 3}}, "expected x to be a Filter"),
         ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
-        ({"filters": {"x": filters.ekf_slam}}, "x is a factory that was not called"),
-        ({"filters": {"x": filters.dead_reckoning}}, "what it returns, x(motion, …)"),
-        ({"filters": catalog.FILTERS}, "ekf is a factory that was not called"),
-        ({"filters": {"fej": catalog.FILTERS["fej"]}}, "what it returns, fej(world, …)"),
+        ({"filters": {"x": filters.ekf_slam}}, "'x' is a factory: call it, x(motion, …)"),
+        ({"filters": {"x": filters.dead_reckoning}}, "call it, x(motion, …)"),
+        ({"filters": catalog.FILTERS}, "'ekf' is a factory: call it, ekf(scenario, …)"),
+        ({"filters": {"fej": catalog.FILTERS["fej"]}}, "call it, fej(world, …)"),
         (
             {"filters": {"x": filters.ekf_slam(motion.unicycle(np.eye(2)), WORLD.sensor, 2)}},
-            "size 3",
+            "takes controls (v [m/s], omega [rad/s], dt [s]), the scenario ring gives (forward [m], ",
+        ),
+        ({"filters": {"x": lambda a, b, key: None}}, "'x' is a factory: call it, x(a, b, key)"),
+        (
+            {"filters": {"x": worlds.ekf(BESIDE)}},
+            "filter x takes measurements (ahead [m], left [m]), the scenario ring gives (range [m], ",
+        ),
+        (
+            {"filters": {"x": lambda truth: worlds.ekf(BESIDE)}},
+            "filter ekf_slam takes measurements (ahead [m]",
         ),
     ],
 )

@@ -127,7 +127,7 @@ def test_a_derivative_that_is_not_finite_is_no_difference_of_0():
         (lambda point: jnp.nan * point, "no value is finite"),
     ):
         report = verify_jacobians(function, lambda point: jnp.full((2, 2), jnp.nan), name="f")
-        assert f"FAIL  f by point: {said}; " in str(report)
+        assert f"FAIL  f by point (hand-derived): {said}; " in str(report)
 
 
 # --- angles that are not named --------------------------------------------------------------------

@@ -168,10 +168,34 @@ def test_a_factory_in_place_of_a_model_is_named():
         verify_jacobians(sensors.range_bearing)
 
 
-def test_the_first_line_of_a_report_counts_its_notes():
-    check = Check("is pure", True)
-    head = str(Report("f", "function", checks=(check,), notes=("an angle",))).splitlines()[0]
-    assert head == "function f: verified, with 1 note"
+def test_the_report_says_which_jacobians_have_no_claim():
+    """A wrong row of a claim that is not there is never seen: "verified" alone would hide that."""
+
+    def head(model):
+        return str(verify_jacobians(model, count=2)).splitlines()[0]
+
+    by_pose = dataclasses.replace(
+        UNMOUNTED, observe_jacobians=lambda pose, point: UNMOUNTED.observe_jacobians(pose, point)[0]
+    )
+    verified = "sensor range_bearing: verified"
+    assert head(by_pose) == f"{verified}; no hand-derived claim of observe by landmark"
+    assert head(UNMOUNTED) == verified
+    none = verify_jacobians(lambda v: 2 * v, arguments={"v": 1}, name="f", count=2)
+    assert "f by v (no hand-derived claim)" in str(none)
+    noted = dataclasses.replace(none, notes=("an angle",))
+    assert str(noted).startswith("function f: verified, with 1 note; no hand-derived claim\n")
+
+
+def test_nothing_compared_is_not_verified():
+    assert not verify_jacobians(
+        lambda v: v[:0], lambda v: jnp.zeros((0, 1)), arguments={"v": 1}
+    ).passed
+    assert not Report("f", "function", checks=(Check("is pure", True),)).passed
+
+
+def test_a_scalar_observation_is_one_failure():
+    scalar = dataclasses.replace(CAMERA, observe=lambda pose, point: CAMERA.observe(pose, point)[0])
+    assert failed(verify_jacobians(scalar, count=2)) == ["observe returns its shape"]
 
 
 def mast_camera(invert_sign=1.0):
@@ -202,7 +226,7 @@ def test_the_states_of_a_sensor_are_those_of_its_inverse_too():
     states = (rng.normal(size=(10, 3)), 5 + rng.normal(size=(10, 2)))
     report = verify_jacobians(mast_camera(), states=states)
     assert report.passed, report
-    assert [f.samples for f in report.findings] == [10] * 5
+    assert [f.samples for f in report.findings] == [10] * 4
     assert np.isfinite(report.linearity)
     drawn = samples.sensor_samples(mast_camera(), 24, 0)
     assert [c.name for c in properties.sensor_checks(mast_camera(), *drawn) if not c.passed] == []

@@ -72,10 +72,17 @@ def test_a_length_that_the_claim_tells_need_not_be_given(verify):
 def test_a_right_claim_passes(verify):
     status, out, err, content = verify(GOOD)
     assert status == 0, out + err
-    assert "function f: verified" in out
+    assert "function f: verified\n" in out
     assert content["passed"] is True
     assert [j["argument"] for j in content["reports"][0]["jacobians"]] == ["pose", "u"]
     assert content["command"].startswith("jaxslam verify ")
+
+
+def test_a_chart_beside_it_is_said_to_be_left_out(verify):
+    text = "import jax.numpy as jnp\nfrom jaxslam import charts\n\nmine = charts.euclidean()\n"
+    text += "\n\ndef f(v):\n    return v\n\n\ndef f_jacobian(v):\n    return jnp.eye(1)\n\n\n"
+    text += 'f_arguments = {"v": ("v [m]",)}\n'
+    verify.says(text, 0, "verified, with 1 note", "not verified: mine (no chart")
 
 
 def test_a_wrong_entry_is_named_and_fails(verify):

@@ -24,7 +24,7 @@ from jaxslam.cli.laser.command import run_laser
 from jaxslam.cli.laser.options import READERS as LASER_LOGS
 from jaxslam.cli.laser.options import refuse_laser_options
 from jaxslam.cli.run.film import film_steps, films, shown_state
-from jaxslam.cli.run.filters import chosen_filters, with_options
+from jaxslam.cli.run.filters import chosen_filters, on_true_poses, with_options
 from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.datasets import READERS, Dataset, Reader
 from jaxslam.datasets.evaluation import Evaluation, evaluate
@@ -118,12 +118,13 @@ def _run(
     pose, pose_cov = (np.asarray(part, np.float64) for part in (data.pose, data.pose_cov))
     state = jax.eval_shape(filter.init, pose, pose_cov)
     has_covariance = isinstance(state, Joint) and name != "square_root"
+    log, unplaced = on_true_poses(data) if name == "mapping" else (data.log, 0)
     with Progress(f"{data.name}, {name}", "steps") as progress:
         began = time.perf_counter()
         # The reader has checked the values; `asarray` converts the log to the chosen dtype.
         result = run_in_pieces(
             filter,
-            jax.tree.map(jnp.asarray, data.log),
+            jax.tree.map(jnp.asarray, log),
             pose,
             pose_cov,
             every=options.check_every if has_covariance else 0,
@@ -146,6 +147,7 @@ def _run(
         "status": {
             s.name.lower(): int((result.status == s).sum()) for s in Status if s != Status.EMPTY
         },
+        **({"measurements without a true pose, left out": unplaced} if unplaced else {}),
         **(innovations if dof else {}),
         "P positive definite": _definiteness(result),
         "final pose": [float(value) for value in last.pose],

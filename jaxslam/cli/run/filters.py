@@ -3,15 +3,16 @@
 import argparse
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS
+from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS, on_given_poses
 from jaxslam.cli.common import pick
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.table.association import association_options
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.types import Truth
+from jaxslam.types import Log, Truth
 
 NAMES = tuple(name for name in ALL if name not in ("ideal", "batch_map"))
 """Those that run on a data set: no truth is needed, and no whole log at once."""
@@ -61,7 +62,20 @@ def chosen_filters(data: Dataset, asked: str) -> dict[str, Filter]:
             "`jaxslam.run` in Python"
         )
     known = {name: ALL[name] for name in ALL if name in NAMES or name in names}
+    known["mapping"] = on_given_poses
     return {name: _filter(name, pick("filters", name, known)(world), data) for name in names}
+
+
+def on_true_poses(data: Dataset) -> tuple[Log, int]:
+    """The log with true poses as controls, for mapping; and how many measurements it leaves out,
+    made where the pose is not known. The control there is the last known pose."""
+    assert data.true_path is not None
+    known = np.ones(data.steps, bool) if data.true_at is None else data.true_at
+    scan = data.log.scan
+    kept = np.asarray(scan.valid) & known[:, None]
+    latest = np.maximum.accumulate(np.where(known, np.arange(data.steps), int(np.argmax(known))))
+    lost = int(np.sum(scan.valid)) - int(kept.sum())
+    return Log(jnp.asarray(data.true_path[latest]), scan._replace(valid=kept)), lost
 
 
 def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:
@@ -69,6 +83,8 @@ def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:
         name in CANONICAL or name == "localization"
     ):
         raise ValueError(f"--filters: {name} needs the tag of every measurement")
+    if name == "mapping" and data.true_path is None:
+        raise ValueError("--filters: mapping needs the true path of the robot")
     if isinstance(candidate, Filter):
         return candidate
     if name in SMOOTHERS:

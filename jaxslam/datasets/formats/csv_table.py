@@ -15,7 +15,8 @@ from jaxslam.logs.tables import TAG, UNITS, Columns, split_unit, unit_divisor
 class CsvTable:
     """The cells of a CSV file (UTF-8, separated by commas, any line ends) below its header.
 
-    It is NAME or NAME.gz. Every column but `tag` has its unit in the header, as in `v [m/s]`.
+    It is NAME or NAME.gz. Every column but `tag` has its unit in the header, as in `v [m/s]`. Lines
+    above the header that begin with # are comments.
     Raises ValueError where the file cannot be read, has no line below its header, or a line with
     another number of cells.
     """
@@ -31,8 +32,12 @@ class CsvTable:
             raise self._error(
                 text.count("\n", 0, text.index("\0")) + 1, "expected text, got a zero byte"
             )
+        above = 0
+        while text.lstrip(" \t\r\n").startswith("#"):  # with its quotes, which csv would pair
+            _, _, text = text.partition("\n")
+            above += 1
         reader = csv.reader(io.StringIO(text, newline=""))
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        lines = [(above + reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
         lines = [(number, cells) for number, cells in lines if any(cells)]
         if not lines:
             raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
@@ -41,6 +46,10 @@ class CsvTable:
         self.cells = [cells for _, cells in lines[1:]]
         if len(self.header) == 1 and ";" in self.header[0]:
             raise self._error(self.head_line, "expected cells separated by commas, got ';'")
+        if all(math.isfinite(_number(cell)) for cell in self.header):
+            raise self._error(
+                self.head_line, f"expected a header, as 't [s],v [m/s]', got {self.header[0]!r}"
+            )
         if not self.cells:
             raise self._error(self.head_line, "expected lines below the header, got none")
         self.names = [split_unit(name)[0] for name in self.header]
@@ -52,7 +61,10 @@ class CsvTable:
                 wanted, hint = len(self.header), ""
                 if len(cells) > wanted:
                     hint = "; a number has a point, no comma: 0.5"
-                raise self._error(number, f"expected {wanted} cells, got {len(cells)}{hint}")
+                raise self._error(
+                    number,
+                    f"expected {wanted} cells, as in line {self.head_line}, got {len(cells)}{hint}",
+                )
 
     def table(self, wanted: Sequence[str], why: str) -> Columns[int]:
         """The wanted columns ("v [m/s]"), in their units.

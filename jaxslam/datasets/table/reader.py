@@ -17,6 +17,9 @@ from jaxslam.types import Log
 
 ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 
+_GAP = 10
+"""An interval of odometry above so many medians is noted."""
+
 
 def table(folder: str | Path) -> Dataset:
     """The data set in the CSV files of a folder.
@@ -83,9 +86,15 @@ def table(folder: str | Path) -> Dataset:
         for file, wanted in ((odometry_file, moved), (seen_file, measured))
         for column in file.unused(wanted)
     ]
+    if len(clock) > 2 and (gaps := np.diff(clock)).max() > _GAP * np.median(gaps):
+        k = int(np.argmax(gaps))
+        notes.append(
+            f"{odometry.at(k + 1, TIME)}: {gaps[k]:.6g} s since the line before, the median is "
+            f"{np.median(gaps):.6g} s; the odometry is taken to hold for so long"
+        )
     survey = _survey(folder / "landmarks.csv")
     rows, tags, dropped = tables.align_tables(
-        odometry, seen, motion.controls, sensor.measurements, tuple(survey or ())
+        odometry, [tables.Seen(seen, sensor.measurements)], motion.controls, tuple(survey or ())
     )
     known = tags if survey is None else survey
     for row, tag in enumerate(seen.tags or ()):

@@ -143,8 +143,8 @@ def delayed_slam(
 
     return Filter(
         name="delayed_slam",
-        control_size=len(motion.controls),
-        measurement_size=1,
+        controls=motion.controls,
+        measurements=sensor.measurements,
         init=init,
         predict=predict,
         update=update,

@@ -138,8 +138,8 @@ def compressed_ekf_slam(
 
     return Filter(
         name="compressed_ekf_slam",
-        control_size=whole.control_size,
-        measurement_size=whole.measurement_size,
+        controls=whole.controls,
+        measurements=whole.measurements,
         init=init,
         predict=predict,
         update=update,

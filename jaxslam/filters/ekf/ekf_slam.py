@@ -133,8 +133,8 @@ def ekf_slam(
     steps = LinearizedSteps(predict, update_map)
     return Filter(
         name="ekf_slam",
-        control_size=len(motion.controls),
-        measurement_size=len(sensor.measurements),
+        controls=motion.controls,
+        measurements=sensor.measurements,
         init=init,
         predict=steps.predict,
         update=steps.update,

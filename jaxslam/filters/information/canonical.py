@@ -174,8 +174,8 @@ def information_filter(
     """The `Filter` of these functions, with its error in map coordinates."""
     return Filter(
         name=settings.name,
-        control_size=len(settings.motion.controls),
-        measurement_size=len(settings.sensor.measurements),
+        controls=settings.motion.controls,
+        measurements=settings.sensor.measurements,
         init=init,
         predict=predict,
         update=update,

@@ -147,8 +147,8 @@ def localization(
 
     return Filter(
         name="localization",
-        control_size=len(motion.controls),
-        measurement_size=len(sensor.measurements),
+        controls=motion.controls,
+        measurements=sensor.measurements,
         init=init,
         predict=predict,
         update=update_pose,

@@ -80,8 +80,8 @@ def mapping(
 
     return Filter(
         name=name,
-        control_size=3,
-        measurement_size=len(sensor.measurements),
+        controls=("x [m]", "y [m]", "theta [rad]"),
+        measurements=sensor.measurements,
         init=init,
         predict=predict,
         update=update,

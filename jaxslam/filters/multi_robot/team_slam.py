@@ -35,7 +35,7 @@ from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Chart, Filter
 from jaxslam.sensors.suite import Part, split_scan
 from jaxslam.slots import Joint
-from jaxslam.team import Robot, check_team, poses, sizes
+from jaxslam.team import Robot, check_team, motion_of, poses, sizes
 from jaxslam.types import Estimate, Info, Scan, Status
 from jaxslam.validation.numbers import check_count
 
@@ -158,8 +158,8 @@ def team_slam(
 
     return Filter(
         name="team_slam",
-        control_size=control_ends[-1],
-        measurement_size=size_z,
+        controls=motion_of(robots, 0).controls,
+        measurements=tuple(f"entry {i} of its sensor" for i in range(size_z)),
         init=init,
         predict=predict,
         update=update_map,

@@ -156,8 +156,8 @@ def fastslam(
 
     return Filter(
         name=name,
-        control_size=len(motion.controls),
-        measurement_size=len(sensor.measurements),
+        controls=motion.controls,
+        measurements=sensor.measurements,
         init=init,
         predict=predict,
         update=update,

@@ -156,7 +156,7 @@ def particle_localization(
         return jax.vmap(sensor.position)(jnp.asarray(points, pose.dtype))
 
     places = sensor.places if isinstance(sensor, Suite) else ()
-    return pose_filter(settings, update, len(sensor.measurements), known_points, names, places)
+    return pose_filter(settings, update, sensor.measurements, known_points, names, places)
 
 
 def info_of_scan(

@@ -33,7 +33,7 @@ Update = Callable[[PoseParticles, Scan, Array], tuple[PoseParticles, Info]]
 def pose_filter(
     settings: MonteCarloSettings,
     update: Update,
-    measurement_size: int,
+    measurements: tuple[str, ...],
     points: Callable[[Float[Array, "3"]], Float[Array, "N 2"]],
     tags: Int[np.ndarray, "N"],
     places: tuple[int, ...] = (),
@@ -65,8 +65,8 @@ def pose_filter(
 
     return Filter(
         name=settings.name,
-        control_size=len(settings.motion.controls),
-        measurement_size=measurement_size,
+        controls=settings.motion.controls,
+        measurements=measurements,
         init=init,
         predict=predict,
         update=update,

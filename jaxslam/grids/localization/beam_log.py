@@ -9,6 +9,9 @@ from numpy.typing import ArrayLike
 from jaxslam.types import Beams, Log, Scan
 from jaxslam.validation.numbers import is_concrete
 
+BEAM = ("range [m]", "angle [rad]")
+"""The measurements of such a log."""
+
 NOTHING = 1e6
 """Range [m] in a log of a beam that met nothing and is infinite in the scan: a log is finite."""
 

@@ -26,7 +26,7 @@ from jaxslam.filters.particles.states.pose_state import (
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
 from jaxslam.grids.grid import Grid, check_grid, to_cells
-from jaxslam.grids.localization.beam_log import beams_of
+from jaxslam.grids.localization.beam_log import BEAM, beams_of
 from jaxslam.grids.localization.free_space import free_region
 from jaxslam.math.arrays import in_dtype
 from jaxslam.math.xla import no_inline
@@ -151,7 +151,7 @@ def localize(
     def no_points(pose: Float[Array, "3"]) -> Float[Array, "0 2"]:
         return jnp.zeros((0, 2), pose.dtype)
 
-    return pose_filter(settings, update, 2, no_points, np.zeros(0, np.int32))
+    return pose_filter(settings, update, BEAM, no_points, np.zeros(0, np.int32))
 
 
 def _blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:

@@ -21,7 +21,7 @@ from jaxslam.filters.particles.states.pose_state import draw_gaussian_poses
 from jaxslam.filters.reporting import with_extra
 from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
 from jaxslam.grids.grid import Grid, check_frame, to_cells
-from jaxslam.grids.localization.beam_log import beams_of
+from jaxslam.grids.localization.beam_log import BEAM, beams_of
 from jaxslam.grids.localization.localize import info_of_beams
 from jaxslam.grids.mapping import Counts, add_scan, check_hit_and_miss, check_shape, occupancy
 from jaxslam.grids.slam.particles import GridParticles, MapInfo, copied_rows, in_place
@@ -275,8 +275,8 @@ def grid_slam(
 
     return Filter(
         name=name,
-        control_size=len(motion.controls),
-        measurement_size=2,
+        controls=motion.controls,
+        measurements=BEAM,
         init=init,
         predict=predict,
         update=update,

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
-from jaxslam.protocols import Motion, Sensor
-from jaxslam.validation.models import unfit_signature
+from jaxslam.protocols import Motion, Sensor, unfit_signature
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.lengths import LONGEST, MOST_UNKNOWN, Deduced, deduce_lengths
 

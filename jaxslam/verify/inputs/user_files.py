@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.graphs import Factor
 from jaxslam.grids.beam_models import BeamModel
-from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
@@ -42,6 +42,8 @@ class Target:
     arguments: Mapping[str, Sequence[str] | int] | None = None
     outputs: Sequence[str] | None = None
     states: Sequence[ArrayLike] | None = None
+    notes: tuple[str, ...] = ()
+    """for the report"""
 
 
 class PrintRecorder(io.TextIOBase):
@@ -87,6 +89,10 @@ def load(target: str) -> list[Target]:
     module = import_file(path)
     keys = [key for key in vars(module) if name in ("", key)]
     found = [t for key in keys if (t := _target(module, key)) is not None]
+    skipped = [key for key in keys if isinstance(vars(module)[key], Chart | Linearizer)]
+    if found and skipped:
+        note = f"not verified: {', '.join(skipped)} (no chart and no linearizer is)"
+        found[0] = dataclasses.replace(found[0], notes=(note,))
     if name:
         if not found and keys:
             raise UnusableFile(
@@ -141,7 +147,12 @@ def _verified(target: Target, verify_one: Callable[..., Report]) -> Report:
         )
     where = ", ".join(printed.lines)
     quiet = Check("prints nothing", not where, f"{where} prints" if where else "")
-    return dataclasses.replace(report, model=target.name, checks=(*report.checks, quiet))
+    return dataclasses.replace(
+        report,
+        model=target.name,
+        checks=(*report.checks, quiet),
+        notes=(*target.notes, *report.notes),
+    )
 
 
 def split_target(target: str) -> tuple[Path, str]:
@@ -209,8 +220,8 @@ def _target(module: ModuleType, name: str) -> Target | None:
     if len(claims) > 1:
         raise UnusableFile(f"expected {name}_jacobian or {name}_jacobians, got both")
     if claims:
-        about = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
-        return Target(name, value, claims[0], *about)
+        arguments, outputs, states = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
+        return Target(name, value, claims[0], arguments, outputs, states)
     if getattr(value, "__module__", "") == module.__name__ and makes_a_model(value):
         try:
             return Target(name, build(value))

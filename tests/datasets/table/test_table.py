@@ -87,14 +87,25 @@ def test_defaults_are_listed(tmp_path):
 
 
 def test_windows_lines_degrees_and_other_columns(tmp_path):
-    """The same numbers: a byte order mark, CRLF, [deg], blanks, columns moved and one too many."""
+    """The same numbers: a byte order mark, CRLF, [deg], blanks, columns moved and one too many,
+    quotes, and comments above the header, one with a quote that is not closed."""
     plain = datasets.table(write(tmp_path, OWN))
     text = "tag, bearing [deg],note, t [ms] ,range [m]\r\n7,14.323944878270581,a,1100,2\r\n\r\n"
     text += "3,-28.64788975654116,b,1100,3\r\n3,28.64788975654116,c,1400,4"
     (tmp_path / "measurements.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    odometry = OWN["odometry.csv"].replace("\n1.0,0.5,", '\n"1.0","0.5",')
+    (tmp_path / "odometry.csv").write_text('# my robot\n\n# on "Monday,"half\n' + odometry)
     data = datasets.table(tmp_path)
     chex.assert_trees_all_close(data.log, plain.log, rtol=1e-14, atol=1e-15)
     assert "column 'note' of measurements.csv is not used" in data.assumed
+
+
+def test_a_gap_in_the_odometry_is_noted(tmp_path):
+    """Over which the last velocity holds, or poses are interpolated."""
+    late = OWN["odometry.csv"] + "1.6,0,0\n61.6,0,0\n"
+    data = datasets.table(write(tmp_path, OWN, "odometry.csv", late))
+    (note,) = (line for line in data.assumed if "since the line before" in line)
+    assert note.startswith(f"{tmp_path / 'odometry.csv'}:6: column 1 (t [s]): 60 s since")
 
 
 def test_packed_tables_are_read_as_they_are(tmp_path):
@@ -189,9 +200,11 @@ BAD = [
     (ODOMETRY, "1.2,1.0", "1.2,", ":3: column 2 (v [m/s]): expected a finite number, got ''"),
     (ODOMETRY, "1.2,1.0", "1.2,1_0", ":3: column 2 (v [m/s]): expected a finite number, got '1_0'"),
     (ODOMETRY, "1.2,1.0", '1.2,"1,0"', ":3: column 2 (v [m/s]): expected a finite number, got '1,0' (w"),
-    (ODOMETRY, "1.2,1.0", "1,2,1,0", ":3: expected 3 cells, got 5; a number has a point, no comma"),
-    (ODOMETRY, "1.2,1.0,0", "1.2,1.0", ":3: expected 3 cells, got 2"),
+    (ODOMETRY, "1.2,1.0", "1,2,1,0", ":3: expected 3 cells, as in line 1, got 5; a number has a point, no comma"),
+    (ODOMETRY, "1.2,1.0,0", "1.2,1.0", ":3: expected 3 cells, as in line 1, got 2"),
     (ODOMETRY, None, "", ":1: expected a header"),
+    (ODOMETRY, "t [s]", "# by robot\n1,2,3\n# t [s]", ":2: expected a header, as 't [s],v [m/s]', got '1'"),
+    (ODOMETRY, "t [s]", "sep=,\nt [s]", ":2: expected 2 cells, as in line 1, got 3"),
     (ODOMETRY, None, "t [s],v [m/s],omega [rad/s]\n", ":1: expected lines below the header, got none"),
     (ODOMETRY, None, "t [s];v [m/s];omega [rad/s]\n1;2;3\n", ":1: expected cells separated by commas, got ';'"),
     (SEEN, "1.4,3", "0.4,3", ":4: column 1 (t [s]): expected a time of at least 1.1"),

@@ -11,7 +11,8 @@ import pytest
 import worlds
 from PIL import Image
 
-from jaxslam import catalog, plot
+import jaxslam
+from jaxslam import catalog, filters, plot
 from jaxslam.filters.delayed.state import TableLayout, empty_state
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.sparse.sparse_state import empty_map
@@ -377,6 +378,19 @@ def test_a_filter_is_filmed_in_a_world_by_itself():
     film = plot.animate_world(world, catalog.BASELINES["dead_reckoning"](world), jax.random.key(0))
     assert len(set(film.frames)) == 4 and film.title == "ring"
     assert film.said[0] == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
+
+
+def test_mapping_from_a_known_path_is_filmed():
+    """The state is one particle, without a cloud to show; poses are exact, without an ellipse."""
+    world = worlds.ring(4)
+    truth, log = jaxslam.simulate(world, jax.random.key(0))
+    log, start = log._replace(control=truth.pose), (np.zeros(3), np.zeros((3, 3)))
+    mapping = filters.mapping(world.sensor, 6)
+    trace = jaxslam.run(mapping, log, *start, jax.random.key(1), probe=plot.probe)
+    film = plot.animate(trace, log, truth)
+    assert film.said[0] == "step 1 of 4 · 6 measurements: 0 fused, 6 new, 0 dropped"
+    assert film.said[3] == "step 4 of 4 · 6 measurements: 6 fused, 0 new, 0 dropped"
+    assert len(set(film.frames)) == 4
 
 
 def test_a_map_scene_has_as_many_paths_as_maps():

@@ -43,9 +43,9 @@ def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
 
         trace = jaxslam.run(filter, log, pose, pose_cov, key, probe=jaxslam.plot.probe)
 
-    None of other filters, whose films need no probe.
+    None of other filters, whose films need no probe; `mapping`, of one particle, is among them.
     """
-    if isinstance(state, SlamParticles | PoseParticles):
+    if isinstance(state, SlamParticles | PoseParticles) and state.log_weight.ndim:
         return Cloud(state.pose, jnp.exp(state.log_weight))
     if isinstance(state, SparseState):
         every = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
