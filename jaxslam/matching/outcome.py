@@ -142,6 +142,9 @@ def determined(
     `least` of the largest are kept (Zhang, Kaess & Singh 2016, "On degeneracy of optimization-based
     state estimation problems", ICRA). A constant for derivatives.
     """
+    eye = jnp.eye(3, dtype=information.dtype)
+    if least <= 0:
+        return eye
     scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
     a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])
     low, high = extreme_eigenvalues(a)
@@ -150,11 +153,10 @@ def determined(
     def below(value: Array) -> Array:
         return jnp.clip(value / jnp.where(some, high, 1.0), 0.0, 1.0) < least
 
-    eye = jnp.eye(3, dtype=a.dtype)
     weak, strong = eigenvector(a, low), eigenvector(a, high)
     across = eye - weak[:, None] * weak[None, :]
     along = jnp.where(some, strong[:, None] * strong[None, :], 0.0)
-    two = below(jnp.trace(a) - low - high) | ~some & (least > 0)
+    two = below(jnp.trace(a) - low - high) | ~some
     kept = jnp.where(two, along, jnp.where(below(low), across, eye))
     return scale[:, None] * kept / scale[None, :]
 
