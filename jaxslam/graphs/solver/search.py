@@ -14,6 +14,7 @@ from jaxslam.graphs.solver.linearized import (
     data_of,
     linearize,
     retract,
+    row_weights,
     variables_of,
 )
 from jaxslam.graphs.solver.model import Model
@@ -60,6 +61,9 @@ class Solution(NamedTuple):
     gradient: Float[Array, ""]
     """length of ½ ∂χ²/∂(increments) at the last iterate"""
     gradient_start: Float[Array, ""]
+    weights: dict[str, Float[Array, "E"]]
+    """ρ'(s) of the rows of each table at the last iterate, by which a kernel multiplies their
+    information: 1 without a kernel, 0 of rows that are not valid"""
 
 
 class Search(NamedTuple):
@@ -251,4 +255,5 @@ def minimize(
         chi2_start=first_chi2,
         gradient=jnp.sqrt(dot(end.system.gradient, end.system.gradient)),
         gradient_start=first_gradient,
+        weights=row_weights(model, plan.who, end.variables, data),
     )
