@@ -14,6 +14,9 @@ from jaxslam.types import JaxOrNumPy
 LOOPS = "relative_pose/loops"
 """Loop edges in a table of their own, so that they can have a robust kernel."""
 
+TRUSTED = ("relative_pose", "prior")
+"""Tables without a robust kernel where loops are doubted: odometry and priors."""
+
 
 class Table(NamedTuple):
     """Measurements of one kind, E rows: K variables, Z numbers measured and R residuals each."""

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam import graphs
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM, relative_covs
 from jaxslam.laser_slam.records import Solved

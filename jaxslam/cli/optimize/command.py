@@ -19,6 +19,7 @@ from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.graph import TRUSTED
 from jaxslam.graphs.solver.search import METHODS
 from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
@@ -34,10 +35,7 @@ ERRORS = {
 
 COST = "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses"
 
-TRUSTED = ("relative_pose", "prior")
-"""Tables without a robust kernel: relative poses of successive poses, and priors."""
-
-SEVERAL = ("given", "odometry", "chordal")
+SEVERAL = ("given", "chordal", "robust")
 """Starts that are tried with a robust kernel: which one is right differs from graph to graph."""
 
 NOT_CONVERGED = 1

@@ -22,6 +22,8 @@ ROUNDS = 100
 """at most"""
 GROWTH = 1.4
 """of μ in each round"""
+SHARP = 1e6
+"""a μ with which nearly all weights are zeros or ones"""
 LOOSE = 1e-6
 """tolerance of the rounds before the last"""
 
@@ -50,8 +52,9 @@ def graduated(
         1 if s <= μ c²/(μ + 1), 0 if s >= (μ + 1) c²/μ, else c √(μ(μ + 1)/s) - μ
 
     and μ grows by 1.4 a round, at least to c²/(2 max s - c²), until all weights are zeros or ones.
-    In the paper the first round has all weights one. Here it has those of the start's residuals:
-    false loops can bend the plain optimum by more than later rounds mend.
+    In the paper the first round has all weights one. Here it has those of the start's residuals,
+    zeros and ones where s < c² for most rows: false loops can bend the plain optimum by more than
+    later rounds mend, and a good start must not be given up for it.
     """
     truncated = {name: k.limit for name, k in model.kernels if k.limit is not None}
     plain = Model(model.factors, tuple((name, k) for name, k in model.kernels if k.limit is None))
@@ -83,7 +86,7 @@ def graduated(
     def convex(ratio: dict[str, Array]) -> Float[Array, "B"]:
         """The μ up to which the surrogate is convex over all rows, from s/c²."""
         worst = jnp.stack([r.max(axis=0, initial=0.0) for r in ratio.values()]).max(axis=0)
-        return 1.0 / jnp.maximum(2 * worst - 1.0, 1e-6)
+        return 1.0 / jnp.maximum(2 * worst - 1.0, 1.0 / SHARP)
 
     def again(state: Round) -> Array:
         return ~state.settled.all() & (state.rounds < ROUNDS)
@@ -115,7 +118,9 @@ def graduated(
     every = row_weights(plain, plan.who, variables_of(graph), data)
     start = Solution(graph, zero, none, none, none - 1, zero, zero, zero, every)
     ratio = ratios(start)
-    control = convex(ratio)
+    rows = [jnp.where(data.valid[name], r, jnp.nan) for name, r in ratio.items()]
+    good = jnp.nanmedian(jnp.concatenate(rows), axis=0) <= 1.0
+    control = jnp.where(good, SHARP, convex(ratio))
     weights = {name: _weight(r, control[None]) for name, r in ratio.items()}
     state = Round(start, weights, control, jnp.zeros(batch, bool), jnp.zeros((), jnp.int32))
     end = jax.lax.while_loop(again, work, state)

@@ -33,7 +33,8 @@ class Ending(IntEnum):
     CONVERGED = 0
     """The next step lowers χ² by less than the tolerance, and the information is regular."""
     STALLED = 1
-    """No step lowers χ²: rounding, or a residual whose derivatives are wrong."""
+    """No step lowers χ²: rounding, or a residual whose derivatives are wrong. Another start may
+    end in a minimum."""
     DIVERGED = 2
     """χ² is not finite, or Gauss-Newton ended above its start."""
     SINGULAR = 3
@@ -41,7 +42,7 @@ class Ending(IntEnum):
     rounding of the numbers: in float32 a chain of some hundred poses from the gauge can be such.
     Where the method damps its steps it went on, and χ² is a minimum."""
     EXHAUSTED = 4
-    """All iterations were made."""
+    """All iterations were made. Another start or method may end, in fewer steps and lower."""
 
 
 class Solution(NamedTuple):
