@@ -26,9 +26,9 @@ from jaxslam.graphs.graph import LOOPS
 from jaxslam.math import stats
 
 FILES = {
-    "intel": ("intel.g2o", 3),
+    "intel": ("intel.g2o", 2),
     "M3500": ("input_M3500_g2o.g2o", 1),
-    "MIT": ("MIT.g2o", 6),
+    "MIT": ("MIT.g2o", 4),
     "FRH": ("FRH_P_toro.graph", 1),
 }
 """The file of each graph, and the number of draws: large graphs take long."""

@@ -48,6 +48,19 @@ def test_a_redescending_kernel_leaves_false_loop_closures_out(name):
             graphs.marginals(found.graph)
 
 
+def test_the_robust_start_is_good_and_is_kept():
+    """Three loops of seven are false; NumPy has the optimum without them."""
+    graph, clean = falsified(ring(spread=0.2), ((2, 12), (6, 15), (1, 9)))
+    poses = dense(clean)[0]
+    start = graphs.starts.robust(graph)
+    off = np.asarray(graphs.starts.odometry(graph).poses)[:, :2] - poses[:, :2]
+    left = start.poses[:, :2] - poses[:, :2]
+    assert np.abs(left).max() < 0.2 * np.abs(off).max() and start.tables is graph.tables
+    found = graphs.optimize(start, kernel={"relative_pose/loops": graphs.truncated()})
+    np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+    assert found.iterations < 10  # weights of zero and one at once, without rounds
+
+
 @pytest.mark.parametrize(("name", "share"), [("huber", 0.5), ("cauchy", 0.1)])
 def test_other_kernels_reduce_the_pull_of_false_loop_closures(name, share):
     """The optimum lies nearer to that without false ones than least squares does, in NumPy."""
