@@ -14,6 +14,9 @@ from jaxslam.types import JaxOrNumPy
 LOOPS = "relative_pose/loops"
 """Loop edges in a table of their own, so that they can have a robust kernel."""
 
+TRUSTED = ("relative_pose", "prior")
+"""Tables without a robust kernel where loops are doubted: odometry and priors."""
+
 
 class Table(NamedTuple):
     """Measurements of one kind, E rows: K variables, Z numbers measured and R residuals each."""
@@ -65,8 +68,11 @@ def with_loops_apart(graph: Graph) -> Graph:
     They are the rows of `relative_pose` between poses that do not follow each other in the order of
     the ids; those of the odometry stay. The order of poses and rows has no influence.
     `graphs.optimize(graph, kernel={"relative_pose/loops": graphs.dcs()})`
-    then doubts the loops alone. Concrete graphs only; a table without rows is left out.
+    then doubts the loops alone. Concrete graphs only; a table without rows is left out. A graph
+    that has a table of loops is returned as it is.
     """
+    if LOOPS in graph.tables:
+        return graph
     tables: dict[str, Table] = {}
     for key, table in graph.tables.items():
         if key != "relative_pose":

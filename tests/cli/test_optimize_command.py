@@ -161,7 +161,8 @@ def test_too_few_steps_are_no_success(file, tmp_path, capsys):
     """By the program of the test above: numbers are its arguments."""
     run = ["optimize", str(file), "--iterations", "1", "--out", str(tmp_path)]
     assert cli.main(run) == 1
-    assert "exhausted" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "exhausted" in told and "--start odometry, spanning_tree, chordal, robust" in told
     assert json.loads((tmp_path / "summary.json").read_text())["status"] == "exhausted"
 
 
@@ -178,7 +179,11 @@ def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monke
     assert asked["tables"] == ["relative_pose", "relative_pose/loops", "relative_position"]
     assert list(asked["kernel"]) == ["relative_pose/loops", "relative_position"]
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["robust cost"] <= summary["chi2"]
+    costs = [summary[f"robust cost from {name}"] for name in ("given", "chordal", "robust")]
+    assert summary["robust cost"] == min(costs)
+    np.testing.assert_allclose(min(costs), summary["chi2 without the kernel"])  # no row is doubted
+    loops, points = "relative_pose/loops", "relative_position"
+    assert summary["kept"] == {loops: 3, points: 16} and sum(summary["left out"].values()) == 0
     assert summary["certificate"].startswith("none: of a robust cost")
     assert len(graphs.read(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
     apart = graphs.with_loops_apart(small())
@@ -250,7 +255,7 @@ def test_each_kind_of_bad_graph_is_named(tmp_path, refused, old, new, message):
     [
         (
             ["--start", "moon"],
-            "unknown start 'moon'; known: given, odometry, spanning_tree, chordal",
+            "unknown start 'moon'; known: given, odometry, spanning_tree, chordal, robust",
         ),
         (["--kernel", "moon"], "unknown kernel 'moon'; known: huber"),
         (["--error", "moon"], "unknown error 'moon'; known: pose, log"),
