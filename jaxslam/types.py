@@ -258,7 +258,7 @@ class Beams(NamedTuple):
     | range [m] | meaning |
     |---|---|
     | above 0, below the maximum range | an obstacle at this distance |
-    | the maximum range (less 1e-6 of it) or more, ∞ | no obstacle up to the maximum range |
+    | the maximum range (less a millionth) or more, ∞ | no obstacle up to the maximum range |
     | 0, below 0, NaN, -∞; any, where `valid` is false or the angle is not finite | nothing |
     """
 

@@ -173,7 +173,7 @@ def test_a_byte_order_mark_is_no_key(tmp_path):
 @pytest.mark.parametrize(
     ("image", "reason"),
     [
-        (b"\x89PNG\r\n\x1a\n123", "expected a PNG image, but "),
+        (b"\x89PNG\r\n\x1a\n123", "expected a PNG image: "),
         (b"P6 3 2 255\n", "expected an image in PGM (P5 or P2), PNG or BMP"),
         (b"", "expected an image in PGM"),
         (b"P5 3 2 255\n123", "the image ends after 3 of 6 bytes"),

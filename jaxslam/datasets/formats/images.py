@@ -53,7 +53,7 @@ def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
     try:
         image = np.asarray(matplotlib.image.imread(io.BytesIO(data), format=form))
     except (OSError, SyntaxError, ValueError) as problem:
-        raise ValueError(f"{path}: expected a {form.upper()} image, but {problem}") from problem
+        raise ValueError(f"{path}: expected a {form.upper()} image: {problem}") from problem
     if np.issubdtype(image.dtype, np.integer):
         image = image / np.iinfo(image.dtype).max
     image = image.astype(np.float64).reshape(*image.shape[:2], -1)
