@@ -73,10 +73,10 @@ def check_laser_log(name: str, log: LogOfScans) -> None:
 
 def met_something(beams: Beams, max_range: float) -> Beams:
     """The beams of some scans; valid are those that met something."""
-    ranges, angles, valid = (np.asarray(part) for part in beams)
-    with np.errstate(invalid="ignore"):
-        met = (valid > 0) & (ranges > 0) & (ranges < max_range * (1 - 1e-6))
-    return Beams(np.where(met, ranges, 0.0), np.where(valid > 0, angles, 0.0), met)
+    some = Beams(*(np.asarray(part) for part in beams))
+    met = np.asarray(some.returns(max_range)[0])
+    angles = np.where(some.valid > 0, some.angle, 0.0)
+    return Beams(np.where(met, some.range, 0.0), angles, met)
 
 
 def scans_of(log: LogOfScans, settings: Settings) -> Scans:
