@@ -1,8 +1,12 @@
-# Each target makes its own .venv and installs what it needs; only make and a Python >= 3.11 with
-# venv must be there. Choose one with `make PYTHON=python3.12 …`.
+# Each target makes its own .venv and installs what it needs; only make and a Python 3.11 to 3.13
+# with venv must be there. Choose one with `make PYTHON=python3.12 …`.
 
-PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
-	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+# The newest one on the path, of pyenv or of uv. Each is run: a shim of pyenv may lead nowhere.
+PYTHON ?= $(shell for v in 3.13 3.12 3.11; do \
+	for p in python$$v "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/$$v*/bin/python$$v \
+	$$(uv python find --system $$v 2>/dev/null) python3 python; do \
+	"$$p" -c "import sys, venv, ensurepip; sys.exit('%d.%d' % sys.version_info[:2] != '$$v')" \
+	2>/dev/null && echo "$$p" && exit; done; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
 ARGS ?=
@@ -15,7 +19,7 @@ unexport PYTHONDONTWRITEBYTECODE
 JEMALLOC := $(firstword $(wildcard /usr/lib/*/libjemalloc.so.2 /usr/lib64/libjemalloc.so.2))
 
 .DELETE_ON_ERROR:
-.PHONY: consistency test check bench docs links clean
+.PHONY: consistency test check bench docs api links clean
 
 ## The main job: is EKF-SLAM honest? 100 simulated runs; results in out/.
 consistency: $(VENV)/.run
@@ -39,13 +43,18 @@ bench: $(VENV)/.dev
 docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --builder html --jobs auto --fail-on-warning --keep-going --quiet docs docs/_build/html $(ARGS)
 
+## The reference and the text of all pages, in docs/_build/api: none of their code is run.
+api: $(VENV)/.dev
+	$(BIN)/sphinx-build --builder html --tag api --jobs auto --quiet docs docs/_build/api $(ARGS)
+
 ## Whether the documentation's links to other sites are alive; needs the network.
 links: $(VENV)/.dev
 	$(BIN)/sphinx-build --builder linkcheck --jobs auto --quiet docs docs/_build/links $(ARGS)
 
 $(VENV)/bin/python:
-	@test -n "$(PYTHON)" || { echo "jaxslam needs Python >= 3.11 with the venv module"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@python="$(PYTHON)"; \
+	test -n "$$python" || { echo "jaxslam needs Python 3.11 to 3.13 with the venv module"; exit 1; }; \
+	echo "$(VENV): $$("$$python" --version) ($$python)"; "$$python" -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 
 $(VENV)/.run: pyproject.toml | $(VENV)/bin/python

@@ -24,6 +24,7 @@ from benchmarks import (
     comparison,
     compile,
     delayed,
+    false_loops,
     fastslam,
     film,
     fuzz,
@@ -112,6 +113,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "graph_kernels": lambda: measure_graphs(quick, ["kernels"]),
         "graph_filters": lambda: measure_graphs(quick, ["filters"]),
         "graph_bicocca": lambda: measure_graphs(quick, ["bicocca"]),
+        "false_loops": lambda: false_loops.measure(quick),
         "graph_speed": lambda: graph_speed.measure(3 if quick else 9),
         "fastslam": lambda: fastslam.measure(
             4 if quick else 20, (10, 100), drawn("fastslam_nees.png")

@@ -14,7 +14,7 @@ from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import graphs
 from jaxslam.consistency.nees import pose_error
-from jaxslam.graphs import Ending, Graph, Solution, starts
+from jaxslam.graphs import Ending, Solution, starts
 
 FOLDER = DATA / "graphs"
 
@@ -79,7 +79,7 @@ def measure() -> list[Metric]:
             metrics.append(Metric(what, slope, high=1e-6))
     optima = {name: found for (name, error), found in best.items() if error == "pose"}
     certify(optima)
-    return metrics + judge({name: optima[name].graph for name in TRUE if name in optima})
+    return metrics + judge({name: optima[name] for name in TRUE if name in optima})
 
 
 def certify(optima: dict[str, Solution]) -> None:
@@ -100,16 +100,17 @@ def certify(optima: dict[str, Solution]) -> None:
         )
 
 
-def judge(optima: dict[str, Graph]) -> list[Metric]:
+def judge(optima: dict[str, Solution]) -> list[Metric]:
     """Errors to the true poses beside what the marginals claim, without gates: a file is one draw.
 
     NEES: mean of (truth - estimate)ᵀ P⁻¹ (truth - estimate) over all poses but the fixed one, 3 if
     honest. Scaled: with P times χ² / dof, as if the noise of the file were known but for a factor.
     """
     metrics = []
-    for name, graph in optima.items():
+    for name, found in optima.items():
+        graph = found.graph
         error = pose_error(TRUE[name](), np.asarray(graph.poses))[1:]
-        cov = np.asarray(graphs.marginals(graph).poses)[1:]
+        cov = np.asarray(graphs.marginals(found).poses)[1:]
         whitened = np.linalg.solve(cov, error[..., None])[..., 0]
         nees = float((error * whitened).sum(axis=1).mean())
         rmse = float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))

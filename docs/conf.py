@@ -1,13 +1,18 @@
-"""How the documentation is built: `make docs`, with every warning an error."""
+"""How the documentation is built: `make docs`, with every warning an error; `make api`, whose tag
+is "api", runs no code of the pages."""
 
 import importlib.metadata
 import os
+import signal
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import jax
 from jupyter_cache import get_cache
+
+# Sphinx ends its workers when it leaves by an exception, but not when a signal kills it.
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -22,13 +27,12 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "myst_nb",
-    "executed",
-    "exit_status",
-    "commands",
     "reference",
 ]
+if not tags.has("api"):  # noqa: F821 Sphinx's
+    extensions += ["executed", "exit_status", "commands"]
 exclude_patterns = ["_build", "_ext"]
-suppress_warnings = ["mystnb.unknown_mime_type"]
+suppress_warnings = ["mystnb.unknown_mime_type", "myst-nb.lexer"]
 
 html_theme = "furo"
 html_title = "jaxslam"
@@ -48,7 +52,7 @@ nb_execution_show_tb = True
 nb_merge_streams = True
 
 # What a page printed and drew is kept until its cells, or code that they reach, change.
-nb_execution_mode = "cache"
+nb_execution_mode = "off" if tags.has("api") else "cache"  # noqa: F821
 nb_execution_cache_path = str(ROOT / ".cache" / "docs")
 get_cache(nb_execution_cache_path).list_cache_records()  # makes it, before several processes do
 

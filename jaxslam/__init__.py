@@ -6,6 +6,7 @@ configuration of JAX; for float64 set `jax_enable_x64` yourself, as the command 
 """
 
 import importlib
+from collections.abc import Callable
 from types import ModuleType
 
 from jaxslam import (
@@ -32,6 +33,7 @@ from jaxslam import (
     team,
     topology,
 )
+from jaxslam._field_docs import attach_field_docs
 from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.run import run
@@ -89,8 +91,17 @@ _ON_DEMAND = {
 }
 
 
-def __getattr__(name: str) -> ModuleType:
-    """A lazily imported module: modules that read files or plot load on first access."""
+def __getattr__(name: str) -> ModuleType | Callable[..., Campaign]:
+    """What reads files or plots is imported on first access."""
+    if name == "load":
+        from jaxslam.results.campaign_files import load
+
+        return load
     if name in _ON_DEMAND:
-        return importlib.import_module(_ON_DEMAND[name])
+        module = importlib.import_module(_ON_DEMAND[name])
+        attach_field_docs()
+        return module
     raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
+
+
+attach_field_docs()

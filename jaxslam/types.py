@@ -251,12 +251,34 @@ class Trace(NamedTuple):
 
 
 class Beams(NamedTuple):
-    """A scan of a laser: B beams, in the frame of its mount."""
+    """A scan of a laser: B beams, in the frame of its mount.
+
+    What a range says, everywhere in the package (`returns`):
+
+    | range [m] | meaning |
+    |---|---|
+    | above 0, below the maximum range | an obstacle at this distance |
+    | the maximum range (less a millionth) or more, ∞ | no obstacle up to the maximum range |
+    | 0, below 0, NaN, -∞; any, where `valid` is false or the angle is not finite | nothing |
+    """
 
     range: Float[JaxOrNumPy, "B"]
-    """[m]; any finite number where not valid"""
+    """[m]"""
     angle: Float[JaxOrNumPy, "B"]
     """direction of each beam [rad], counter-clockwise from the x axis"""
     valid: Bool[JaxOrNumPy, "B"]
-    """false for a beam that says nothing: a dropout, NaN, or padding. A beam that met nothing has
-    the laser's maximum range, and is valid."""
+    """false for a beam that says nothing: a dropout or padding. A beam that met nothing has the
+    laser's maximum range, and is valid."""
+
+    def returns(
+        self, max_range: float | JaxOrNumPy = np.inf, *, min_range: float | JaxOrNumPy = 0.0
+    ) -> tuple[Bool[JaxOrNumPy, "*n"], Bool[JaxOrNumPy, "*n"]]:
+        """Which beams met an obstacle nearer than max_range [m], and which met none up to there.
+
+        The others say nothing, as does a range of min_range or less. See the table of `Beams`.
+        """
+        with np.errstate(invalid="ignore"):  # comparisons with NaN, which are false
+            says = (self.range > min_range) & (self.valid != 0)
+            says = says & (self.angle > -np.inf) & (self.angle < np.inf)
+            met = self.range < max_range * (1 - 1e-6)  # less the rounding of float32
+        return says & met, says & ~met

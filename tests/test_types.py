@@ -1,11 +1,14 @@
 """types: what `check_log` refuses, and naming the row; the counts of `Info`."""
 
+import pydoc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.types import Info, Log, Scan, Status
+from jaxslam import graphs
+from jaxslam.types import Info, Log, Scan, Status, Truth
 from jaxslam.validation import check_log
 
 
@@ -134,3 +137,11 @@ def test_info_counts_statuses_of_a_step_and_of_a_trace():
 def test_status_codes_are_distinct_and_empty_is_zero():
     assert Status.EMPTY == 0
     assert len({int(s) for s in Status}) == len(Status)
+
+
+def test_help_shows_the_docstrings_of_fields():
+    """Of named tuples, whose fields Python calls "Alias for field number 0"."""
+    text = pydoc.plain(pydoc.render_doc(graphs.Marginals))
+    assert "of (x, y, θ), in world coordinates as the poses themselves" in text
+    assert "a variable does not have are zero" in text and "Alias for field" not in text
+    assert Truth.origin.__doc__.startswith("the tag of the landmark each measurement is")

@@ -29,7 +29,7 @@ GAP = 1.0
 """[s]"""
 NEAR = np.array([3.0, 3.0, 0.5])
 """what a loop may differ from the true path in [m, m, rad]"""
-TRUSTED = "relative_pose/odometry"
+TRUSTED = "relative_pose"
 FACTORS = {"relative_pose": graphs.relative_pose_log()}
 
 

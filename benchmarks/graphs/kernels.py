@@ -52,7 +52,7 @@ def compare(graph, names=("none", *ROBUST), runs=10):
 def _solved(graph, kernel, plan):
     """Poses, covariances and squared residuals at the optimum, and whether it was not reached."""
     solution = graphs.optimize(graph, kernel=kernel, plan=plan)
-    cov = graphs.marginals(solution.graph, kernel=kernel, plan=plan).poses
+    cov = graphs.marginals(solution, plan=plan).poses
     square = graphs.squared_residuals(solution.graph)
     return solution.graph.poses, cov, square, solution.status != graphs.Ending.CONVERGED
 

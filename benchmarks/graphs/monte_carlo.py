@@ -59,16 +59,17 @@ def draws(graph, scale, runs, block=8):
     keys = jax.random.split(jax.random.key(round(10 * scale)), runs)
     one = jax.tree.map(np.asarray, measured(graph, keys[0], scale))
     plan = graphs.plan(one, marginals=True)
-    bound = np.asarray(graphs.marginals(one, plan=plan).poses)[1:]
+    true = graphs.optimize(one, plan=plan, iterations=0)
+    bound = np.asarray(graphs.marginals(true, plan=plan).poses)[1:]
     solve = jax.jit(jax.vmap(partial(graphs.optimize, plan=plan)))
-    spread = jax.jit(jax.vmap(lambda graph: graphs.marginals(graph, plan=plan).poses[1:]))
+    spread = jax.jit(jax.vmap(lambda found: graphs.marginals(found, plan=plan).poses[1:]))
     prove = jax.jit(jax.vmap(lambda graph: graphs.certificate(graph, plan=plan).certified))
     draw = jax.jit(jax.vmap(partial(measured, graph, scale=scale)))
     rows = []
     for begin in range(0, runs, block):
         many = jax.device_get(draw(keys[np.arange(begin, begin + block) % runs]))
         found, again = solve(many), solve(_from_chordal(many))
-        cov, certified = jax.device_get((spread(found.graph), prove(again.graph)))
+        cov, certified = jax.device_get((spread(found), prove(again.graph)))
         error = pose_error(np.asarray(graph.poses), found.graph.poses)[:, 1:]
         nees = np.einsum("rni,rni->rn", error, np.linalg.solve(cov, error[..., None])[..., 0])
         square = (error[..., :2] ** 2).sum(axis=-1)

@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.real_data import DATA
 from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
+from jaxslam.graphs.graph import LOOPS
 from jaxslam.math import se2
 
 MANHATTAN = Path(DATA) / "graphs" / "manhattanOlson3500.g2o"
@@ -82,22 +83,25 @@ class Mixed(NamedTuple):
 
 
 def with_false_closures(graph, share, seed=0):
-    """The graph with false loops, a `share` of all loops: between poses drawn at random, at the
-    relative pose of a true loop."""
-    rng = np.random.default_rng(seed)
-    (name, table), *_ = graph.tables.items()
-    table = Table(*(np.asarray(leaf) for leaf in table))
-    follows = table.who[:, 1] - table.who[:, 0] == 1
-    odometry, loops = (Table(*(leaf[rows] for leaf in table)) for rows in (follows, ~follows))
-    count, poses = len(loops.who), len(graph.poses)
+    """The graph with false loops, a `share` of all loops (`with_false_loops`)."""
+    apart = graphs.with_loops_apart(graph)
+    count = len(apart.tables[LOOPS].who)
     wanted = int(share / (1 - share) * count)
-    source, first = rng.integers(count, size=wanted), rng.integers(poses, size=wanted)
+    mixed = with_false_loops(apart, wanted, seed)
+    return Mixed(mixed, LOOPS, np.arange(count + wanted) >= count)
+
+
+def with_false_loops(apart, wanted, seed=0):
+    """The graph, with its loops apart, and so many false ones: between poses drawn at random, at
+    the relative pose of a true loop."""
+    rng = np.random.default_rng(seed)
+    loops, poses = Table(*map(np.asarray, apart.tables[LOOPS])), len(apart.poses)
+    source, first = rng.integers(len(loops.who), size=wanted), rng.integers(poses, size=wanted)
     second = (first + rng.integers(5, poses - 5, size=wanted)) % poses
     both = Table(
         np.concatenate([loops.who, np.stack([first, second], axis=1)]),
         np.concatenate([loops.z, loops.z[source]]),
         np.concatenate([loops.information, loops.information[source]]),
-        np.ones(count + wanted, bool),
+        np.ones(len(loops.who) + wanted, bool),
     )
-    tables = {f"{name}/odometry": odometry, f"{name}/loops": both}
-    return Mixed(graph._replace(tables=tables), f"{name}/loops", np.arange(len(both.who)) >= count)
+    return apart._replace(tables=apart.tables | {LOOPS: both})

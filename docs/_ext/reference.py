@@ -198,7 +198,7 @@ def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: lis
         pieces[k] = re.sub(r"([*|\\])", r"\\\1", pieces[k])
         pieces[k] = re.sub(r"(\w)_(?!\w)", r"\1\\_", pieces[k])
         pieces[k] = re.sub(r":\n\n(?= )", "::\n\n", pieces[k])  # a diagram
-        pieces[k] = re.sub(r"\berrata\b", ":doc:`errata </background/errata>`", pieces[k])
+        pieces[k] = re.sub(r"\berrata\b(?!:)", ":doc:`errata </background/errata>`", pieces[k])
     for k in range(1, len(pieces), 2):
         pieces[k] += "\\ " if re.match(r"[\w(]", pieces[k + 1]) else ""
     plain = "".join(pieces).split("\n")

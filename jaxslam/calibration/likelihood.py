@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 
 from jaxslam import programs
 from jaxslam.calibration.errors import (
@@ -117,6 +116,8 @@ def fit_noise(
     here = before if guess is None else at(_coordinates(begin, logged))
     _check_same(before, here, logged)
     scale, path = 1.0 / max(abs(here.value), 1.0), [here.q]
+
+    from scipy.optimize import minimize  # slow to load
 
     def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
         there = tried(q)

@@ -94,10 +94,10 @@ def held_array(values: ArrayLike) -> ArrayLike:
     return np.asarray(values, np.float64)
 
 
-def check_count(name: str, value: object) -> None:
-    """Raise ValueError unless value is an integer >= 1 (a bool is not)."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-        raise ValueError(f"{name}: expected an integer >= 1, got {value!r}")
+def check_count(name: str, value: object, least: int = 1) -> None:
+    """Raise ValueError unless value is an integer >= `least` (a bool is not)."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")
 
 
 def check_key(name: str, key: object) -> None:

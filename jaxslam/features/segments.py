@@ -63,9 +63,10 @@ def segments(
     arc: one in two where it is 46 σ/√n above their common chord, n beams on both.
 
     Args:
-        beams: of one scan, (B,) each, angles increasing.
+        beams: of one scan, (B,) each, angles increasing. Where the last is within half a step of a
+            full turn from the first, both are one beam.
         sigma: standard deviation of a range [m]. sigma_angle: of a beam's direction [rad].
-        max_range: [m]; beams of that or more met nothing.
+        max_range: [m]; what a range says: `Beams`.
         least: number of beams of a segment, at least 3.
         trim: beams given up at each end.
         probability: of a straight wall to pass each test.
@@ -87,10 +88,16 @@ def segments(
             "segments: expected sigma and max_range above 0, sigma_angle and trim of at least 0, "
             f"least of at least 3, got {sigma}, {max_range}, {sigma_angle}, {trim}, {least}"
         )
-    if not (np.diff(angle) > 0).all() or (len(angle) and not np.ptp(angle) <= 2 * np.pi):
+    known = np.isfinite(angle)
+    angle, distance, valid = angle[known], distance[known], valid[known]
+    step = np.diff(angle)
+    beyond = np.sum(step) - 2 * np.pi
+    half = 0.5 * np.median(step) if len(step) else 0.0
+    if not (step > 0).all() or not beyond <= half:
         raise ValueError("segments: expected angles that increase within one turn")
-    with np.errstate(invalid="ignore"):
-        used = valid & np.isfinite(distance) & (distance > 0) & (distance < max_range)
+    used, _ = Beams(distance, angle, valid).returns(max_range)
+    if beyond > -half and used[0]:  # the first direction once more
+        used[-1] = False
     angle, distance = angle[used], distance[used]
     noise = sigma, sigma_angle
 

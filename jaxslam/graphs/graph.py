@@ -14,6 +14,9 @@ from jaxslam.types import JaxOrNumPy
 LOOPS = "relative_pose/loops"
 """Loop edges in a table of their own, so that they can have a robust kernel."""
 
+TRUSTED = ("relative_pose", "prior")
+"""Tables without a robust kernel where loops are doubted: odometry and priors."""
+
 
 class Table(NamedTuple):
     """Measurements of one kind, E rows: K variables, Z numbers measured and R residuals each."""
@@ -48,20 +51,34 @@ class Graph(NamedTuple):
     """identity in a file, or tag in a log"""
 
 
+def ranks(graph: Graph) -> Int[np.ndarray, "N"]:
+    """The place of each pose in the order of the ids, whatever the order of the poses is."""
+    return np.argsort(np.argsort(np.asarray(graph.pose_id), kind="stable"))
+
+
+def successive(graph: Graph, who: Int[JaxOrNumPy, "E 2"]) -> Bool[np.ndarray, "E"]:
+    """Which rows join poses that follow each other in the order of the ids: the odometry."""
+    first, second = ranks(graph)[np.asarray(who)].reshape(-1, 2).T
+    return np.asarray(np.abs(second - first) == 1)
+
+
 def with_loops_apart(graph: Graph) -> Graph:
     """The graph with its loop edges in the table "relative_pose/loops".
 
-    They are the rows of `relative_pose` between poses whose indices do not follow each other; those
-    of the odometry stay. `graphs.optimize(graph, kernel={"relative_pose/loops": graphs.dcs()})`
-    then doubts the loops alone. Concrete graphs only; a table without rows is left out.
+    They are the rows of `relative_pose` between poses that do not follow each other in the order of
+    the ids; those of the odometry stay. The order of poses and rows has no influence.
+    `graphs.optimize(graph, kernel={"relative_pose/loops": graphs.dcs()})`
+    then doubts the loops alone. Concrete graphs only; a table without rows is left out. A graph
+    that has a table of loops is returned as it is.
     """
+    if LOOPS in graph.tables:
+        return graph
     tables: dict[str, Table] = {}
     for key, table in graph.tables.items():
         if key != "relative_pose":
             tables[key] = table
             continue
-        who = np.asarray(table.who)
-        along = np.abs(who[:, 1] - who[:, 0]) == 1
+        along = successive(graph, table.who)
         for name, rows in ((key, along), (LOOPS, ~along)):
             if rows.any():
                 tables[name] = Table(*(part[rows] for part in table))

@@ -48,7 +48,7 @@ def optimize(
         method: "levenberg_marquardt", "gauss_newton" (λ = 0, every step is taken) or "dogleg".
         kernel: robust kernels, one for all tables or by table. With `truncated` the iterations are
             rounds of graduated non-convexity (`gnc`), and `iterations` is the limit of each.
-        iterations: steps at most.
+        iterations: steps at most; with 0 the solution is of the graph as it is.
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
             predicts, and at least by rounding.
         plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
@@ -60,7 +60,7 @@ def optimize(
     caller = "graphs.optimize"
     if method not in METHODS:
         raise ValueError(f"{caller}: no method {method!r}; there are: {', '.join(METHODS)}")
-    check_count(f"{caller}: iterations", iterations)
+    check_count(f"{caller}: iterations", iterations, least=0)
     if is_concrete(tolerance) and not 0 <= tolerance < np.inf:
         raise ValueError(
             f"{caller}: expected tolerance to be a finite number >= 0, got {tolerance}"
@@ -76,7 +76,10 @@ def optimize(
     if not fill:
         return found
     singular = own_number(found.singular, own, graph)
-    return found._replace(graph=cut(found.graph, own), singular=singular)
+    rows = {name: table.valid for name, table in own.tables.items()}
+    return found._replace(
+        graph=cut(found.graph, own), singular=singular, weights=cut(found.weights, rows)
+    )
 
 
 def chi2(

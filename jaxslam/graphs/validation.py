@@ -221,14 +221,15 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
 def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Graph:
     """The graph with a pose fixed, if no variable is and no measurement is of one pose alone.
 
-    It is the first pose, of the largest part where the graph is disconnected. A graph that has a
-    gauge is returned as it is: the same object.
+    It is the pose of the lowest id, of the largest part where the graph is disconnected. A graph
+    that has a gauge is returned as it is: the same object.
     """
     known = factors_of("graphs.with_gauge", graph, factors)
     parts = parts_of(graph, known)
     if not len(graph.poses) or parts.anchored.any():
         return graph
     fixed = np.asarray(graph.fixed_pose).copy()
-    of_poses = parts.part[: len(graph.poses)]
-    fixed[np.flatnonzero(of_poses == np.bincount(of_poses).argmax())[0]] = True
+    by_id = np.argsort(np.asarray(graph.pose_id), kind="stable")
+    part = parts.part[by_id]
+    fixed[by_id[np.bincount(part)[part].argmax()]] = True
     return graph._replace(fixed_pose=fixed)

@@ -10,12 +10,15 @@ def read_map(path: str | Path) -> Grid:
 
     | key | meaning |
     |---|---|
-    | `image` | a PGM file (P5 or P2), relative to the folder of the YAML file |
+    | `image` | a PGM (P5 or P2), PNG or BMP file, relative to the folder of the YAML file |
     | `resolution` | side of a cell [m] |
     | `origin` | [x, y, yaw], pose of the lower left corner of the lower left cell [m, m, rad] |
     | `negate` | 0: dark is occupied, p = 1 - shade; 1: p = shade; shade in [0, 1] |
     | `occupied_thresh`, `free_thresh` | above, below which p a cell is occupied, free |
     | `mode` | `trinary` (default): all else is unknown; `scale`: all else is in between |
+
+    Another key, as `map_type`, is named in a warning. Shades have 8 or 16 bits; a colour counts as
+    the mean of its channels.
 
     An occupied cell gets the log-odds `datasets.formats.ros_map.CERTAIN`, a free one the negative
     of it, an unknown one 0. In mode `scale` a cell between the thresholds has the probability
@@ -24,9 +27,9 @@ def read_map(path: str | Path) -> Grid:
     Source: the map format of the ROS package `map_server`, wiki.ros.org/map_server.
 
     Raises:
-        ValueError: `path:line: reason` for a malformed line, a key that is missing or unknown, a
-            resolution that is not above 0, an origin that is no pose, thresholds out of order, and
-            an image that is missing, of another format, or damaged.
+        ValueError: `path:line: reason` for what is not YAML, a key that is missing or occurs twice,
+            a resolution that is not above 0, an origin that is no pose, thresholds out of order, a
+            mode `raw`, and an image that is missing, transparent, of another format, or damaged.
     """
     from jaxslam.datasets.formats import ros_map
 

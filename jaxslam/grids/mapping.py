@@ -31,7 +31,7 @@ class Counts(NamedTuple):
     outside: Int[JaxOrNumPy, ""]
     """usable beams that say nothing: their origin is off the map"""
     unusable: Int[JaxOrNumPy, ""]
-    """beams that are not valid, of a NaN, or of a range below 0"""
+    """beams that say nothing: not valid, or of a range of 0, below 0 or NaN (`Beams`)"""
 
 
 def count(
@@ -49,8 +49,9 @@ def count(
 
     A beam misses each cell that it crosses, in order (Amanatides & Woo 1987), before the one in
     which it ends, which it hits. One of max_range or more hits nothing, and misses the cells up to
-    no_return; where that is 0 it says nothing. What is off the map is not counted. The counts are
-    sums of integers: the order of the scans does not matter, and those of two logs add.
+    no_return; where that is 0 it says nothing. What other ranges say: `Beams`. What is off the map
+    is not counted. The counts are sums of integers: the order of the scans does not matter, and
+    those of two logs add.
 
     Args:
         origin, resolution: of the map, as in `Grid`.
@@ -161,9 +162,9 @@ def add_scan(
     """
     height, width = shape
     nowhere = hits.shape[0]
-    usable = usable_beams(scan)
-    far = scan.range >= max_range
-    length = jnp.where(far, free, jnp.where(usable, scan.range, 0.0))
+    met, far = scan.returns(jnp.asarray(max_range))
+    usable = met | far
+    length = jnp.where(met, scan.range, jnp.where(far, free, 0.0))
     heading = eyes[:, 2:] + jnp.where(usable, scan.angle, 0.0)[None]
     e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
     ends = to_cells(origin, resolution, eyes[:, None, :2] + length[None, :, None] * e)

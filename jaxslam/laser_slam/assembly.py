@@ -9,6 +9,8 @@ from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.math import numpy_poses as poses
 
+PART = 2048
+"""Pairs whose covariances are computed at once."""
 ROOM = 4096
 """Poses of a graph: smaller graphs are filled up to it, so that all logs share their programs."""
 
@@ -50,15 +52,18 @@ def graph_of(
     )
 
 
-def relative_covs(graph: Graph, pairs: Int[np.ndarray, "Q 2"]) -> Float[np.ndarray, "Q 3 3"]:
+def relative_covs(
+    solution: graphs.Solution, pairs: Int[np.ndarray, "Q 2"]
+) -> Float[np.ndarray, "Q 3 3"]:
     """The covariance of the end of the second pose in the frame of the first, of each pair.
 
     From the joint marginals of both, by the Jacobians of x_i⁻¹ ∘ x_j.
     """
-    parts = [pairs[begin : begin + 4 * ROOM] for begin in range(0, len(pairs), 4 * ROOM)]
-    found = [np.asarray(graphs.marginals(graph, pairs=of, room=ROOM).pairs) for of in parts]
+    # Each pair fills the factor, so that time and memory grow with the pairs of a part.
+    parts = [pairs[begin : begin + PART] for begin in range(0, len(pairs), PART)]
+    found = [np.asarray(graphs.marginals(solution, pairs=of, room=ROOM).pairs) for of in parts]
     joint = np.concatenate(found).astype(np.float64)
-    at = np.asarray(graph.poses, np.float64)
+    at = np.asarray(solution.graph.poses, np.float64)
     i, j = at[pairs[:, 0]], at[pairs[:, 1]]
     # x_i + δ_i is x_i ∘ R(θ_i)ᵀ δ_i to first order, which moves the end by -Ad(z)⁻¹ of it.
     by_i = -poses.adjoint(poses.between(j, i)) @ covariances.turns(-i[:, 2])

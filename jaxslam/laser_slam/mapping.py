@@ -30,13 +30,13 @@ def frame_of(
     log: LogOfScans, paths: list[Float[np.ndarray, "K 3"]], settings: Settings
 ) -> tuple[tuple[int, int], Float[np.ndarray, "3"], float]:
     """(shape, origin, resolution) of a map that holds the ends of all beams at all poses."""
-    beams = _used(log, settings, np.ones(len(log.time), bool))
+    every = np.ones(len(log.time), bool)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for path in paths:
         laser = poses.compose(path, np.asarray(log.mount, float))
         for begin in range(0, len(laser), ROWS):
             rows = slice(begin, begin + ROWS)
-            first, last = _boxes(laser[rows], Beams(*(part[rows] for part in beams)))
+            first, last = _boxes(laser[rows], _used(log, settings, every, rows))
             low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
     resolution = max(settings.resolution, float((high - low).max()) / LARGEST)
     low = (np.floor(low / resolution - 4) + ASIDE) * resolution
@@ -56,7 +56,10 @@ def map_of(
     shape, origin, resolution = frame
     counts = np.zeros((2, *shape), np.int32)
     laser = poses.compose(path, np.asarray(log.mount, float))
-    _count(counts, origin, resolution, laser, _used(log, settings, usable), settings)
+    for begin in range(0, len(path), ROWS):
+        rows = slice(begin, begin + ROWS)
+        beams = _used(log, settings, usable, rows)
+        _count(counts, origin, resolution, laser[rows], beams, settings)
     return _occupancy(counts, origin, resolution)
 
 
@@ -80,11 +83,17 @@ def _count(
             part = Beams(*(each[:, begin : begin + WIDTH] for each in beams))
             _count(counts, origin, resolution, laser, part, settings)
         return
+    if len(laser) > ROWS:
+        for begin in range(0, len(laser), ROWS):
+            rows = slice(begin, begin + ROWS)
+            part = Beams(*(each[rows] for each in beams))
+            _count(counts, origin, resolution, laser[rows], part, settings)
+        return
     corner, ends = _boxes(laser, beams)
     first = np.floor((corner.min(axis=0) - origin[:2]) / resolution).astype(int) - 1
     size = np.ceil((ends.max(axis=0) - origin[:2]) / resolution).astype(int) + 2 - first
-    if len(laser) > ROWS or ((size > WINDOW).any() and len(laser) > 1):
-        half = ROWS if len(laser) > ROWS else len(laser) // 2
+    if (size > WINDOW).any() and len(laser) > 1:
+        half = len(laser) // 2
         for rows in (slice(half), slice(half, None)):
             part = Beams(*(each[rows] for each in beams))
             _count(counts, origin, resolution, laser[rows], part, settings)
@@ -147,22 +156,23 @@ def growing_maps(
     shape, _, resolution = frame_of(log, paths, settings)
     coarse = max(resolution, max(shape) * resolution / FILM)
     shape, origin, resolution = frame_of(log, paths, replace(settings, resolution=coarse))
-    beams = _used(log, settings, np.ones(len(path), bool))
     laser = poses.compose(path, np.asarray(log.mount, float))
     together = -(-len(path) // min(frames, len(path)))
     counts = np.zeros((2, *shape), np.int32)
     maps, until = [], []
     for begin in range(0, len(path), together):
         rows = slice(begin, begin + together)
-        scans = Beams(*(part[rows] for part in beams))
-        _count(counts, origin, resolution, laser[rows], scans, settings)
+        beams = _used(log, settings, np.ones(len(path), bool), rows)
+        _count(counts, origin, resolution, laser[rows], beams, settings)
         maps.append(_occupancy(counts, origin, resolution))
         until.append(min(begin + together, len(path)))
     return maps, np.array(until)
 
 
-def _used(log: LogOfScans, settings: Settings, usable: np.ndarray) -> Beams:
-    ranges, angles, met = (np.asarray(part) for part in met_something(log))
-    seen = met & usable[:, None]
+def _used(log: LogOfScans, settings: Settings, usable: np.ndarray, rows: slice) -> Beams:
+    """The beams of some scans as maps take them: what a scan that is not usable met is nothing."""
+    some = Beams(*(np.asarray(part)[rows] for part in log.beams))
+    ranges, angles, met = (np.asarray(part) for part in met_something(some, log.max_range))
+    seen = met & usable[rows, None]
     ranges = np.where(seen, np.minimum(ranges, settings.max_range), 0.0)
     return Beams(ranges, angles, seen)

@@ -5,8 +5,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam import graphs
 from jaxslam.laser_slam import covariances
-from jaxslam.laser_slam.assembly import relative_covs
+from jaxslam.laser_slam.assembly import ROOM, relative_covs
 from jaxslam.laser_slam.records import Solved
 from jaxslam.math import numpy_poses as poses
 from jaxslam.metrics.relations import Relations
@@ -53,8 +54,9 @@ def relation_covs(
     apart = a != b
     pairs, row = np.unique(np.stack([a, b], axis=1)[apart], axis=0, return_inverse=True)
     if len(pairs):
+        optimum = graphs.optimize(solved.graph, room=ROOM, iterations=0)
         starts = range(0, len(pairs), TOGETHER)
-        parts = [relative_covs(solved.graph, pairs[k : k + TOGETHER]) for k in starts]
+        parts = [relative_covs(optimum, pairs[k : k + TOGETHER]) for k in starts]
         between[apart] = np.concatenate(parts)[row.reshape(-1)]
     z = poses.between(solved.poses[i], solved.poses[j])
     at_start = covariances.moved(solved.z_cov[i], z)

@@ -71,44 +71,54 @@ def check_laser_log(name: str, log: LogOfScans) -> None:
         raise ValueError(f"{name}: expected a max_range above 0, got {log.max_range}")
 
 
-def met_something(log: LogOfScans) -> Beams:
-    """The beams of a log; valid are those that met something."""
-    ranges, angles, valid = (np.asarray(part) for part in log.beams)
-    with np.errstate(invalid="ignore"):
-        met = (valid > 0) & (ranges > 0) & (ranges < log.max_range * (1 - 1e-6))
-    return Beams(np.where(met, ranges, 0.0), np.where(valid > 0, angles, 0.0), met)
+def met_something(beams: Beams, max_range: float) -> Beams:
+    """The beams of some scans; valid are those that met something."""
+    some = Beams(*(np.asarray(part) for part in beams))
+    met = np.asarray(some.returns(max_range)[0])
+    angles = np.where(some.valid > 0, some.angle, 0.0)
+    return Beams(np.where(met, some.range, 0.0), angles, met)
 
 
 def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     """The points of a log's scans in the robot's frame, and the lines through those within two
     degrees of each."""
-    ranges, angles, met = (np.asarray(part) for part in met_something(log))
-    changed = _changed(ranges, met)
-    stride = -(-ranges.shape[1] // WIDTH)
-    ranges, angles, met = (part[:, ::stride] for part in (ranges, angles, met))
-    there = np.asarray(log.beams.valid)[:, ::stride] > 0
-    near = met & (ranges < settings.max_range)
-    spacing = max(_spacing(angles, there), 1e-3)
+    count, beams = np.shape(log.beams.range)
+    stride = -(-beams // WIDTH)
+    some = slice(None, None, -(-count // ROWS))
+    angles, there = np.asarray(log.beams.angle)[some], np.asarray(log.beams.valid)[some] > 0
+    spacing = max(_spacing(angles[:, ::stride], there[:, ::stride]), 1e-3)
     span = np.int32(np.clip(round(SPAN / spacing), 2, MAX_NEIGHBOURS))
-    x, y, heading = np.asarray(log.mount, float)
+    every, kept = -(-len(range(0, beams, stride)) // settings.beams), settings.beams
+    parts, changed = [], []
+    for begin in range(0, count, ROWS):  # some at a time, since a log may be long
+        last = max(begin - 1, 0)
+        near = met_something(
+            Beams(*(np.asarray(part)[last : begin + ROWS] for part in log.beams)), log.max_range
+        )
+        differs = _changed(np.asarray(near.range), np.asarray(near.valid))
+        changed.append(differs if begin == 0 else differs[1:])
+        rows = Beams(*(np.asarray(part)[begin - last :, ::stride] for part in near))
+        points = _points(rows, np.asarray(log.mount), settings.max_range)
+        filled = _filled(points)
+        lines = jax.tree.map(np.asarray, _surfaces(filled, span))
+        # Beams that fill a scan up come last: they are cut off, or stay without a point.
+        size = len(rows.range)
+        both = filled, lines
+        parts.append(jax.tree.map(lambda part, n=size: _thinned(part[:n], every, kept), both))
+    whole, line = jax.tree.map(lambda *each: np.concatenate(each), *parts)
+    usable = np.asarray(whole.valid).sum(axis=1) >= settings.fewest
+    return Scans(whole, line, usable, np.concatenate(changed))
+
+
+def _points(beams: Beams, mount: Float[np.ndarray, "3"], max_range: float) -> Points:
+    """The ends of the beams that met something nearer than max_range, in the robot's frame."""
+    ranges, angles, met = (np.asarray(part) for part in beams)
+    near = met & (ranges < max_range)
+    x, y, heading = np.asarray(mount, float)
     rays = np.stack([np.cos(heading + angles), np.sin(heading + angles)], axis=-1)
     position = np.where(near[..., None], [x, y] + ranges[..., None] * rays, 0.0)
     parts: Any = position.astype(np.float32), rays.astype(np.float32), near
-    points = Points(*parts)
-    every, kept = -(-ranges.shape[1] // settings.beams), settings.beams
-    rows, found = [], []
-    for begin in range(0, len(ranges), ROWS):
-        rows.append(_filled(points, begin))
-        found.append(jax.tree.map(np.asarray, _surfaces(rows[-1], span)))
-    # Beams that fill a scan up come last: they are cut off, or stay without a point.
-    whole, line = (
-        jax.tree.map(
-            lambda *parts: _thinned(np.concatenate(parts)[: len(ranges)], every, kept), *of
-        )
-        for of in (rows, found)
-    )
-    usable = np.asarray(whole.valid).sum(axis=1) >= settings.fewest
-    return Scans(whole, line, usable, changed)
+    return Points(*parts)
 
 
 def _thinned(part: np.ndarray, every: int, width: int) -> np.ndarray:
@@ -117,13 +127,12 @@ def _thinned(part: np.ndarray, every: int, width: int) -> np.ndarray:
     return np.pad(found, [(0, 0), (0, width - found.shape[1])] + [(0, 0)] * (part.ndim - 2))
 
 
-def _filled(points: Points, begin: int) -> Points:
-    """The next scans, filled up to `ROWS` of `WIDTH` beams by points that are not valid."""
+def _filled(points: Points) -> Points:
+    """Some scans, filled up to `ROWS` of `WIDTH` beams by points that are not valid."""
 
     def one(part: np.ndarray) -> np.ndarray:
-        some = np.asarray(part[begin : begin + ROWS])
-        more = [(0, ROWS - len(some)), (0, WIDTH - some.shape[1])] + [(0, 0)] * (some.ndim - 2)
-        return np.pad(some, more)
+        more = [(0, ROWS - len(part)), (0, WIDTH - part.shape[1])] + [(0, 0)] * (part.ndim - 2)
+        return np.pad(part, more)
 
     filled: Points = jax.tree.map(one, points)
     return filled

@@ -115,7 +115,8 @@ def _of_scans(
     if len(at) == 1:
         marginal = np.zeros((1, 3, 3))
     else:
-        marginal = np.asarray(graphs.marginals(graph, room=ROOM).poses, np.float64)
+        optimum = graphs.optimize(graph, room=ROOM, iterations=0)
+        marginal = np.asarray(graphs.marginals(optimum, room=ROOM).poses, np.float64)
     at_key = covariances.turns(-at[row, 2]) @ marginal[row] @ covariances.turns(at[row, 2])
     step = np.where(is_key[:, None, None], 0.0, odometry.cov)
     cov = covariances.of_coordinates(covariances.composed_cov(at_key, z, step), path)

@@ -12,9 +12,16 @@ from jaxslam.grids.grid import Field, Grid, to_cells
 from jaxslam.grids.interpolation import interpolate
 from jaxslam.matching.correspondences import Rule, weights
 from jaxslam.matching.matcher import Match, Matcher
-from jaxslam.matching.outcome import Limits, concluded, determined, information_of, length_of
+from jaxslam.matching.outcome import (
+    Limits,
+    concluded,
+    determined,
+    fused,
+    information_of,
+    length_of,
+)
 from jaxslam.matching.points import Points
-from jaxslam.matching.prior import Prior, prior_cost, prior_information
+from jaxslam.matching.prior import Prior, prior_cost, prior_terms
 from jaxslam.matching.surface import surface, surface_information
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
@@ -30,9 +37,9 @@ class _At(NamedTuple):
     residual: Float[Array, "N"]
     weight: Float[Array, "N"]
     curvature: Float[Array, "3 3"]
-    """A, with Λ"""
+    """A, of the scan"""
     slope: Float[Array, "3"]
-    """half of the cost's"""
+    """half of that of the scan's cost"""
 
 
 _State: TypeAlias = tuple[Array, Array, _At, Array, Array]
@@ -82,9 +89,6 @@ def field(
         there = points.valid & _on_map(of, points, pose) & (residual < reach)
         weight = weights(rule, residual, there)
         curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
-        if prior is not None:
-            curvature = curvature + prior.information
-            slope = slope + prior.information @ prior.error(pose)
         cost = _robust_cost(rule, residual, points) + 2 * prior_cost(prior, pose)
         return _At(cost, residual, weight, curvature, slope)
 
@@ -95,15 +99,22 @@ def field(
         def unfinished(state: _State) -> Array:
             return jnp.asarray((state[0] < iterations) & ~state[4])
 
+        def onto_of(pose: Array, at: _At) -> Array:
+            information = surface_information(lines, pose, at.weight)
+            return determined(information, length, least_condition)
+
+        def moved(pose: Array, move: Array) -> Array:
+            return jnp.concatenate([pose[:2] + move[:2], wrap(pose[2] + move[2])[None]])
+
         def step(state: _State) -> _State:
             k, pose, at, damping, _ = state
             diagonal = jnp.diagonal(at.curvature)
             diagonal = jnp.maximum(diagonal, 1e-9 * jnp.maximum(diagonal.max(), 1e-9))
-            move, _ = linalg.solve_psd(at.curvature + damping * jnp.diag(diagonal), -at.slope)
-            known = surface_information(lines, pose, at.weight)
-            known = known + prior_information(prior, known)
-            move = determined(move, known, length, least_condition)
-            tried = jnp.concatenate([pose[:2] + move[:2], wrap(pose[2] + move[2])[None]])
+            damped = at.curvature + damping * jnp.diag(diagonal)
+            onto = onto_of(pose, at)
+            curvature, slope = fused(damped, at.slope, prior_terms(prior, pose), onto, length)
+            move, _ = linalg.solve_psd(curvature, -slope)
+            tried = moved(pose, move)
             there = at_pose(of, points, tried, prior)
             better = there.cost < at.cost
             small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= tolerance
@@ -112,10 +123,22 @@ def field(
             damping = jnp.clip(jnp.where(better, 0.1 * damping, 10 * damping), low, high)
             return k + 1, pose, at, damping, small
 
+        begin = start
+        if prior is not None:
+            # Along what the scan does not determine it begins where the prior has it: a step that
+            # the roughness of a field of cells might refuse.
+            onto = onto_of(start, at_pose(of, points, start, prior))
+            free = jnp.eye(3, dtype=start.dtype) - onto
+            known, slope = prior_terms(prior, start)
+            held = jnp.diag(jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length**2]))
+            curvature, slope = fused(
+                held, 0 * slope, (free.T @ known @ free, free.T @ slope), onto, length
+            )
+            begin = moved(start, linalg.solve_psd(curvature, -slope)[0])
         first = (
             jnp.zeros((), jnp.int32),
-            start,
-            at_pose(of, points, start, prior),
+            begin,
+            at_pose(of, points, begin, prior),
             jnp.asarray(_DAMPING[0], start.dtype),
             jnp.zeros((), bool),
         )

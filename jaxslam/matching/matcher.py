@@ -62,6 +62,9 @@ class Match(NamedTuple):
     information"""
     condition: Float[Array, ""]
     """its eigenvalue over the largest, lengths in RMS ranges"""
+    determined: Float[Array, "3 3"]
+    """projection of a motion (dx, dy, dθ) onto what the scans determine: the identity, unless the
+    match is DEGENERATE"""
     pair: Int[Array, "N"]
     """the partner of each point in the reference, -1 without; in a grid 0 where it took part"""
     weight: Float[Array, "N"]

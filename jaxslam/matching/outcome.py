@@ -52,7 +52,8 @@ def concluded(
     if score is None:
         closeness = jnp.where(took_part, jnp.exp(-0.5 * (residual / spread) ** 2), 0.0)
         score = closeness.sum() / count
-    condition, weakest = weakest_direction(information, length_of(points))
+    length = length_of(points)
+    condition, weakest = weakest_direction(information, length)
     few = took_part.sum() < limits.fewest
     status = jnp.asarray(MatchStatus.CONVERGED, jnp.int32)
     for applies, value in (
@@ -73,6 +74,7 @@ def concluded(
         information=information,
         weakest=weakest,
         condition=condition,
+        determined=determined(information, length, limits.condition),
         pair=jnp.where(took_part, pair, -1),
         weight=weight,
         prior=prior,
@@ -132,20 +134,52 @@ def weakest_direction(
 
 
 def determined(
-    motion: Float[Array, "3"],
-    information: Float[Array, "3 3"],
-    length: Float[Array, ""],
-    least: float,
-) -> Float[Array, "3"]:
-    """A motion without its part along the weakest direction, where the condition is below `least`.
+    information: Float[Array, "3 3"], length: Float[Array, ""], least: float
+) -> Float[Array, "3 3"]:
+    """The projection D of a motion onto what the scans determine; the identity where that is all.
 
-    So noise does not carry the pose along what the scans do not determine (Zhang, Kaess & Singh
-    2016, "On degeneracy of optimization-based state estimation problems", ICRA).
+    With lengths in RMS ranges, the directions of the eigenvectors whose eigenvalue is at least
+    `least` of the largest are kept (Zhang, Kaess & Singh 2016, "On degeneracy of optimization-based
+    state estimation problems", ICRA). A constant for derivatives.
     """
-    condition, weakest = weakest_direction(information, length)
+    eye = jnp.eye(3, dtype=information.dtype)
+    if least <= 0:
+        return eye
+    scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
+    a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])
+    low, high = extreme_eigenvalues(a)
+    some = high > 0
+
+    def below(value: Array) -> Array:
+        return jnp.clip(value / jnp.where(some, high, 1.0), 0.0, 1.0) < least
+
+    weak, strong = eigenvector(a, low), eigenvector(a, high)
+    across = eye - weak[:, None] * weak[None, :]
+    along = jnp.where(some, strong[:, None] * strong[None, :], 0.0)
+    two = below(jnp.trace(a) - low - high) | ~some
+    kept = jnp.where(two, along, jnp.where(below(low), across, eye))
+    return scale[:, None] * kept / scale[None, :]
+
+
+def fused(
+    curvature: Float[Array, "3 3"],
+    slope: Float[Array, "3"],
+    prior: tuple[Float[Array, "3 3"], Float[Array, "3"]],
+    onto: Float[Array, "3 3"],
+    length: Float[Array, ""],
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    """Curvature Dᵀ A D + Λ and slope Dᵀ g + Λ e of a step: what the scans do not determine (D of
+    `determined`) is the prior's alone, however little it says.
+
+    A small share of Λ, and where it is zero of A, keeps a motion at zero that neither determines.
+    """
     scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length])
-    along = ((scale * weakest) * (scale * motion)).sum()
-    return jnp.where(condition < least, motion - along * weakest, motion)
+    eye = jnp.eye(3, dtype=curvature.dtype)
+    free = scale[:, None] * (eye - onto)
+    of_prior, of_scans = jnp.trace(prior[0]), jnp.trace(curvature)
+    size = jnp.where(of_prior > 0, of_prior, jnp.where(of_scans > 0, of_scans, 1.0))
+    keep = float(jnp.finfo(curvature.dtype).eps) ** 0.75 * size / length**2
+    return onto.T @ curvature @ onto + prior[0] + keep * free.T @ free, onto.T @ slope + prior[1]
 
 
 def extreme_eigenvalues(a: Float[Array, "3 3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:

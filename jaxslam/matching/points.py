@@ -33,8 +33,8 @@ def points(
 ) -> Points:
     """The ends of the beams in the robot's frame, in the order of the beams.
 
-    A beam that is not valid, has no finite angle or range, or a range not between min_range and
-    max_range [m] (both excluded) gives no point: one of max_range met nothing.
+    A beam that says nothing or met nothing up to max_range [m] gives no point (`Beams`), nor does a
+    range of min_range or less.
 
     Args:
         mount: (3,) pose of the laser on the robot.
@@ -47,8 +47,10 @@ def points(
         raise ValueError(f"points: expected ranges, angles and masks (B,) of one scan, got {told}")
     check_positive("points", max_range=max_range)
     r = jnp.asarray(beams.range)
-    valid = (r > min_range) & (r < jnp.asarray(max_range) * (1 - 1e-6)) & beams.valid
-    valid = valid & jnp.isfinite(beams.angle)
+    valid, _ = beams._replace(range=r).returns(
+        jnp.asarray(max_range), min_range=jnp.asarray(min_range)
+    )
+    valid = jnp.asarray(valid)
     r = jnp.where(valid, r, 1.0)
     eye = jnp.asarray(mount, r.dtype)
     heading = eye[2] + jnp.where(valid, beams.angle, 0.0)

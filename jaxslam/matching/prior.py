@@ -33,6 +33,10 @@ def prior_cost(prior: Prior | None, pose: Float[Array, "3"]) -> Float[Array, ""]
     return jnp.zeros((), pose.dtype) if prior is None else prior.cost(pose)
 
 
-def prior_information(prior: Prior | None, like: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The information Λ of a prior; zeros like another matrix where there is none."""
-    return jnp.zeros_like(like) if prior is None else prior.information
+def prior_terms(
+    prior: Prior | None, pose: Float[Array, "3"]
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    """The curvature Λ and the slope Λ e of `Prior.cost`; zeros without a prior."""
+    if prior is None:
+        return jnp.zeros((3, 3), pose.dtype), jnp.zeros_like(pose)
+    return prior.information, prior.information @ prior.error(pose)

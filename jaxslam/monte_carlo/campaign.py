@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Literal
 
 import jax
+import numpy as np
 from jax.typing import DTypeLike
 
 from jaxslam.consistency import Summary, Tally, summarize
@@ -194,15 +195,20 @@ def _check(
         )
 
 
+def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, Summary]]:
+    """How many runs there are, the divergence limit, and the summary of each filter."""
+    done = sum(count for _, count in tallies[BOUND].pieces())
+    bound = {name: total / done for name, total in tallies[BOUND].sums.items()} or None
+    found = {name: summarize(one, bound) for name, one in tallies.items() if name != BOUND}
+    return done, tallies[BOUND].first("limit"), found
+
+
 def _summed_up(
     plan: CampaignPlan, tallies: dict[str, Tally], work: Work, seconds: float
 ) -> Campaign:
     """The campaign of the runs in the tallies."""
     scenario = plan.scenario
-    done = sum(count for _, count in tallies[BOUND].pieces())
-    limit = tallies[BOUND].first("limit")
-    bound = {name: total / done for name, total in tallies[BOUND].sums.items()} or None
-    summaries = {name: summarize(tallies[name], bound) for name in plan.filters}
+    done, limit, summaries = summaries_of(tallies)
     steps = max(scenario.steps, 1)
     return Campaign(
         scenario=scenario.name,

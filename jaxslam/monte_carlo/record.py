@@ -34,8 +34,8 @@ class Campaign:
     seconds: float
     """wall time, compilation included."""
     compile_seconds: float
-    """wall time until the last program was there; blocks begun meanwhile ran beside. 0 where
-    nothing was left to run."""
+    """wall time until the last program was traced, and compiled or found compiled; blocks begun
+    meanwhile ran beside. 0 where nothing was left to run."""
     step_seconds: dict[str, float]
     """Wall time of a step of one run on one device, by filter: the median over the blocks that this
     process computed while nothing was being compiled (where there are none, over all), several of

@@ -1,13 +1,19 @@
 """The report of a campaign: its files, written whole or not at all, and its part of a notebook."""
 
+import json
 import os
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxslam.monte_carlo import Campaign
-from jaxslam.results import report
+from jaxslam.consistency import Tally
+from jaxslam.monte_carlo import Campaign, missing
+from jaxslam.monte_carlo.blocks.block import BOUND
+from jaxslam.monte_carlo.campaign import summaries_of
+from jaxslam.monte_carlo.kept import add_kept
+from jaxslam.results import report, store
 from jaxslam.results.files import check_writable, versions, write_files
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
@@ -15,6 +21,9 @@ if TYPE_CHECKING:  # Matplotlib is slow to load
 
 PAGE, RESULT, CURVES = "report.html", "consistency.json", "consistency.csv"
 """The page; the verdicts, measures and counts; the averages of every step."""
+
+BLOCKS = "blocks"
+"""The folder of a campaign's finished blocks, beside its results."""
 
 FORMATS = ("png", "pdf", "svg")
 """Formats of the files of figures."""
@@ -108,6 +117,48 @@ def save_campaign(
     for name in {*stale} - {*files}:
         (folder / name).unlink(missing_ok=True)
     return paths
+
+
+def load(folder: str | Path) -> Campaign:
+    """The finished campaign that `jaxslam consistency` left in a folder, as it was computed.
+
+        campaign = jaxslam.load("out")
+        jaxslam.plot.nees_figure(campaign, width=3.5).savefig("nees.pdf")
+
+    It is read from `blocks/` and `consistency.json`, without the scenario or the filters. Run 0 of
+    each filter is not kept: `Campaign.first` is empty, and its two figures need the command.
+
+    Raises:
+        ValueError: if the folder holds no campaign, or one that is not finished.
+    """
+    folder = Path(folder)
+    kept, path = store.resume(folder / BLOCKS), folder / RESULT
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        tallies = {name: Tally() for name in (*found["filters"], BOUND)}
+        runs = int(found["runs"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path}: expected the results of a campaign: jaxslam consistency --resume {folder} "
+            "writes them"
+        ) from error
+    if missing(add_kept(tallies, kept, runs, lambda first: True), runs, max(runs, 1)):
+        raise ValueError(
+            f"{folder}: the campaign is not finished: jaxslam consistency --resume {folder}"
+        )
+    _, limit, summaries = summaries_of(tallies)
+    told = ("scenario", "source", "published", "steps", "dtype")
+    times = ("seconds", "compile_seconds", "step_seconds")
+    return Campaign(
+        **{name: found[name] for name in (*told, *times)},
+        runs=runs,
+        divergence_limit=float(limit),
+        filters={
+            name: replace(one, doubts=tuple(found["filters"][name]["doubts"]))
+            for name, one in summaries.items()
+        },
+        run_numbers=tallies[BOUND].numbers(),
+    )
 
 
 def _holds(path: Path, text: object) -> bool:

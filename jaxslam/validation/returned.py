@@ -2,7 +2,6 @@
 
 from typing import TypeVar
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,21 +22,18 @@ def same_state(name: str, before: _S, after: PyTree) -> _S:
 
     Tree, shapes and dtypes must be the same, since the state is the carry of a `lax.scan`.
     """
-    try:
-        chex.assert_trees_all_equal_structs(before, after)
-    except AssertionError:
+    old: PyTree = jax.tree.structure(before)
+    if old != jax.tree.structure(after):
         told = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
-        raise ValueError(f"{name}: {told}") from None
-    try:
-        chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
-    except AssertionError:
-        pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
-        unlike = [
-            f"state{jax.tree_util.keystr(path)}: expected {_array(old)}, got {_array(new)}"
-            for (path, old), new in pairs
-            if _array(old) != _array(new)
-        ]
-        raise ValueError(f"{name}: {'; '.join(unlike)}") from None
+        raise ValueError(f"{name}: {told}")
+    pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
+    unlike = [
+        f"state{jax.tree_util.keystr(path)}: expected {_array(old)}, got {_array(new)}"
+        for (path, old), new in pairs
+        if _array(old) != _array(new)
+    ]
+    if unlike:
+        raise ValueError(f"{name}: {'; '.join(unlike)}")
     state: _S = after
     return state
 

@@ -46,7 +46,11 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(plot, "render", lambda scene, **more: scenes.update(scene=scene) or FILM)
     out = tmp_path / "out"
     assert (
-        cli.main(["optimize", str(file), "--start", "chordal", "--animate", "--out", str(out)]) == 0
+        cli.main(
+            ["optimize", str(file), "--start", "chordal", "--animate", "--certificate"]
+            + ["--out", str(out)]
+        )
+        == 0
     )
     printed = capsys.readouterr().out
     fixed = small()._replace(fixed_pose=np.arange(8) == 0)
@@ -99,13 +103,51 @@ def test_a_file_of_toro_is_optimized_and_written_as_g2o(tmp_path, capsys, undraw
     none = np.zeros(0, int)
     graph = graph._replace(points=np.zeros((0, 2)), point_id=none, fixed_point=none > 0)
     graphs.write(tmp_path / "small.toro", graph)
-    run = ["optimize", str(tmp_path / "small.toro"), "--no-certificate", "--out", str(tmp_path)]
+    run = ["optimize", str(tmp_path / "small.toro"), "--out", str(tmp_path)]
     assert cli.main(run) == 0
     assert "optimized.g2o" in capsys.readouterr().out
     again = graphs.read(tmp_path / "optimized.g2o")
-    assert again.fixed_pose.tolist() == [True] + [False] * 7
+    assert not again.fixed_pose.any()
     chi2 = json.loads((tmp_path / "summary.json").read_text())["chi2"]
-    np.testing.assert_allclose(chi2, plain.optimum(graph._replace(fixed_pose=again.fixed_pose))[2])
+    fixed = np.arange(8) == 0
+    np.testing.assert_allclose(chi2, plain.optimum(graph._replace(fixed_pose=fixed))[2])
+
+
+ORDERED = """VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 1 0 0
+VERTEX_SE2 2 2 0 0
+VERTEX_XY 5 1 1
+EDGE_SE2 0 1 1 0 0 5 0 0 5 0 5
+EDGE_SE2 1 2 1 0 0 5 0 0 5 0 5
+EDGE_SE2_XY 0 5 1 1 5 0 5
+EDGE_SE2 0 2 2.1 0 0 5 0 0 5 0 5
+"""
+
+
+@pytest.mark.parametrize("fixed", ["", "FIX 0\n"])
+def test_gtsam_reads_what_is_written(tmp_path, undrawn, fixed):
+    """Poses, relative poses and informations; FIX stands only where the file has it."""
+    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed")
+    (tmp_path / "a.g2o").write_text(fixed + "".join(sorted(ORDERED.splitlines(True))))
+    run = ["optimize", str(tmp_path / "a.g2o"), "--kernel", "huber", "--out", str(tmp_path / "o")]
+    assert cli.main(run) == 0
+    written = list((tmp_path / "o").glob("*.g2o"))
+    assert len(written) == 1
+    assert written[0].read_text().count("FIX") == bool(fixed)
+    again = graphs.read(written[0])
+    factors, values = gtsam.readG2o(str(written[0]), False)
+    table = again.tables["relative_pose"]
+    assert factors.size() == len(table.z) == 3
+    for row in range(3):
+        factor = factors.at(row)
+        assert list(factor.keys()) == again.pose_id[table.who[row]].tolist()
+        z = factor.measured()
+        np.testing.assert_allclose([z.x(), z.y(), z.theta()], table.z[row], atol=1e-12)
+        information = factor.noiseModel().information()
+        np.testing.assert_allclose(information, table.information[row], rtol=1e-12)
+    for name, pose in zip(again.pose_id, again.poses, strict=True):
+        at = values.atPose2(int(name))
+        np.testing.assert_allclose([at.x(), at.y(), at.theta()], pose, atol=1e-12)
 
 
 def test_an_optimum_without_a_proof_says_what_to_try(monkeypatch):
@@ -119,7 +161,8 @@ def test_too_few_steps_are_no_success(file, tmp_path, capsys):
     """By the program of the test above: numbers are its arguments."""
     run = ["optimize", str(file), "--iterations", "1", "--out", str(tmp_path)]
     assert cli.main(run) == 1
-    assert "exhausted" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "exhausted" in told and "--start odometry, spanning_tree, chordal, robust" in told
     assert json.loads((tmp_path / "summary.json").read_text())["status"] == "exhausted"
 
 
@@ -131,12 +174,16 @@ def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monke
         return solve(graph, factors, **options)
 
     monkeypatch.setattr(graphs, "optimize", optimize)
-    run = ["optimize", str(file), "--kernel", "huber", "--out", str(tmp_path)]
+    run = ["optimize", str(file), "--kernel", "huber", "--certificate", "--out", str(tmp_path)]
     assert cli.main(run) == 0
     assert asked["tables"] == ["relative_pose", "relative_pose/loops", "relative_position"]
     assert list(asked["kernel"]) == ["relative_pose/loops", "relative_position"]
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["robust cost"] <= summary["chi2"]
+    costs = [summary[f"robust cost from {name}"] for name in ("given", "chordal", "robust")]
+    assert summary["robust cost"] == min(costs)
+    np.testing.assert_allclose(min(costs), summary["chi2 without the kernel"])  # no row is doubted
+    loops, points = "relative_pose/loops", "relative_position"
+    assert summary["kept"] == {loops: 3, points: 16} and sum(summary["left out"].values()) == 0
     assert summary["certificate"].startswith("none: of a robust cost")
     assert len(graphs.read(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
     apart = graphs.with_loops_apart(small())
@@ -208,7 +255,7 @@ def test_each_kind_of_bad_graph_is_named(tmp_path, refused, old, new, message):
     [
         (
             ["--start", "moon"],
-            "unknown start 'moon'; known: given, odometry, spanning_tree, chordal",
+            "unknown start 'moon'; known: given, odometry, spanning_tree, chordal, robust",
         ),
         (["--kernel", "moon"], "unknown kernel 'moon'; known: huber"),
         (["--error", "moon"], "unknown error 'moon'; known: pose, log"),
@@ -231,5 +278,5 @@ def test_points_of_an_earlier_result_do_not_stay(file, tmp_path, undrawn):
     text = [line for line in file.read_text().splitlines() if "XY" not in line]
     posed.write_text("\n".join(text))
     for path, there in ((file, True), (posed, False)):
-        assert cli.main(["optimize", str(path), "--out", str(out), "--no-certificate"]) == 0
+        assert cli.main(["optimize", str(path), "--out", str(out)]) == 0
         assert (out / "points.csv").exists() is there

@@ -182,3 +182,24 @@ def test_lines_that_set_the_odometry_after_scans_of_another_laser(tmp_path):
     log = datasets.carmen(path, laser="RAWLASER1")
     assert len(log.time) == len(lines) and log.dropped == {"scans FLASER": 8}
     np.testing.assert_allclose(log.odometry, odometry, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "backward"),
+    [([0, 1, 1, 1, 2], 0), ([0, 2, 1, 3, 2.5], 2), ([0, 1, 1e9, 1e9 + 1, 2], 1)],
+)
+def test_stamps_that_repeat_run_backward_or_jump_change_no_pose(tmp_path, stamps, backward):
+    """Lines count in their order; headings pass ±π."""
+    at = [np.array([0.3 * k, 0.0, 3.0 + 0.1 * k]) for k in range(5)]
+    path = tmp_path / "a.log"
+    pairs = (
+        (odom(pose, t), flaser(pose + 0.01, pose + 0.01, t))
+        for pose, t in zip(at, stamps, strict=True)
+    )
+    path.write_text("\n".join(line for pair in pairs for line in pair) + "\n")
+    log = datasets.carmen(path)
+    off = log.raw - at
+    np.testing.assert_allclose(off - [0, 0, 2 * np.pi] * np.round(off / (2 * np.pi)), 0, atol=1e-9)
+    np.testing.assert_array_equal(log.time, stamps)
+    told = f"scans stamped before their predecessor, kept in order: {backward}"
+    assert (told in log.corrections) == (backward > 0)

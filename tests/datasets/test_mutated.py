@@ -186,6 +186,7 @@ def test_text_with_other_bytes(name, data, tmp_path):
             assert found.measurements + sum(found.dropped.values()) == measured(name, tmp_path)
 
 
+@pytest.mark.filterwarnings("ignore:.* is not read")
 @pytest.mark.parametrize("name", OTHERS)
 @fuzz
 @given(data=st.data())

@@ -46,6 +46,26 @@ def test_a_room_has_its_four_walls_each_once_and_across_the_seam():
         np.testing.assert_allclose(ends @ [np.cos(alpha), np.sin(alpha)], r, atol=1e-9)
 
 
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize(
+    "angle",
+    [
+        np.linspace(0, 6.28319, 360),  # of a TurtleBot3 in Gazebo: 4.7e-6 above a turn
+        np.linspace(-np.float32(np.pi), np.float32(np.pi), 361),
+        np.linspace(0, 2 * np.pi, 360),
+    ],
+)
+def test_the_first_beam_once_more_is_no_other_beam(angle, lost):
+    """The segments are those without one of the two: the last, or the first where that is lost."""
+    beams = scan(np.append(angle, np.nan), 0)  # a direction that is not finite says nothing
+    beams.range[0] = np.nan if lost else beams.range[0]
+    once = Beams(*(part[1:-1] if lost else part[:-2] for part in beams))
+    found, expected = (segments(of, sigma=SIGMA, max_range=10) for of in (beams, once))
+    assert sorted(nearest(found)) == [0, 1, 2, 3]
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_the_covariance_of_a_fit_is_that_of_the_draws():
     """A wall seen from -30° to 70°, 600 draws of the ranges and of the directions."""
     angle, true, noise = np.deg2rad(np.arange(-30, 71.0)), np.array([2.0, 0.0]), (0.03, 0.004)
@@ -131,6 +151,7 @@ def test_a_bent_wall_is_found_as_often_as_the_docstring_says_and_a_straight_one_
     [
         ({"range": np.ones(3)}, {}, "segments: expected one scan"),
         ({"angle": AROUND[::-1]}, {}, "segments: expected angles that increase"),
+        ({"angle": 1.01 * AROUND}, {}, "segments: expected angles that increase within one turn"),
         ({}, {"sigma": 0.0}, "segments: expected sigma and max_range above 0"),
         ({"range": np.full(360, 1e-300)}, {}, "fit_line: expected beams"),
         ({}, {"least": 2}, "segments: .*least of at least 3"),

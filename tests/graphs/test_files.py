@@ -66,14 +66,34 @@ def test_a_file_by_hand(tmp_path):
     assert list(graph.tables) == ["relative_pose", "relative_position", "bearing", "prior"]
 
 
-def test_toro_has_another_order(tmp_path):
-    text = "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 11 12 200 300 13 23\n"
+@pytest.mark.parametrize("tag", ["2", ""])
+def test_toro_has_another_order(tmp_path, tag):
+    """Both pairs of tags, VERTEX2 and EDGE2, VERTEX and EDGE."""
+    edge = f"EDGE{tag} 0 1 1 0 0 11 12 200 300 13 23"
+    text = f"VERTEX{tag} 0 0 0 0\nVERTEX{tag} 1 1 0 0\n{edge}\n"
     same = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 11 12 13 200 23 300\n"
     toro, plain = (graphs.read(wrote(tmp_path, t)) for t in (text, same))
     assert_same(toro, plain)
     np.testing.assert_array_equal(
         toro.tables["relative_pose"].information, [[[11, 12, 13], [12, 200, 23], [13, 23, 300]]]
     )
+
+
+def test_what_is_no_part_of_the_graph_is_skipped_and_counted(tmp_path):
+    """Offsets of sensors, to which no edge here refers, begin the files of RTAB-Map."""
+    text = "PARAMS_SE2OFFSET 0 0 0 0\n" + SMALL + "VERTEX_TAG 7 here\nROBOTLASER1 0 1 2\n"
+    loaded = g2o.load(wrote(tmp_path, text))
+    assert loaded.skipped == {"comments": 1, "sensor offsets": 1, "notes": 1, "laser scans": 1}
+    assert_same(loaded.graph, graphs.read(wrote(tmp_path, SMALL)))
+    with pytest.raises(ValueError, match=":15: unknown kind 'EDGE_SE2_OFFSET'"):
+        g2o.load(wrote(tmp_path, text + "EDGE_SE2_OFFSET 7 3 0 0 1 0 0 1 0 0 1 0 1\n"))
+
+
+def test_fixed_variables_are_written_last_and_only_where_they_are(tmp_path):
+    """GTSAM's reader stops at a line FIX."""
+    graph = graphs.read(wrote(tmp_path, SMALL))
+    assert g2o.text_of(graph).splitlines()[-1] == "FIX 7"
+    assert "FIX" not in g2o.text_of(graph._replace(fixed_pose=np.zeros(2, bool)))
 
 
 def test_the_round_trip_is_exact(tmp_path):
@@ -235,7 +255,11 @@ def test_errors_say_where(tmp_path, old, new, line, reason):
         ("VERTEX_SE2 0 0 0 0\n", ":1: no edge in the file"),
         ("EDGE_SE2_XY 1 2 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n", ":2: vertex 2 is a p"),
         (
-            "EDGE2 0 1 1 0 0 1 0 0 1 0 5\n",
+            "EDGE2 0 1 1 0 0 5 0 0 5 0 5\n",
+            ":1: the information is not positive semidefinite; EDGE2",
+        ),
+        (
+            "EDGE_SE2 0 1 1 0 0 5 0 5 5 0 0\n",
             ":1: the information is not positive semidefinite; EDGE2",
         ),
     ],

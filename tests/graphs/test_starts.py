@@ -131,3 +131,69 @@ def test_chordal_lies_close_to_the_optimum_of_real_graphs(name, best, share):
         pytest.skip(f"{path} is not there")
     found = plain.chi2(starts.chordal(graphs.read(path)))
     assert best < found < share * best
+
+
+@pytest.mark.parametrize("name", PLACING)
+def test_a_row_without_information_places_nothing(name):
+    truth = small_graphs.only(small_graphs.drawn(), "relative_pose")
+    table = truth.tables["relative_pose"]
+    false = graphs.Table(
+        np.array([[0, 4]]), np.full((1, 3), 9.0), np.zeros((1, 3, 3)), np.array([True])
+    )
+    both = graphs.Table(*map(np.concatenate, zip(table, false, strict=True)))
+    assert_close(starts.STARTS[name](truth._replace(tables={"relative_pose": both})), truth)
+
+
+def shuffled(graph):
+    """The graph with its poses, its points and the rows of each table in another order."""
+    random = np.random.default_rng(4)
+    pose, point = random.permutation(len(graph.poses)), random.permutation(len(graph.points))
+    at = {"pose": np.argsort(pose), "point": np.argsort(point)}
+
+    def row_order(key, table):
+        rows = random.permutation(len(table.z))
+        kinds = graphs.REGISTRY[key]().variables
+        who = np.stack([at[kind][table.who[:, k]] for k, kind in enumerate(kinds)], axis=1)
+        return graphs.Table(who[rows], table.z[rows], table.information[rows], table.valid[rows])
+
+    return graph._replace(
+        poses=graph.poses[pose],
+        points=graph.points[point],
+        tables={key: row_order(key, table) for key, table in graph.tables.items()},
+        fixed_pose=graph.fixed_pose[pose],
+        fixed_point=graph.fixed_point[point],
+        pose_id=graph.pose_id[pose],
+        point_id=graph.point_id[point],
+    )
+
+
+@pytest.mark.parametrize(
+    "tables", [("relative_pose", "relative_position"), ("relative_pose", "prior")]
+)
+def test_the_order_of_poses_and_rows_has_no_influence(tables):
+    """On gauge, loops and starts, with two priors and with edges that occur twice."""
+    drawn = small_graphs.drawn(noise=0.1, fixed_pose=np.zeros(8, bool))
+    twice = {
+        key: graphs.Table(*(np.concatenate([part, part[:3]]) for part in table))
+        for key, table in drawn.tables.items()
+    }
+    twice["relative_pose"].z[-3:] += 0.1
+    twice["prior"] = twice["prior"]._replace(
+        who=np.array([[6], [3]]), z=twice["prior"].z + [[0], [1]]
+    )
+    graph = small_graphs.only(drawn._replace(tables=twice), *tables)
+    other = shuffled(graph)
+    for found in (graph, other):
+        held = graphs.with_gauge(found)
+        expected = [] if "prior" in tables else [10]
+        assert held.pose_id[held.fixed_pose].tolist() == expected
+        apart = graphs.with_loops_apart(found).tables
+        who = found.pose_id[apart["relative_pose/loops"].who]
+        assert sorted(who.tolist()) == [[12, 16], [15, 11], [17, 10]]
+        who = found.pose_id[apart["relative_pose"].who]
+        assert sorted(who.tolist()) == sorted([[i, i + 1] for i in [*range(10, 17), 10, 11, 12]])
+    for name in PLACING:
+        one, two = (starts.STARTS[name](each) for each in (graph, other))
+        order = np.argsort(two.pose_id)
+        np.testing.assert_allclose(two.poses[order], one.poses, atol=1e-12)
+        np.testing.assert_allclose(two.points[np.argsort(two.point_id)], one.points, atol=1e-12)

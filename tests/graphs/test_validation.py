@@ -222,3 +222,38 @@ def test_a_residual_of_another_shape_is_refused(residual, got):
     for use in (graphs.optimize, graphs.chi2, graphs.squared_residuals, graphs.plan):
         with pytest.raises(ValueError, match=rf"graphs\.{use.__name__}: {told} .*, got {got}"):
             use(graph, factors)
+
+
+GRAPH = small_graphs.drawn()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: graphs.optimize("x.g2o"), "optimize: expected a Graph, .*, got 'x.g2o'"),
+        (lambda: graphs.chi2(None), "chi2: expected a Graph, .*, got a NoneType"),
+        (lambda: graphs.starts.chordal("x.g2o"), "starts: expected a Graph, .*, got 'x.g2o'"),
+        (lambda: graphs.plan(GRAPH.tables), "plan: expected a Graph, .*, got a dict"),
+        (
+            lambda: graphs.optimize(GRAPH, kernel=graphs.dcs),
+            r"optimize: expected a Kernel, as graphs.huber\(\), got the function dcs",
+        ),
+        (
+            lambda: graphs.chi2(GRAPH, kernel={"bearing": "dcs"}),
+            r"chi2: expected a Kernel, as graphs.huber\(\), got 'dcs'",
+        ),
+        (
+            lambda: graphs.optimize(GRAPH, {"bearing": graphs.bearing}),
+            r"optimize: expected a Factor, as graphs.relative_pose\(\), got the function bearing",
+        ),
+        (
+            lambda: graphs.optimize(GRAPH, graphs.bearing()),
+            "optimize: expected factors as a dict by table, got a Factor",
+        ),
+        (lambda: graphs.optimize(GRAPH, iterations=-1), "iterations: expected an integer >= 0"),
+        (lambda: graphs.marginals(GRAPH), "marginals: expected a Solution, .* got a Graph"),
+    ],
+)
+def test_another_thing_than_the_argument_is_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

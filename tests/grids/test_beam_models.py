@@ -213,7 +213,7 @@ def test_both_fits_find_the_parameters():
         ),
         (lambda m, f: ray_cast(max_range=1.0, method="lut"), "ray_cast: expected a method"),
         (lambda m, f: fit(np.ones(3), np.ones(3), 0.0), "fit: expected max_range above 0"),
-        (lambda m, f: fit(np.ones(3), -np.ones(3), FAR), "fit: expected finite ranges"),
+        (lambda m, f: fit(np.ones(3), -np.ones(3), FAR), "fit: expected predicted ranges"),
         (
             lambda m, f: likelihood_field(0.0, max_range=1.0),
             "likelihood_field: expected sigma above 0, got 0.0",
@@ -232,7 +232,10 @@ def test_both_fits_find_the_parameters():
             lambda m, f: fit(np.ones(3), np.ones(3), FAR, start=Mixture(0, 0, 0, 0, 1, 1)),
             "fit: start: expected shares",
         ),
-        (lambda m, f: fit(np.ones(3) * np.nan, np.ones(3), FAR), "fit: expected finite ranges"),
+        (
+            lambda m, f: fit(np.ones(3) * np.nan, np.ones(3), FAR),
+            "fit: none of 3 ranges is above 0",
+        ),
         (lambda m, f: fit(np.ones(3), np.ones(3), FAR, method="mcmc"), "fit: expected method"),
     ],
 )

@@ -69,6 +69,46 @@ def test_text_images_wide_shades_and_lists_in_lines(tmp_path):
     same(grids.read_map(made(tmp_path, lines)), expected)
 
 
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "[-1.5, 2.0,\n         0.25]",
+        "[\n  -1.5,\n  2.0,\n  0.25,\n]",
+        "\n  - -1.5\n  - 2\n  - 0.25",
+    ],
+)
+def test_what_other_programs_write_is_read_and_their_keys_are_named(tmp_path, origin):
+    """YAML as map_saver, slam_toolbox, nav2 and Cartographer write it, with keys of their own."""
+    expected = grids.read_map(made(tmp_path))
+    text = YAML.replace("[-1.5, 2.0, 0.25]", origin)
+    text = f"%YAML 1.1\n---\nmap_type: occupancy\n{text}info: {{frame: map, layers: [a, b]}}\n"
+    with pytest.warns(UserWarning, match="is not read") as told:
+        same(grids.read_map(made(tmp_path, text)), expected)
+    keys = [str(one.message).partition("map.yaml")[2] for one in told]
+    assert keys[0] == ":3: key 'map_type' is not read"
+    assert [key.partition(": ")[2] for key in keys[1:]] == ["key 'info' is not read"]
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "I;16", "BMP"])
+def test_images_of_other_formats(tmp_path, mode):
+    """Written by Pillow, which Matplotlib brings along: grey, colours, 16 bits."""
+    image = pytest.importorskip("PIL.Image")
+    shades = np.array(SHADES, np.uint8)
+    name = "map.bmp" if mode == "BMP" else "map.png"
+    if mode == "I;16":
+        drawn = image.fromarray(shades.astype(np.uint16) * 257)
+    else:
+        drawn = image.fromarray(shades).convert("L" if mode == "BMP" else mode)
+    drawn.save(tmp_path / name)
+    expected = grids.read_map(made(tmp_path))
+    same(grids.read_map(made(tmp_path, YAML.replace("map.pgm", name))), expected)
+    if mode == "RGBA":
+        drawn.putalpha(100)
+        drawn.save(tmp_path / name)
+        with pytest.raises(ValueError, match=r"map\.png: expected an image that is opaque"):
+            grids.read_map(made(tmp_path, YAML.replace("map.pgm", name)))
+
+
 @pytest.mark.parametrize("mode", ["trinary", "scale"])
 def test_round_trips_are_exact(tmp_path, mode):
     first = grids.read_map(made(tmp_path))
@@ -109,13 +149,14 @@ def test_the_map_of_turtlebot(tmp_path):
         ("0.05", "fine", 3, "resolution is not a finite number: 'fine'"),
         ("0.05", "nan", 3, "resolution is not a finite number"),
         ("-1.5, 2.0, 0.25", "-1.5, 2.0", 4, "expected origin: [x, y, yaw], got [-1.5, 2.0]"),
-        ("2.0, 0.25]", "2.0, 0.25", 4, "expected origin: [x, y, yaw], got [-1.5, 2.0, 0.25"),
+        ("2.0, 0.25]", "2.0, 0.25", 4, "expected YAML, but "),
         ("-1.5, 2.0, 0.25", "-1.5, 2.0, inf", 4, "yaw is not a finite number"),
         ("negate: 0", "negate: 2", 5, "expected negate to be 0 or 1"),
         ("negate: 0", "mode: raw\nnegate: 0", 5, "expected mode to be trinary or scale"),
         ("0.65", "0.1", 6, "expected 0 <= free_thresh < occupied_thresh <= 1"),
-        ("negate: 0", "negat: 0", 5, "unknown key 'negat'"),
-        ("negate: 0", "negate 0", 5, "expected `key: value`"),
+        ("negate: 0", "negate 0", 5, "expected YAML, but could not find expected ':'"),
+        ("image: map.pgm", "image: [map.pgm]", 2, "expected one value of image"),
+        (YAML, "- 1", 1, "expected `key: value`"),
         ("negate: 0", "resolution: 0.05", 5, "resolution occurs twice"),
         ("negate: 0\n", "", 6, "negate is missing"),
     ],
@@ -132,9 +173,9 @@ def test_a_byte_order_mark_is_no_key(tmp_path):
 @pytest.mark.parametrize(
     ("image", "reason"),
     [
-        (b"\x89PNG\r\n\x1a\n123", "expected a PGM image (P5 or P2), got PNG"),
-        (b"P6 3 2 255\n", "got P6"),
-        (b"", "got another format"),
+        (b"\x89PNG\r\n\x1a\n123", "expected a PNG image: "),
+        (b"P6 3 2 255\n", "expected an image in PGM (P5 or P2), PNG or BMP"),
+        (b"", "expected an image in PGM"),
         (b"P5 3 2 255\n123", "the image ends after 3 of 6 bytes"),
         (b"P2 3 2 255\n1 2 3", "the image ends after 3 of 6 numbers"),
         (b"P2 3 2 255\n1 2 3 4 5 x", "expected a whole number, got 'x'"),

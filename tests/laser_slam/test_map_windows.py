@@ -31,7 +31,7 @@ def both(log, monkeypatch, window, settings=SETTINGS):
     """(hits, misses), counted in windows and at once; and the shapes of the windows."""
     monkeypatch.setattr(mapping, "WINDOW", window)
     shape, origin, resolution = mapping.frame_of(log, [log.raw], settings)
-    beams = mapping._used(log, settings, np.ones(len(log.time), bool))
+    beams = mapping._used(log, settings, np.ones(len(log.time), bool), slice(None))
     laser = poses.compose(log.raw, np.array(log.mount))
     whole = grids.count(shape, origin, resolution, laser, beams, max_range=settings.max_range)
     calls = []

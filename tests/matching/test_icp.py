@@ -148,6 +148,38 @@ def test_a_corridor_is_degenerate_along_itself(found):
     assert abs(found["lines", None].pose[7, 1]) < 0.01
 
 
+@pytest.mark.parametrize("make", [matching.point_to_line, matching.point_to_point, matching.field])
+@pytest.mark.parametrize("sigma", [0.0, 0.02])
+def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
+    """Walls at y = ±1, both scans from one place: the scans do not depend on x.
+
+    Of so many directions of the corridor, since a rotation of all must change nothing.
+    """
+    worth = np.array([1e-3, 1e-2, 1.0, 10.0, 1e3])
+    angle = np.linspace(-np.pi, np.pi, 180, endpoint=False) + 0.003
+    turn = np.array([0.0, 0.0, 0.5, 0.0, -2.0])
+    rng = np.random.default_rng(0)
+
+    def seen():
+        ranges = 1 / np.abs(np.sin(angle)) + sigma * rng.normal(size=180)
+        ray = np.stack([np.cos(angle + turn[:, None]), np.sin(angle + turn[:, None])], axis=-1)
+        near = np.tile(ranges < 6, (5, 1))
+        return Points(np.where(near[..., None], ranges[:, None] * ray, 0.0), ray, near)
+
+    reference, scan = seen(), seen()
+    matcher = make()
+    if matcher.of_grid:
+        reference = jax.vmap(lambda of: matching.raster(of, 0.05, 8.0))(reference)
+    along = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    prior = Prior(np.c_[0.35 * along, np.zeros(5)], worth[:, None, None] * np.eye(3))
+    found = jax.device_get(matching.match(matcher, reference, scan, np.zeros((5, 3)), prior))
+    assert np.all(found.status == MatchStatus.DEGENERATE)
+    np.testing.assert_allclose((found.pose[:, :2] * along).sum(axis=1), 0.35, atol=2e-3)
+    np.testing.assert_allclose(found.determined[0], np.diag([0, 1, 1]), atol=0.02)
+    alone = matching.match(matcher, reference, scan, np.zeros((5, 3)))
+    np.testing.assert_allclose((alone.pose[:, :2] * along).sum(axis=1), 0, atol=2e-3)
+
+
 @pytest.mark.parametrize("make", [matching.point_to_point, matching.point_to_line])
 def test_a_prior_holds_what_the_scans_do_not_determine(make):
     """At the end the slope of the cost is zero; in the corridor x is that of the prior."""
@@ -161,14 +193,13 @@ def test_a_prior_holds_what_the_scans_do_not_determine(make):
     def slope(of, scan, end):
         return jax.grad(lambda pose: matcher.cost(matcher.prepare(of), scan, pose, end))(end.pose)
 
-    good = [*range(GOOD), 7]
-    np.testing.assert_allclose(slope(REFERENCES, SCANS, found)[np.array(good)], 0, atol=1e-5)
-    assert found.status[7] == MatchStatus.DEGENERATE
-    if make is matching.point_to_line:
-        # Of the cost's slope along x only the prior's part is left, up to the tilt of the lines;
-        # at the start it is 0.7 · 0.03 - 0.2 · 0.02 + 0.2 · 0.01 = 0.019.
-        e = found.pose[7] - prior.pose[7]
-        assert abs(information[0] @ e) < 0.003
+    np.testing.assert_allclose(slope(REFERENCES, SCANS, found)[:GOOD], 0, atol=1e-5)
+    np.testing.assert_array_equal(found.determined[0], np.eye(3))
+    # In the corridor the slope of the scans' cost counts across it alone.
+    whole, of_prior = slope(REFERENCES, SCANS, found)[7], information @ (found.pose - prior.pose)[7]
+    left = found.determined[7].T @ (whole - of_prior) + of_prior
+    np.testing.assert_allclose(left, 0, atol=2e-5)
+    assert np.linalg.matrix_rank(found.determined[7], tol=1e-6) == 2
 
 
 def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite():

@@ -14,7 +14,6 @@ import jax
 from jaxslam.cli.common import INTERRUPTED, OUT, asked_figures, check_out
 from jaxslam.cli.consistency.film import write_films
 from jaxslam.cli.consistency.folder import (
-    BLOCKS,
     CampaignOptions,
     earlier_results,
     open_store,
@@ -159,7 +158,7 @@ def _asked(options: argparse.Namespace) -> tuple[CampaignOptions, Mapping[str, o
     asked = {n: value for n, value in vars(options).items() if n in CampaignOptions._fields}
     if options.resume is None:
         return CampaignOptions(**asked), {}
-    there = store.resume(options.resume / BLOCKS)
+    there = store.resume(options.resume / campaign_files.BLOCKS)
     whole = resumed(options, there, asked)
     if options.block is None:  # blocks of another size would round differently
         options.block = there.settings.get("block")

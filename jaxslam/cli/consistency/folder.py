@@ -12,10 +12,7 @@ import jax
 from jaxslam.cli.runtime import devices
 from jaxslam.monte_carlo import missing
 from jaxslam.results import store
-from jaxslam.results.campaign_files import RESULT
-
-BLOCKS = "blocks"
-"""The folder of a campaign's finished blocks, beside its results."""
+from jaxslam.results.campaign_files import BLOCKS, RESULT
 
 
 class CampaignOptions(NamedTuple):

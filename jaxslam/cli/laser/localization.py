@@ -161,7 +161,7 @@ def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLo
     rays = grids.ray_map(grid, method="cells")
     cast = jax.jit(jax.vmap(lambda pose, angles: grids.cast(rays, pose, angles, log.max_range)))
     off = np.abs(np.asarray(cast(compose(poses, log.mount), scans.angle)) - scans.range)
-    met = scans.valid & (scans.range < log.max_range)
+    met, _ = scans.returns(log.max_range)
     return float((met & (off < REACH)).sum() / max(met.sum(), 1))
 
 

@@ -69,11 +69,11 @@ def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[
 
     Raises ValueError where no beam returns, and on more than `MOST` cells.
     """
-    ranges, angles, valid = (np.asarray(part) for part in log.beams)
+    ranges, angles = np.asarray(log.beams.range), np.asarray(log.beams.angle)
     pose = poses.compose(log.corrected, log.mount)  # of the laser
     heading = pose[:, 2:] + angles
     ends = pose[:, None, :2] + ranges[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
-    met = valid & (ranges < log.max_range)
+    met, _ = log.beams.returns(log.max_range)
     if not met.any():
         raise ValueError(
             f"{log.source}: no beam returns within {log.max_range:g} m (--max-range), so there is "
@@ -129,7 +129,7 @@ def counted(
 
 def beams_told(log: LaserLog, counts: Counts) -> dict[str, int]:
     """The numbers of beams in the map, without an echo, and unusable: entries of the summary."""
-    far = int((np.asarray(log.beams.valid) & (log.beams.range >= log.max_range)).sum())
+    far = int(log.beams.returns(log.max_range)[1].sum())
     return {
         "in the map": int(counts.hits.sum()),
         "met nothing": far,

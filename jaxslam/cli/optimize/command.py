@@ -1,9 +1,11 @@
 """The command `jaxslam optimize`: the optimum of a graph in a file."""
 
 import argparse
+import importlib
 import sys
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import jax
@@ -18,6 +20,7 @@ from jaxslam.core.numbers import check_count
 from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.graph import TRUSTED
 from jaxslam.graphs.solver.search import METHODS
 from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
@@ -32,15 +35,16 @@ ERRORS = {
 
 COST = "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses"
 
-TRUSTED = ("relative_pose", "prior")
-"""Tables without a robust kernel: relative poses of successive poses, and priors."""
+SEVERAL = ("given", "chordal", "robust")
+"""Starts that are tried with a robust kernel: which one is right differs from graph to graph."""
 
 NOT_CONVERGED = 1
 
 
 def optimize_graph(options: argparse.Namespace, command: str) -> int:
     """Optimize a graph, print and write the result; returns the exit status, 1 if not converged."""
-    start = pick("start", options.start, starts.STARTS)
+    if options.start is not None:
+        pick("start", options.start, starts.STARTS)
     kernel = None if options.kernel is None else pick("kernel", options.kernel, graphs.KERNELS)()
     relative, equation = pick("error", options.error, ERRORS)
     pick("method", options.method, {name: name for name in METHODS})
@@ -58,29 +62,45 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     graphs.check_graph(str(options.path), held, factors)
     given = held if kernel is None else graphs.with_loops_apart(held)
     factors = {key: known[key.split("/")[0]] for key in given.tables}
-    begun = start(given, factors)
     doubted = {key: kernel for key in given.tables if key not in TRUSTED} if kernel else None
-    with Progress(Path(options.path).name, "steps") as progress:
+    # Matplotlib loads while XLA compiles.
+    threading.Thread(target=importlib.import_module, args=["jaxslam.results.plot"]).start()
+    begins, impossible = _begins(options.start, doubted is not None, given, factors)
+    solutions = {}
+    with Progress(Path(options.path).name, "starts") as progress:
         progress.say("compiling and solving …")
         with CompileClock() as clock:
-            solution = jax.block_until_ready(
-                graphs.optimize(
-                    begun,
-                    factors,
-                    method=options.method,
-                    kernel=doubted,
-                    iterations=options.iterations,
+            for name, begun in begins.items():
+                solutions[name] = jax.block_until_ready(
+                    graphs.optimize(
+                        begun,
+                        factors,
+                        method=options.method,
+                        kernel=doubted,
+                        iterations=options.iterations,
+                    )
                 )
-            )
             seconds, compiling = clock.seconds, clock.compiling
+    tried = {name: float(np.nan_to_num(each.chi2, nan=np.inf)) for name, each in solutions.items()}
+    start = min(tried, key=tried.__getitem__)
+    begun, solution = begins[start], solutions[start]
     found = jax.tree.map(np.asarray, solution.graph)
-    squared = {k: np.asarray(s) for k, s in graphs.squared_residuals(found, factors).items()}
+    squared = _squared(found, factors)
     converged = int(solution.status) == Ending.CONVERGED
     costs = (
-        json_number(graphs.chi2(begun, factors)),
-        json_number(sum(s.sum() for s in squared.values())),
+        json_number(_sum(_squared(begun, factors))),
+        json_number(_sum(squared)),
     )
     status = _status(solution, found)
+    shown = costs
+    if doubted:
+        shown = json_number(graphs.chi2(begun, factors, kernel=doubted)), json_number(solution.chi2)
+    cost = "robust cost" if doubted else "χ²"
+    subtitles = (
+        f"start ({start}): {cost} = {as_text(shown[0])}",
+        f"{status.split(':')[0]}: {cost} = {as_text(shown[1])}",
+    )
+    plain = "" if kernel is None else " without the kernel"
     summary = {
         "file": str(options.path),
         "command": command,
@@ -91,17 +111,21 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "skipped lines": loaded.skipped,
         "placed along the edges": loaded.placed,
         "gauge": _gauge(loaded.graph, held),
-        "start": options.start,
+        "start": start,
         "method": options.method,
         "kernel": options.kernel or "none",
-        "chi2 of the file": json_number(graphs.chi2(given, factors)),
-        "chi2 at the start": costs[0],
-        "chi2": costs[1],
+        **(_robust(solution, doubted, tried, impossible) if doubted else {}),
+        f"chi2 of the file{plain}": costs[0]
+        if begun is given
+        else json_number(_sum(_squared(given, factors))),
+        f"chi2 at the start{plain}": costs[0],
+        f"chi2{plain}": costs[1],
         "degrees of freedom": graphs.degrees_of_freedom(found, factors),
-        **({} if kernel is None else {"robust cost": json_number(solution.chi2)}),
         "status": status,
         "iterations": int(solution.iterations),
-        "gradient / at the start": json_number(solution.gradient / solution.gradient_start),
+        "gradient / at the start": json_number(
+            float(solution.gradient) / (float(solution.gradient_start) or 1.0)
+        ),
         "seconds to compile": round(compiling, 3),
         "seconds to run": round(seconds - compiling, 3),
         **(_certificate(found, converged, kernel is None) if options.certificate else {}),
@@ -113,8 +137,10 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
             summary | {"worst residuals": worst, "versions": versions()},
         ),
         "poses.csv": _csv(("x", "y", "theta"), found.pose_id, found.poses, found.fixed_pose),
-        "optimized.g2o": g2o.text_of(found),
-        "graph.png": figure_writer(options, begun, found, squared, costs, status),
+        "optimized.g2o": g2o.text_of(
+            found._replace(fixed_pose=loaded.graph.fixed_pose, fixed_point=loaded.graph.fixed_point)
+        ),
+        "graph.png": figure_writer(options, begun, found, squared, subtitles),
     }
     if options.animate:
         files |= film_writers(options, begun, factors, doubted, solution)
@@ -124,8 +150,66 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     print("\nwrote " + ", ".join(str(path) for path in written))
     if converged:
         return 0
-    print(f"jaxslam: {status}", file=sys.stderr)
+    print(f"jaxslam: {status}{_advice(int(solution.status), tried)}", file=sys.stderr)
     return NOT_CONVERGED
+
+
+def _squared(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, np.ndarray]:
+    """eᵀ Ω e of each row; one program for the file, the start and the optimum."""
+    return {k: np.asarray(s) for k, s in graphs.squared_residuals(graph, factors).items()}
+
+
+def _sum(squared: Mapping[str, np.ndarray]) -> float:
+    return float(sum(s.sum() for s in squared.values()))
+
+
+def _begins(
+    name: str | None, robust: bool, given: Graph, factors: Mapping[str, Factor]
+) -> tuple[dict[str, Graph], dict[str, str]]:
+    """The graph at each start to try; and the starts that cannot be, with the reason."""
+    if name is not None or not robust:
+        name = name or "given"
+        return {name: starts.STARTS[name](given, factors)}, {}
+    begins, impossible = {}, {}
+    for each in SEVERAL:
+        try:
+            begins[each] = starts.STARTS[each](given, factors)
+        except ValueError as error:
+            impossible[each] = str(error)
+    return begins, impossible
+
+
+def _robust(
+    solution: graphs.Solution,
+    doubted: Mapping[str, graphs.Kernel],
+    tried: Mapping[str, float],
+    impossible: Mapping[str, str],
+) -> dict[str, object]:
+    """What a robust kernel made of the graph: entries of the summary."""
+    kept, left_out = {}, {}
+    for key in doubted:
+        valid, weight = np.asarray(solution.graph.tables[key].valid), solution.weights[key]
+        kept[key] = int((np.asarray(weight)[valid] > 0.5).sum())
+        left_out[key] = int(valid.sum()) - kept[key]
+    return {
+        "robust cost": json_number(solution.chi2),
+        "kept": kept,
+        "left out": left_out,
+        **{f"robust cost from {name}": json_number(cost) for name, cost in tried.items()},
+        **{f"robust cost from {name}": f"none: {reason}" for name, reason in impossible.items()},
+    }
+
+
+def _advice(status: int, tried: Collection[str]) -> str:
+    """What to try after an optimization without a minimum; nothing where the status says enough."""
+    if status == Ending.SINGULAR:
+        return ""
+    others = ", ".join(name for name in starts.STARTS if name not in tried)
+    more = ", more --iterations" * (status == Ending.EXHAUSTED)
+    return (
+        f": no minimum was reached; try another start (--start {others}){more}, another --method, "
+        "or --kernel if loops may be false"
+    )
 
 
 def _gauge(read: Graph, given: Graph) -> str:

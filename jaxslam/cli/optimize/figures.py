@@ -25,10 +25,9 @@ def figure_writer(
     before: Graph,
     after: Graph,
     squared: Mapping[str, np.ndarray],
-    costs: tuple[float | None, float | None],
-    status: str,
+    subtitles: tuple[str, str],
 ) -> Callable[[Path], object]:
-    """The function that draws the graph before and after into a file; costs: χ² of both."""
+    """The function that draws the graph before and after into a file."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
     title = Path(options.path).name
@@ -38,10 +37,7 @@ def figure_writer(
         after,
         squared,
         worst=WORST,
-        subtitles=(
-            f"start ({options.start}): χ² = {as_text(costs[0])}",
-            f"{status.split(':')[0]}: χ² = {as_text(costs[1])}",
-        ),
+        subtitles=subtitles,
         title=f"{title}: {len(after.poses):,} poses, {edges:,} edges",
     )
     return lambda path: path.write_bytes(plot.png(figure))

@@ -3,7 +3,7 @@
 import argparse
 
 from jaxslam.cli.common import add_dtype, add_out
-from jaxslam.cli.optimize.command import ERRORS, optimize_graph
+from jaxslam.cli.optimize.command import ERRORS, SEVERAL, optimize_graph
 from jaxslam.cli.runtime import cache
 from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
 from jaxslam.graphs.solver.search import METHODS as STEPS
@@ -14,25 +14,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam optimize`."""
     parser.add_argument("path", metavar="FILE", help="a graph in the format of g2o or TORO")
     for name, default, known, text in (
-        ("start", "given", STARTS, "where to start"),
         ("method", "levenberg_marquardt", STEPS, "the steps"),
-        ("kernel", None, KERNELS, "a robust kernel for loop edges and measurements of points"),
         ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
     ):
         parser.add_argument(
             f"--{name}",
             metavar="NAME",
             default=default,
-            help=f"{text}, one of: {', '.join(known)} (default: {default or 'none'})",
+            help=f"{text}, one of: {', '.join(known)} (default: {default})",
         )
+    parser.add_argument(
+        "--start",
+        metavar="NAME",
+        help=f"where to start, one of: {', '.join(STARTS)} (default: given; with a kernel each of "
+        f"{', '.join(SEVERAL)}, and the lowest robust cost is kept)",
+    )
+    parser.add_argument(
+        "--kernel",
+        metavar="NAME",
+        nargs="?",
+        const="truncated",
+        help="a robust kernel for loop edges and measurements of points, one of: "
+        f"{', '.join(KERNELS)} (default: none; without a NAME: truncated)",
+    )
     parser.add_argument(
         "--iterations", type=int, default=1000, help="number of steps at most (default: 1000)"
     )
     parser.add_argument(
         "--certificate",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="also prove, where it can be, that no poses have a lower chordal cost (default: yes)",
+        action="store_true",
+        help="also prove, where it can be, that no poses have a lower chordal cost",
     )
     parser.add_argument(
         "--animate",

@@ -1,15 +1,17 @@
-"""Reader and writer of occupancy grids as ROS has them: a flat YAML file and a PGM image."""
+"""Reader and writer of occupancy grids as ROS has them: a YAML file and an image."""
 
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
+from jaxslam.datasets.formats.images import pgm_bytes, read_shades
 from jaxslam.datasets.formats.lines import TextFile
-from jaxslam.datasets.formats.pgm import pgm_bytes, read_pgm
 from jaxslam.grids.grid import Grid, check_grid
 from jaxslam.results.files import write_files
 
@@ -41,7 +43,7 @@ def load(path: str | Path) -> Grid:
     image = head.file.path.parent / head.text("image")
     if not image.is_file():
         raise head.error("image", f"no image {image}")
-    shade = read_pgm(image)
+    shade = read_shades(image)
     p = shade if negate else 1.0 - shade
     between = np.full(p.shape, 0.5) if mode == "trinary" else (p - free) / (occupied - free)
     p = np.where(p > occupied, 1.0, np.where(p < free, 0.0, between))
@@ -101,62 +103,70 @@ def _levels(log_odds: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
 
 
 class Header:
-    """The keys of a map file, a line each as `key: value`; a list may follow in lines `- value`."""
+    """The keys of a map file and their values; a key that `load` does not read gives a warning.
+
+    PyYAML parses the file to nodes, which keep the text and the line of each value.
+    """
 
     def __init__(self, path: str | Path) -> None:
         self.file = TextFile(path)
-        self.found: dict[str, tuple[int, str]] = {}
-        key = ""
-        for line, text in enumerate(self.file.lines, start=1):
-            text = _without_comment(text).strip()
-            if not text or text in ("---", "..."):
-                continue
-            if text.startswith("- ") and key:
-                at, so_far = self.found[key]
-                self.found[key] = at, f"{so_far}, {text[2:].strip()}".removeprefix(", ")
-                continue
-            key, colon, value = text.partition(":")
-            key = key.strip()
-            if not colon or (value and not value[0].isspace()):
-                raise self.file.error(line, f"expected `key: value`, got {text!r}")
-            if key not in (*_REQUIRED, "mode"):
-                raise self.file.error(line, f"unknown key {key!r}")
-            if key in self.found:
-                raise self.file.error(line, f"{key} occurs twice")
-            self.found[key] = line, value.strip()
+        text = "\n".join(self.file.lines)
+        try:
+            root = yaml.compose(text, yaml.SafeLoader)
+        except yaml.MarkedYAMLError as problem:
+            mark = problem.context_mark or problem.problem_mark  # where it begins
+            raise self.file.error(
+                mark.line + 1, f"expected YAML, but {problem.problem}"
+            ) from problem
+        except yaml.reader.ReaderError as problem:
+            line = text.count("\n", 0, problem.position) + 1
+            raise self.file.error(line, f"expected YAML, but {problem.reason}") from problem
+        if not isinstance(root, yaml.MappingNode):
+            raise self.file.error(1, "expected `key: value`")
+        self.found: dict[str, yaml.Node] = {}
+        for name, value in root.value:
+            line = name.start_mark.line + 1
+            if not isinstance(name, yaml.ScalarNode):
+                raise self.file.error(line, "expected `key: value`")
+            if name.value in self.found:
+                raise self.file.error(line, f"{name.value} occurs twice")
+            if name.value in (*_REQUIRED, "mode"):
+                self.found[name.value] = value
+            else:
+                unknown = f"{self.file.path}:{line}: key {name.value!r} is not read"
+                warnings.warn(unknown, stacklevel=4)
         for key in _REQUIRED:
             if key not in self.found:
                 raise self.file.end_error(f"{key} is missing")
 
     def error(self, key: str, reason: str) -> ValueError:
-        """A ValueError about the line of a key, for the caller to raise."""
-        return self.file.error(self.found[key][0], reason)
+        """A ValueError about the line of a value, for the caller to raise."""
+        return self.file.error(self.found[key].start_mark.line + 1, reason)
 
     def text(self, key: str) -> str:
-        """The value of a key, without quotes."""
-        value = self.found[key][1]
-        if len(value) > 1 and value[0] == value[-1] and value[0] in "\"'":
-            value = value[1:-1].replace("''", "'") if value[0] == "'" else value[1:-1]
-        if not value:
-            raise self.error(key, f"{key} has no value")
+        """The value of a key as it stands in the file, without quotes."""
+        value = self.found[key].value
+        if not isinstance(value, str) or not value:
+            raise self.error(key, f"expected one value of {key}")
         return value
 
     def number(self, key: str) -> float:
         """The value of a key as a finite number."""
-        return self.file.numbers(self.found[key][0], [self.text(key)], [key])[0]
+        line = self.found[key].start_mark.line + 1
+        return self.file.numbers(line, [self.text(key)], [key])[0]
 
     def numbers(self, key: str, names: tuple[str, ...]) -> list[float]:
         """The value of a key as a list of finite numbers, one a name."""
-        line, value = self.found[key]
-        if value.startswith("[") != value.endswith("]"):
-            raise self.file.error(line, f"expected {key}: [{', '.join(names)}], got {value}")
-        fields = [field.strip() for field in value.removeprefix("[").removesuffix("]").split(",")]
+        node = self.found[key]
+        items = node.value if isinstance(node, yaml.SequenceNode) else [node]
+        fields = [item.value if isinstance(item, yaml.ScalarNode) else "" for item in items]
+        line = node.start_mark.line + 1
         try:
             return self.file.numbers(line, fields, names)
         except ValueError as problem:
             reason = str(problem).removeprefix(f"{self.file.path}:{line}: ")
-            wanted = f"expected {key}: [{', '.join(names)}]"
-            raise self.file.error(line, f"{wanted}, got {value}: {reason}") from problem
+            wanted = f"expected {key}: [{', '.join(names)}], got [{', '.join(fields)}]"
+            raise self.error(key, f"{wanted}: {reason}") from problem
 
     def choice(self, key: str, choices: dict[str, _Value], default: str | None = None) -> _Value:
         """What the value of a key stands for."""
@@ -172,16 +182,3 @@ def _scalar(text: str) -> str:
     """A text as YAML has it: in quotes unless letters, digits and a few signs are all it has."""
     plain = text[0].isalnum() and all(letter.isalnum() or letter in " ._-/" for letter in text)
     return text if plain else "'" + text.replace("'", "''") + "'"
-
-
-def _without_comment(text: str) -> str:
-    """A line up to a # that begins it or follows a blank, outside a value in quotes."""
-    quote = ""
-    for at, letter in enumerate(text):
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "\"'" and text[:at].rstrip().endswith((":", "'")):
-            quote = letter
-        elif letter == "#" and (at == 0 or text[at - 1].isspace()):
-            return text[:at]
-    return text

@@ -14,11 +14,11 @@ from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
-from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.linearized import data_of, linearize, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.padding import LEAST, cut, own_number, padded_graph, padded_number
 from jaxslam.graphs.solver.plan import Plan, checked_pairs, plan_for
+from jaxslam.graphs.solver.search import Solution
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
 from jaxslam.graphs.sparse.inverse import selected_inverse
 from jaxslam.graphs.sparse.sweeps import padded_size
@@ -40,35 +40,42 @@ class Marginals(NamedTuple):
 
 
 def marginals(
-    graph: Graph,
+    solution: Solution,
     factors: Mapping[str, Factor] | None = None,
     *,
-    kernel: Kernel | Mapping[str, Kernel] | None = None,
     pairs: ArrayLike = (),
     plan: Plan | None = None,
     room: int = 0,
 ) -> Marginals:
     """The covariances (Σ Jᵀ ρ' Ω J)⁻¹ of all poses and points of a graph, and of pairs of them.
 
-    J is taken at the graph's variables, so give the graph of a `Solution`. The inverse is computed
-    where the Cholesky factor has blocks (`sparse.inverse`), and at the pairs.
+    J and the weights ρ' of robust kernels are those of the solution: a row that a kernel leaves out
+    does not count. The inverse is computed where the Cholesky factor has blocks (`sparse.inverse`),
+    and at the pairs.
 
     Args:
-        graph: outside of a trace it is checked.
+        solution: of `optimize`. Outside of a trace its graph is checked. Of a graph as it is:
+            `optimize(graph, iterations=0)`.
         factors: as in `optimize`.
-        kernel: as in `optimize`.
         pairs: (Q, 2), two variables each, points counted on from the poses.
         plan: of `plan(graph, marginals=True, pairs=pairs)`; needed under `jit` and `vmap`. Its
             pairs stand if none are given here.
         room: as in `optimize`.
     Raises:
-        ValueError: on what `check_graph` refuses, on a plan without marginals or those pairs, and
-            outside of a trace on a variable that the measurements do not determine.
+        ValueError: on a graph in place of a solution, on what `check_graph` refuses, on a plan
+            without marginals or those pairs, and outside of a trace on a variable that the
+            measurements do not determine.
     """
     caller = "graphs.marginals"
-    model = model_of(caller, graph, factors, kernel)
+    if not isinstance(solution, Solution):
+        raise ValueError(
+            f"{caller}: expected a Solution, whose weights say what a kernel left out, got a "
+            f"{type(solution).__name__}; of a graph as it is: graphs.optimize(graph, iterations=0)"
+        )
+    model = model_of(caller, solution.graph, factors)
     known = dict(model.factors)
-    check_graph(caller, graph, known)
+    check_graph(caller, solution.graph, known)
+    graph = _weighted(solution)
     wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     if plan is None and programs.outside(graph):
         more = padded_graph(graph, room)
@@ -86,6 +93,18 @@ def marginals(
             f"{caller}: the measurements do not determine {label(graph, int(found.singular))}"
         )
     return found
+
+
+def _weighted(solution: Solution) -> Graph:
+    """The graph of a solution, each information multiplied by the weight of its row."""
+    array = np.asarray if programs.outside(solution) else jnp.asarray  # no program for each shape
+    tables = {
+        name: table._replace(
+            information=array(table.information) * array(solution.weights[name])[:, None, None]
+        )
+        for name, table in solution.graph.tables.items()
+    }
+    return solution.graph._replace(tables=tables)
 
 
 def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:

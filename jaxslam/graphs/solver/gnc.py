@@ -7,7 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.solver.linearized import chi2_of, data_of, row_costs, variables_of
+from jaxslam.graphs.solver.linearized import (
+    chi2_of,
+    data_of,
+    row_costs,
+    row_weights,
+    variables_of,
+)
 from jaxslam.graphs.solver.model import Model
 from jaxslam.graphs.solver.plan import Plan
 from jaxslam.graphs.solver.search import Ending, Solution, minimize
@@ -16,6 +22,8 @@ ROUNDS = 100
 """at most"""
 GROWTH = 1.4
 """of μ in each round"""
+SHARP = 1e6
+"""a μ with which nearly all weights are zeros or ones"""
 LOOSE = 1e-6
 """tolerance of the rounds before the last"""
 
@@ -39,12 +47,14 @@ def graduated(
 
     Yang et al. 2020, "Graduated non-convexity for robust spatial perception: from non-minimal
     solvers to global outlier rejection", RA-L 5(2). Rounds of weighted least squares: with s = eᵀΩe
-    of the round before, a row has the weight
+    before the round, a row has the weight
 
         1 if s <= μ c²/(μ + 1), 0 if s >= (μ + 1) c²/μ, else c √(μ(μ + 1)/s) - μ
 
-    and μ grows by 1.4 a round, from c²/(2 max s - c²) after a first round with all weights one,
-    until all weights are zeros or ones.
+    and μ grows by 1.4 a round, at least to c²/(2 max s - c²), until all weights are zeros or ones.
+    In the paper the first round has all weights one. Here it has those of the start's residuals,
+    zeros and ones where s < c² for most rows: false loops can bend the plain optimum by more than
+    later rounds mend, and a good start must not be given up for it.
     """
     truncated = {name: k.limit for name, k in model.kernels if k.limit is not None}
     plain = Model(model.factors, tuple((name, k) for name, k in model.kernels if k.limit is None))
@@ -57,7 +67,8 @@ def graduated(
             tables[name] = table._replace(information=table.information * weight[:, None, None])
         return minimize(plain, method, plan, iterations, tolerance, graph._replace(tables=tables))
 
-    def squares(found: Solution) -> dict[str, Array]:
+    def ratios(found: Solution) -> dict[str, Array]:
+        """s/c² of the rows that can be left out."""
         out = {}
         for name, factor in model.factors:
             if name in truncated:
@@ -69,8 +80,13 @@ def graduated(
                     data.z[name],
                     data.information[name],
                 )[1]
-                out[name] = jnp.where(data.valid[name], s, 0.0)
+                out[name] = jnp.where(data.valid[name], s, 0.0) / truncated[name] ** 2
         return out
+
+    def convex(ratio: dict[str, Array]) -> Float[Array, "B"]:
+        """The μ up to which the surrogate is convex over all rows, from s/c²."""
+        worst = jnp.stack([r.max(axis=0, initial=0.0) for r in ratio.values()]).max(axis=0)
+        return 1.0 / jnp.maximum(2 * worst - 1.0, 1.0 / SHARP)
 
     def again(state: Round) -> Array:
         return ~state.settled.all() & (state.rounds < ROUNDS)
@@ -89,10 +105,8 @@ def graduated(
         found = jax.tree.map(
             lambda a, b: jnp.where(state.settled[(None,) * (a.ndim - 1)], b, a), new, state.found
         )
-        ratio = {name: s / truncated[name] ** 2 for name, s in squares(found).items()}
-        worst = jnp.stack([r.max(axis=0, initial=0.0) for r in ratio.values()]).max(axis=0)
-        begin = 1.0 / jnp.maximum(2 * worst - 1.0, 1e-6)
-        control = jnp.where(first, begin, GROWTH * state.control)
+        ratio = ratios(found)
+        control = jnp.maximum(GROWTH * state.control, convex(ratio))
         weights = {name: _weight(r, control[None]) for name, r in ratio.items()}
         same = [(weights[name] == state.weights[name]).all(axis=0) for name in weights]
         settled = state.settled | (binary & jnp.stack(same).all(axis=0))
@@ -101,13 +115,19 @@ def graduated(
     batch = graph.poses.shape[-1:]
     zero, none = jnp.zeros(batch, graph.poses.dtype), jnp.zeros(batch, jnp.int32)
     loose = jnp.maximum(tolerance, jnp.asarray(LOOSE, tolerance.dtype))
-    start = Solution(graph, zero, none, none, none - 1, zero, zero, zero)
-    ones = {name: jnp.ones_like(data.z[name][:, 0]) for name in truncated}
-    state = Round(start, ones, zero, jnp.zeros(batch, bool), jnp.zeros((), jnp.int32))
+    every = row_weights(plain, plan.who, variables_of(graph), data)
+    start = Solution(graph, zero, none, none, none - 1, zero, zero, zero, every)
+    ratio = ratios(start)
+    rows = [jnp.where(data.valid[name], r, jnp.nan) for name, r in ratio.items()]
+    good = jnp.nanmedian(jnp.concatenate(rows), axis=0) <= 1.0
+    control = jnp.where(good, SHARP, convex(ratio))
+    weights = {name: _weight(r, control[None]) for name, r in ratio.items()}
+    state = Round(start, weights, control, jnp.zeros(batch, bool), jnp.zeros((), jnp.int32))
     end = jax.lax.while_loop(again, work, state)
     found, converged = end.found, end.found.status == Ending.CONVERGED
     return found._replace(
         chi2=chi2_of(model, plan.who, variables_of(found.graph), data),
+        weights=row_weights(model, plan.who, variables_of(found.graph), data),
         status=jnp.where(converged & ~end.settled, Ending.EXHAUSTED, found.status),
     )
 

@@ -12,6 +12,7 @@ from jaxslam.graphs.solver.linearized import (
     half_hessian,
     linearize,
     retract,
+    row_weights,
     variables_of,
 )
 from jaxslam.graphs.solver.model import Model
@@ -40,6 +41,9 @@ def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solutio
     return jax.lax.stop_gradient(found)._replace(
         graph=graph._replace(poses=end.poses[..., 0], points=end.points[..., 0]),
         chi2=chi2_of(model, plan.who, variables, data)[0],
+        weights={
+            name: weight[..., 0] for name, weight in row_weights(model, plan.who, end, data).items()
+        },
     )
 
 

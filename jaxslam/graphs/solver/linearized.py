@@ -106,6 +106,21 @@ def chi2_of(
     return total(parts)
 
 
+def row_weights(
+    model: Model, who: Mapping[str, Array], variables: Variables, data: Data
+) -> dict[str, Float[Array, "_ B"]]:
+    """The weights ρ'(s) of the rows of each table: 1 without a kernel, 0 where not valid."""
+    weights = {}
+    for name, factor in model.factors:
+        z, info, kernel = data.z[name], data.information[name], model.kernel(name)
+        if kernel is None:
+            weight = jnp.ones_like(z, shape=data.valid[name].shape)
+        else:
+            weight = kernel.weight(row_costs(factor, None, who[name], variables, z, info)[1])
+        weights[name] = jnp.where(data.valid[name], weight, 0.0)
+    return weights
+
+
 def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> System:
     """The normal equations about the variables."""
     width, poses = data.free.shape[1], len(variables.poses)

@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from inspect import isfunction
 
 import jax
 import jax.numpy as jnp
@@ -36,12 +37,10 @@ def model_of(
 ) -> Model:
     """The model of a graph's tables. Raises ValueError, which begins with a caller's name."""
     known = factors_of(name, graph, factors)
-    if isinstance(kernel, str):
-        raise ValueError(
-            f"{name}: expected a Kernel, as graphs.huber(), or one for each table, got {kernel!r}"
-        )
-    if isinstance(kernel, Kernel):
+    if kernel is not None and not isinstance(kernel, Mapping):
         kernel = dict.fromkeys(graph.tables, kernel)
+    for each in (kernel or {}).values():
+        _check_made(name, each, Kernel, "graphs.huber()")
     if lost := sorted(set(kernel or ()) - set(graph.tables)):
         raise ValueError(
             f"{name}: kernels of tables that are not in the graph: {', '.join(lost)}; "
@@ -57,7 +56,17 @@ def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) ->
     factors they are those of files. Raises ValueError, which begins with a caller's name, also on a
     factor whose residual has another shape than its `errors` tell.
     """
+    if not isinstance(graph, Graph):
+        got = repr(graph) if isinstance(graph, str) else f"a {type(graph).__name__}"
+        raise ValueError(
+            f"{name}: expected a Graph, as graphs.read(path) or the graph of a solution, got {got}"
+        )
     known = of_files() if factors is None else factors
+    if not isinstance(known, Mapping):
+        got = type(known).__name__
+        raise ValueError(f"{name}: expected factors as a dict by table, got a {got}")
+    for each in known.values():
+        _check_made(name, each, Factor, "graphs.relative_pose()")
     out = {}
     for key in sorted(graph.tables):
         found = known.get(key, known.get(key.split("/")[0]))
@@ -74,6 +83,13 @@ def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) ->
     if not out:
         raise ValueError(f"{name}: the graph has no tables")
     return out
+
+
+def _check_made(name: str, value: object, kind: type, example: str) -> None:
+    """Raise ValueError unless a value is of a kind, e.g. on the function that makes one."""
+    if not isinstance(value, kind):
+        got = f"the function {value.__name__}" if isfunction(value) else repr(value)
+        raise ValueError(f"{name}: expected a {kind.__name__}, as {example}, got {got}")
 
 
 @functools.lru_cache(maxsize=256)

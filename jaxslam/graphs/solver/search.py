@@ -14,6 +14,7 @@ from jaxslam.graphs.solver.linearized import (
     data_of,
     linearize,
     retract,
+    row_weights,
     variables_of,
 )
 from jaxslam.graphs.solver.model import Model
@@ -32,7 +33,8 @@ class Ending(IntEnum):
     CONVERGED = 0
     """The next step lowers χ² by less than the tolerance, and the information is regular."""
     STALLED = 1
-    """No step lowers χ²: rounding, or a residual whose derivatives are wrong."""
+    """No step lowers χ²: rounding, or a residual whose derivatives are wrong. Another start may
+    end in a minimum."""
     DIVERGED = 2
     """χ² is not finite, or Gauss-Newton ended above its start."""
     SINGULAR = 3
@@ -40,7 +42,7 @@ class Ending(IntEnum):
     rounding of the numbers: in float32 a chain of some hundred poses from the gauge can be such.
     Where the method damps its steps it went on, and χ² is a minimum."""
     EXHAUSTED = 4
-    """All iterations were made."""
+    """All iterations were made. Another start or method may end, in fewer steps and lower."""
 
 
 class Solution(NamedTuple):
@@ -60,6 +62,9 @@ class Solution(NamedTuple):
     gradient: Float[Array, ""]
     """length of ½ ∂χ²/∂(increments) at the last iterate"""
     gradient_start: Float[Array, ""]
+    weights: dict[str, Float[Array, "E"]]
+    """ρ'(s) of the rows of each table at the last iterate, by which a kernel multiplies their
+    information: 1 without a kernel, 0 of rows that are not valid"""
 
 
 class Search(NamedTuple):
@@ -97,9 +102,8 @@ def minimize(
     """The solutions of graphs with a last axis B."""
     data = data_of(graph, plan.column)
     start = variables_of(graph)
-    unknown = jax.eval_shape(lambda v: linearize(model, plan, v, data), start)
-    unsolved = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unknown)
-    batch, dtype = unknown.chi2.shape, unknown.chi2.dtype
+    width, batch, dtype = data.free.shape[1], start.poses.shape[-1:], start.poses.dtype
+    blocks = jnp.zeros((*plan.block_column.shape, width, width, *batch), dtype)
     eps = float(jnp.finfo(dtype).eps)
     none, no = jnp.zeros(batch, jnp.int32), jnp.zeros(batch, bool)
     zero = jnp.zeros(batch, dtype)
@@ -109,7 +113,7 @@ def minimize(
         length=zero,
         stepped=~no,
         variables=start,
-        system=unsolved._replace(chi2=zero + jnp.inf),
+        system=System(zero + jnp.inf, jnp.zeros(data.free.shape, dtype), blocks),
         bound=zero + (jnp.inf if method == "dogleg" else 0.0),
         going=~no,
         ending=none + Ending.EXHAUSTED,
@@ -252,4 +256,5 @@ def minimize(
         chi2_start=first_chi2,
         gradient=jnp.sqrt(dot(end.system.gradient, end.system.gradient)),
         gradient_start=first_gradient,
+        weights=row_weights(model, plan.who, end.variables, data),
     )

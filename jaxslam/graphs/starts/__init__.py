@@ -1,8 +1,8 @@
 """Starts of the optimization: each a pure function from a graph to one with other values.
 
-They are computed on the host with NumPy and SciPy, for concrete graphs. Fixed variables stay where
+They are computed on the host, for concrete graphs. Fixed variables stay where
 they are. A part of the graph without a fixed pose is held at the pose of its first prior (a table
-"prior"), or else at its first pose as it is. The start decides which minimum is found; it has no
+"prior"), or else at the pose of its lowest id. The start decides which minimum is found; it has no
 other influence on the optimum.
 """
 
@@ -11,6 +11,7 @@ from collections.abc import Callable
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.starts.chordal import chordal
 from jaxslam.graphs.starts.relative import Factors
+from jaxslam.graphs.starts.robust import robust
 from jaxslam.graphs.starts.tree import odometry, spanning_tree
 
 
@@ -24,7 +25,8 @@ STARTS: dict[str, Callable[..., Graph]] = {
     "odometry": odometry,
     "spanning_tree": spanning_tree,
     "chordal": chordal,
+    "robust": robust,
 }
 """The starts by name, for the command line."""
 
-__all__ = ["STARTS", "chordal", "given", "odometry", "spanning_tree"]
+__all__ = ["STARTS", "chordal", "given", "odometry", "robust", "spanning_tree"]

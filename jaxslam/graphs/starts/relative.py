@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxslam import programs
 from jaxslam.graphs.factor import Factor
-from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.graph import Graph, ranks
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.math import se2
 from jaxslam.types import JaxOrNumPy
@@ -32,13 +32,16 @@ class Relative(NamedTuple):
 
 
 def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
-    """The relative poses that valid rows between two poses measure, of all tables."""
+    """The relative poses that valid rows between two poses measure, of all tables, by id.
+
+    A row of zero information measures none.
+    """
     found, known = [], factors_of("graphs.starts", graph, factors)
     for key, table in graph.tables.items():
         factor = known[key]
         if factor.variables != ("pose", "pose") or factor.predict is None:
             continue
-        valid = np.asarray(table.valid)
+        valid = np.asarray(table.valid) & np.asarray(table.information).any(axis=(1, 2))
         who, z, information = (
             np.asarray(part)[valid] for part in (table.who, table.z, table.information)
         )
@@ -49,7 +52,19 @@ def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
             Relative(who[:, 0], who[:, 1], np.asarray(z, float), np.asarray(information, float))
         )
     nothing = Relative(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    return Relative(*map(np.concatenate, zip(*found, strict=True))) if found else nothing
+    if not found:
+        return nothing
+    every = Relative(*map(np.concatenate, zip(*found, strict=True)))
+    rows = _by_id(graph, np.stack(every[:2], axis=1), every.pose)
+    return Relative(*(part[rows] for part in every))
+
+
+def _by_id(graph: Graph, who: Int[np.ndarray, "E K"], z: Float[np.ndarray, "E Z"]) -> np.ndarray:
+    """The rows in the order of the ids of their poses, then of the size of what they measured.
+
+    The first row for a variable places it; in this order that row does not depend on a file's.
+    """
+    return np.lexsort((*z.T, np.linalg.norm(z, axis=1), *ranks(graph)[who].T[::-1]))
 
 
 def _measured(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -77,7 +92,7 @@ def anchors_of(
     """
     poses = np.array(graph.poses, np.float64)
     anchors = np.asarray(graph.fixed_pose).copy()
-    count = len(poses)
+    count, lowest = len(poses), np.argmin(graph.pose_id) if len(poses) else 0
     joined = coo_array(
         (np.ones(len(relative.first)), (relative.first, relative.second)), shape=(count, count)
     )
@@ -85,16 +100,14 @@ def anchors_of(
     held = np.bincount(part, anchors, minlength=parts) > 0
     if "prior" in graph.tables:
         table = graph.tables["prior"]
-        for (pose,), z in zip(
-            np.asarray(table.who)[np.asarray(table.valid)],
-            np.asarray(table.z)[np.asarray(table.valid)],
-            strict=True,
-        ):
+        who, priors = (np.asarray(part)[np.asarray(table.valid)] for part in (table.who, table.z))
+        rows = _by_id(graph, who, priors)
+        for (pose,), z in zip(who[rows], priors[rows], strict=True):
             if not held[part[pose]]:
                 anchors[pose] = held[part[pose]] = True
                 poses[pose] = z
     if not held.any() and count:
-        anchors[0] = held[part[0]] = True
+        anchors[lowest] = held[part[lowest]] = True
     if not held.all():
         lost = int(np.flatnonzero(~held[part])[0])
         raise ValueError(
@@ -121,7 +134,7 @@ def as_before(before: JaxOrNumPy, values: np.ndarray) -> np.ndarray:
 def with_points(
     graph: Graph, factors: Factors | None, placed: Bool[np.ndarray, "P"] | None = None
 ) -> Graph:
-    """The graph with each point placed by its first measurement from a pose that can.
+    """The graph with each point placed by a measurement from the pose of the lowest id that can.
 
     Points that are fixed or placed already stay, and those without such a measurement.
     """
@@ -133,6 +146,8 @@ def with_points(
         if factor.variables != ("pose", "point") or factor.predict is None:
             continue
         who, z = (np.asarray(part)[np.asarray(table.valid)] for part in (table.who, table.z))
+        rows = _by_id(graph, who[:, :1], z)
+        who, z = who[rows], z[rows]
         found, at = np.unique(who[:, 1], return_index=True)
         at = at[~done[found]]
         if len(at):

@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.graph import Graph, ranks
 from jaxslam.graphs.starts.relative import (
     Factors,
     Relative,
@@ -21,9 +20,10 @@ from jaxslam.graphs.starts.relative import (
 def odometry(graph: Graph, factors: Factors | None = None) -> Graph:
     """The graph with its poses placed along consecutive edges, the path of the odometry.
 
-    The tree that is followed prefers the edges between poses of the nearest indices: it is the
-    minimum spanning tree by |i - j|. Points are placed by the first measurement of each that tells
-    where it is.
+    The tree that is followed prefers the edges between poses of the nearest ids: it is the minimum
+    spanning tree by |i - j|, i and j being places in the order of the ids. Of several edges between
+    two poses the shortest is followed. Points are placed by a measurement of each from the first
+    pose that tells where it is. The order of poses and rows has no influence.
 
     Args:
         factors: as for `optimize`; by default those of the tables of files.
@@ -31,8 +31,7 @@ def odometry(graph: Graph, factors: Factors | None = None) -> Graph:
         ValueError: if some pose is not connected to an anchor by relative poses.
     """
     relative = measured_relative_poses(graph, factors)
-    weights = np.abs(relative.second - relative.first).astype(float)
-    return with_points(_along_a_tree("odometry", graph, relative, weights), factors)
+    return with_points(_along_a_tree("odometry", graph, relative, nearest=True), factors)
 
 
 def spanning_tree(graph: Graph, factors: Factors | None = None) -> Graph:
@@ -41,29 +40,29 @@ def spanning_tree(graph: Graph, factors: Factors | None = None) -> Graph:
     Arguments, points and errors are those of `odometry`.
     """
     relative = measured_relative_poses(graph, factors)
-    placed = _along_a_tree("spanning_tree", graph, relative, None)
-    return with_points(placed, factors)
+    return with_points(_along_a_tree("spanning_tree", graph, relative, nearest=False), factors)
 
 
-def _along_a_tree(
-    name: str, graph: Graph, relative: Relative, weights: Float[np.ndarray, "E"] | None
-) -> Graph:
+def _along_a_tree(name: str, graph: Graph, relative: Relative, nearest: bool) -> Graph:
     """The graph with poses composed along a tree from the anchors.
 
-    weights: of the edges, of which the tree has the least sum; None for the fewest edges to each.
+    nearest: whether the tree has the least sum of |i - j|; otherwise the fewest edges to each pose.
     """
     anchors, poses = anchors_of(name, graph, relative)
-    count, (first, second) = len(poses), relative[:2]
+    # Nodes are counted in the order of the ids, which decides where trees are as good.
+    rank = ranks(graph)
+    count, first, second = len(poses), rank[relative.first], rank[relative.second]
+    anchors, poses = anchors[by_id := np.argsort(rank)], poses[by_id]
     # A node more, from which every anchor is reached.
     roots = np.flatnonzero(anchors)
     ends = np.concatenate([first, np.full(len(roots), count)]), np.concatenate([second, roots])
     low, high = np.minimum(*ends), np.maximum(*ends)
     edges, at = np.unique(np.stack([low, high], axis=1), axis=0, return_index=True)
     cost = np.ones(len(ends[0]))
-    if weights is not None:
-        cost[: len(first)] += weights
+    if nearest:
+        cost[: len(first)] += np.abs(second - first)
     tree = coo_array((cost[at], tuple(edges.T)), shape=(count + 1, count + 1)).tocsr()
-    if weights is not None:
+    if nearest:
         tree = minimum_spanning_tree(tree)
     order, before = breadth_first_order(tree, count, directed=False)
     row_of = {(int(i), int(j)): int(row) for (i, j), row in zip(edges, at, strict=True)}
@@ -77,7 +76,7 @@ def _along_a_tree(
         forward = first[row] == parent
         step = rows[row] if forward else _inverse(rows[row])
         placed[node] = _compose(placed[parent], step)
-    return with_poses(graph, np.array(placed).reshape(-1, 3))
+    return with_poses(graph, np.array(placed).reshape(-1, 3)[rank])
 
 
 def _compose(a: list[float], b: list[float]) -> list[float]:

@@ -41,7 +41,7 @@ def log_likelihood(
 ) -> Float[Array, ""]:
     """The log-likelihood of a scan at a pose (3,): exponent · Σ log p(z_k) over its valid beams.
 
-    Beams that are not valid, of NaN or of a range below 0 add nothing. The beams of a scan are
+    Beams that say nothing (`Beams`) add nothing. The beams of a scan are
     taken to be independent given the pose, which they are not: what the map lacks, or a pose
     between two cells, spoils many of them in the same way. `every` takes each n-th beam alone, and
     an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
@@ -72,12 +72,9 @@ def log_likelihood(
 
 
 def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
-    """Which beams say something: valid ones of a finite angle and a range that is not below 0.
-
-    An infinite range is that of a beam that met nothing, and is usable.
-    """
-    angle = beams.angle
-    return beams.valid & (beams.range >= 0) & (angle > -np.inf) & (angle < np.inf)  # NaN is not
+    """Which beams say something, by `Beams.returns`."""
+    met, free = beams.returns()
+    return met | free
 
 
 def check_beams(name: str, beams: object) -> None:
@@ -94,7 +91,7 @@ def check_beams(name: str, beams: object) -> None:
         raise ValueError(f"{name}: expected as many ranges, angles and masks, got {told}")
     if not is_concrete(beams):
         return
-    valid = np.asarray(beams.valid) & (np.asarray(beams.range) >= 0)
+    valid = np.asarray(beams.valid) & (np.asarray(beams.range) > 0)
     if not np.all(np.isfinite(np.asarray(beams.angle)[valid])):
         raise ValueError(f"{name}: expected finite angles of valid beams")
     if not np.any(valid):

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from scipy.optimize import minimize
 
 from jaxslam import programs
 from jaxslam.core.numbers import check_positive
 from jaxslam.grids.beam_models.ray_cast import Mixture, check_weights, mixture_log_density
+from jaxslam.types import Beams
 
 START = Mixture(0.6, 0.15, 0.1, 0.15, 0.2, 0.5)
 """Where the search begins."""
@@ -36,8 +36,10 @@ def fit(
         neglects the limits [0, max_range] and [0, z*] of the two densities: Thrun, Burgard & Fox
         2005, "Probabilistic robotics", table 6.2. So λ is too large where obstacles are near.
 
-    Raises ValueError on lengths that differ, numbers that are not finite, a range below 0, no data,
-    a start that is no mixture, and a max_range that is not above 0.
+    Ranges that say nothing are left out (`Beams`).
+
+    Raises ValueError on lengths that differ, expected ranges that are not finite or below 0, no
+    range that says anything, a start that is no mixture, and a max_range that is not above 0.
     """
     ranges, stars = np.asarray(z, np.float64), np.asarray(expected, np.float64)
     if ranges.ndim != 1 or ranges.shape != stars.shape or len(ranges) == 0:
@@ -48,17 +50,22 @@ def fit(
     check_positive("fit: start", sigma=start.sigma, rate=start.rate)
     check_weights("fit: start", dict(zip(Mixture._fields[:4], start[:4], strict=True)))
     check_positive("fit", max_range=max_range)
-    both = np.concatenate([ranges, stars])
-    if not np.all(np.isfinite(both)) or both.min() < 0:
-        raise ValueError("fit: expected finite ranges, not below 0")
+    if not np.all(np.isfinite(stars)) or stars.min() < 0:
+        raise ValueError("fit: expected predicted ranges that are finite and not below 0")
+    met, far = Beams(ranges, np.zeros_like(ranges), np.ones(len(ranges), bool)).returns(max_range)
+    if not (met | far).any():
+        raise ValueError(f"fit: none of {len(ranges)} ranges is above 0")
     if method not in ("gradient", "em"):
         raise ValueError(f'fit: expected method "gradient" or "em", got {method!r}')
-    ranges, stars = np.minimum(ranges, max_range), np.minimum(stars, max_range)
+    ranges = np.where(far, max_range, ranges)[met | far]
+    stars = np.minimum(stars, max_range)[met | far]
     if method == "em":
         mixture = Mixture(*(float(np.asarray(value)) for value in start))
         for _ in range(iterations):
             mixture = _em_step(mixture, ranges, stars, max_range)
         return mixture
+
+    from scipy.optimize import minimize  # slow to load
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = programs.call(_cost_and_slope, (), x, ranges, stars, max_range)

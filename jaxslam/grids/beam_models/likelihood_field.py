@@ -55,7 +55,7 @@ def likelihood_field(
     def ends_of(pose: Array, beams: Beams) -> tuple[Bool[JaxOrNumPy, "B"], Float[Array, "B 2"]]:
         """Which beams have max_range, and the ends of the others."""
         eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
-        far = beams.range >= max_range
+        _, far = beams.returns(max_range)
         ranges = jnp.where(far, 0.0, beams.range)
         # In the frame of the laser, which poses of a `vmap` share, and turned: no sine a beam.
         ahead, left = ranges * jnp.cos(beams.angle), ranges * jnp.sin(beams.angle)

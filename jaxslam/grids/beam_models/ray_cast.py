@@ -119,7 +119,7 @@ def ray_cast(
     def each(rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
         expected = cast(rays, eye, beams.angle, max_range)
-        z = jnp.minimum(beams.range, max_range)
+        z = jnp.where(beams.returns(max_range)[1], max_range, beams.range)
         return mixture_log_density(mixture, z, expected, max_range)
 
     def jacobian(rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
@@ -130,7 +130,7 @@ def ray_cast(
             return cast(rays, se2.compose(pose, frame), beams.angle, max_range)
 
         expected, by_pose = expected_at(pose), jax.jacfwd(expected_at)(pose)
-        z = jnp.minimum(beams.range, max_range)
+        z = jnp.where(beams.returns(max_range)[1], max_range, beams.range)
         by_range: Array = density_slope(mixture, z, expected, max_range)
         return by_range[:, None] * jnp.asarray(by_pose)
 

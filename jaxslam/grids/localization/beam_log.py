@@ -12,6 +12,9 @@ from jaxslam.types import Beams, Log, Scan
 BEAM = ("range [m]", "angle [rad]")
 """The measurements of such a log."""
 
+BEAM = ("range [m]", "angle [rad]")
+"""The measurements of such a log."""
+
 NOTHING = 1e6
 """Range [m] in a log of a beam that met nothing and is infinite in the scan: a log is finite."""
 
@@ -19,8 +22,8 @@ NOTHING = 1e6
 def beam_log(control: ArrayLike, beams: Beams) -> Log:
     """The log of T controls and T scans of B beams: measurements (range, angle), without tags.
 
-    A beam that is not valid, is NaN or has a range below 0 is not valid in the log. An infinite
-    range becomes `NOTHING`. Arrays are NumPy's, within a trace JAX's.
+    A beam that says nothing (`Beams`) is not valid in the log. An infinite range becomes `NOTHING`.
+    Arrays are NumPy's, within a trace JAX's.
 
     Args:
         control: (T, U) of the motion model; row t led to where scan t was taken.
@@ -43,13 +46,15 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
     concrete = is_concrete(control, beams)
     xp: ModuleType = np if concrete else jnp
     moved, ranges, angle, valid = (xp.asarray(part) for part in (control, *beams))
-    usable = valid & (ranges >= 0)  # NaN is not
+    met, free = Beams(ranges, angle, valid).returns()
+    usable = xp.asarray(met | free)
     if concrete:
+        lost = valid & (ranges > 0) & ~np.isfinite(angle)
+        if lost.any():
+            step = int(np.argmax(lost.any(axis=1)))
+            raise ValueError(f"beam_log: scan {step}: the angle of a valid beam is not finite")
         if not usable.any():
             raise ValueError(f"beam_log: none of {steps} scans has a valid beam")
-        if not np.isfinite(angle[usable]).all():
-            step = int(np.argmax((usable & ~np.isfinite(angle)).any(axis=1)))
-            raise ValueError(f"beam_log: scan {step}: the angle of a valid beam is not finite")
     z = xp.stack([xp.minimum(ranges, NOTHING), angle], axis=-1)
     scan = Scan(
         z=xp.where(usable[..., None], z, 0.0).astype(moved.dtype),
@@ -62,6 +67,6 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
 def beams_of(scan: Scan, every: int) -> Beams:
     """Each n-th beam of a scan of such a log; those not valid are of range 0."""
     z, there = scan.z[::every], scan.valid[::every]
-    used = there & (z[:, 0] >= 0)
+    used = there & (z[:, 0] > 0)
     clean = jnp.where(used[:, None], z, 0.0)
     return Beams(clean[:, 0], clean[:, 1], used)

@@ -174,7 +174,7 @@ def info_of_beams(
     taken = (jnp.arange(m) % every == 0) & used
     kind = scan.z.dtype
     return info_of(
-        status_of(scan.valid, matched=taken, inside=scan.z[:, 0] >= 0),
+        status_of(scan.valid, matched=taken, inside=scan.z[:, 0] > 0),
         taken,
         size=0,
         slot=jnp.full(m, -1, jnp.int32),

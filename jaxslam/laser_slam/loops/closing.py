@@ -73,6 +73,7 @@ def closed(
         *(np.asarray(part)[keyframe] for part in (scans.points.position, scans.points.valid))
     )
     graph = graph_of(at, keyframe, chain)
+    solution: graphs.Solution | None = None
     tried: list[Candidates] = []
     found: list[Matches] = []
     done: set[tuple[int, int, bool]] = set()
@@ -88,8 +89,8 @@ def closed(
         pairs = near(path, middle, usable, ends, most, reach, settings.loop_gap)
         cov = (
             covariances.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
-            if turn == 0 or not len(pairs)
-            else relative_covs(graph, pairs)
+            if solution is None or not len(pairs)
+            else relative_covs(solution, pairs)
         )
         new = by_place(path, pairs, cov, done, settings, NARROW, WIDE)
         if turn == 0 and settings.appearance:
@@ -113,8 +114,9 @@ def closed(
         ends |= set(zip(loops.first[kept].tolist(), loops.second[kept].tolist(), strict=True))
         edges = table_of(loops.first[kept], loops.second[kept], loops.z[kept], loops.cov[kept])
         graph = graph_of(path, keyframe, chain, edges)
-        if kept.any():
-            graph = _host(graphs.optimize(graph, kernel=KERNEL, room=ROOM).graph)
+        kernel = KERNEL if kept.any() else None
+        solution = graphs.optimize(graph, kernel=kernel, room=ROOM)
+        graph = _host(solution.graph)
     doubtful = table_of(index[:-1], index[1:], steps, odometry.cov[keyframe[1:]])
     return _final(graph, doubtful, loops, kept, keyframe, settings)._replace(left_out=left_out)
 

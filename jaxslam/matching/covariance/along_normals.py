@@ -9,8 +9,8 @@ from jaxslam.core.numbers import check_positive
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
-    inverse_of,
-    own_prior_information,
+    beside_prior,
+    propagated,
     stated,
 )
 from jaxslam.matching.matcher import Matcher
@@ -61,8 +61,6 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
         of_partner = jax.ops.segment_sum(weight[:, None] * jacobian, j, len(reference.valid))
         by_reference = (lines.normal * reference.ray).sum(axis=1)[:, None] * of_partner
         noise = by_scan.T @ by_scan + by_reference.T @ by_reference
-        shape = shape + own_prior_information(found)
-        gain = inverse_of(shape, shape, sigma=sigma)
-        return jnp.asarray(sigma) ** 2 * gain @ (noise + own_prior_information(found)) @ gain
+        return propagated(found, beside_prior(found, shape), noise, jnp.asarray(sigma))
 
     return stated("along_normals", of, sigma)

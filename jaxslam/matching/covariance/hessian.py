@@ -6,9 +6,9 @@ from jaxtyping import Array, Float
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
+    beside_prior,
     curvature,
     inverse_of,
-    own_prior_information,
     stated,
 )
 from jaxslam.matching.matcher import Matcher
@@ -29,6 +29,6 @@ def hessian() -> MatchCovariance:
         free = (found.weight > 0).sum() - (3 if found.prior is None else 0)
         least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(free, 1)
         shape = curvature(matcher, prepared, points, found)
-        return least * inverse_of(shape, found.information + own_prior_information(found))
+        return least * inverse_of(shape, beside_prior(found, found.information))
 
     return stated("hessian", of)

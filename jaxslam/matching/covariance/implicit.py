@@ -10,8 +10,7 @@ from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
     curvature,
-    inverse_of,
-    own_prior_information,
+    propagated,
     range_count,
     stated,
     with_ranges,
@@ -54,8 +53,6 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
         zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)
         by_ranges = jnp.concatenate(jax.jacrev(slope, argnums=(0, 1))(*zeros), axis=1)
         shape = curvature(matcher, prepared, points, found)
-        gain = inverse_of(shape, found.information + own_prior_information(found), sigma=sigma)
-        noise = by_ranges @ by_ranges.T + own_prior_information(found)
-        return jnp.asarray(sigma) ** 2 * gain @ noise @ gain.T
+        return propagated(found, shape, by_ranges @ by_ranges.T, jnp.asarray(sigma))
 
     return stated("implicit", of, sigma)

@@ -10,12 +10,13 @@ from jaxslam.core.numbers import check_positive
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
+    beside_prior,
     curvature,
     inverse_of,
-    own_prior_information,
     stated,
 )
 from jaxslam.matching.matcher import Matcher
+from jaxslam.matching.prior import prior_cost
 from jaxslam.math import linalg
 
 
@@ -50,18 +51,21 @@ def lattice(
         reference, points, found, *_ = scans
         prepared = matcher.prepare(reference)
         dtype = found.pose.dtype
+        alone = found._replace(prior=None)
         bound = jnp.diag(jnp.asarray(prior, dtype))
         variance = jnp.asarray(sigma) ** 2
         shape = curvature(matcher, prepared, points, found) / variance + bound
-        peak = inverse_of(
-            shape, (found.information + own_prior_information(found)) / variance + bound
-        )
+        peak = inverse_of(shape, beside_prior(found, found.information) / variance + bound)
         root = linalg.cholesky(peak)[0]
         offset = jnp.asarray(grid, dtype) @ root.T
 
         def one(shift: Array) -> Array:
-            here = matcher.cost(prepared, points, found.pose + shift, found)
-            return -here / jnp.asarray(sigma) ** 2 - 0.5 * (shift * (bound @ shift)).sum()
+            far = (shift * (bound @ shift)).sum()
+            here = prior_cost(found.prior, found.pose + shift)
+            if found.prior is not None:
+                shift = found.determined @ shift
+            here = here + matcher.cost(prepared, points, found.pose + shift, alone)
+            return -here / jnp.asarray(sigma) ** 2 - 0.5 * far
 
         weight = jax.nn.softmax(jax.lax.map(one, offset, batch_size=64))
         mean = weight @ offset

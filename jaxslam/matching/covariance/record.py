@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxslam import programs
 from jaxslam.matching.matcher import Match, Matcher, MatchStatus, Reference
 from jaxslam.matching.points import Points, moved_along_rays
-from jaxslam.matching.prior import prior_information
+from jaxslam.matching.prior import prior_terms
 from jaxslam.math import linalg
 
 
@@ -55,7 +55,7 @@ def stated(
         found = scans.found
         nothing = jnp.zeros_like(found.information)
         scale = jnp.asarray(1.0 if sigma is None else sigma, nothing.dtype)
-        known = nothing if sigma is None else own_prior_information(found)
+        known = nothing if sigma is None else prior_terms(found.prior, found.pose)[0]
         unknown = scale**2 * inverse_of(known, nothing, sigma=scale)
         return jnp.where(found.status >= MatchStatus.UNLIKE, unknown, of(matcher, scans))
 
@@ -107,15 +107,36 @@ def inverse_of(
     return linalg.self_gram(jnp.where(positive, first, jnp.where(usable, second, last)))
 
 
+def propagated(
+    found: Match, shape: Float[Array, "3 3"], noise: Float[Array, "3 3"], sigma: Array
+) -> Float[Array, "3 3"]:
+    """The covariance σ² A⁻¹ B A⁻¹ of a curvature A, with a prior's, and the scans' noise σ² B.
+
+    What neither scans nor prior determine has the noise of `inverse_of`'s floor: a kilometre.
+    """
+    gain = inverse_of(shape, beside_prior(found, found.information), sigma=sigma)
+    floor = (sigma * 1e-3) ** 2 * jnp.eye(3, dtype=noise.dtype)
+    return sigma**2 * gain @ (beside_prior(found, noise) + floor) @ gain.T
+
+
 def curvature(matcher: Matcher, prepared: PyTree, points: Points, found: Match) -> Array:
     """The curvature ∂²E/∂x² (3, 3) of the matcher's cost at the pose, pairs and weights kept."""
-    by_pose = jax.hessian(lambda pose: matcher.cost(prepared, points, pose, found))
-    return jnp.asarray(by_pose(found.pose))
+    alone = found._replace(prior=None)
+    by_pose = jax.hessian(lambda pose: matcher.cost(prepared, points, pose, alone))
+    return beside_prior(found, jnp.asarray(by_pose(found.pose)))
 
 
-def own_prior_information(found: Match) -> Float[Array, "3 3"]:
-    """The information Λ of a match's prior, or zeros; σ² Λ is its noise in the cost's slope."""
-    return prior_information(found.prior, found.information)
+def beside_prior(found: Match, of_scans: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Curvature, information or noise DᵀAD + Λ, of which the scans have A and a prior Λ; A alone
+    without a prior.
+
+    D leaves what the scans determine (`Match.determined`), as the match does: along a corridor the
+    noise of normals feigns information, beside which a realistic prior is nothing.
+    """
+    if found.prior is None:
+        return of_scans
+    onto = found.determined
+    return onto.T @ of_scans @ onto + found.prior.information
 
 
 def with_ranges(reference: Reference, by: Float[Array, "M"]) -> Reference:

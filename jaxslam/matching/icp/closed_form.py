@@ -98,6 +98,17 @@ def of_prior(prior: Prior, pose: Float[Array, "3"], middle: Float[Array, "2"]) -
     )
 
 
+def linearized(of: Quadratic) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    """Gauss-Newton's curvature (3, 3) and half of the slope (3,) of a cost by (t, θ), at no motion.
+
+    There r = (1, 0) and ∂r/∂θ = (0, 1).
+    """
+    by_turn = of.cross[:, 1:]
+    curvature = jnp.block([[of.shift, by_turn], [by_turn.T, of.turn[1:, 1:]]])
+    turning = of.turn[1, 0] - of.turn_slope[1]
+    return curvature, jnp.concatenate([of.cross[:, 0] - of.shift_slope, turning[None]])
+
+
 def least(of: Quadratic) -> Float[Array, "3"]:
     """The motion (t, θ) of the least cost, exactly.
 

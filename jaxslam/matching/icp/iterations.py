@@ -10,19 +10,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.matching.correspondences import Rule, nearest_points, weights
-from jaxslam.matching.icp.closed_form import Quadratic, added, least, of_prior
+from jaxslam.matching.icp.closed_form import Quadratic, added, least, linearized, of_prior
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import (
     Limits,
     concluded,
     determined,
+    fused,
     information_along,
     length_of,
 )
 from jaxslam.matching.points import Points
-from jaxslam.matching.prior import Prior, prior_cost
+from jaxslam.matching.prior import Prior, prior_cost, prior_terms
 from jaxslam.matching.surface import Surface, surface
-from jaxslam.math import se2
+from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
 
 
@@ -118,6 +119,14 @@ def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
     def match(of: Surface, points: Points, start: Array, prior: Prior | None = None) -> Match:
         length = length_of(points)
 
+        def within(of: Quadratic, middle: Array, onto: Array, pose: Array) -> Array:
+            arm = middle - pose[:2]
+            to_middle = jnp.eye(3, dtype=pose.dtype).at[:2, 2].set(jnp.stack([-arm[1], arm[0]]))
+            curvature, slope = linearized(of)
+            curvature, slope = to_middle.T @ curvature @ to_middle, to_middle.T @ slope
+            curvature, slope = fused(curvature, slope, prior_terms(prior, pose), onto, length)
+            return to_middle @ linalg.solve_psd(curvature, -slope)[0]
+
         def unfinished(state: _State) -> Array:
             k, _, _, change = state
             return jnp.asarray((k < iterations) & (change > tolerance))
@@ -128,11 +137,17 @@ def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
             total = pairs.weight.sum()
             middle = pairs.weight @ pairs.moved / jnp.where(total > 0, total, 1.0)
             quadratic = metric.quadratic(of, pairs, middle)
-            information = _information(of, pairs, middle, settings.lone)
+            both = quadratic
             if prior is not None:
-                quadratic = added(quadratic, of_prior(prior, pose, middle))
-                information = information + about(prior.information, pose[:2] - middle)
-            moved = determined(least(quadratic), information, length, limits.condition)
+                both = added(quadratic, of_prior(prior, pose, middle))
+            information = _information(of, pairs, pose[:2], settings.lone)
+            onto = determined(information, length, limits.condition)
+            # The exact step where the scans determine all of it, else that of Gauss and Newton.
+            moved = jnp.where(
+                (onto == jnp.eye(3)).all(),
+                least(both),
+                within(quadratic, middle, onto, pose),
+            )
             pivot = se2.from_frame(moved, pose[:2] - middle) + middle
             after = jnp.concatenate([pivot, wrap(pose[2] + moved[2])[None]])
             # A limit cycle of two steps, where pairs alternate, has ended as well.
@@ -172,13 +187,6 @@ def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
 def _size(a: Array, b: Array, length: Array) -> Array:
     """How far two poses are apart [m]."""
     return jnp.hypot(a[0] - b[0], a[1] - b[1]) + length * jnp.abs(wrap(a[2] - b[2]))
-
-
-def about(information: Float[Array, "3 3"], arm: Float[Array, "2"]) -> Float[Array, "3 3"]:
-    """The information of a pose by a motion about a point, from which the pose is an arm away."""
-    by_turn = jnp.stack([-arm[1], arm[0], jnp.ones_like(arm[0])])
-    jacobian = jnp.eye(3, dtype=information.dtype).at[:, 2].set(by_turn)
-    return jacobian.T @ information @ jacobian
 
 
 def _information(

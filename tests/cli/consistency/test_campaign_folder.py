@@ -2,15 +2,18 @@
 
 import dataclasses
 import json
+import shutil
 import threading
 
 import drawn
 import numpy as np
 import pytest
 
-from jaxslam import cli, store
+import jaxslam
+from jaxslam import cli, plot, store
 from jaxslam.cli.common import check_out
 from jaxslam.monte_carlo import Interrupted
+from jaxslam.results import report
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
@@ -71,6 +74,14 @@ def results(out):
     }
 
 
+def _without(out, copy, pattern):
+    """A copy of a folder without some of its files."""
+    shutil.copytree(out, copy)
+    for path in copy.glob(pattern):
+        path.unlink()
+    return copy
+
+
 def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys, refused, undrawn):
     out = tmp_path / "out"
     again = ["consistency", "--resume", str(out), "--devices", "1"]
@@ -79,6 +90,16 @@ def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys, refused, un
     assert cli.main([*asked, "--out", str(out)]) == 0
     whole, csv = results(out), (out / "consistency.csv").read_text()
     assert len(kept(out)) == 4
+
+    loaded = jaxslam.load(out)
+    written = json.loads((out / "consistency.json").read_text())
+    again_written = json.loads(report.as_json(loaded, written["command"], written["seed"]))
+    assert again_written == written and report.as_csv(loaded) == csv
+    assert np.isclose(plot.nees_figure(loaded, width=3.5).get_figwidth(), 3.5)
+    with pytest.raises(ValueError, match="expected the results of a campaign: jaxslam consistency"):
+        jaxslam.load(_without(out, tmp_path / "no results", "consistency.json"))
+    with pytest.raises(ValueError, match="not finished: jaxslam consistency --resume"):
+        jaxslam.load(_without(out, tmp_path / "a block less", "blocks/block-00000000*"))
 
     # A finished one prints its result and stays as it is, files that were lost come back; a lost
     # block is computed again, a damaged one set aside.

@@ -30,16 +30,35 @@ def falsified(graph, false=((2, 12), (6, 15))):
 @pytest.mark.parametrize("name", ["dcs", "truncated"])
 def test_a_redescending_kernel_leaves_false_loop_closures_out(name):
     graph, clean = falsified(ring())
-    poses, _, _, _ = dense(clean)
+    poses, _, information, _ = dense(clean)
     kernel = graphs.KERNELS[name]()
     found = graphs.optimize(graph, kernel={"relative_pose/loops": kernel})
     s = graphs.squared_residuals(found.graph)["relative_pose/loops"]
-    weights = np.asarray(kernel.weight(s))
+    weights = np.asarray(found.weights["relative_pose/loops"])
+    np.testing.assert_allclose(weights, kernel.weight(s), rtol=1e-9)
     assert found.status == Ending.CONVERGED
-    assert (weights[:2] < 1e-3).all()
+    assert (weights[:2] < 1e-3).all() and (found.weights["relative_pose"] == 1).all()
     if name == "truncated":  # binary: the others' own optimum
         assert (weights[2:] == 1).all()
         np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+        # The covariance is that without the false ones; they would make it smaller.
+        cov = np.linalg.inv(information)[-3:, -3:]
+        np.testing.assert_allclose(graphs.marginals(found).poses[-1], cov, rtol=1e-5, atol=1e-9)
+        with pytest.raises(ValueError, match=r"expected a Solution.* got a Graph; of a graph as"):
+            graphs.marginals(found.graph)
+
+
+def test_the_robust_start_is_good_and_is_kept():
+    """Three loops of seven are false; NumPy has the optimum without them."""
+    graph, clean = falsified(ring(spread=0.2), ((2, 12), (6, 15), (1, 9)))
+    poses = dense(clean)[0]
+    start = graphs.starts.robust(graph)
+    off = np.asarray(graphs.starts.odometry(graph).poses)[:, :2] - poses[:, :2]
+    left = start.poses[:, :2] - poses[:, :2]
+    assert np.abs(left).max() < 0.2 * np.abs(off).max() and start.tables is graph.tables
+    found = graphs.optimize(start, kernel={"relative_pose/loops": graphs.truncated()})
+    np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+    assert found.iterations < 10  # weights of zero and one at once, without rounds
 
 
 @pytest.mark.parametrize(("name", "share"), [("huber", 0.5), ("cauchy", 0.1)])

@@ -20,6 +20,7 @@ _POSE = ("x", "y", "theta")
 EDGES = {
     "EDGE_SE2": Edge("relative_pose", ("pose", "pose"), _POSE, _BY_ROWS),
     "EDGE2": Edge("relative_pose", ("pose", "pose"), _POSE, TORO_ORDER),
+    "EDGE": Edge("relative_pose", ("pose", "pose"), _POSE, TORO_ORDER),
     "EDGE_PRIOR_SE2": Edge("prior", ("pose",), _POSE, _BY_ROWS),
     "EDGE_SE2_XY": Edge(
         "relative_position", ("pose", "point"), ("x", "y"), ((0, 0), (0, 1), (1, 1))
@@ -29,9 +30,15 @@ EDGES = {
 VERTICES = {
     "VERTEX_SE2": ("pose", _POSE),
     "VERTEX2": ("pose", _POSE),
+    "VERTEX": ("pose", _POSE),
     "VERTEX_XY": ("point", ("x", "y")),
 }
-SKIPPED = {"ROBOTLASER1": "laser scans"}
+SKIPPED = {
+    "ROBOTLASER1": "laser scans",
+    "PARAMS_SE2OFFSET": "sensor offsets",  # no edge of EDGES refers to one
+    "VERTEX_TAG": "notes",
+    "VERTEX_ELLIPSE": "notes",
+}
 """Lines that are no part of the graph, and what they are counted as."""
 
 
@@ -50,7 +57,7 @@ class Format(NamedTuple):
 G2O = Format(
     "g2o",
     {"pose": "VERTEX_SE2", "point": "VERTEX_XY"},
-    {edge.table: kind for kind, edge in EDGES.items() if kind != "EDGE2"},
+    {edge.table: kind for kind, edge in EDGES.items() if edge.entries != TORO_ORDER},
     fix=True,
 )
 TORO = Format("TORO", {"pose": "VERTEX2"}, {"relative_pose": "EDGE2"}, fix=False)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.datasets.formats.g2o.kinds import EDGES, SKIPPED, TORO_ORDER, VERTICES, Edge
+from jaxslam.datasets.formats.g2o.kinds import EDGES, SKIPPED, VERTICES, Edge
 from jaxslam.datasets.formats.lines import TextFile
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.starts import odometry
@@ -182,7 +182,7 @@ def _table(file: TextFile, rows: _Rows, index: dict[str, dict[int, int]]) -> Tab
     if bad.any():
         row = int(bad.argmax())
         why = "the information is not positive semidefinite"
-        if rows.kinds[row].entries == TORO_ORDER:
+        if size == 3:
             why += "; EDGE2 has the order I11 I12 I22 I33 I13 I23, EDGE_SE2 that of the rows"
         raise file.error(rows.lines[row], why)
     return Table(np.array(who, np.int32), numbers[:, :size], information, np.ones(len(who), bool))

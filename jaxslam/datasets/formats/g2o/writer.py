@@ -38,7 +38,6 @@ def text_of(graph: Graph, form: Format = G2O) -> str:
         for kind, name in form.vertices.items()
         for one, row in zip(ids[kind], values[kind], strict=True)
     ]
-    lines += [f"FIX {one}" for kind in form.vertices for one in ids[kind][held[kind]]]
     for key, table in graph.tables.items():
         name = form.edges[key.split("/")[0]]
         edge = EDGES[name]
@@ -49,6 +48,8 @@ def text_of(graph: Graph, form: Format = G2O) -> str:
         who = np.asarray(table.who)[valid]
         names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
         lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
+    # Last: GTSAM's readG2o stops at a line that does not begin with two numbers, as `FIX 0` does.
+    lines += [f"FIX {one}" for kind in form.vertices for one in ids[kind][held[kind]]]
     return "\n".join(lines) + "\n"
 
 

@@ -9,6 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from jaxslam.graphs import Factor, Graph
+from jaxslam.graphs.graph import successive
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.results.plot.style import (
     COLORS,
@@ -37,7 +38,7 @@ def graph_figure(
 ) -> Figure:
     """A graph before and after its optimization, side by side, with its worst residuals.
 
-    Edges between poses of successive indices are the path, others are loop edges. Measurements of
+    Edges between poses of successive ids are the path, others are loop edges. Measurements of
     one variable alone are not drawn.
 
     Args:
@@ -89,7 +90,7 @@ def _draw(
         between = factors[key].variables == ("pose", "pose")
         ends = np.stack([poses[who[:, 0]], (poses if between else points)[who[:, 1], :2]], axis=1)
         if between:
-            steps = np.abs(who[:, 1] - who[:, 0]) == 1
+            steps = successive(graph, who)
             _lines(axes, ends[valid & ~steps], "loop edges", FAINT, 0.4, 2.0, alpha=0.5)
             _lines(axes, ends[valid & steps], "path", COLORS[0], 0.8, 3.0)
         else:

@@ -91,7 +91,7 @@ def grid_figure(
         }
         axes.plot(*path[-1, :2], marker="o", zorder=5, **end)
     if beams is not None and path is not None:
-        valid, angle = np.asarray(beams.valid), path[-1, 2] + np.asarray(beams.angle)
+        valid, angle = np.asarray(beams.returns()[0]), path[-1, 2] + np.asarray(beams.angle)
         far = np.asarray(beams.range)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         ends = (path[-1, :2] + far)[valid]
         both = np.stack([np.broadcast_to(path[-1, :2], ends.shape), ends], axis=1)

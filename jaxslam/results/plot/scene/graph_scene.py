@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxslam.graphs import Factor, Graph
+from jaxslam.graphs.graph import successive
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.results.plot.scene.layers import lines_between, marks, still
 from jaxslam.results.plot.scene.render import Layer, Panel, Scene
@@ -22,7 +23,7 @@ def graph_scene(
 ) -> Scene:
     """The scene of one graph at each of F iterates: path, loop edges, points, and χ² in words.
 
-    The last iterate stays in the background. Edges between poses of successive indices are the
+    The last iterate stays in the background. Edges between poses of successive ids are the
     path, others are loop edges.
 
     Args:
@@ -52,9 +53,9 @@ def graph_scene(
         if not between:
             found["measurements"].append(ends)
             continue
-        successive = np.abs(who[:, 1] - who[:, 0]) == 1
-        found["path"].append(ends[:, successive])
-        found["loop edges"].append(ends[:, ~successive])
+        along = successive(iterates[0], who)
+        found["path"].append(ends[:, along])
+        found["loop edges"].append(ends[:, ~along])
     edges = {name: np.concatenate(each, axis=1) for name, each in found.items() if each}
     layers: list[Layer] = [still(poses[-1], color=SHADE, lw=2.5, label="path at the end", zorder=1)]
     for name, color, width, order in (

@@ -1,34 +1,32 @@
-"""Grey images in files of the format PGM: P5 (binary) and P2 (text)."""
+"""Grey images in files: PGM, P5 (binary) and P2 (text), read here; PNG and BMP by Matplotlib."""
 
+import io
 from pathlib import Path
 
+import matplotlib.image
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxslam.datasets.formats.lines import read_bytes
 
-_OTHERS = {
-    b"\x89PNG": "PNG",
-    b"\xff\xd8": "JPEG",
-    b"BM": "BMP",
-    b"GIF8": "GIF",
-    b"II*\0": "TIFF",
-    b"MM\0*": "TIFF",
-    **{f"P{k}".encode(): f"P{k}" for k in (1, 3, 4, 6, 7)},
-}
+_BY_MATPLOTLIB = {b"\x89PNG": "png", b"BM": "bmp"}
 
 
-def read_pgm(path: Path) -> NDArray[np.float64]:
+def read_shades(path: Path) -> NDArray[np.float64]:
     """The shades of an image (rows, columns), 0 black to 1 white; the first row is at the top.
 
-    Raises ValueError, `path: reason`, on a file of another format or one that is damaged.
+    A colour counts as the mean of its three channels, as in `map_server`.
+
+    Raises ValueError, `path: reason`, on a file of another format, one that is damaged, and an
+    image that is transparent somewhere.
     """
     path, data = read_bytes(path)
+    for begin, form in _BY_MATPLOTLIB.items():
+        if data.startswith(begin):
+            return _by_matplotlib(path, data, form)
     kind = data[:2]
     if kind not in (b"P5", b"P2") or not data[2:3].isspace():
-        names = [name for begin, name in _OTHERS.items() if data.startswith(begin)]
-        got = names[0] if names else "another format"
-        raise ValueError(f"{path}: expected a PGM image (P5 or P2), got {got}")
+        raise ValueError(f"{path}: expected an image in PGM (P5 or P2), PNG or BMP")
     header, at = _fields(path, data, 2, 3)
     width, height, top = header
     if width < 1 or height < 1 or not 1 <= top <= 65535:
@@ -49,6 +47,20 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
     if found.max() > top:
         raise ValueError(f"{path}: a shade of {found.max()} is above the largest, {top}")
     return np.asarray(found.reshape(height, width) / top, np.float64)
+
+
+def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
+    try:
+        image = np.asarray(matplotlib.image.imread(io.BytesIO(data), format=form))
+    except (OSError, SyntaxError, ValueError) as problem:
+        raise ValueError(f"{path}: expected a {form.upper()} image: {problem}") from problem
+    if np.issubdtype(image.dtype, np.integer):
+        image = image / np.iinfo(image.dtype).max
+    image = image.astype(np.float64).reshape(*image.shape[:2], -1)
+    colours = image.shape[2] - (image.shape[2] in (2, 4))
+    if np.any(image[..., colours:] < 1):
+        raise ValueError(f"{path}: expected an image that is opaque everywhere")
+    return np.asarray(image[..., :colours].mean(axis=2))
 
 
 def _fields(path: Path, data: bytes, at: int, count: int) -> tuple[list[int], int]:
