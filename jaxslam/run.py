@@ -37,7 +37,7 @@ def run(
     trace it is compiled once for a structure: another call, with other values or a filter with
     other noises, runs the same program (`programs`). The arithmetic runs in
     the wider dtype of the log's controls and measurements. A valid measurement that is not finite
-    or beyond `validation.numbers.largest` is refused where its value is concrete, and dropped as
+    or beyond `core.numbers.largest` is refused where its value is concrete, and dropped as
     `Status.REJECTED` under a trace. Reverse
     mode stores one state a step, and recomputes each step in the backward pass.
 

@@ -36,7 +36,6 @@ def blind(scenario):
 ready = blind(world)
 alike = lambda scenario: lambda truth: blind(scenario)
 wrong = lambda scenario: scenario.nothing
-named = dataclasses.replace(ready, name="my filter")
 of_two = lambda scenario, capacity: ready
 untraceable = lambda scenario: dataclasses.replace(ready, update=lambda s, scan, key: undefined(s))
 """
@@ -93,7 +92,7 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
             "mine.py:wrong: called with the scenario, it fails: mine.py:25: AttributeError: 'Scen",
         ),
         (["--filters", "mine.py:of_two"], "mine.py:of_two is called with one argument: missing a"),
-        (["--filters", "mine.py:untraceable"], "mine.py:28: NameError: name 'undefined'"),
+        (["--filters", "mine.py:untraceable"], "mine.py:27: NameError: name 'undefined'"),
         (["--filters", "mine.py:blind,mine.py:blind"], "expected each name once, got blind twice"),
         (
             ["--scenario", "mine.py:number"],
