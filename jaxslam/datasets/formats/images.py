@@ -3,7 +3,6 @@
 import io
 from pathlib import Path
 
-import matplotlib.image
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,6 +49,8 @@ def read_shades(path: Path) -> NDArray[np.float64]:
 
 
 def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
+    import matplotlib.image  # late, since most commands read no image
+
     try:
         image = np.asarray(matplotlib.image.imread(io.BytesIO(data), format=form))
     except (OSError, SyntaxError, ValueError) as problem:

@@ -35,7 +35,16 @@ def test_a_scan_in_pieces_loses_and_moves_nothing():
         return state + jnp.where(scan.valid, scan.z[:, 0], 0.0).sum(), info
 
     seen = in_pieces(
-        Filter("toy", 3, 2, lambda p, c: p[0], lambda s, u, k: s, update, lambda s: s, euclidean()),
+        Filter(
+            "toy",
+            ("a", "b", "c"),
+            ("x [m]", "y [m]"),
+            lambda p, c: p[0],
+            lambda s, u, k: s,
+            update,
+            lambda s: s,
+            euclidean(),
+        ),
         3,
     )
     tag = jnp.asarray([7, 3, 9, 1, 4, 8, 0])
