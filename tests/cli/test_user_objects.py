@@ -38,6 +38,7 @@ alike = lambda scenario: lambda truth: blind(scenario)
 wrong = lambda scenario: scenario.nothing
 of_two = lambda scenario, capacity: ready
 untraceable = lambda scenario: dataclasses.replace(ready, update=lambda s, scan, key: undefined(s))
+named = dataclasses.replace(ready, name="my filter")
 """
 
 
