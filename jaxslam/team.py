@@ -31,9 +31,8 @@ class Robot:
 
     def __post_init__(self) -> None:
         if not isinstance(self.motion, Motion) or not isinstance(self.sensors, Suite):
-            raise ValueError(
-                f"Robot: expected a motion and a Suite, got {self.motion!r} and {self.sensors!r}"
-            )
+            got = f"{type(self.motion).__name__} and {type(self.sensors).__name__}"
+            raise ValueError(f"Robot: expected a motion and a Suite, got {got}")
         if self.start is not None:
             if np.shape(self.start[0]) != (3,):
                 raise ValueError(
@@ -55,7 +54,7 @@ def check_team(
         raise ValueError(f"{name}: expected at least one robot, got {robots!r}")
     for robot in robots:
         if not isinstance(robot, Robot):
-            raise ValueError(f"{name}: expected a team.Robot, got {robot!r}")
+            raise ValueError(f"{name}: expected a team.Robot, got {type(robot).__name__}")
     if robots[0].start is not None:
         raise ValueError(f"{name}: expected no start of robot 0: it begins at the pose of the run")
     made = tuple(range(landmarks, landmarks + len(robots))) if tags is None else tuple(tags)

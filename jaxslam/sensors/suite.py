@@ -77,6 +77,9 @@ class Suite(Sensor):
     """each given as a `Part` or (sensor, places)"""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.parts, Sequence):
+            got = type(self.parts).__name__
+            raise ValueError(f"Suite: expected parts in a list or a tuple, got {got}")
         made = tuple(part if isinstance(part, Part) else _part(part) for part in self.parts)
         if not made:
             raise ValueError("Suite: expected at least one sensor")
@@ -144,7 +147,7 @@ class Suite(Sensor):
 
 def _part(given: object) -> Part:
     if not isinstance(given, tuple) or len(given) != 2:
-        raise ValueError(f"Suite: expected a Part or (sensor, places), got {given!r}")
+        raise ValueError(f"Suite: expected a Part or (sensor, places), got {type(given).__name__}")
     return Part(*given)
 
 

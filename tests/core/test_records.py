@@ -125,6 +125,8 @@ class Later(sensors.RangeBearing):
         (lambda: sensors.RangeBearing(R, np.nan * MOUNT), "RangeBearing: .* not finite"),
         (lambda: sensor_of(noise_cov=R, measurements=("x [m]",)), "Own: expected a method observe"),
         (lambda: motion_of(step=min, controls=("x",), noises="w"), "Own: expected noises to be a tup"),
+        (lambda: sensors.Suite(sensors.RangeBearing(R)), "Suite: expected parts in a list or a tuple"),
+        (lambda: sensors.Suite([sensors.RangeBearing(R)]), "Suite: expected a Part or .* got RangeB"),
         (Bare, "Bare: expected @record above the class"),
         (lambda: Later(R), "Later: expected @record above the class"),
     ],

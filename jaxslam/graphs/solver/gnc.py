@@ -118,8 +118,9 @@ def graduated(
     every = row_weights(plain, plan.who, variables_of(graph), data)
     start = Solution(graph, zero, none, none, none - 1, zero, zero, zero, every)
     ratio = ratios(start)
-    rows = [jnp.where(data.valid[name], r, jnp.nan) for name, r in ratio.items()]
-    good = jnp.nanmedian(jnp.concatenate(rows), axis=0) <= 1.0
+    rows = jnp.concatenate([data.valid[name] for name in ratio])
+    fitting = rows & (jnp.concatenate(list(ratio.values())) <= 1.0)
+    good = 2 * fitting.sum(axis=0) >= rows.sum(axis=0)
     control = jnp.where(good, SHARP, convex(ratio))
     weights = {name: _weight(r, control[None]) for name, r in ratio.items()}
     state = Round(start, weights, control, jnp.zeros(batch, bool), jnp.zeros((), jnp.int32))

@@ -396,7 +396,10 @@ def signs():
         (lambda: team_slam(crew(2), 3, update="at once"), "expected update"),
         (lambda: team_slam([signs()], 3), "expected landmarks \\(x, y\\)"),
         (lambda: team_slam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
-        (lambda: team.Robot(motion.Increment(Q), ring().sensor), "a motion and a Suite"),
+        (
+            lambda: team.Robot(motion.Increment(Q), ring().sensor),
+            "a motion and a Suite, got Increment and RangeBearing",
+        ),
         (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
         (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
         (lambda: world(unknown(crew(2))), "expected a start of every robot"),
