@@ -1,9 +1,7 @@
 """The command `jaxslam optimize`: the optimum of a graph in a file."""
 
 import argparse
-import importlib
 import sys
-import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -63,8 +61,6 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     given = held if kernel is None else graphs.with_loops_apart(held)
     factors = {key: known[key.split("/")[0]] for key in given.tables}
     doubted = {key: kernel for key in given.tables if key not in TRUSTED} if kernel else None
-    # Matplotlib loads while XLA compiles.
-    threading.Thread(target=importlib.import_module, args=["jaxslam.results.plot"]).start()
     begins, impossible = _begins(options.start, doubted is not None, given, factors)
     solutions = {}
     with Progress(Path(options.path).name, "starts") as progress:
