@@ -53,8 +53,8 @@ def graduated(
 
     and μ grows by 1.4 a round, at least to c²/(2 max s - c²), until all weights are zeros or ones.
     In the paper the first round has all weights one. Here it has those of the start's residuals,
-    zeros and ones where s <= c² for half of the rows or more: false loops can bend the plain optimum
-    by more than later rounds mend, and a good start must not be given up for it.
+    zeros and ones where s <= c² for half of the rows or more: false loops can bend the plain
+    optimum by more than later rounds mend, and a good start must not be given up for it.
     """
     truncated = {name: k.limit for name, k in model.kernels if k.limit is not None}
     plain = Model(model.factors, tuple((name, k) for name, k in model.kernels if k.limit is None))
