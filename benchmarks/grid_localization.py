@@ -44,8 +44,6 @@ HALF = {"hit": 0.1, "random": 0.9}
 """Of the beam model in the map of a first half; chosen among a dozen settings on these logs, when
 the reader took steps of the corrected path for odometry. With true raw odometry the default shares
 do as well."""
-METHOD = "surface"
-"""Of rays in the office, with which its recorded table was made; the default would be "cells"."""
 ALPHA = (0.05, 0.03, 0.02, 0.01)
 """Noise of raw odometry, as of `jaxslam run --localize`: for a straight step of 0.7 m 10 cm ahead
 and 7° of each turn. Its steps differ from those of the corrected poses by 4 cm, 5 cm and 3.5° (RMS)
@@ -70,7 +68,7 @@ def learnt(grid, world):
     """The mixture of `grids.fit` for the ranges of a third drive, given those that the map predicts
     at its true poses."""
     log, far = laser.scan_world(world, jax.random.key(1001)), world.laser.max_range
-    rays = grids.ray_map(grid, method=METHOD)
+    rays = grids.ray_map(grid)
     expected = grids.cast(rays, log.pose, world.laser.angles, far)
     seen = np.asarray(log.beams.valid)
     return grids.fit(np.asarray(log.beams.range)[seen], np.asarray(expected)[seen], far)
@@ -97,7 +95,7 @@ def tempering_rays(runs):
     world, grid = office(beams=BEAMS), office_map()
     mixture = learnt(grid, office())
     far = world.laser.max_range
-    model = in_single(grids.ray_cast(mixture, max_range=far, method=METHOD))
+    model = in_single(grids.ray_cast(mixture, max_range=far))
     told = ", ".join(f"{name} {value:.4f}" for name, value in mixture._asdict().items())
     return tempering("office, ray_cast", world, grid, model, told, RAY_EXPONENTS, runs)
 
