@@ -13,7 +13,6 @@ import numpy as np
 
 from jaxslam.charts.left_invariant import left_invariant
 from jaxslam.charts.right_invariant import right_invariant
-from jaxslam.charts.robocentric import robocentric
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.observability import monitored
 from jaxslam.filters.ekf.settings import EkfOptions
@@ -229,7 +228,6 @@ FILTERS: Named[Callable[..., Candidate]] = Named(
         "oc": lambda world, **more: variant(world, linearize=observability(), **more),
         "right_invariant": lambda world, **more: variant(world, chart=right_invariant(), **more),
         "left_invariant": lambda world, **more: variant(world, chart=left_invariant(), **more),
-        "robocentric": lambda world, **more: variant(world, chart=robocentric(), **more),
         "ukf": lambda world, **more: variant(world, linearize=unscented(), **more),
         "ukf_right": lambda world, **more: variant(
             world, chart=right_invariant(), linearize=unscented(), **more
@@ -284,7 +282,7 @@ KINDS: Named[tuple[str, ...]] = Named(
     {
         "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
         "consistent Jacobians": ("fej", "oc"),
-        "error coordinates": ("right_invariant", "left_invariant", "robocentric"),
+        "error coordinates": ("right_invariant", "left_invariant"),
         "unscented": ("ukf", "ukf_right", "ukf_left"),
         "smoothing": ("fixed_lag", "fixed_lag_fej", "batch_map"),
         "information": ("eif_slam", "seif", "eseif"),

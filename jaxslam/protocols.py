@@ -290,10 +290,6 @@ class Chart:
     """(pose0, l0, pose, l) -> (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
     basis: Callable[[Array, Array], Basis] | None = None
     """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
-    motion_apart: bool = False
-    """whether the last motion is a separate variable during corrections, with which the map is
-    composed afterwards. Retractions must be additive: by one error and then by another is by
-    their sum."""
     landmark_size: int | None = None
     """numbers L of the landmarks it acts on; None where any."""
 

@@ -29,8 +29,6 @@ class Joint(NamedTuple):
     """-1 where dead"""
     lin: PyTree
     """the linearizer's memory"""
-    last: PyTree = None
-    """the `Last` motion, in a chart with `motion_apart`"""
     life: PyTree = None
     """the memory of a `Life`, of a filter that is pruned"""
     reduced: PyTree = None
@@ -38,17 +36,6 @@ class Joint(NamedTuple):
     a sensor whose landmarks may become points"""
     co_observed: jax.Array | None = None
     """(N, N) bool: pairs of landmarks that one scan measured, of a filter that merges others"""
-
-
-class Last(NamedTuple):
-    """The error δ = (x, y, θ) of the robot's last motion, in the frame where it began."""
-
-    frame: Float[Array, ""]
-    """heading of that frame"""
-    cov: Float[Array, "3 D"]
-    """covariance of δ with all errors of the map, in the filter's chart"""
-    own: Float[Array, "3 3"]
-    """covariance of δ"""
 
 
 def empty(
@@ -59,7 +46,6 @@ def empty(
     lin: PyTree = (),
     *,
     square_root: bool = False,
-    motion_apart: bool = False,
 ) -> Joint:
     """The initial state: a robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero."""
     size = 3 + capacity * landmark_size
@@ -72,9 +58,6 @@ def empty(
         alive=jnp.zeros(capacity, bool),
         tag=jnp.full(capacity, -1, jnp.int32),
         lin=lin,
-        last=Last(pose[2], jnp.zeros((3, size), pose.dtype), 0 * pose_cov)
-        if motion_apart
-        else None,
     )
 
 

@@ -24,7 +24,7 @@ from jaxslam.simulation.worlds import simulate
 
 _Model = TypeVar("_Model", Motion, Sensor)
 
-NAMES = ("ekf", "ideal", "fej", "oc", "right_invariant", "robocentric")
+NAMES = ("ekf", "ideal", "fej", "oc", "right_invariant")
 MEASURES = ("nees_pose", "nees_own", "square_position", "square_heading", "unobservable")
 PLACES = 9  # the fullest scan of the first 100 maps
 PUBLISHED = {

@@ -19,7 +19,7 @@ PRIOR = math.radians(5.0)
 NOTHING = 1e-6
 """of the prior's information."""
 
-HONEST = ("ideal", "fej", "oc", "right_invariant", "robocentric", "ukf_right")
+HONEST = ("ideal", "fej", "oc", "right_invariant", "ukf_right")
 
 
 def measure(runs: int = 200, seed: int = 0) -> tuple[Section, list[Metric], Figure]:

@@ -5,14 +5,12 @@ from collections.abc import Callable
 from jaxslam.charts.euclidean import euclidean
 from jaxslam.charts.left_invariant import left_invariant
 from jaxslam.charts.right_invariant import right_invariant
-from jaxslam.charts.robocentric import robocentric
 from jaxslam.protocols import Chart
 
 REGISTRY: dict[str, Callable[[], Chart]] = {
     "euclidean": euclidean,
     "left_invariant": left_invariant,
     "right_invariant": right_invariant,
-    "robocentric": robocentric,
 }
 
-__all__ = ["REGISTRY", "euclidean", "left_invariant", "right_invariant", "robocentric"]
+__all__ = ["REGISTRY", "euclidean", "left_invariant", "right_invariant"]

@@ -95,7 +95,7 @@ def assert_told(log, estimate, info, tame):
 
 
 SUITE = [
-    *("ekf", "ideal", "oc", "right_invariant", "robocentric", "ukf"),
+    *("ekf", "ideal", "oc", "right_invariant", "ukf"),
     *("eif_slam", "seif", "fastslam2", "particle_localization", "localization", "dead_reckoning"),
 ]
 """Of filters that share their steps one is in the suite; programs are what a test here costs."""

@@ -72,7 +72,6 @@ def test_both_signs_are_one_set_of_points():
     [
         (lambda s: filters.ekf_slam(MOVES, s, 4, linearize=linearize.first_estimate()), "line"),
         (lambda s: filters.ekf_slam(MOVES, s, 4, chart=charts.right_invariant()), "line"),
-        (lambda s: filters.ekf_slam(MOVES, s, 4, chart=charts.robocentric()), "line"),
         (lambda s: filters.seif(MOVES, s, 4, active=2, links=2), "line"),
         (lambda s: sensors.Suite(((s, 2), (s, 2))), r"share landmarks \(x, y\)"),
         (lambda s: filters.merging(filters.ekf_slam(MOVES, s, 4), 0.5), "cannot be merged"),

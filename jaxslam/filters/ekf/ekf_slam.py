@@ -79,10 +79,9 @@ def ekf_slam(
         ValueError: on models, charts, linearizers or associations of another type or size
             (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
             update or covariance, a chart or linearizer that does not fit the sensor's landmarks or
-            one another, a `Life` without `make_room`, a square root in a chart with
-            `motion_apart`, several iterations of a statistical linearizer, or a linearizer of
-            landmarks for a suite with an absolute sensor; from `update`, on a make_room without
-            `pruning`.
+            one another, a `Life` without `make_room`, several iterations of a statistical
+            linearizer, or a linearizer of landmarks for a suite with an absolute sensor; from
+            `update`, on a make_room without `pruning`.
     """
     validation.check_models("ekf_slam", motion, sensor)
     validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
@@ -166,7 +165,6 @@ def initial_state(
         size_l,
         settings.linearize.init(pose, ground),
         square_root=settings.square_root,
-        motion_apart=chart.motion_apart,
     )
     if sensor.reduced is not None:
         joint = joint._replace(reduced=jnp.zeros_like(joint.alive))

@@ -9,7 +9,6 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxslam import validation
 from jaxslam.filters.ekf.coordinates.linear_system import (
-    InTurn,
     LinearLandmarks,
     LinearMeasurements,
     LinearSystem,
@@ -104,9 +103,7 @@ def monitored(filter: Filter) -> Filter:
 def after(monitor: Monitor, system: LinearSystem) -> Monitor:
     """The monitor after a linear system."""
     for part in system:
-        if isinstance(part, InTurn):
-            monitor = jax.lax.scan(lambda m, one: (after(m, one), None), monitor, part.system)[0]
-        elif isinstance(part, LinearMeasurements):
+        if isinstance(part, LinearMeasurements):
             monitor = _with_information(monitor, part)
         elif isinstance(part, LinearLandmarks):
             monitor = monitor._replace(directions=_with_landmarks(monitor.directions, part))

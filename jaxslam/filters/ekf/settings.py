@@ -143,11 +143,6 @@ def check_settings(settings: EkfSettings) -> None:
                 f"chart {chart.name} does not support, since its errors of landmarks turn with the "
                 "robot"
             )
-    if chart.motion_apart and settings.square_root:
-        raise ValueError(
-            f'ekf_slam: expected covariance "plain" or "joseph" with the chart {chart.name}, got '
-            '"square_root"'
-        )
 
 
 def check_make_room(make_room: Life | None) -> None:

@@ -204,10 +204,6 @@ class _OfRobot(Wrapped):
 
 def _of_pose(chart: Chart) -> Chart:
     """The chart restricted to the pose, for landmarks without parameters."""
-    if chart.motion_apart:
-        raise ValueError(
-            f"localization: the chart {chart.name} is for estimated maps, not for a known one"
-        )
     whole_basis = chart.basis
     size = 2 if chart.landmark_size is None else chart.landmark_size
 

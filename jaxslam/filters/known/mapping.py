@@ -122,8 +122,7 @@ def as_prior(
             f"as_prior: expected a filter of {capacity} landmarks with {size} parameters each, got "
             f"{filter.name}"
         )
-    plain = filter.chart.basis is None and not filter.chart.motion_apart
-    if not plain or filter.square_root or jax.tree.leaves(joint.lin):
+    if filter.chart.basis is not None or filter.square_root or jax.tree.leaves(joint.lin):
         raise ValueError(
             "as_prior: expected a filter in the Euclidean chart with a covariance, not its square "
             "root, and with Jacobians at the estimate"

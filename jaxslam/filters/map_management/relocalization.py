@@ -171,8 +171,8 @@ def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool =
     In coordinates P_RR ← pose_cov, P_RM ← 0, P_MM as it is: the pose is marginalized out and given
     an independent prior, at the estimate there was.
 
-    Raises ValueError on landmarks that are no points, a chart that keeps the last motion apart, a
-    linearizer with a memory, or a pose_cov that is none.
+    Raises ValueError on landmarks that are no points, a linearizer with a memory, or a pose_cov
+    that is none.
     """
     check_point_map("lost", joint, chart)
     check_covariance("lost: pose_cov", pose_cov, 3)
@@ -248,7 +248,5 @@ def check_point_map(caller: str, joint: Joint, chart: Chart) -> None:
         raise ValueError(
             f"{caller}: expected landmarks (x, y), got {joint.landmarks.shape[1]} parameters each"
         )
-    if chart.motion_apart:
-        raise ValueError(f"{caller}: the chart {chart.name} is not supported")
     if jax.tree.leaves(joint.lin):
         raise ValueError(f"{caller}: a linearizer that keeps former estimates is not supported")

@@ -135,7 +135,6 @@ def test_gradients_are_finite_in_float32_with_gate_overflow_and_empty_scans(gate
 FORMS = {
     "sigma points": {"chart": charts.right_invariant(), "linearize": linearize.unscented()},
     "square root": {"covariance": "square_root"},
-    "robocentric": {"chart": charts.robocentric()},
 }
 
 

@@ -59,7 +59,6 @@ def dense(name):
         ("euclidean", True),
         ("right_invariant", False),
         ("left_invariant", True),
-        ("robocentric", False),
     ],
 )
 def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_root):

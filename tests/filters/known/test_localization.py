@@ -225,7 +225,6 @@ BAD = {
     "nan": ({"landmarks": np.full((2, 2), np.nan)}, "not finite"),
     "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
     "negative tag": ({"tags": [-1, 0, 1, 2, 3, 4]}, "different tags"),
-    "chart": ({"chart": charts.robocentric()}, "is for estimated maps"),
     "linearizer": ({"linearize": linearize.first_estimate()}, "is for estimated maps"),
     "iterated": ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
     "update": ({"update": "whole"}, "sequential"),

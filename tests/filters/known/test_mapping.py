@@ -124,7 +124,6 @@ def test_refusals():
     for options, message in (
         ({"capacity": 3}, "a filter of 2 landmarks"),
         ({"chart": charts.right_invariant()}, "Euclidean"),
-        ({"chart": charts.robocentric()}, "Euclidean"),
         ({"covariance": "square_root"}, "covariance"),
         ({"linearize": linearize.first_estimate()}, "Jacobians"),
     ):

@@ -436,8 +436,6 @@ def test_refusals():
     with pytest.raises(ValueError, match="shape"):
         relocalize(points, cov[:4], yes, seen, covs, yes)
     joint = some_joint()
-    with pytest.raises(ValueError, match="robocentric is not supported"):
-        lost(joint, charts.robocentric(), np.eye(3))
     with pytest.raises(ValueError, match="covariance"):
         lost(joint, charts.euclidean(), -np.eye(3))
     with pytest.raises(ValueError, match="keeps former estimates"):

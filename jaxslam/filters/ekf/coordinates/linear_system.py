@@ -84,13 +84,7 @@ class LinearLandmarks(NamedTuple):
     """G, errors by errors"""
 
 
-class InTurn(NamedTuple):
-    """Several systems of the same shapes, one after the other: leaves with a leading axis."""
-
-    system: "LinearSystem"
-
-
-LinearSystem = tuple[Transition | LinearMeasurements | LinearLandmarks | InTurn, ...]
+LinearSystem = tuple[Transition | LinearMeasurements | LinearLandmarks, ...]
 
 
 @dataclass(frozen=True, eq=False)

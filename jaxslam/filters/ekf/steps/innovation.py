@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam import slots
-from jaxslam.filters.ekf.coordinates.linear_system import Transition, basis_of_each
+from jaxslam.filters.ekf.coordinates.linear_system import basis_of_each
 from jaxslam.filters.ekf.coordinates.to_points import at_slot
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.predicted_measurements import in_chart, projected_cov
@@ -40,9 +40,6 @@ class Correction(NamedTuple):
     """H by coordinates, against the prior"""
     basis: Float[Array, "m 3+L 3+L"] | None
     """the coordinates by the errors in the chart; None says identity"""
-    moved: Transition | None = None
-    """of the errors where the map was composed with the corrected last motion: once after all
-    measurements, or (m, …) after each"""
 
 
 class View(NamedTuple):

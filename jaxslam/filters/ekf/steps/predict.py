@@ -7,10 +7,10 @@ from jaxtyping import Array, Bool, Float
 from jaxslam import slots
 from jaxslam.filters.ekf.coordinates.linear_system import Transition
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.math import linalg, se2
+from jaxslam.math import linalg
 from jaxslam.math.xla import materialize
 from jaxslam.protocols import Basis, Here, Motion
-from jaxslam.slots import Joint, Last
+from jaxslam.slots import Joint
 
 
 def propagate(
@@ -39,12 +39,7 @@ def propagate(
         cov = linalg.triangular_root(jnp.concatenate([moved.times(joint.cov), added], axis=1))
     else:
         cov = moved_cov(joint.cov, moved, noise)
-    last = joint.last
-    if chart.motion_apart:
-        back = se2.adjoint(jnp.stack([0 * pose[0], 0 * pose[1], joint.pose[2]])).T
-        cov_last = linalg.matmul(back @ noise, moved.lift(joint.cov.shape[0]).T)
-        last = Last(joint.pose[2], cov_last, back @ noise @ back.T)
-    return joint._replace(pose=pose, cov=cov, lin=lin, last=last), moved
+    return joint._replace(pose=pose, cov=cov, lin=lin), moved
 
 
 def in_charts(
@@ -68,15 +63,9 @@ def in_charts(
 
 
 def moved_cov(
-    cov: Float[Array, "D D"],
-    moved: Transition,
-    noise: Float[Array, "3 3"] | None,
-    shared: tuple[Float[Array, "k D"], Float[Array, "k D"]] | None = None,
+    cov: Float[Array, "D D"], moved: Transition, noise: Float[Array, "3 3"] | None
 ) -> Float[Array, "D D"]:
-    """The predicted covariance A P Aᵀ + G N Gᵀ, each entry of P written once or twice.
-
-    shared: two matrices, of which Sᵀ T + Tᵀ S is added; in another chart than the Euclidean.
-    """
+    """The predicted covariance A P Aᵀ + G N Gᵀ, each entry of P written once or twice."""
     if moved.cross is None:
         robot = linalg.matmul(moved.robot, cov[:3])
         own = linalg.matmul(robot[:, :3], moved.robot.T)
@@ -91,10 +80,7 @@ def moved_cov(
     # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.
     b = jnp.concatenate([moved.robot - jnp.eye(3, dtype=cov.dtype), moved.cross.reshape(-1, 3)])
     half = cov[:3] + 0.5 * linalg.matmul(cov[:3, :3], b.T)
-    left, right = [b.T], [half]
-    if shared is not None:
-        left, right = [*left, shared[0]], [*right, shared[1]]
-    change = linalg.gram_both(*materialize((jnp.concatenate(left), jnp.concatenate(right))))
+    change = linalg.gram_both(*materialize((b.T, half)))
     if noise is not None:
         added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
         change = change + linalg.self_gram(materialize(added))

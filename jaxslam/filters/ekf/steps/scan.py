@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
 from jaxslam.filters.ekf.coordinates.linear_system import (
-    InTurn,
     LinearLandmarks,
     LinearMeasurements,
     LinearSystem,
@@ -123,9 +122,15 @@ def update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> ScanUpd
     joint, done = by_scan(joint, scan.z, slot, matched, settings)
     joint, new = initialize_landmarks(joint, scan, found, matched, done, settings)
     info = report_scan(scan, found, matched, done, new, settings)
-    system = linear_corrections(scan.z, slot, matched, done, settings)
+    seen = LinearMeasurements(
+        jacobian=done.jacobian,
+        basis=done.basis,
+        noise=jax.vmap(settings.sensor.noise_cov)(scan.z),
+        slot=slot,
+        fused=matched & done.inside & done.positive,
+    )
     born = LinearLandmarks(new.slot, new.granted, new.by_pose)
-    return ScanUpdate(joint, info, new.evicted, (*system, born))
+    return ScanUpdate(joint, info, new.evicted, (seen, born))
 
 
 def associate_scan(
@@ -257,28 +262,6 @@ def report_scan(
         log_likelihood=done.log_likelihood.sum(),
         exhausted=jnp.asarray(found.exhausted),
     )
-
-
-def linear_corrections(
-    z: Float[Array, "M Z"],
-    slot: Int[Array, "M"],
-    matched: Bool[Array, "M"],
-    done: Correction,
-    settings: EkfSettings,
-) -> LinearSystem:
-    """The linear system of the correction by these measurements."""
-    seen = LinearMeasurements(
-        jacobian=done.jacobian,
-        basis=done.basis,
-        noise=jax.vmap(settings.sensor.noise_cov)(z),
-        slot=slot,
-        fused=matched & done.inside & done.positive,
-    )
-    if done.moved is None:
-        return (seen,)
-    if done.moved.robot.ndim == 2:
-        return seen, done.moved
-    return (InTurn((jax.tree.map(lambda leaf: leaf[:, None], seen), done.moved)),)
 
 
 def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:

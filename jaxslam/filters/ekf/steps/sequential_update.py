@@ -9,9 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
-from jaxslam.filters.ekf.coordinates.robocentric_motion import unmoved
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.steps import robocentric_update
 from jaxslam.filters.ekf.steps.innovation import Correction, innovate, view_of
 from jaxslam.filters.ekf.steps.update import correct, retract_means
 from jaxslam.math import linalg
@@ -53,9 +51,8 @@ def correct_in_turn(
     localization and map-building algorithm for real-time implementation", IEEE T-RA 17(3)), over
     one scan. A group without a known measurement in any run of a batch costs nothing.
 
-    In a chart with `motion_apart`, map and motion are corrected separately and composed once
-    (`robocentric_update`). A form of the covariance that needs all of P is corrected by
-    `correct`, one measurement at a time.
+    A form of the covariance that needs all of P is corrected by `correct`, one measurement at a
+    time.
     """
     measurements = z, slot, known
     size = joint.cov.shape[1]
@@ -63,8 +60,6 @@ def correct_in_turn(
         return _one_by_one(joint, measurements, settings)
     cached = size <= _CACHED
     group = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
-    if settings.chart.motion_apart and joint.last:
-        return _in_turn_with_motion(joint, measurements, group, settings)
     if cached:
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
     joint, done = _in_groups(
@@ -82,43 +77,11 @@ def _one_by_one(
 ) -> tuple[Joint, Correction]:
     """`correct_in_turn` by `correct` of each measurement alone."""
 
-    def of_one(done: Correction) -> Correction:
-        return done._replace(moved=jax.tree.map(lambda leaf: leaf[None], done.moved))
-
     def work(joint: Joint, one: Measurements) -> tuple[Joint, Correction]:
-        joint, done = correct(joint, *one, settings)
-        return joint, of_one(done)
+        return correct(joint, *one, settings)
 
-    def nothing(one: Measurements) -> Correction:
-        return of_one(_nothing(joint, one, settings.chart))
-
+    nothing = partial(_nothing, joint, chart=settings.chart)
     return _in_groups(work, joint, measurements, 1, nothing)
-
-
-def _in_turn_with_motion(
-    joint: Joint, measurements: Measurements, group: int, settings: EkfSettings
-) -> tuple[Joint, Correction]:
-    """`correct_in_turn` in a chart with `motion_apart`; P has columns for the last motion."""
-    known = measurements[2]
-    size = joint.cov.shape[1]
-    columns = size + 3 + (-(size + 3) % _LANES if size <= _CACHED else 0)
-
-    def with_motion(joint: Joint) -> tuple[Joint, Correction]:
-        rest, done = _in_groups(
-            lambda rest, part: robocentric_update.correct_map_and_motion(rest, part, settings),
-            robocentric_update.separate_motion(joint, settings.chart, columns),
-            measurements,
-            group,
-            partial(_nothing, joint._replace(last=None), chart=settings.chart),
-        )
-        # A run without a measurement must keep exactly its map.
-        after = robocentric_update.compose_map(rest, settings.chart)
-        before = joint, unmoved(joint, settings.chart)
-        kept, moved = jax.tree.map(lambda a, b: jnp.where(known.any(), a, b), after, before)
-        return kept, done._replace(moved=moved)
-
-    nothing = _nothing(joint, measurements, settings.chart)
-    return where_any(known.any(), with_motion, lambda joint: (joint, nothing), joint)
 
 
 def _in_groups(
@@ -220,7 +183,6 @@ def _nothing(joint: Joint, unused: Measurements, chart: Chart) -> Correction:
         positive=flags,
         jacobian=jnp.zeros((m, size, width), dtype),
         basis=None if chart.basis is None else jnp.zeros((m, width, width), dtype),
-        moved=unmoved(joint, chart) if joint.last else None,
     )
 
 

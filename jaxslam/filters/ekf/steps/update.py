@@ -9,15 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.filters.ekf.coordinates.linear_system import Transition
 from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
-from jaxslam.filters.ekf.coordinates.robocentric_motion import lever_of_motion, moved_anew
 from jaxslam.filters.ekf.settings import Covariance, EkfSettings
 from jaxslam.filters.ekf.steps.innovation import (
     Correction,
     Innovation,
     innovate,
-    seen_rows,
     view_of,
 )
 from jaxslam.math import linalg
@@ -50,9 +47,6 @@ def correct(
     view = view_of(joint, slot, settings.square_root)
     found = innovate(joint, slot, view, z, known, (joint, slot), settings)
     cov = _corrected_cov(joint.cov, found, settings.covariance)
-    if joint.last:
-        joint, moved = _with_last_motion(joint, found, cov, slot, settings.chart)
-        return joint, found.correction._replace(moved=moved)
     return retract_means(joint, found.xi, settings.chart)._replace(cov=cov), found.correction
 
 
@@ -75,26 +69,6 @@ def _corrected_cov(
     root = factor + root.reshape(m * size_z, m * size_z)
     hx = found.hx.reshape(m * size_z, -1)
     return cov - linalg.gram(v, materialize(linalg.solve_lower(root, hx)))
-
-
-def _with_last_motion(
-    joint: Joint, found: Innovation, cov: Float[Array, "D D"], slot: Int[Array, "m"], chart: Chart
-) -> tuple[Joint, Transition]:
-    """The map corrected, then composed with the corrected last motion; and its transition."""
-    last, size_l = joint.last, joint.landmarks.shape[1]
-    of_map = last.cov.T
-    own = of_map[3:].reshape(-1, size_l, 3)[slot]
-    seen_last = seen_rows(jnp.concatenate(found.jacobians, axis=2), of_map[:3], own)
-    seen_last = linalg.solve_lower(found.factor, seen_last.reshape(-1, 3))
-    step = linalg.gram(seen_last, found.whitened[:, None])[:, 0]
-    lever = lever_of_motion(joint, chart)
-    last = last._replace(
-        cov=last.cov - linalg.gram(seen_last, found.v),
-        own=last.own - linalg.gram(seen_last, seen_last),
-    )
-    moved = retract_means(joint, found.xi - lever @ step, chart)
-    moved = moved._replace(cov=cov, last=last)
-    return moved_anew(moved, moved.pose[2] - joint.pose[2], step, lever, chart)
 
 
 def retract_means(joint: Joint, xi: Float[Array, "D"], chart: Chart) -> Joint:
