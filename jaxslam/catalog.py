@@ -17,7 +17,6 @@ from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.observability import monitored
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.filters.information.eif_slam import eif_slam
-from jaxslam.filters.information.eseif import eseif
 from jaxslam.filters.information.in_pieces import in_pieces
 from jaxslam.filters.information.seif import seif
 from jaxslam.filters.known.dead_reckoning import dead_reckoning
@@ -264,7 +263,6 @@ CANONICAL: Named[Callable[..., Candidate]] = Named(
     {
         "eif_slam": lambda world, **more: in_canonical_form(world, eif_slam, sparse=False, **more),
         "seif": lambda world, **more: in_canonical_form(world, seif, **more),
-        "eseif": lambda world, **more: in_canonical_form(world, eseif, **more),
     }
 )
 """The information filters, exact and sparse; as FILTERS."""
@@ -285,7 +283,7 @@ KINDS: Named[tuple[str, ...]] = Named(
         "error coordinates": ("right_invariant", "left_invariant"),
         "unscented": ("ukf", "ukf_right", "ukf_left"),
         "smoothing": ("fixed_lag", "fixed_lag_fej", "batch_map"),
-        "information": ("eif_slam", "seif", "eseif"),
+        "information": ("eif_slam", "seif"),
         "particles": ("fastslam1", "fastslam2", "particle_localization"),
         "baselines": ("dead_reckoning", "localization", "mapping"),
     }

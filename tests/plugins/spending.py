@@ -42,7 +42,7 @@ HEAVY = tuple(
         ("programs", "programs"),
         ("filters/particles", "particle_localization"),
         ("filters", "gate_table"),
-        ("filters/information", "seif eseif"),
+        ("filters/information", "seif"),
         ("conformance", "jacobians"),
         ("equivalence", "compressed"),
         ("models", "suite"),
