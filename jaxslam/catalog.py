@@ -231,9 +231,6 @@ FILTERS: Named[Callable[..., Candidate]] = Named(
         "ukf_right": lambda world, **more: variant(
             world, chart=right_invariant(), linearize=unscented(), **more
         ),
-        "ukf_left": lambda world, **more: variant(
-            world, chart=left_invariant(), linearize=unscented(), **more
-        ),
         "square_root": lambda world, **more: variant(world, covariance="square_root", **more),
     }
 )
@@ -281,7 +278,7 @@ KINDS: Named[tuple[str, ...]] = Named(
         "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
         "consistent Jacobians": ("fej", "oc"),
         "error coordinates": ("right_invariant", "left_invariant"),
-        "unscented": ("ukf", "ukf_right", "ukf_left"),
+        "unscented": ("ukf", "ukf_right"),
         "smoothing": ("fixed_lag", "fixed_lag_fej", "batch_map"),
         "information": ("eif_slam", "seif"),
         "particles": ("fastslam1", "fastslam2", "particle_localization"),

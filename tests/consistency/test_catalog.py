@@ -20,7 +20,7 @@ from jaxslam.types import Status
 
 KEY = jax.random.key(0)
 CURES = ["ideal", "fej", "oc", "right_invariant", "ukf_right"]
-VICTIMS = ["ekf", "iterated", "left_invariant", "ukf", "ukf_left", "square_root"]
+VICTIMS = ["ekf", "iterated", "left_invariant", "ukf", "square_root"]
 
 
 def draw(world):
