@@ -1,8 +1,8 @@
-"""The campaign: blocks of runs over devices and processes, kept as they finish, then summed up.
+"""The campaign: blocks of runs over devices, kept as they finish, then summed up.
 
 A run is a number: its key and its place in a block. For one size of blocks and one number of
-devices its world and its filters' results are the same to the bit, whatever workers and processes
-there are and whatever was interrupted; otherwise to rounding. Only scores are kept of a block, so
+devices its world and its filters' results are the same to the bit, whatever workers and parts there
+are and whatever was interrupted; otherwise to rounding. Only scores are kept of a block, so
 memory is that of the blocks in flight however many runs there are.
 """
 
@@ -31,7 +31,6 @@ from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.kept import Keep, add_kept
 from jaxslam.monte_carlo.pieces import check_part, cores, in_part, missing
 from jaxslam.monte_carlo.record import Campaign, Interrupted
-from jaxslam.monte_carlo.together import gathered_tallies, share
 from jaxslam.monte_carlo.work import Work, shown_progress
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario, with_positions
@@ -58,9 +57,6 @@ def monte_carlo(
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
 
-    Where `jax.distributed` has been initialized, the processes divide the blocks among themselves,
-    and each returns the whole campaign.
-
     Args:
         scenario: what to draw; see `scenarios`.
         filters: by name. A function instead of a filter is called with each run's `Truth`.
@@ -69,7 +65,7 @@ def monte_carlo(
         block: runs vmapped together on a device, which sets memory; default 16 on a CPU, and
             by its memory on an accelerator. Where memory does not suffice, half of it is tried,
             with a warning.
-        devices: of this process; default all of `jax.local_devices()`.
+        devices: default all of `jax.local_devices()`.
         workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
             accelerator).
         bound: also take the conditional Cramér-Rao bound of every run (`conditional_bound`), at
@@ -84,7 +80,7 @@ def monte_carlo(
             campaign, each with a `keep` from `store.join` on one folder, with the same block and
             number of devices; without `part` the blocks are summed up, and those that are missing
             computed.
-        progress: called with (runs done, runs) of this process after each block. Default a bar with
+        progress: called with (runs done, runs) after each block. Default a bar with
             rate and remaining time, on a terminal and in a notebook alone; False: none.
         glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
             block of each filter has run, while the others may still be compiled. A campaign of no
@@ -125,7 +121,7 @@ def monte_carlo(
         keep.claim(told)
         done = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
     pieces = missing(done, runs, plan.wide)
-    todo = share([piece for piece in pieces if in_part(piece[0], plan.wide, part)])
+    todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
     work = Work(workers, keep, progress or None, glimpse, {name: Tally() for name in names})
     try:
         with shown_progress(work, plan, progress is None):
@@ -133,7 +129,7 @@ def monte_carlo(
         interrupted = False
     except KeyboardInterrupt:
         interrupted = True
-    for name, tally in (work.own if interrupted else gathered_tallies(work.own)).items():
+    for name, tally in work.own.items():
         tallies[name].merge(tally)
     campaign = None
     if tallies[BOUND].pieces():
@@ -161,8 +157,6 @@ def _check(
             check_count(f"monte_carlo: {name}", value)
     if part is not None:
         check_part("monte_carlo: part", part)
-        if jax.process_count() > 1:
-            raise ValueError("monte_carlo: part: expected none where jax.distributed divides")
     check_record("monte_carlo", "scenario", scenario, Scenario)
     if scenario.recorded is not None and runs > (most := len(scenario.recorded[0].pose)):
         raise ValueError(

@@ -30,7 +30,7 @@ class Work:
     progress: Callable[[int, int], None] | None
     glimpse: Glimpse | None
     own: dict[str, Tally]
-    """what this process has computed, by filter"""
+    """what was computed here, by filter"""
     compile_seconds: float = 0.0
     run_seconds: dict[str, float] = field(default_factory=dict)
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)

@@ -35,7 +35,6 @@ HEAVY = tuple(
         ("filters/ekf", "gradients"),
         ("laser_slam", "solve"),
         ("graphs", "log"),
-        ("monte_carlo", "processes"),
         ("conformance", "fuzzed_logs"),
         ("smoothing", "smoothing fixed_lag"),
         ("equivalence", "information ekf"),
