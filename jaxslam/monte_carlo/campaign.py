@@ -17,7 +17,7 @@ from jax.typing import DTypeLike
 
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.core.numbers import check_count, check_key
-from jaxslam.monte_carlo.blocks.block import BOUND, Glimpse
+from jaxslam.monte_carlo.blocks.block import BOUND
 from jaxslam.monte_carlo.blocks.blockwise import Library
 from jaxslam.monte_carlo.blocks.plan import CampaignPlan
 from jaxslam.monte_carlo.candidates import (
@@ -51,7 +51,6 @@ def monte_carlo(
     keep: Keep | None = None,
     part: tuple[int, int] | None = None,
     progress: Callable[[int, int], None] | Literal[False] | None = None,
-    glimpse: Glimpse | None = None,
     library: Library | None = None,
     identity: Mapping[str, str] | None = None,
 ) -> Campaign:
@@ -82,10 +81,6 @@ def monte_carlo(
             computed.
         progress: called with (runs done, runs) after each block. Default a bar with
             rate and remaining time, on a terminal and in a notebook alone; False: none.
-        glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
-            block of each filter has run, while the others may still be compiled. A campaign of no
-            more than `workers` blocks is compiled in full first: its steps are timed. Default a
-            line on the terminal, with the default `progress`.
         library: compiled programs are taken from there, without a trace, and put there. The caller
             answers for it: its programs are of this scenario and these filters, by name.
         identity: what `keep` is told instead of the fingerprint, where the caller knows without a
@@ -122,7 +117,7 @@ def monte_carlo(
         done = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
     pieces = missing(done, runs, plan.wide)
     todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
-    work = Work(workers, keep, progress or None, glimpse, {name: Tally() for name in names})
+    work = Work(workers, keep, progress or None, {name: Tally() for name in names})
     try:
         with shown_progress(work, plan, progress is None):
             work.in_blocks_that_fit(plan, todo)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import jax
 
-from jaxslam.cli.common import INTERRUPTED, OUT, asked_figures, check_out
+from jaxslam.cli.common import INTERRUPTED, OUT, check_out
 from jaxslam.cli.consistency.film import write_films
 from jaxslam.cli.consistency.folder import (
     CampaignOptions,
@@ -38,9 +38,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     out = options.resume or options.out or OUT
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
-    drawn = [kind for kind in campaign_files.FORMATS if (out / f"nees.{kind}").exists()]
-    wanted = asked_figures(options, drawn if options.resume else ())
-    formats = campaign_files.check_figure_formats("--figures", wanted)
+    formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
     there = [kind for kind in run_table.FORMATS if (out / f"runs.{kind}").exists()]  # up to date
     asked_for = filter(None, options.table.split(","))
     tables = run_table.check_table_formats("--table", [*asked_for, *there])
