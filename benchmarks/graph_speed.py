@@ -136,7 +136,7 @@ def many_graphs(repeats: int) -> list[Metric]:
     print(f"  GTSAM GN {MANY / np.median(other):7.0f} graphs a second and core")
     gained = np.median(np.array(other) / own)
     return [
-        Metric("ring: graphs a second and core / GTSAM's", gained, low=5.0),
+        Metric("ring: graphs a second and core / GTSAM's", gained, low=2.5),
         Metric("ring: greatest χ² / GTSAM's - 1", float(np.max(off)), high=1e-6),
     ]
 
