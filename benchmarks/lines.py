@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, alone
 from jaxslam import features, filters, scenarios, sensors
-from jaxslam.consistency.nees import mean_pose_nees
+from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.math.stats import t_quantile
 from jaxslam.simulation import laser, walls
 from jaxslam.types import Beams, Scan
@@ -104,8 +104,10 @@ def judge(name: str, runs: int, every: int) -> tuple[float, float, float]:
     go = jax.jit(jax.vmap(lambda control, scans: drive(world, len(lines), control, scans)))
     pose, cov, nis, dof = (np.asarray(part) for part in go(logs.control, scans))
     measured = slice(every, None)  # P0 = 0 at first
-    of_pose, there = mean_pose_nees(logs.pose[:, measured], pose[:, measured], cov[:, measured])
-    of_pose, of_lines = of_pose[there], np.concatenate(nees)
+    estimate, error = pose[:, measured], pose_error(logs.pose[:, measured], pose[:, measured])
+    of_pose, regular = block_nees(estimate, error, error, cov[:, measured])["pose"]
+    of_pose, of_lines = np.ma.array(of_pose, mask=~regular).mean(axis=1), np.concatenate(nees)
+    of_pose = of_pose.compressed()
     ratio = nis.sum(axis=1) / dof.sum(axis=1)
     error = np.sqrt(((logs.pose - pose)[:, -1, :2] ** 2).sum(axis=1).mean())
     print(f"{name}: {runs} runs × {steps} steps, a scan every {every}")

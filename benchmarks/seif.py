@@ -1,13 +1,12 @@
-"""The sparse information filters: `python -m benchmarks.seif [--runs 10] [--steps 300] [--park]`.
+"""The sparse information filter: `python -m benchmarks.seif [--runs 10] [--steps 300] [--park]`.
 
-SEIF and the exactly sparse ESEIF beside the EKF, on the same draws of `circle` and of a cloister
-seen 3 m far: the errors of their maps, and their NEES, by the Markov-blanket marginals that they
-report unless told otherwise and by the whole of their Ω. --park: Victoria Park instead, where there
-is no ground truth: the distance of their maps, aligned, from the batch solution's, against the
-EKF's. There a scan has two measurements and a loop hundreds of scans, and mean recovery decides:
-with the ten landmarks a scan of the default most means lag behind, and models are linearized at
-them. So each filter runs with `passive` 10 and 150, all landmarks. What a step costs is in
-`benchmarks.scaling`.
+SEIF beside the EKF, on the same draws of `circle` and of a cloister seen 3 m far: the error of its
+map, and its NEES by the Markov-blanket marginals that it reports by default and by the whole Ω.
+--park: Victoria Park instead, which has no ground truth: the distance of the aligned map from the
+batch solution, against that of the EKF. A scan has two measurements there and a loop hundreds of
+scans, and mean recovery decides: with the default of ten landmarks a scan most means lag behind,
+and models are linearized at them. So SEIF runs with `passive` 10 and 150, all landmarks. The cost
+of a step is in `benchmarks.scaling`.
 """
 
 import argparse
@@ -25,7 +24,6 @@ from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.simulation.scenarios.view import between_ranges
 from jaxslam.simulation.worlds import simulate
-from jaxslam.types import Status
 
 KEY = jax.random.key(0)
 EVERY = 10  # steps between two looks at covariances
@@ -35,8 +33,8 @@ def driven(filter, start, log):
     """The states after each step; EVERY steps apart if there are that many."""
 
     def step(state, row):
-        state, info = filter.update(filter.predict(state, row.control, KEY), row.scan, KEY)
-        return state, (state.pose, info.status)
+        state, _ = filter.update(filter.predict(state, row.control, KEY), row.scan, KEY)
+        return state, state.pose
 
     def block(state, rows):
         state, seen = jax.lax.scan(step, state, rows)
@@ -44,8 +42,8 @@ def driven(filter, start, log):
 
     whole = len(log.control) // EVERY * EVERY
     rows = jax.tree.map(lambda x: x[:whole].reshape(-1, EVERY, *x.shape[1:]), log)
-    final, (states, (path, status)) = jax.lax.scan(block, start, rows)
-    return final, states, path.reshape(-1, 3), status.reshape(whole, -1)
+    final, (states, path) = jax.lax.scan(block, start, rows)
+    return final, states, path.reshape(-1, 3)
 
 
 def estimated_map(state):
@@ -78,19 +76,18 @@ def errors_and_nees(world, runs: int, candidates) -> dict[str, dict[str, float]]
 
     def one(key, filter):
         truth, log = simulate(world, key)
-        final, states, path, status = driven(filter, filter.init(*start), log)
+        final, states, path = driven(filter, filter.init(*start), log)
         at = jnp.arange(EVERY - 1, len(path), EVERY)
         nees, square = jax.lax.map(
             lambda row: look(*row, truth.landmarks), (states, truth.pose[at])
         )
         position = ((path - truth.pose[: len(path)])[:, :2] ** 2).sum(axis=1).mean()
-        deferred = (status == Status.DEFERRED).sum()
-        return nees.mean(axis=0), square[-1], position, deferred, getattr(final, "counts", ())
+        return nees.mean(axis=0), square[-1], position, getattr(final, "counts", ())
 
     out = {}
     for name, filter in candidates.items():
         keys = jax.random.split(jax.random.key(7), runs)
-        nees, square, position, deferred, counts = jax.jit(
+        nees, square, position, counts = jax.jit(
             lambda k, f=filter: jax.lax.map(partial(one, filter=f), k)
         )(keys)
         nees = np.asarray(nees).mean(axis=0)
@@ -104,21 +101,19 @@ def errors_and_nees(world, runs: int, candidates) -> dict[str, dict[str, float]]
         }
         if counts:
             mean = {k: float(np.mean(v)) for k, v in counts._asdict().items()}
-            out[name] |= {k: mean[k] for k in ("cut", "relocated", "dropped", "refused")}
-            out[name]["deferred"] = float(np.mean(deferred))
+            out[name] |= {k: mean[k] for k in ("cut", "dropped", "refused")}
         row = "  ".join(f"{k} {v:.4g}" for k, v in out[name].items())
         print(f"  {name:18}{row}", flush=True)
     return out
 
 
 def compared(world, runs, setups) -> dict[str, dict[str, float]]:
-    """The EKF, and SEIF and ESEIF of each setup (active, links)."""
+    """The EKF, and SEIF of each setup (active, links)."""
     count = len(world.landmarks)
     models = world.motion, world.sensor, count
     candidates = {"EKF": filters.ekf_slam(*models, update="joint")}
     for active, links in setups:
-        for name, make in (("SEIF", filters.seif), ("ESEIF", filters.eseif)):
-            candidates[f"{name}, {active} active"] = make(*models, active=active, links=links)
+        candidates[f"SEIF, {active} active"] = filters.seif(*models, active=active, links=links)
     print(
         f"\n{world.name}, {runs} runs of {world.steps} steps; a consistent filter has a NEES of 3"
     )
@@ -133,20 +128,19 @@ def measure(runs: int = 10, steps: int = 300) -> list[Metric]:
         cloister(steps), visible=between_ranges(0.0, 3.0), places=14, pose_cov=start
     )
     metrics = []
-    # On circle 20 active are all there are, and both filters the EIF; so 8 as well, for the table.
+    # On circle 20 active are all there are, and SEIF is the EIF; so 8 as well, for the table.
     for name, world, setups in (
         ("circle", ring, [(20, 19), (8, 19)]),
         ("cloister", near, [(20, 35)]),
     ):
         table = compared(world, runs, setups)
         ekf = table["EKF"]["map RMSE [m]"]
-        for filter in ("SEIF", "ESEIF"):
-            row = table[f"{filter}, 20 active"]
-            share = row["map RMSE [m]"] / ekf
-            metrics += [
-                Metric(f"{filter}, 20 active, map RMSE by EKF's, {name}", share, high=1.1),
-                Metric(f"{filter}, scans refused, {name}", row["refused"], high=0.0),
-            ]
+        row = table["SEIF, 20 active"]
+        share = row["map RMSE [m]"] / ekf
+        metrics += [
+            Metric(f"SEIF, 20 active, map RMSE by EKF's, {name}", share, high=1.1),
+            Metric(f"SEIF, scans refused, {name}", row["refused"], high=0.0),
+        ]
     return metrics
 
 
@@ -154,7 +148,7 @@ def measure(runs: int = 10, steps: int = 300) -> list[Metric]:
 
 
 def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Metric]:
-    """The maps of SEIF and ESEIF against the EKF's, aligned and as they are."""
+    """The maps of SEIF against the EKF's, aligned and as they are."""
     import gtsam
 
     from benchmarks.victoria_park import Solution, compare, run_batch
@@ -163,14 +157,10 @@ def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Me
     models = data.motion, data.sensor, data.capacity
     options = {"active": active, "links": links}
     all_means = {"passive": data.capacity, "sweeps": 3}
-    waits = {"wait": False}  # two measurements a scan rarely fix a pose: `eseif` else fails here
     candidates = {
         "EKF": filters.ekf_slam(*models, update="joint"),
         "SEIF": filters.seif(*models, **options),
         "SEIF, all means": filters.seif(*models, **options, **all_means),
-        "ESEIF": filters.eseif(*models, **options),
-        "ESEIF, wait=False": filters.eseif(*models, **options, **waits),
-        "ESEIF, wait=False, all means": filters.eseif(*models, **options, **waits, **all_means),
     }
     found, metrics = {}, []
     places = data.log.scan.tag.shape[1]
@@ -179,13 +169,10 @@ def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Me
     for name, filter in candidates.items():
         start = filter.init(jnp.asarray(data.pose, float), jnp.asarray(data.pose_cov, float))
         drive = jax.jit(lambda log, f=filter, s=start: _final(f, s, log))
-        state, path_, deferred = drive(jax.tree.map(jnp.asarray, data.log))
-        points, alive, both = estimated_map(state)
+        state, path_ = drive(jax.tree.map(jnp.asarray, data.log))
+        points, _, both = estimated_map(state)
         found[name] = Solution(np.asarray(path_), np.asarray(points))
         spread = [float(jnp.sqrt(jnp.linalg.det(pose[:2, :2]))) for pose, _ in both]
-        if not bool(alive.all()):
-            print(f"  {name}: {int(alive.sum())} landmarks, {int(deferred)} measurements deferred")
-            continue
         apart = compare(found[name], found["EKF"])
         if name == "EKF":
             batch = run_batch(data, found[name]).solution
@@ -196,7 +183,7 @@ def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Me
         )
         row = "  ".join(f"{k} {v:.3f}" for k, v in apart.items())
         ends = f"√|P| of position at the end {spread[0]:.4f} m², whole {spread[1]:.4f} m²"
-        print(f"  {name:30}{row}  {ends}  deferred {int(deferred)}")
+        print(f"  {name:30}{row}  {ends}")
         if hasattr(state, "counts"):
             print(20 * " " + "  ".join(f"{k} {v:.5g}" for k, v in state.counts._asdict().items()))
         share = from_batch / compare(found["EKF"], batch)["map RMSE [m]"]
@@ -208,11 +195,10 @@ def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Me
 
 def _final(filter, state, log):
     def step(state, row):
-        state, info = filter.update(filter.predict(state, row.control, KEY), row.scan, KEY)
-        return state, (state.pose, (info.status == Status.DEFERRED).sum())
+        state, _ = filter.update(filter.predict(state, row.control, KEY), row.scan, KEY)
+        return state, state.pose
 
-    state, (path, deferred) = jax.lax.scan(step, state, log)
-    return state, path, deferred.sum()
+    return jax.lax.scan(step, state, log)
 
 
 def main() -> int:

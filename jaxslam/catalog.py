@@ -17,7 +17,6 @@ from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.observability import monitored
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.filters.information.eif_slam import eif_slam
-from jaxslam.filters.information.eseif import eseif
 from jaxslam.filters.information.in_pieces import in_pieces
 from jaxslam.filters.information.seif import seif
 from jaxslam.filters.known.dead_reckoning import dead_reckoning
@@ -232,9 +231,6 @@ FILTERS: Named[Callable[..., Candidate]] = Named(
         "ukf_right": lambda world, **more: variant(
             world, chart=right_invariant(), linearize=unscented(), **more
         ),
-        "ukf_left": lambda world, **more: variant(
-            world, chart=left_invariant(), linearize=unscented(), **more
-        ),
         "square_root": lambda world, **more: variant(world, covariance="square_root", **more),
     }
 )
@@ -264,7 +260,6 @@ CANONICAL: Named[Callable[..., Candidate]] = Named(
     {
         "eif_slam": lambda world, **more: in_canonical_form(world, eif_slam, sparse=False, **more),
         "seif": lambda world, **more: in_canonical_form(world, seif, **more),
-        "eseif": lambda world, **more: in_canonical_form(world, eseif, **more),
     }
 )
 """The information filters, exact and sparse; as FILTERS."""
@@ -283,9 +278,9 @@ KINDS: Named[tuple[str, ...]] = Named(
         "Kalman filter": ("ekf", "ideal", "iterated", "square_root"),
         "consistent Jacobians": ("fej", "oc"),
         "error coordinates": ("right_invariant", "left_invariant"),
-        "unscented": ("ukf", "ukf_right", "ukf_left"),
+        "unscented": ("ukf", "ukf_right"),
         "smoothing": ("fixed_lag", "fixed_lag_fej", "batch_map"),
-        "information": ("eif_slam", "seif", "eseif"),
+        "information": ("eif_slam", "seif"),
         "particles": ("fastslam1", "fastslam2", "particle_localization"),
         "baselines": ("dead_reckoning", "localization", "mapping"),
     }

@@ -39,8 +39,7 @@ class Status(IntEnum):
     OVERFLOW = 4
     """A new landmark, but the map is full; dropped."""
     DEFERRED = 5
-    """A new landmark beyond `births`, the limit of new landmarks a scan, or a landmark that `eseif`
-    cannot activate until it relocates the robot; dropped in this scan."""
+    """A new landmark beyond `births`, the limit of new landmarks a scan; dropped in this scan."""
     REPEATED = 6
     """Its new tag occurs earlier in the same scan; dropped."""
     SINGULAR = 7

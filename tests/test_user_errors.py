@@ -31,7 +31,6 @@ FACTORIES = {
     "fastslam": lambda m, s, **o: filters.fastslam(m, s, 3, 4, **o),
     "eif_slam": lambda m, s, **o: filters.eif_slam(m, s, 3, **o),
     "seif": lambda m, s, **o: filters.seif(m, s, 3, active=2, links=2, **o),
-    "eseif": lambda m, s, **o: filters.eseif(m, s, 3, active=2, links=2, **o),
     "delayed_slam": lambda m, s, **o: filters.delayed_slam(m, s, 3, **o),
     "dead_reckoning": lambda m, s, **o: filters.dead_reckoning(m, s, **o),
     "smooth": lambda m, s, **o: smoothing.smooth(m, s, 3, np.zeros(3), np.eye(3), **o),
@@ -89,9 +88,7 @@ def test_a_chart_or_linearizer_that_was_not_called_is_told(name):
         make(MOVE, SEES, chart="euclidean")
 
 
-@pytest.mark.parametrize(
-    "name", sorted(set(FACTORIES) - {"dead_reckoning", "eif_slam", "seif", "eseif"})
-)
+@pytest.mark.parametrize("name", sorted(set(FACTORIES) - {"dead_reckoning", "eif_slam", "seif"}))
 def test_an_association_that_was_not_called_or_is_none_is_told(name):
     if name == "compressed_ekf_slam":
         return  # it takes none

@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -42,27 +41,22 @@ def campaign(runs: int, where: str = "free") -> tuple[float, float, float]:
 
 
 def processes(count: int, runs: int) -> float:
-    """Seconds a piece of a campaign takes processes with a core each, from the first that each of
-    them keeps on, before which it compiled."""
+    """Seconds a block takes with a part of the campaign a process, and a core each, from the first
+    block that each keeps, before which it compiled."""
     cores = sorted(os.sched_getaffinity(0))[:count]
-    with tempfile.TemporaryDirectory() as folder, socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-        free.close()
+    with tempfile.TemporaryDirectory() as folder:
         ask = ["consistency", "--scenario", "cloister", "--runs", str(runs)]
         ask += ["--devices", "1", "--out", folder]
-        if count > 1:
-            ask += ["--coordinator", address, "--processes", str(count)]
         started = []
         for i, core in enumerate(cores):
-            own = ["--process-id", str(i)] if count > 1 else []
+            own = ["--part", f"{i + 1}/{count}"]
             pinned = ["taskset", "-c", str(core), sys.executable, "-m", "jaxslam", *ask, *own]
             started.append(subprocess.Popen(pinned, stdout=subprocess.DEVNULL))
         for process in started:
             if process.wait() != 0:
                 raise RuntimeError(f"process {process.args} failed")
         kept = sorted((Path(folder) / "blocks").glob("*.npz"))
-        # The pieces go to the processes in turn.
+        # A part has each count-th block.
         rates = [_rate([p.stat().st_mtime for p in kept[i::count]]) for i in range(count)]
     return 1 / sum(rates)
 

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
         with CompileClock() as clock, cache.from_options(options), threadpool_limits(1, "blas"):
             status = int(options.command(options, shlex.join(["jaxslam", *arguments])))
-            if status != INTERRUPTED and jax.process_index() == 0:
+            if status != INTERRUPTED:
                 print(clock)
         sys.stdout.flush()  # here, so that a closed pipe is met below
         return status

@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -95,15 +95,9 @@ def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more:
     parser.add_argument(
         "--figures",
         metavar="FORMATS",
+        default="png",
         help=f"formats of figures, of {', '.join(formats)}; comma-separated (default: png{more})",
     )
-
-
-def asked_figures(options: argparse.Namespace, there: Sequence[str] = ()) -> Sequence[str]:
-    """The formats of figures that a command asks for; else those that are there, else PNG."""
-    if options.figures is not None:
-        return list(options.figures.split(","))
-    return there or ("png",)
 
 
 def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:

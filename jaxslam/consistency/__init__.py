@@ -27,7 +27,7 @@ from jaxslam.consistency.localization import (
     seed_spread,
     summarize_localization,
 )
-from jaxslam.consistency.nees import DOF, mean_pose_nees, own_error_of
+from jaxslam.consistency.nees import DOF, own_error_of
 from jaxslam.consistency.score import LANDMARK_DOF, LEVELS, Score, monitor_of, score
 from jaxslam.consistency.statistics import LAGS, RunStatistics, run_statistics
 from jaxslam.consistency.summary import Summary, summarize
@@ -60,7 +60,6 @@ __all__ = [
     "judge",
     "judge_localization",
     "lopsided",
-    "mean_pose_nees",
     "monitor_of",
     "own_error_of",
     "percentage",

@@ -83,19 +83,6 @@ def block_nees(
     return found
 
 
-def mean_pose_nees(
-    truth: Float[np.ndarray, "R T 3"],
-    pose: Float[np.ndarray, "R T 3"],
-    cov: Float[np.ndarray, "R T 3 3"],
-) -> tuple[Float[np.ndarray, "R"], Bool[np.ndarray, "R"]]:
-    """The mean over time of each run's pose NEES, and whether there is one."""
-    error = pose_error(truth, pose)
-    nees, regular = block_nees(pose, error, error, cov)["pose"]
-    count = regular.sum(axis=1)
-    finite = np.isfinite(pose).all(axis=(1, 2)) & np.isfinite(cov).all(axis=(1, 2, 3))
-    return nees.sum(axis=1) / np.maximum(count, 1), finite & (count > 0)
-
-
 def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Float[Array, "T 3"]:
     """The pose error in the filter's coordinates, brought to (x, y, θ) by its basis.
 

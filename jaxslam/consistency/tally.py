@@ -8,7 +8,6 @@ depend on how the runs were divided; Knuth's two-sum, and the sums of Dekker 197
 technique for extending the available precision", Numerische Mathematik 18).
 """
 
-import io
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -111,33 +110,6 @@ class Tally:
             self._sums[name] = plus(self._sums[name], value) if name in self._sums else value
         for first, runs in other._runs.items():
             self._place(first, runs, other._blocks[first])
-
-    def packed(self) -> bytes:
-        """All of it as the bytes of an npz, for another process to `unpack`."""
-        arrays = {}
-        for name, (high, low) in self._sums.items():
-            arrays[f"high/{name}"], arrays[f"low/{name}"] = high, low
-        for first, block in self._blocks.items():
-            arrays[f"runs/{first}"] = np.asarray(self._runs[first])
-            arrays |= {f"{first}/{name}": value for name, value in block.items()}
-        out = io.BytesIO()
-        np.savez(out, allow_pickle=False, **arrays)
-        return out.getvalue()
-
-    @classmethod
-    def unpack(cls, content: bytes) -> "Tally":
-        """The inverse of `packed`."""
-        tally = cls()
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            for label in arrays.files:
-                kind, _, name = label.partition("/")
-                if kind == "high":
-                    tally._sums[name] = Sum(arrays[label], arrays[f"low/{name}"])
-                elif kind == "runs":
-                    tally._place(int(name), int(arrays[label]), tally._blocks.get(int(name), {}))
-                elif kind != "low":
-                    tally._blocks.setdefault(int(kind), {})[name] = arrays[label]
-        return tally
 
     def _place(self, first: int, runs: int, block: dict[str, np.ndarray]) -> None:
         self._blocks[first], self._runs[first] = block, runs

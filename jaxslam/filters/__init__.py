@@ -5,7 +5,6 @@ from jaxslam.filters.ekf.compressed_ekf_slam import compressed_ekf_slam
 from jaxslam.filters.ekf.ekf_slam import ekf_slam
 from jaxslam.filters.ekf.observability import monitored
 from jaxslam.filters.information.eif_slam import eif_slam
-from jaxslam.filters.information.eseif import eseif
 from jaxslam.filters.information.seif import seif
 from jaxslam.filters.known.dead_reckoning import dead_reckoning
 from jaxslam.filters.known.localization import localization
@@ -24,7 +23,6 @@ __all__ = [
     "delayed_slam",
     "eif_slam",
     "ekf_slam",
-    "eseif",
     "fastslam",
     "localization",
     "mapping",

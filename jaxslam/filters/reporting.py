@@ -17,7 +17,6 @@ def status_of(
     matched: Mask = None,
     positive: Mask = None,
     inside: Mask = None,
-    postponed: Mask = None,
     new: Mask = None,
     repeated: Mask = None,
     granted: Mask = None,
@@ -34,11 +33,10 @@ def status_of(
     | not valid | EMPTY |
     | matched, S not positive definite | SINGULAR |
     | matched, outside the gate, or d² not finite | REJECTED |
-    | matched, postponed | DEFERRED |
     | matched | FUSED |
     | new, its tag earlier in the scan | REPEATED |
     | new, a slot granted | BORN |
-    | new, beyond `births` or postponed | DEFERRED |
+    | new, beyond `births` | DEFERRED |
     | new, stored for a later initialization | SIGHTED |
     | new, with a covariance that is not positive definite | SINGULAR |
     | new, none of these: no slot is free | OVERFLOW |
@@ -54,7 +52,6 @@ def status_of(
         positive: S is positive definite, alone and with those of the scan that are fused with it,
             and so is whatever the filter needs to compute S.
         inside: d² is finite and at most the gate. Any value where S is not positive definite.
-        postponed: known, but the filter cannot activate it now (`eseif`).
         new: association found it to be of no landmark.
         repeated, granted, deferred, stored, singular: outcomes of a new one.
     """
@@ -65,8 +62,6 @@ def status_of(
         cases.append((matched & ~positive, Status.SINGULAR))
     if inside is not None:
         cases.append((matched & ~inside, Status.REJECTED))
-    if postponed is not None:
-        cases.append((matched & postponed, Status.DEFERRED))
     cases.append((matched, Status.FUSED))
     fates = (
         (repeated, Status.REPEATED),

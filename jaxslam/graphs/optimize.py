@@ -1,4 +1,4 @@
-"""The optimum of a graph: Gauss-Newton and Levenberg-Marquardt on sparse blocks."""
+"""The optimum of a graph: Levenberg-Marquardt on sparse blocks."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ from jaxslam.graphs.solver.linearized import chi2_of, data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.padding import cut, own_number, padded_graph
 from jaxslam.graphs.solver.plan import Plan, plan_for
-from jaxslam.graphs.solver.search import METHODS, Solution, minimize
+from jaxslam.graphs.solver.search import Solution, minimize
 from jaxslam.graphs.validation import check_graph
 
 
@@ -29,7 +29,6 @@ def optimize(
     graph: Graph,
     factors: Mapping[str, Factor] | None = None,
     *,
-    method: str = "levenberg_marquardt",
     kernel: Kernel | Mapping[str, Kernel] | None = None,
     iterations: int = 100,
     tolerance: float = 1e-12,
@@ -38,14 +37,14 @@ def optimize(
 ) -> Solution:
     """The graph at a minimum of χ² = Σ ρ(eᵀ Ω e), from the variables it has.
 
-    Each step solves (H + λD) δ = -g with H = Σ Jᵀ ρ' Ω J and g = Σ Jᵀ ρ' Ω e, J by increments δ in
-    the frame of a pose, X ∘ exp(δ) as in `se2.boxplus`, and D = diag H.
+    Each step of Levenberg and Marquardt solves (H + λD) δ = -g with H = Σ Jᵀ ρ' Ω J and
+    g = Σ Jᵀ ρ' Ω e, J by increments δ in the frame of a pose, X ∘ exp(δ) as in `se2.boxplus`, and
+    D = diag H.
 
     Args:
         graph: outside of a trace it is checked.
         factors: the factor of each table; those of files by default. A table "name/part" takes the
             factor "name".
-        method: "levenberg_marquardt", "gauss_newton" (λ = 0, every step is taken) or "dogleg".
         kernel: robust kernels, one for all tables or by table. With `truncated` the iterations are
             rounds of graduated non-convexity (`gnc`), and `iterations` is the limit of each.
         iterations: steps at most; with 0 the solution is of the graph as it is.
@@ -55,11 +54,9 @@ def optimize(
             of about the same size share a compiled program (`solver.padding`).
         room: without a plan, all graphs of at most about so many variables share one.
     Raises:
-        ValueError: on what `check_graph` refuses, and on unknown methods or tables.
+        ValueError: on what `check_graph` refuses, and on unknown tables.
     """
     caller = "graphs.optimize"
-    if method not in METHODS:
-        raise ValueError(f"{caller}: no method {method!r}; there are: {', '.join(METHODS)}")
     check_count(f"{caller}: iterations", iterations, least=0)
     if is_concrete(tolerance) and not 0 <= tolerance < np.inf:
         raise ValueError(
@@ -72,7 +69,7 @@ def optimize(
     own, fill = graph, plan is None and programs.outside(graph)
     graph = padded_graph(graph, room) if fill else graph
     plan = plan_for(caller, graph, known, plan, room=room)
-    found = programs.call(_optimize, (model, method), graph, plan, *limits)
+    found = programs.call(_optimize, (model,), graph, plan, *limits)
     if not fill:
         return found
     singular = own_number(found.singular, own, graph)
@@ -102,17 +99,17 @@ def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
 
 
 def _optimize(
-    model: Model, method: str, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
+    model: Model, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
     graph = graph_in_one_dtype(graph)
-    return _solver(model, method)(graph, plan, iterations, tolerance.astype(graph.poses.dtype))
+    return _solver(model)(graph, plan, iterations, tolerance.astype(graph.poses.dtype))
 
 
 @functools.lru_cache(maxsize=256)
-def _solver(model: Model, method: str) -> Callable[..., Solution]:
+def _solver(model: Model) -> Callable[..., Solution]:
     """The solution of one graph, with derivatives, and batched by `vmap`."""
     search = graduated if any(k.limit is not None for _, k in model.kernels) else minimize
-    solve = over_batch("graphs.optimize", functools.partial(search, model, method))
+    solve = over_batch("graphs.optimize", functools.partial(search, model))
 
     @jax.custom_jvp
     def solved(graph: Graph, *shared: PyTree) -> Solution:

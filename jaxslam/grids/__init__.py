@@ -1,4 +1,4 @@
-"""Occupancy grids: maps, files, distances, rays, beam models, mapping, localization, SLAM."""
+"""Occupancy grids: maps, files, distances, rays, beam models, mapping, localization."""
 
 from jaxslam.grids.beam_models import (
     BeamModel,
@@ -16,7 +16,6 @@ from jaxslam.grids.interpolation import interpolate
 from jaxslam.grids.localization import Clusters, beam_log, clusters, localize
 from jaxslam.grids.mapping import Counts, count, entropy, occupancy, reflection
 from jaxslam.grids.resampling import correlation, crop, resample
-from jaxslam.grids.slam import GridParticles, best_map, grid_slam
 
 __all__ = [
     "BeamModel",
@@ -24,11 +23,9 @@ __all__ = [
     "Counts",
     "Field",
     "Grid",
-    "GridParticles",
     "Mixture",
     "RayMap",
     "beam_log",
-    "best_map",
     "cast",
     "centers",
     "check_grid",
@@ -40,7 +37,6 @@ __all__ = [
     "entropy",
     "fit",
     "gradient",
-    "grid_slam",
     "interpolate",
     "likelihood_field",
     "localize",

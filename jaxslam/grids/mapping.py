@@ -63,7 +63,7 @@ def count(
         ValueError: a shape, a frame, a mount, poses and beams that do not fit; outside a trace, no
             usable beam, or a usable pose that is not finite.
     """
-    check_shape("count", shape)
+    _check_shape(shape)
     check_frame("count", origin, resolution)
     check_mount("count", mount)
     _check_scans(poses, beams, max_range)
@@ -77,11 +77,11 @@ def count(
     )
 
 
-def check_shape(name: str, shape: tuple[int, int]) -> None:
+def _check_shape(shape: tuple[int, int]) -> None:
     """Raise ValueError unless the shape (H, W) of a map is two integers of at least 1."""
     if np.shape(shape) != (2,) or not all(isinstance(n, Integral) and n >= 1 for n in shape):
         raise ValueError(
-            f"{name}: expected a shape (H, W), integers, of at least one cell, got {shape!r}"
+            f"count: expected a shape (H, W), integers, of at least one cell, got {shape!r}"
         )
 
 
@@ -127,13 +127,12 @@ def _count(
     def add(total: PyTree, row: tuple[Array, Beams]) -> tuple[PyTree, None]:
         hits, misses, outside, unusable = total
         pose, scan = row
-        eye = se2.compose(pose, mount)[None]
-        hits, misses, lost = add_scan(
+        eye = se2.compose(pose, mount)
+        hits, misses, lost = _add_scan(
             hits, misses, shape, origin, resolution, eye, scan, max_range, free
         )
         usable = usable_beams(scan)
-        outside = outside + lost.sum(dtype=jnp.int32)
-        return (hits, misses, outside, unusable + (~usable).sum(dtype=jnp.int32)), None
+        return (hits, misses, outside + lost, unusable + (~usable).sum(dtype=jnp.int32)), None
 
     none = jnp.zeros(shape[0] * shape[1], jnp.int32)
     zero = jnp.zeros((), jnp.int32)
@@ -141,58 +140,49 @@ def _count(
     return Counts(total[0].reshape(shape), total[1].reshape(shape), origin, resolution, *total[2:])
 
 
-def add_scan(
-    hits: Int[Array, "PHW"],
-    misses: Int[Array, "PHW"],
+def _add_scan(
+    hits: Int[Array, "HW"],
+    misses: Int[Array, "HW"],
     shape: tuple[int, int],
     origin: Float[Array, "3"],
     resolution: Array,
-    eyes: Float[Array, "P 3"],
+    eye: Float[Array, "3"],
     scan: Beams,
     max_range: ArrayLike,
     free: ArrayLike,
-) -> tuple[Int[Array, "PHW"], Int[Array, "PHW"], Int[Array, "P"]]:
-    """The counts of P maps, one after the other in a flat array, with one scan from P poses.
-
-    Also the usable beams of each pose that say nothing, since it is off the map. All beams of all
-    maps are treated together, since a loop of each map's own would copy all counts in each step.
+) -> tuple[Int[Array, "HW"], Int[Array, "HW"], Int[Array, ""]]:
+    """The counts with one scan more, and the number of usable beams if its pose is off the map.
 
     Args:
-        eyes: poses of the laser. free: as `no_return` of `count`.
+        eye: pose of the laser. free: as `no_return` of `count`.
     """
     height, width = shape
     nowhere = hits.shape[0]
     met, far = scan.returns(jnp.asarray(max_range))
     usable = met | far
     length = jnp.where(met, scan.range, jnp.where(far, free, 0.0))
-    heading = eyes[:, 2:] + jnp.where(usable, scan.angle, 0.0)[None]
+    heading = eye[2] + jnp.where(usable, scan.angle, 0.0)
     e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
-    ends = to_cells(origin, resolution, eyes[:, None, :2] + length[None, :, None] * e)
-    start = to_cells(origin, resolution, eyes[:, :2])
-    inside = (start >= 0).all(axis=1) & (start[:, 0] < width) & (start[:, 1] < height)
-    said = usable & ~(far & (jnp.asarray(free) <= 0))
-    live = (inside[:, None] & said[None]).reshape(-1)
-    first = jnp.broadcast_to(start[:, None], ends.shape).reshape(-1, 2)
-    ends = ends.reshape(-1, 2)
-    map_of = height * width * jnp.arange(len(eyes), dtype=jnp.int32)
-    base = jnp.repeat(map_of, scan.range.shape[0])
-    misses, last = _cross(misses, first, ends, live, base, shape)
+    ends = to_cells(origin, resolution, eye[None, :2] + length[:, None] * e)
+    start = to_cells(origin, resolution, eye[:2])
+    inside = (start >= 0).all() & (start[0] < width) & (start[1] < height)
+    live = inside & usable & ~(far & (jnp.asarray(free) <= 0))
+    misses, last = _cross(misses, jnp.broadcast_to(start, ends.shape), ends, live, shape)
     on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
-    at = jnp.where(live & on_map, base + last, nowhere)
-    hit = jnp.tile(~far, len(eyes))
-    hits = hits.at[at].add(hit.astype(jnp.int32), mode="drop")
-    misses = misses.at[at].add((~hit).astype(jnp.int32), mode="drop")
+    at = jnp.where(live & on_map, last, nowhere)
+    hits = hits.at[at].add((~far).astype(jnp.int32), mode="drop")
+    misses = misses.at[at].add(far.astype(jnp.int32), mode="drop")
     lost = jnp.where(inside, 0, usable.sum(dtype=jnp.int32))
     return hits, misses, lost
 
 
 def _cross(
-    misses: Array, start: Array, ends: Array, live: Array, base: Array, shape: tuple[int, int]
+    misses: Array, start: Array, ends: Array, live: Array, shape: tuple[int, int]
 ) -> tuple[Array, Array]:
     """Add one to each cell from start up to, without, that of the end; and the latter's index.
 
     A beam crosses as many lines of the table as there are between the two cells; one that leaves
-    the map does not return. base: where the map of each beam begins.
+    the map does not return.
     """
     height, width = shape
     nowhere = misses.shape[0]
@@ -210,7 +200,7 @@ def _cross(
         misses, cell, done = state
         going = done < steps
         inside = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
-        at = jnp.where(going & inside, base + cell[:, 1] * width + cell[:, 0], nowhere)
+        at = jnp.where(going & inside, cell[:, 1] * width + cell[:, 0], nowhere)
         misses = misses.at[at].add(1, mode="drop")
         # The share of the beam up to the next line of each axis; none where the end is reached.
         crossing = (cell + (forward > 0) - start) * slope
@@ -234,20 +224,15 @@ def occupancy(counts: Counts, *, hit: ArrayLike = 0.7, miss: ArrayLike = 0.4) ->
 
     Raises ValueError unless 0 < miss < ½ < hit < 1.
     """
-    check_hit_and_miss("occupancy", hit, miss)
-    log_hit = jnp.log(hit) - jnp.log1p(-jnp.asarray(hit))
-    log_miss = jnp.log(miss) - jnp.log1p(-jnp.asarray(miss))
-    log_odds = counts.hits * log_hit + counts.misses * log_miss
-    return Grid(log_odds, counts.origin, counts.resolution)
-
-
-def check_hit_and_miss(name: str, hit: ArrayLike, miss: ArrayLike) -> None:
-    """Raise ValueError unless 0 < miss < ½ < hit < 1."""
     if (
         is_concrete(hit, miss)
         and not 0 < float(np.asarray(miss)) < 0.5 < float(np.asarray(hit)) < 1
     ):
-        raise ValueError(f"{name}: expected 0 < miss < 0.5 < hit < 1, got {miss!r} and {hit!r}")
+        raise ValueError(f"occupancy: expected 0 < miss < 0.5 < hit < 1, got {miss!r} and {hit!r}")
+    log_hit = jnp.log(hit) - jnp.log1p(-jnp.asarray(hit))
+    log_miss = jnp.log(miss) - jnp.log1p(-jnp.asarray(miss))
+    log_odds = counts.hits * log_hit + counts.misses * log_miss
+    return Grid(log_odds, counts.origin, counts.resolution)
 
 
 def reflection(counts: Counts, *, prior: ArrayLike = 1.0) -> Grid:

@@ -1,8 +1,8 @@
-"""The campaign: blocks of runs over devices and processes, kept as they finish, then summed up.
+"""The campaign: blocks of runs over devices, kept as they finish, then summed up.
 
 A run is a number: its key and its place in a block. For one size of blocks and one number of
-devices its world and its filters' results are the same to the bit, whatever workers and processes
-there are and whatever was interrupted; otherwise to rounding. Only scores are kept of a block, so
+devices its world and its filters' results are the same to the bit, whatever workers and parts there
+are and whatever was interrupted; otherwise to rounding. Only scores are kept of a block, so
 memory is that of the blocks in flight however many runs there are.
 """
 
@@ -17,7 +17,7 @@ from jax.typing import DTypeLike
 
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.core.numbers import check_count, check_key
-from jaxslam.monte_carlo.blocks.block import BOUND, Glimpse
+from jaxslam.monte_carlo.blocks.block import BOUND
 from jaxslam.monte_carlo.blocks.blockwise import Library
 from jaxslam.monte_carlo.blocks.plan import CampaignPlan
 from jaxslam.monte_carlo.candidates import (
@@ -31,7 +31,6 @@ from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.monte_carlo.kept import Keep, add_kept
 from jaxslam.monte_carlo.pieces import check_part, cores, in_part, missing
 from jaxslam.monte_carlo.record import Campaign, Interrupted
-from jaxslam.monte_carlo.together import gathered_tallies, share
 from jaxslam.monte_carlo.work import Work, shown_progress
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import Scenario, with_positions
@@ -52,14 +51,10 @@ def monte_carlo(
     keep: Keep | None = None,
     part: tuple[int, int] | None = None,
     progress: Callable[[int, int], None] | Literal[False] | None = None,
-    glimpse: Glimpse | None = None,
     library: Library | None = None,
     identity: Mapping[str, str] | None = None,
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
-
-    Where `jax.distributed` has been initialized, the processes divide the blocks among themselves,
-    and each returns the whole campaign.
 
     Args:
         scenario: what to draw; see `scenarios`.
@@ -69,7 +64,7 @@ def monte_carlo(
         block: runs vmapped together on a device, which sets memory; default 16 on a CPU, and
             by its memory on an accelerator. Where memory does not suffice, half of it is tried,
             with a warning.
-        devices: of this process; default all of `jax.local_devices()`.
+        devices: default all of `jax.local_devices()`.
         workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
             accelerator).
         bound: also take the conditional Cramér-Rao bound of every run (`conditional_bound`), at
@@ -84,12 +79,8 @@ def monte_carlo(
             campaign, each with a `keep` from `store.join` on one folder, with the same block and
             number of devices; without `part` the blocks are summed up, and those that are missing
             computed.
-        progress: called with (runs done, runs) of this process after each block. Default a bar with
+        progress: called with (runs done, runs) after each block. Default a bar with
             rate and remaining time, on a terminal and in a notebook alone; False: none.
-        glimpse: called with (filter, runs, interval of their mean pose NEES) as soon as the first
-            block of each filter has run, while the others may still be compiled. A campaign of no
-            more than `workers` blocks is compiled in full first: its steps are timed. Default a
-            line on the terminal, with the default `progress`.
         library: compiled programs are taken from there, without a trace, and put there. The caller
             answers for it: its programs are of this scenario and these filters, by name.
         identity: what `keep` is told instead of the fingerprint, where the caller knows without a
@@ -125,15 +116,15 @@ def monte_carlo(
         keep.claim(told)
         done = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
     pieces = missing(done, runs, plan.wide)
-    todo = share([piece for piece in pieces if in_part(piece[0], plan.wide, part)])
-    work = Work(workers, keep, progress or None, glimpse, {name: Tally() for name in names})
+    todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
+    work = Work(workers, keep, progress or None, {name: Tally() for name in names})
     try:
         with shown_progress(work, plan, progress is None):
             work.in_blocks_that_fit(plan, todo)
         interrupted = False
     except KeyboardInterrupt:
         interrupted = True
-    for name, tally in (work.own if interrupted else gathered_tallies(work.own)).items():
+    for name, tally in work.own.items():
         tallies[name].merge(tally)
     campaign = None
     if tallies[BOUND].pieces():
@@ -161,8 +152,6 @@ def _check(
             check_count(f"monte_carlo: {name}", value)
     if part is not None:
         check_part("monte_carlo: part", part)
-        if jax.process_count() > 1:
-            raise ValueError("monte_carlo: part: expected none where jax.distributed divides")
     check_record("monte_carlo", "scenario", scenario, Scenario)
     if scenario.recorded is not None and runs > (most := len(scenario.recorded[0].pose)):
         raise ValueError(

@@ -5,8 +5,6 @@ import sys
 import time
 from collections.abc import Callable
 
-from jaxslam.consistency import DOF, Measure
-
 
 class Progress:
     """A progress bar on a terminal's standard error or below a notebook's cell, gone at the end.
@@ -52,15 +50,6 @@ class Progress:
             rate = (done - self._first[1]) / (now - self._first[0])
             line += f", {_rate(rate)} a second, {_duration((total - done) / rate)} left"
         self._draw(line)
-
-    def glimpse(self, name: str, runs: int, nees: Measure | None) -> None:
-        """Print a line with the pose NEES of a filter's first block, while others are compiled."""
-        if self._terminal and nees is not None:
-            one = runs == 1
-            shown = f"{nees.value:.3g}" + ("" if one else f" ({nees.low:.3g} to {nees.high:.3g})")
-            of = "run" if one else f"block of {runs} runs"
-            self._draw(f"{name}: pose NEES {shown} over a first {of}; honest is {DOF['pose']}\n")
-            self.say("compiling …")
 
     def __exit__(self, *_: object) -> None:
         self._draw("")

@@ -123,10 +123,9 @@ class Campaign:
         """Write the table of `to_dataframe` to a file, and return its path; it is replaced.
 
         Args:
-            path: ends in .csv, .json (a list a column) or .parquet, which sets the format. Parquet
-                is there where pyarrow is installed; jaxslam does not require it.
+            path: ends in .csv or .json (a list a column), which sets the format.
         Raises:
-            ValueError: on another ending, or .parquet without pyarrow.
+            ValueError: on another ending.
             OSError: if the folder cannot be written.
         """
         from jaxslam.results import run_table

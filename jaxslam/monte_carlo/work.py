@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Tally
-from jaxslam.monte_carlo.blocks.block import BOUND, BlockRunner, Glimpse
+from jaxslam.monte_carlo.blocks.block import BOUND, BlockRunner
 from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
 from jaxslam.monte_carlo.blocks.programs import compile_programs
 from jaxslam.monte_carlo.kept import Keep, add_block, flat
@@ -28,9 +28,8 @@ class Work:
     workers: int
     keep: Keep | None
     progress: Callable[[int, int], None] | None
-    glimpse: Glimpse | None
     own: dict[str, Tally]
-    """what this process has computed, by filter"""
+    """what was computed here, by filter"""
     compile_seconds: float = 0.0
     run_seconds: dict[str, float] = field(default_factory=dict)
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
@@ -68,7 +67,7 @@ class Work:
         ][::-1]
         plan = replace(plan, with_first=any(first == 0 for first, _ in queue))
         promises = Promises(list(plan.filters))
-        runner = BlockRunner(plan, promises, self.glimpse)
+        runner = BlockRunner(plan, promises)
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
         early = len(queue) > self.workers
@@ -79,8 +78,7 @@ class Work:
             try:
                 while queue and len(flight) <= self.workers:
                     first, count = queue.pop()
-                    block = pool.submit(runner.block, first, count, early, not flight)
-                    flight[block] = first, count
+                    flight[pool.submit(runner.block, first, count, early)] = first, count
                 began = time.perf_counter()
                 compile_programs(plan, promises)
                 self.compile_seconds += time.perf_counter() - began
@@ -102,8 +100,7 @@ class Work:
                             self.progress(done, total)
                     while queue and stop is None and len(flight) <= self.workers:
                         first, count = queue.pop()
-                        block = pool.submit(runner.block, first, count, True, False)
-                        flight[block] = first, count
+                        flight[pool.submit(runner.block, first, count, True)] = first, count
                 except BaseException as error:
                     if stop is not None:
                         raise
@@ -125,6 +122,5 @@ def shown_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[Non
         yield
         return
     work.progress = bar
-    work.glimpse = work.glimpse or bar.glimpse
     with bar:
         yield

@@ -1,8 +1,7 @@
-"""The runs of a campaign as a table: CSV, JSON, Parquet, or the columns of a data frame."""
+"""The runs of a campaign as a table: CSV, JSON, or the columns of a data frame."""
 
-import importlib.util
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.files import check_writable, csv_text, write_files
 
-FORMATS = ("csv", "json", "parquet")
+FORMATS = ("csv", "json")
 
 
 def columns(campaign: Campaign) -> dict[str, np.ndarray]:
@@ -29,16 +28,11 @@ def columns(campaign: Campaign) -> dict[str, np.ndarray]:
 
 
 def check_table_formats(caller: str, asked: Iterable[str]) -> tuple[str, ...]:
-    """The formats, each once; raises ValueError that names another, or Parquet without pyarrow."""
+    """The formats, each once; raises ValueError that names another."""
     kinds = tuple(dict.fromkeys(asked))
     for kind in kinds:
         if kind not in FORMATS:
             raise ValueError(f"{caller}: expected formats of {', '.join(FORMATS)}, got {kind!r}")
-        if kind == "parquet" and importlib.util.find_spec("pyarrow") is None:
-            raise ValueError(
-                f"{caller}: parquet needs pyarrow, which is not installed: pip install pyarrow, "
-                "or take csv"
-            )
     return kinds
 
 
@@ -47,16 +41,13 @@ def save_table(campaign: Campaign, path: str | Path) -> Path:
 
     In CSV what is not finite is an empty cell, in JSON (a list a column) null.
 
-    Raises ValueError on another format, and on Parquet where pyarrow is not installed.
+    Raises ValueError on another format.
     """
     path = Path(path)
     (kind,) = check_table_formats("Campaign.save_runs", [path.suffix.removeprefix(".")])
     check_writable(path.parent)
     found = columns(campaign)
-    made: str | Callable[[Path], object]
-    if kind == "parquet":
-        made = lambda target: _write_parquet(found, target)  # noqa: E731
-    elif kind == "json":
+    if kind == "json":
         made = json.dumps({name: _plain(column) for name, column in found.items()}) + "\n"
     else:
         cells = [
@@ -72,9 +63,3 @@ def _plain(column: np.ndarray) -> list[object]:
     if column.dtype.kind != "f":
         return list(column.tolist())
     return [value if np.isfinite(value) else None for value in column.tolist()]
-
-
-def _write_parquet(found: dict[str, np.ndarray], path: Path) -> None:
-    arrow = importlib.import_module("pyarrow")
-    parquet = importlib.import_module("pyarrow.parquet")
-    parquet.write_table(arrow.table(found), path)

@@ -175,7 +175,7 @@ def join(
     settings: Mapping[str, object] | None = None,
     runs: int | None = None,
 ) -> Store:
-    """The store of a campaign that processes without a coordinator compute, each a part of it.
+    """The store of a campaign that independent processes compute, each a part of it.
 
     The first to claim it makes the manifest, with the fingerprint; the others must have the same
     settings and the same fingerprint.

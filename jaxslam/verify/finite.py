@@ -1,4 +1,4 @@
-"""Values and derivatives that are not finite: at which state, by which line, and the cure."""
+"""Values and derivatives that are not finite: at which state, and by which line."""
 
 import contextlib
 import io
@@ -10,7 +10,6 @@ import numpy as np
 
 from jaxslam.math.xla import quick_jit
 from jaxslam.verify.derivatives.jacobians import Evaluated
-from jaxslam.verify.derivatives.singular import CURES, singular_operation
 from jaxslam.verify.errors import place_of_error
 from jaxslam.verify.inputs.functions import Function, at_state
 from jaxslam.verify.inputs.samples import coincident
@@ -36,10 +35,10 @@ def finite_check(evaluated: Evaluated) -> Check:
             i = int(np.argmax(bad))
             state = tuple(a[i] for a in samples.values)
             hand = function.hand if what.startswith("hand") else None
-            cause, cure = _explained(function, state, hand, derivative=what != "a value")
+            where = _line_of_nan(function, state, hand, derivative=what != "a value")
             often = f"at {int(np.sum(bad))} of {count} states"
             at = f"{samples.labels[i]}: {at_state(function, state)}"
-            return Check(name, False, f"{cause}{what} is not finite, {often}; {at}", cure)
+            return Check(name, False, f"{where}{what} is not finite, {often}; {at}")
     return Check(name, True, f"{count} states")
 
 
@@ -69,29 +68,21 @@ def singular_notes(evaluated: Evaluated) -> Iterator[str]:
             what = f"the derivative by {' and '.join(bad)}"
         else:
             continue
-        cause, cure = _explained(function, state, None, derivative=what != "the value")
-        told = f"{cause}{what} is not finite with the {label}: {at_state(function, state)}."
-        yield " ".join([told, *cure[:1]]) + "".join(f"\n{line}" for line in cure[1:])
+        where = _line_of_nan(function, state, None, derivative=what != "the value")
+        yield f"{where}{what} is not finite with the {label}: {at_state(function, state)}"
 
 
-def _explained(
+def _line_of_nan(
     function: Function, state: State, hand: Callable[..., object] | None, *, derivative: bool
-) -> tuple[str, tuple[str, ...]]:
-    """The user's line that is not finite, as "line: " or "", and the cure."""
+) -> str:
+    """The user's line at which a NaN or an infinity first appears, as "line: " or ""."""
     call: Callable[..., object] = hand or function.call
-    kind = singular_operation(call, state)
     if derivative and hand is None:
         call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
-    where = _line_of_nan(call, state)
-    cure = (f"The cause is {kind}. {CURES[kind][0]}", *CURES[kind][1:]) if kind else ()
-    return f"{where}: " if where else "", cure
-
-
-def _line_of_nan(call: Callable[..., object], state: State) -> str:
-    """The user's line at which a NaN or an infinity first appears when a function is called."""
     try:  # JAX prints what it found
         with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
             call(*(jnp.asarray(a) for a in state))
     except (Exception, SystemExit) as error:
-        return place_of_error(error)
+        where = place_of_error(error)
+        return f"{where}: " if where else ""
     return ""

@@ -246,7 +246,7 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
             )
         scale = 1.0 + max(float(np.max(np.abs(np.asarray(a)), initial=0)) for a in (*state, first))
         off = first - evaluated.values[i]
-        if bad := _deviation(off / scale, function.periods / scale):
+        if bad := _deviation(off / scale, periods(function.outputs) / scale):
             return f"under jit and vmap the value differs, {bad}"
     return ""
 

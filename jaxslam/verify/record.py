@@ -129,15 +129,11 @@ class Check:
     name: str
     passed: bool
     detail: str = ""
-    cure: tuple[str, ...] = ()
-    """of a singular place, what to do: a sentence, then lines of code"""
 
-    def lines(self) -> Iterator[str]:
-        """The check as a line of text, and those of its cure."""
+    def __str__(self) -> str:
+        """The check as a line of text."""
         detail = f": {self.detail}" if self.detail else ""
-        yield f"{'ok  ' if self.passed else 'FAIL'}  {self.name}{detail}"
-        for number, line in enumerate(self.cure):
-            yield from _wrapped(line, 6) if number == 0 else [f"        {line}"]
+        return f"{'ok  ' if self.passed else 'FAIL'}  {self.name}{detail}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -152,7 +148,7 @@ class Report:
     """of a model, the median of `linearity_index` over the random states, for standard deviations
     of 0.1 (0.05 of [rad] and [1/m])"""
     notes: tuple[str, ...] = field(default=())
-    """what the user should know although it is no failure: text, then lines of code"""
+    """what the user should know although it is no failure"""
 
     @property
     def passed(self) -> bool:
@@ -180,13 +176,12 @@ class Report:
             lines += [f"  {line}" for line in finding.lines()]
         for check in self.checks:
             if not check.passed:
-                lines += [f"  {line}" for line in check.lines()]
+                lines.append(f"  {check}")
         held = "; ".join(check.name for check in self.checks if check.passed)
         if held:
             lines += _wrapped(f"ok    {held}", 2)
         for note in self.notes:
-            text, *code = note.split("\n")
-            lines += [*_wrapped(f"note  {text}", 2), *(f"        {line}" for line in code)]
+            lines += _wrapped(f"note  {note}", 2)
         if self.linearity is not None:
             lines.append(f"  linearity index {self.linearity:.3g}, median (3 σ of 0.1 m, 0.05 rad)")
         return "\n".join(lines)

@@ -1,7 +1,7 @@
 """The function `verify_jacobians`: samples, Jacobians, other checks, and the report."""
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,14 +11,11 @@ from jaxslam.grids.beam_models import BeamModel
 from jaxslam.math.arrays import float64
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify.comparison import compare_methods
-from jaxslam.verify.derivatives.jacobians import Evaluated
 from jaxslam.verify.examination import Model, examine, functions_of, typical_linearity
 from jaxslam.verify.inputs.beam_models import FAR, beam_function, beam_samples
 from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.functions import (
     Function,
-    at_state,
-    example_of,
     factor_function,
     makes_a_model,
     plain_function,
@@ -74,12 +71,8 @@ def verify_jacobians(
             first argument, or by all of them side by side. Models bring their own.
         arguments: of a function, the names of the entries of its arguments with units, as in
             {"pose": ("x [m]", "y [m]", "theta [rad]")}, or only their number. Parameters called
-            pose, frame, landmark, l or point need not be given; others need not where `states`
-            are given, or where one length alone fits the function and the shapes of its claimed
-            Jacobian (`lengths.deduce_lengths`). A note says what was deduced.
-        outputs: of a function, the names of its outputs with units; [rad] is modulo 2π. An output
-            without a unit that jumps by 2π is noted; that is no failure, since its derivative is
-            right on both sides, and only its author knows whether it is an angle.
+            pose, frame, landmark, l or point need not be given, nor others where `states` are.
+        outputs: of a function, the names of its outputs with units; [rad] is modulo 2π.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
             sensor those of `observe`; `invert` is tried at the measurements of these.
         name: of a function, its name in the report; default: its own.
@@ -89,7 +82,7 @@ def verify_jacobians(
     Returns:
         A `Report`: `passed`, `findings`, `checks`, `notes`, `as_dict()`, and text when printed.
     Raises:
-        ValueError: if the length of an argument is not determined, states have the wrong shape,
+        ValueError: if the length of an argument is not known, states have the wrong shape,
             or count or a tolerance is not positive.
     """
     if not tolerance > 0 or not float32_tolerance > 0:
@@ -151,33 +144,7 @@ def verify_jacobians(
         ]
     with float64():
         linearity = typical_linearity(model, examined)
-    notes = [note for one in examined.evaluated for note in notes_of(one, kind)]
-    notes += examined.singular
-    return Report(name, kind, tuple(findings), examined.checks, linearity, tuple(notes))
-
-
-def notes_of(evaluated: Evaluated, kind: str) -> Iterator[str]:
-    """What a user should know although nothing is wrong: lengths deduced, angles not named."""
-    function = evaluated.function
-    for argument in function.arguments:
-        if argument.deduced:
-            count = len(argument.entries)
-            entries = "1 entry" if count == 1 else f"{count} entries"
-            example = example_of(function.name, {argument.name: count})
-            yield (
-                f"{argument.name}: {entries}, deduced from shapes. Difficult values are tried too "
-                f"if you name them with their units: {example}"
-            )
-    for jump in evaluated.jumps if kind != "motion" else ():
-        output, turn = function.outputs[jump.output], "2π" if jump.unit == "[rad]" else "360"
-        field, then = "outputs", "it is then compared on the circle"
-        if kind == "sensor":
-            field = "landmark" if function.name == "invert" else "measurements"
-            then += ", and the residual is checked for wrapping"
-        yield (
-            f"{output} jumps by {turn} at {at_state(function, jump.state)}. If it is an angle, end "
-            f'its name in {field} with {jump.unit}, as in "bearing {jump.unit}": {then}'
-        )
+    return Report(name, kind, tuple(findings), examined.checks, linearity, examined.singular)
 
 
 def build(

@@ -89,22 +89,6 @@ def test_the_version_is_told(capsys):
         (["--cache", ""], "--cache: expected a folder, got ''"),
         (["--resume", " "], "--resume: expected a folder, got ' '"),
         (["--devices", "abacus"], "--devices: expected all, a number, or one of cpu"),
-        (["--processes", "2"], "expected --coordinator HOST:PORT with them"),
-        (["--coordinator", "here"], "--coordinator: expected HOST:PORT or auto"),
-        (["--coordinator", "127.0.0.1:9", "--processes", "2"], "I from 0 to P-1"),
-        (
-            [
-                "--coordinator",
-                "127.0.0.1:9",
-                "--processes",
-                "2",
-                "--process-id",
-                "1",
-                "--timeout",
-                "1",
-            ],
-            "no process 0 at 127.0.0.1:9 within 1 s",
-        ),
     ],
 )
 def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, change, message):

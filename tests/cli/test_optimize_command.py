@@ -259,7 +259,6 @@ def test_each_kind_of_bad_graph_is_named(tmp_path, refused, old, new, message):
         ),
         (["--kernel", "moon"], "unknown kernel 'moon'; known: huber"),
         (["--error", "moon"], "unknown error 'moon'; known: pose, log"),
-        (["--method", "moon"], "--method: unknown method 'moon'; known: levenberg_marquardt"),
         (["--iterations", "0"], "iterations: expected an integer >= 1, got 0"),
     ],
 )

@@ -108,7 +108,7 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
             "; or FILE.py:NAME, one of your own",
         ),
         (["--figures", "gif"], "--figures: expected formats of png, pdf, svg, got 'gif'"),
-        (["--table", "xls"], "--table: expected formats of csv, json, parquet, got 'xls'"),
+        (["--table", "xls"], "--table: expected formats of csv, json, got 'xls'"),
         (["--figures", ""], "--figures: expected formats of png, pdf, svg, got ''"),
     ],
 )

@@ -16,7 +16,7 @@ from jaxslam.filters.reporting import info_of, nothing_of, status_of
 from jaxslam.types import Scan, Status
 
 MASKS = (
-    "valid", "matched", "positive", "inside", "postponed",
+    "valid", "matched", "positive", "inside",
     "new", "repeated", "granted", "deferred", "stored", "singular",
 )  # fmt: skip
 
@@ -27,7 +27,6 @@ def expected(**of):
         (not of["valid"], Status.EMPTY),
         (of["matched"] and not of["positive"], Status.SINGULAR),
         (of["matched"] and not of["inside"], Status.REJECTED),
-        (of["matched"] and of["postponed"], Status.DEFERRED),
         (of["matched"], Status.FUSED),
         (of["new"] and of["repeated"], Status.REPEATED),
         (of["new"] and of["granted"], Status.BORN),
@@ -133,7 +132,6 @@ FAMILIES = {
 }
 SPARSE = {
     "seif": lambda s: filters.seif(MOVE, s, 5, active=9, links=4, gate=20.0),
-    "eseif": lambda s: filters.eseif(MOVE, s, 5, active=9, links=4, gate=20.0),
 }
 
 
@@ -192,7 +190,7 @@ def test_every_family_reports_a_scan_by_the_table(family):
 
 @pytest.mark.parametrize(
     "family",
-    ["compressed_ekf_slam", "ekf_slam", "ekf_slam, at once", "eif_slam", "seif", "eseif"],
+    ["compressed_ekf_slam", "ekf_slam", "ekf_slam, at once", "eif_slam", "seif"],
 )
 def test_scans_without_places_and_measurements_beyond_all_numbers(family):
     """A scan of none is none; a d² that overflows is outside any gate, and moves nothing."""

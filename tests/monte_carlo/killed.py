@@ -1,4 +1,4 @@
-"""Campaigns in processes that are killed, or whose disk is full, of a toy filter or by the command.
+"""Campaigns in processes that are killed, or whose disk is full, of a toy filter.
 
 They are forked from one process that has imported the package, but not begun to use JAX, and take
 compiled programs from a folder: so each begins in a few tenths of a second.
@@ -17,10 +17,9 @@ import jax
 import numpy as np
 import worlds
 
-from jaxslam import cli, filters, store
+from jaxslam import filters, store
 from jaxslam.cli.runtime.library import ProgramFolder
 from jaxslam.monte_carlo import monte_carlo
-from jaxslam.results import campaign_files
 
 RUNS, BLOCK = 240, 2
 FULL = 28
@@ -77,16 +76,6 @@ def started(target, *arguments):
 def begin(folder, programs, full_after=None):
     """A process that computes what is missing of the campaign in a folder."""
     return started(_begin, folder, programs, full_after)
-
-
-def command(arguments, said):
-    """The target of a process: the command, whose report has no figures; what it says to a file."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    with open(said, "wb") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    campaign_files._drawings = lambda *_: {}
-    sys.exit(cli.main(arguments))
 
 
 def end(process):

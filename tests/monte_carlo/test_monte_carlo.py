@@ -185,25 +185,6 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
         campaign_of()
 
 
-def test_a_first_block_tells_of_each_filter_before_the_campaign_is_done(in_fours):
-    told = []
-    campaign = campaign_of(
-        workers=1,
-        glimpse=lambda *told_of: told.append(("glimpse", *told_of)),
-        progress=lambda *done: told.append(("progress", *done)),
-    )
-    same(campaign.filters["ekf"], in_fours.filters["ekf"])
-    names = list(campaign.filters)
-    assert [(what, name, runs) for what, name, runs, *_ in told[: len(names)]] == [
-        ("glimpse", name, 4) for name in names
-    ]
-    assert [what for what, *_ in told[len(names) :]] == ["progress"] * 3
-    for what, name, runs, nees in told[: len(names)]:
-        per_run = campaign.filters[name].per_run["nees_pose"][:runs]
-        assert nees.value == pytest.approx(per_run.mean(), rel=1e-12), what
-        assert nees.low < nees.value < nees.high
-
-
 def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it():
     def broken(truth):
         raise ValueError("no filter for this truth")

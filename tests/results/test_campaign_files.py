@@ -4,7 +4,6 @@ The campaign's numbers are made up; nothing is compiled but for the errors of ru
 """
 
 import dataclasses
-import importlib.machinery
 import json
 import sys
 import types
@@ -204,30 +203,5 @@ def test_runs_are_written_as_csv_and_json(found, tmp_path):
     assert list(read) == text[0].split(",")
     assert read["nees_pose"] == [0, 1, 2, 5, None, 7] and read["run"] == [0, 4, 5] * 2
     found.save_runs(tmp_path / "runs.json")  # replaced
-    with pytest.raises(
-        ValueError, match="save_runs: expected formats of csv, json, parquet, got 'xls'"
-    ):
+    with pytest.raises(ValueError, match="save_runs: expected formats of csv, json, got 'xls'"):
         found.save_runs(tmp_path / "runs.xls")
-
-
-def test_runs_are_written_as_parquet_by_pyarrow_alone(found, tmp_path, monkeypatch):
-    """By a stand-in that takes what pyarrow does; without one a line says so."""
-    taken = {}
-    module = types.ModuleType("pyarrow.parquet")
-    module.write_table = lambda table, path: (taken.update(table), path.write_bytes(b"PAR1"))
-    arrow = types.ModuleType("pyarrow")
-    arrow.table, arrow.__spec__ = dict, importlib.machinery.ModuleSpec("pyarrow", None)
-    monkeypatch.setitem(sys.modules, "pyarrow", arrow)
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", module)
-    assert found.save_runs(tmp_path / "runs.parquet").read_bytes() == b"PAR1"
-    assert list(taken["run"]) == [0, 4, 5] * 2
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ValueError, match="parquet needs pyarrow, which is not installed"):
-        found.save_runs(tmp_path / "runs2.parquet")
-    assert not (tmp_path / "runs2.parquet").exists()
-
-
-def test_pyarrow_takes_it(found, tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    read = parquet.read_table(found.save_runs(tmp_path / "runs.parquet"))
-    assert read.column_names[:2] == ["filter", "run"] and read.num_rows == 6

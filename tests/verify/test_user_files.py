@@ -65,10 +65,6 @@ def f_jacobian(pose, u):
 """
 
 
-def test_a_length_that_the_claim_tells_need_not_be_given(verify):
-    verify.says(GOOD.replace("f_arguments", "g_arguments"), 0, "u: 1 entry, deduced from shapes")
-
-
 def test_a_right_claim_passes(verify):
     status, out, err, content = verify(GOOD)
     assert status == 0, out + err
@@ -111,7 +107,6 @@ def test_williams_and_the_notes_are_caught(verify):
     assert {(e["row"], e["column"]) for e in usual} == slips
     assert {tuple(e["dissent"]) for e in usual} == {("hand",)}
     assert "notes_velocity.py:19: a value is not finite, " in out  # v/ω at ω = 0
-    assert "The cause is a division by 0." in out
     assert "prints" in out  # the check that it prints nothing was made, and passed
     assert "FAIL  prints" not in out
 

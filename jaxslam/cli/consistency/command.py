@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import jax
 
-from jaxslam.cli.common import INTERRUPTED, OUT, asked_figures, check_out
+from jaxslam.cli.common import INTERRUPTED, OUT, check_out
 from jaxslam.cli.consistency.film import write_films
 from jaxslam.cli.consistency.folder import (
     CampaignOptions,
@@ -38,10 +38,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     out = options.resume or options.out or OUT
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
-    devices.join_processes(options)
-    drawn = [kind for kind in campaign_files.FORMATS if (out / f"nees.{kind}").exists()]
-    wanted = asked_figures(options, drawn if options.resume else ())
-    formats = campaign_files.check_figure_formats("--figures", wanted)
+    formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
     there = [kind for kind in run_table.FORMATS if (out / f"runs.{kind}").exists()]  # up to date
     asked_for = filter(None, options.table.split(","))
     tables = run_table.check_table_formats("--table", [*asked_for, *there])
@@ -93,17 +90,14 @@ def consistency(options: argparse.Namespace, command: str) -> int:
             )
     except Interrupted as stop:
         if stop.campaign is None:
-            if not keep.spans() and part is None:  # other processes may have saved some
+            if not keep.spans() and part is None:  # other jobs may have saved some
                 shutil.rmtree(keep.folder, ignore_errors=True)
             raise
-        if jax.process_index() == 0:
-            print(stop.campaign)
-            print(f"\njaxslam: interrupted, {stop}; --resume {out} continues it", file=sys.stderr)
+        print(stop.campaign)
+        print(f"\njaxslam: interrupted, {stop}; --resume {out} continues it", file=sys.stderr)
         return INTERRUPTED
     for sentence in keep.set_aside:
         print(f"jaxslam: {sentence}", file=sys.stderr)
-    if jax.process_index() > 0:
-        return 0
     if part is not None:
         print(
             f"part {part[0]} of {part[1]} is done, {campaign.runs:,} runs; {keep.folder} holds "
@@ -172,12 +166,7 @@ def _part(options: argparse.Namespace) -> tuple[int, int] | None:
     found = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise ValueError(f"--part: expected I/N with 1 <= I <= N, as 3/16, got {options.part!r}")
-    unfit = {
-        "--coordinator": options.coordinator,
-        "--overwrite": options.overwrite,
-        "--again": options.again,
-    }
-    for name, given in unfit.items():
+    for name, given in (("--overwrite", options.overwrite), ("--again", options.again)):
         if given:
             raise ValueError(f"--part: expected no {name} with it")
     return int(found[1]), int(found[2])
@@ -215,7 +204,7 @@ def _prepare_drawing() -> None:
 def _run_zero(
     scenario: Scenario, candidate: Candidate, key: jax.Array, dtype: str
 ) -> tuple[Truth, Estimate]:
-    """Run 0 of a filter, computed again where another process or an earlier command computed it."""
+    """Run 0 of a filter, computed again where an earlier command computed it."""
     truth, log = rounded(world_of_run(scenario, key, 0), dtype)
     method, _ = estimator_of(candidate, truth, scenario)
     estimate = method(log, run_keys(key, 0)[1]).estimate

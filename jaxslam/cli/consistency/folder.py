@@ -7,9 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
-
-from jaxslam.cli.runtime import devices
 from jaxslam.monte_carlo import missing
 from jaxslam.results import store
 from jaxslam.results.campaign_files import BLOCKS, RESULT
@@ -114,10 +111,9 @@ def open_store(
     settings = settings or {"asked": told, "block": options.block}
     if devices_of_part is not None:
         return _joined(folder, {"devices": devices_of_part, **settings}, runs, options)
-    if options.resume is None and jax.process_index() == 0:
+    if options.resume is None:
         _remove_old_blocks(options, out, settings, runs)
         store.create(folder, settings, runs)
-    devices.wait_for_all("campaign folder")
     return store.resume(folder, settings, runs)
 
 

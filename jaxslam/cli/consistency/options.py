@@ -84,17 +84,4 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="compute only part I of N of the runs, as 3/16, in a folder that independent jobs "
         "share; --resume then sums up, and computes what is missing",
     )
-    others = parser.add_argument_group(
-        "several processes", "run the same command in each, with its own --process-id"
-    )
-    others.add_argument(
-        "--coordinator",
-        metavar="HOST:PORT",
-        help='address on which process 0 listens; "auto" for SLURM, Kubernetes, Open MPI',
-    )
-    others.add_argument("--processes", type=int, metavar="P", help="number of processes")
-    others.add_argument("--process-id", type=int, metavar="I", help="number of this one, from 0")
-    others.add_argument(
-        "--timeout", type=int, default=60, help="seconds to wait for the others (default: 60)"
-    )
     parser.set_defaults(command=consistency)

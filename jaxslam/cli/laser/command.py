@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxslam.cli import films
-from jaxslam.cli.common import SUMMARY, asked_figures, check_out, summary_table
+from jaxslam.cli.common import SUMMARY, check_out, summary_table
 from jaxslam.cli.laser.job import Job
 from jaxslam.cli.laser.localization import run_localization
 from jaxslam.cli.laser.mapping import run_mapping
@@ -22,7 +22,7 @@ def run_laser(options: argparse.Namespace, command: str) -> int:
     """Do what the options ask for, print and write the results; returns the exit status."""
     began = time.perf_counter()
     options = complete(options)
-    formats = check_figure_formats("--figures", asked_figures(options))
+    formats = check_figure_formats("--figures", options.figures.split(","))
     log, left_out = read_log(options)
     check_out(options.out, "run")
     job = _job_of(options)(log, options)

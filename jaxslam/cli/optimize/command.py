@@ -19,7 +19,6 @@ from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor, of_files
 from jaxslam.graphs.graph import TRUSTED
-from jaxslam.graphs.solver.search import METHODS
 from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import csv_text, json_number, json_text, versions, write_files
@@ -45,7 +44,6 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         pick("start", options.start, starts.STARTS)
     kernel = None if options.kernel is None else pick("kernel", options.kernel, graphs.KERNELS)()
     relative, equation = pick("error", options.error, ERRORS)
-    pick("method", options.method, {name: name for name in METHODS})
     if options.animate and kernel is not None and kernel.limit is not None:
         raise ValueError(
             f"--animate: the kernel {options.kernel} is solved in rounds of many iterations each; "
@@ -71,7 +69,6 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
                     graphs.optimize(
                         begun,
                         factors,
-                        method=options.method,
                         kernel=doubted,
                         iterations=options.iterations,
                     )
@@ -108,7 +105,6 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "placed along the edges": loaded.placed,
         "gauge": _gauge(loaded.graph, held),
         "start": start,
-        "method": options.method,
         "kernel": options.kernel or "none",
         **(_robust(solution, doubted, tried, impossible) if doubted else {}),
         f"chi2 of the file{plain}": costs[0]
@@ -203,7 +199,7 @@ def _advice(status: int, tried: Collection[str]) -> str:
     others = ", ".join(name for name in starts.STARTS if name not in tried)
     more = ", more --iterations" * (status == Ending.EXHAUSTED)
     return (
-        f": no minimum was reached; try another start (--start {others}){more}, another --method, "
+        f": no minimum was reached; try another start (--start {others}){more}, "
         "or --kernel if loops may be false"
     )
 

@@ -62,9 +62,7 @@ def film_writers(
     iterates, costs = [begun], [float(solution.chi2_start)]
     with Progress(f"{Path(options.path).name}: film", "frames") as progress:
         for done, steps in enumerate(shown):
-            at = graphs.optimize(
-                begun, factors, method=options.method, kernel=kernel, iterations=steps
-            )
+            at = graphs.optimize(begun, factors, kernel=kernel, iterations=steps)
             iterates.append(jax.tree.map(np.asarray, at.graph))
             costs.append(float(at.chi2))
             progress(done + 1, len(shown))

@@ -6,23 +6,19 @@ from jaxslam.cli.common import add_dtype, add_out
 from jaxslam.cli.optimize.command import ERRORS, SEVERAL, optimize_graph
 from jaxslam.cli.runtime import cache
 from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
-from jaxslam.graphs.solver.search import METHODS as STEPS
 from jaxslam.graphs.starts import STARTS
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam optimize`."""
     parser.add_argument("path", metavar="FILE", help="a graph in the format of g2o or TORO")
-    for name, default, known, text in (
-        ("method", "levenberg_marquardt", STEPS, "the steps"),
-        ("error", "pose", ERRORS, "the residual of a relative pose, g2o's or GTSAM's"),
-    ):
-        parser.add_argument(
-            f"--{name}",
-            metavar="NAME",
-            default=default,
-            help=f"{text}, one of: {', '.join(known)} (default: {default})",
-        )
+    parser.add_argument(
+        "--error",
+        metavar="NAME",
+        default="pose",
+        help="the residual of a relative pose, g2o's or GTSAM's, one of: "
+        f"{', '.join(ERRORS)} (default: pose)",
+    )
     parser.add_argument(
         "--start",
         metavar="NAME",

@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from jaxslam.cli.common import (
     COUNT,
     SUMMARY,
-    asked_figures,
     check_out,
     pick,
     summary_table,
@@ -46,7 +45,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     refuse_laser_options(options)
     if options.check_every is not None and options.check_every < 0:
         raise ValueError(f"--check-every: expected at least 0, got {options.check_every}")
-    formats = check_figure_formats("--figures", asked_figures(options))
+    formats = check_figure_formats("--figures", options.figures.split(","))
     data = _reader(options.dataset)(options.path, options.robot)
     data = with_options(data, options)
     filters = chosen_filters(data, options.filters or "ekf")

@@ -94,13 +94,13 @@ class ProgramFolder:
 def program_folder(campaign: Mapping[str, str]) -> Iterator[ProgramFolder | None]:
     """A block with a campaign's `ProgramFolder` in place of JAX's own cache.
 
-    It is None where the cache is off, and where several processes share the work.
+    It is None where the cache is off.
 
     Args:
         campaign: its `identity`.
     """
     folder = jax.config.jax_compilation_cache_dir
-    if folder is None or jax.process_count() > 1:
+    if folder is None:
         yield None
         return
     with cache.jax_settings(jax_compilation_cache_dir=None):

@@ -1,1 +1,1 @@
-"""Information filters: EIF-SLAM, and the sparse filters SEIF and ESEIF."""
+"""Information filters: EIF-SLAM, and the sparse filter SEIF."""

@@ -136,19 +136,16 @@ def report(
     association: TagAssociation,
     of: CanonicalInnovations,
     initialized: Bool[Array, "M"],
-    waiting: Bool[Array, "M"] | None = None,
 ) -> Info:
-    """The `Info` of a scan; measurements of landmarks that are not active yet are DEFERRED."""
+    """The `Info` of a scan."""
     status = status_of(
         scan.valid,
         matched=association.known,
         positive=of.positive,
         inside=of.inside,
-        postponed=waiting,
         new=association.new,
         repeated=association.repeated,
         granted=initialized,
-        deferred=waiting,
         singular=association.has_slot,
     )
     return info_of(

@@ -2,9 +2,10 @@
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.information import canonical
+from jaxslam.filters.information import canonical, innovation
+from jaxslam.filters.information.innovation import CanonicalInnovations
 from jaxslam.filters.information.settings import SparseSettings
 from jaxslam.filters.information.sparse.active_set import (
     activate,
@@ -12,22 +13,23 @@ from jaxslam.filters.information.sparse.active_set import (
     assign_indices,
     deactivate,
 )
+from jaxslam.filters.information.sparse.marginals import blanket_marginals, whole_marginals
 from jaxslam.filters.information.sparse.mean_recovery import (
+    recover_active_means,
     recover_passive_means,
     repeat_recovery,
 )
-from jaxslam.filters.information.sparse.sparse_filter import (
-    check_scan_size,
-    correct_active,
-    finish_scan,
-    initialize_active,
-    sparse_filter,
+from jaxslam.filters.information.sparse.sparse_state import (
+    SparseState,
+    active_means,
+    active_residual,
+    empty_map,
+    with_active_residual,
 )
-from jaxslam.filters.information.sparse.sparse_state import SparseState
 from jaxslam.filters.information.sparse.sparsification import cut_robot_links
 from jaxslam.filters.information.tag_association import TagAssociation, associate_by_index
 from jaxslam.protocols import Filter, Motion, Sensor
-from jaxslam.types import Info, Scan
+from jaxslam.types import Estimate, Info, Scan
 
 
 def seif(
@@ -63,8 +65,8 @@ def seif(
     With active = capacity it is `eif_slam`. `sparsification` documents what is dropped, and
     `SparseState.counts` counts it. NIS, gate and, unless `whole`, `estimate` use covariances of
     Markov blankets (`marginals`), which hold all other landmarks at their means: less than the true
-    ones, by much in a map that has drifted as a whole. Sparsification is overconfident too, which
-    `eseif` is not. Landmarks are points associated by their tags, and the tag of one is its slot.
+    ones, by much in a map that has drifted as a whole. Sparsification is overconfident
+    too. Landmarks are points associated by their tags, and the tag of one is its slot.
 
     An active block that is not positive definite: as in `eif_slam`, counted in
     `ApproximationCounts.refused`.
@@ -104,25 +106,49 @@ def seif(
     )
 
     def update(state: SparseState, scan: Scan, key: Array) -> tuple[SparseState, Info]:
-        check_scan_size(settings, scan)
+        _check_scan_size(settings, scan)
         state = recover_passive_means(state, settings.recovered)
         measured = associate_by_index(state.alive, scan)
-        state, index = sparsify_and_activate(settings, state, measured)
-        state, omega, innovations, solved = correct_active(
+        state, index = _sparsify_and_activate(settings, state, measured)
+        state, omega, innovations, solved = _correct_active(
             settings, state, scan, index, measured.known
         )
         state = repeat_recovery(settings, state, omega, solved)
         room = measured.new & measured.has_slot & solved
-        state, omega, initialized = initialize_active(
+        state, omega, initialized = _initialize_active(
             settings, state, omega, scan, measured.slot, index, room
         )
-        state = finish_scan(state, scan, index, measured.has_slot, omega, solved)
+        state = _finish_scan(state, scan, index, measured.has_slot, omega, solved)
         return state, canonical.report(scan, measured, innovations, initialized)
 
-    return sparse_filter(settings, update)
+    def init(pose: Array, pose_cov: Array) -> SparseState:
+        information = canonical.initial_information(pose_cov, settings.floor).astype(pose.dtype)
+        return empty_map(pose, information, settings.capacity, settings.active_size, settings.links)
+
+    def predict(state: SparseState, u: Array, key: Array) -> SparseState:
+        pose, omega, residual = canonical.motion_update(
+            settings.motion, state.pose, u, state.omega, active_residual(state)
+        )
+        return with_active_residual(state._replace(pose=pose, omega=omega), residual)
+
+    def estimate(state: SparseState) -> Estimate:
+        marginals = whole_marginals if settings.whole else blanket_marginals
+        pose_cov, point_covs = marginals(state)
+        unit = jnp.eye(2, dtype=point_covs.dtype)[None]
+        alive = state.alive
+        return Estimate(
+            pose=state.pose,
+            pose_cov=pose_cov,
+            points=jnp.where(alive[:, None], state.landmarks, 0.0),
+            point_covs=jnp.where(alive[:, None, None], point_covs, unit),
+            alive=alive,
+            tag=jnp.where(alive, jnp.arange(settings.capacity), -1).astype(jnp.int32),
+        )
+
+    return canonical.information_filter(settings, init, predict, update, estimate)
 
 
-def sparsify_and_activate(
+def _sparsify_and_activate(
     settings: SparseSettings, state: SparseState, measured: TagAssociation
 ) -> tuple[SparseState, Int[Array, "M"]]:
     """The state with all measured landmarks active, and their indices in the active set.
@@ -140,3 +166,74 @@ def sparsify_and_activate(
     state = cut_robot_links(state, leaving)
     state = deactivate(state, leaving, most, settings.conservative)
     return activate(state, index, measured.slot, enters), index
+
+
+def _check_scan_size(settings: SparseSettings, scan: Scan) -> None:
+    """Raise ValueError unless all landmarks of a scan can be active at once."""
+    size = scan.tag.shape[0]
+    if size > settings.active:
+        raise ValueError(
+            f"{settings.name}: expected active >= {size}, the measurement slots of a scan, got "
+            f"{settings.active}"
+        )
+
+
+def _correct_active(
+    settings: SparseSettings,
+    state: SparseState,
+    scan: Scan,
+    index: Int[Array, "M"],
+    known: Bool[Array, "M"],
+) -> tuple[SparseState, Float[Array, "D D"], CanonicalInnovations, Bool[Array, ""]]:
+    """The state with its mean corrected by measurements of active landmarks, Ω after them, their
+    innovations, and whether the mean could be solved for."""
+    found = innovation.innovations(
+        settings, state.omega, state.pose, active_means(state), scan, index, known
+    )
+    omega, residual = canonical.measurement_update(state.omega, active_residual(state), found)
+    state, solved = recover_active_means(state, omega, residual, found.omega_positive)
+    return state, omega, innovation.refuse_unless(solved, found), solved
+
+
+def _initialize_active(
+    settings: SparseSettings,
+    state: SparseState,
+    omega: Float[Array, "D D"],
+    scan: Scan,
+    slot: Int[Array, "M"],
+    index: Int[Array, "M"],
+    wanted: Bool[Array, "M"],
+) -> tuple[SparseState, Float[Array, "D D"], Bool[Array, "M"]]:
+    """The state with new landmarks in their slots where wanted, Ω with them, and which were
+    started."""
+    omega, landmarks, initialized = canonical.initialize_landmarks(
+        settings.sensor, omega, state.pose, scan.z, index, wanted
+    )
+    into = jnp.where(initialized, slot, state.alive.shape[0])
+    state = state._replace(
+        landmarks=state.landmarks.at[into].set(landmarks, mode="drop"),
+        alive=state.alive.at[into].set(True, mode="drop"),
+    )
+    return state, omega, initialized
+
+
+def _finish_scan(
+    state: SparseState,
+    scan: Scan,
+    index: Int[Array, "M"],
+    has_slot: Bool[Array, "M"],
+    omega: Float[Array, "D D"],
+    solved: Bool[Array, ""],
+) -> SparseState:
+    """The state with Ω of the active block, with diagonal loading if not solved; one more scan.
+
+    index: where the measured landmarks are in the active set.
+    """
+    at = jnp.where(has_slot, index, state.active.shape[0])
+    refused = state.counts.refused + (scan.valid.any() & ~solved)
+    return state._replace(
+        omega=jnp.where(solved, omega, canonical.diagonal_loading(state.omega)),
+        last_measured=state.last_measured.at[at].set(state.scans + 1, mode="drop"),
+        scans=state.scans + 1,
+        counts=state.counts._replace(refused=refused),
+    )

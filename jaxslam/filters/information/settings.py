@@ -76,18 +76,3 @@ class SparseSettings(InformationSettings):
     def recovered(self) -> int:
         """The number of passive means that a round of mean recovery updates."""
         return min(self.passive, self.capacity)
-
-
-@dataclass(frozen=True, eq=False)
-class RelocationSettings(SparseSettings):
-    """The settings of a filter that relocates the robot."""
-
-    turn: float
-    """greatest standard deviation of the heading [rad] that a relocation may leave"""
-    wait: bool
-    """measurements wait for a relocation; or else links are cut by sparsification"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.turn > 0:
-            raise ValueError(f"{self.name}: expected a turn above 0, got {self.turn}")

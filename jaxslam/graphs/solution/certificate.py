@@ -143,7 +143,7 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     chordal = Model(tuple((name, chordal_factor(factor)) for name, factor in model.factors))
     surrogate = graph._replace(tables=tables, fixed_pose=held)
     tolerance = jnp.asarray(1e-13, dtype)
-    found = minimize(chordal, "levenberg_marquardt", plan, jnp.asarray(100), tolerance, surrogate)
+    found = minimize(chordal, plan, jnp.asarray(100), tolerance, surrogate)
     variables, data = variables_of(found.graph), data_of(surrogate, plan.column)
     blocks, multipliers, turns = dual(chordal, plan, variables, data)
     value = found.chi2

@@ -41,7 +41,7 @@ class Round(NamedTuple):
 
 
 def graduated(
-    model: Model, method: str, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
+    model: Model, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
 ) -> Solution:
     """The solutions of graphs with a last axis B, whose model has truncated kernels.
 
@@ -65,7 +65,7 @@ def graduated(
         for name, weight in weights.items():
             table = tables[name]
             tables[name] = table._replace(information=table.information * weight[:, None, None])
-        return minimize(plain, method, plan, iterations, tolerance, graph._replace(tables=tables))
+        return minimize(plain, plan, iterations, tolerance, graph._replace(tables=tables))
 
     def ratios(found: Solution) -> dict[str, Array]:
         """s/c² of the rows that can be left out."""

@@ -19,9 +19,7 @@ from jaxslam.graphs.solver.linearized import (
 )
 from jaxslam.graphs.solver.model import Model
 from jaxslam.graphs.solver.plan import Plan
-from jaxslam.graphs.solver.steps import dogleg, dot, marquardt
-
-METHODS = ("levenberg_marquardt", "gauss_newton", "dogleg")
+from jaxslam.graphs.solver.steps import dot, marquardt
 
 FIRST_DAMPING = 1e-7
 """λ after an undamped step that fails, as a share of the diagonal."""
@@ -36,13 +34,13 @@ class Ending(IntEnum):
     """No step lowers χ²: rounding, or a residual whose derivatives are wrong. Another start may
     end in a minimum."""
     DIVERGED = 2
-    """χ² is not finite, or Gauss-Newton ended above its start."""
+    """χ² of the start is not finite."""
     SINGULAR = 3
     """The measurements do not determine the variable `singular`, at the last iterate, beyond the
     rounding of the numbers: in float32 a chain of some hundred poses from the gauge can be such.
-    Where the method damps its steps it went on, and χ² is a minimum."""
+    Damped steps went on, and χ² is a minimum."""
     EXHAUSTED = 4
-    """All iterations were made. Another start or method may end, in fewer steps and lower."""
+    """All iterations were made. Another start may end, in fewer steps and lower."""
 
 
 class Solution(NamedTuple):
@@ -73,15 +71,13 @@ class Search(NamedTuple):
     trial: Variables
     predicted: Float[Array, "B"]
     """by how much the trial lowers χ² in the quadratic model"""
-    length: Float[Array, "B"]
-    """of the trial's step, with the diagonal as the metric"""
     stepped: Bool[Array, "B"]
     """whether the trial is another point than the iterate"""
     variables: Variables
     system: System
     """about the iterate"""
-    bound: Float[Array, "B"]
-    """λ, or the radius of the dogleg"""
+    damping: Float[Array, "B"]
+    """λ"""
     going: Bool[Array, "B"]
     ending: Int[Array, "B"]
     taken: Int[Array, "B"]
@@ -97,7 +93,7 @@ class Search(NamedTuple):
 
 
 def minimize(
-    model: Model, method: str, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
+    model: Model, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
 ) -> Solution:
     """The solutions of graphs with a last axis B."""
     data = data_of(graph, plan.column)
@@ -110,11 +106,10 @@ def minimize(
     begin = Search(
         trial=start,
         predicted=zero,
-        length=zero,
         stepped=~no,
         variables=start,
         system=System(zero + jnp.inf, jnp.zeros(data.free.shape, dtype), blocks),
-        bound=zero + (jnp.inf if method == "dogleg" else 0.0),
+        damping=zero,
         going=~no,
         ending=none + Ending.EXHAUSTED,
         taken=none - 1,
@@ -140,30 +135,24 @@ def minimize(
         finite, began = jnp.isfinite(there.chi2), search.taken < 0
         gain = search.system.chi2 - there.chi2
         ratio = gain / jnp.where(search.predicted > 0, search.predicted, 1.0)
-        if method == "gauss_newton":
-            good = finite
-            bound = search.bound
-        else:
-            # A step hardly damped may go uphill, as far as the iterate before: it crosses curved
-            # valleys along which damped steps crawl (Grippo, Lampariello and Lucidi 1986, "A
-            # nonmonotone line search technique for Newton's method", SIAM J. Num. Analysis 23(4)).
-            above = jnp.maximum(search.former - search.system.chi2, 0.0)
-            plain = (search.bound <= FIRST_DAMPING) & (method == "levenberg_marquardt")
-            slack = jnp.where(plain, above, 0.0)
-            good = finite & (began | (gain + slack > 1e-3 * search.predicted))
-            bound = (radius if method == "dogleg" else damping)(search, good, ratio)
+        # A step hardly damped may go uphill, as far as the iterate before: it crosses curved
+        # valleys along which damped steps crawl (Grippo, Lampariello and Lucidi 1986, "A
+        # nonmonotone line search technique for Newton's method", SIAM J. Num. Analysis 23(4)).
+        above = jnp.maximum(search.former - search.system.chi2, 0.0)
+        slack = jnp.where(search.damping <= FIRST_DAMPING, above, 0.0)
+        good = finite & (began | (gain + slack > 1e-3 * search.predicted))
         asked = search.going & search.stepped
         take = asked & good
-        refused = jnp.where(take, False, search.refused | (asked & ~good & (search.bound == 0)))
+        refused = jnp.where(take, False, search.refused | (asked & ~good & (search.damping == 0)))
 
         def chosen(new: Array, old: Array) -> Array:
             return jnp.where(take.reshape((1,) * (new.ndim - 1) + batch), new, old)
 
-        lost = asked & ~finite & (began | (method == "gauss_newton"))
+        lost = asked & ~finite & began
         return search._replace(
             variables=jax.tree.map(chosen, search.trial, search.variables),
             system=jax.tree.map(chosen, there, search.system),
-            bound=jnp.where(asked & ~began, bound, search.bound),
+            damping=jnp.where(asked & ~began, damping_after(search, good, ratio), search.damping),
             going=search.going & ~lost,
             ending=jnp.where(lost, Ending.DIVERGED, search.ending).astype(jnp.int32),
             taken=search.taken + asked,
@@ -173,84 +162,64 @@ def minimize(
             judged=search.judged & ~take,
         )
 
-    def damping(search: Search, good: Array, ratio: Array) -> Array:
+    def damping_after(search: Search, good: Array, ratio: Array) -> Array:
         """The damping λ after a step: less after good ones, down to none; more after refused ones.
 
         The first good step after a refused one leaves it as it is.
         """
         known = search.singular >= 0
-        less = jnp.where(search.bound < 1e-10, jnp.where(known, 1e-10, 0.0), search.bound / 10)
-        kept = jnp.where((ratio > 0.25) & ~search.careful, less, search.bound)
-        more = jnp.where(search.careful, 100.0, 10.0) * search.bound
+        least = jnp.where(known, 1e-10, 0.0)
+        less = jnp.where(search.damping < 1e-10, least, search.damping / 10)
+        kept = jnp.where((ratio > 0.25) & ~search.careful, less, search.damping)
+        more = jnp.where(search.careful, 100.0, 10.0) * search.damping
         return jnp.where(good, kept, jnp.maximum(more, FIRST_DAMPING))
-
-    def radius(search: Search, good: Array, ratio: Array) -> Array:
-        """The trust region's radius after a step (Nocedal and Wright 2006, algorithm 4.1)."""
-        wider = jnp.maximum(search.bound, 2 * search.length)
-        kept = jnp.where(ratio > 0.75, wider, search.bound)
-        return jnp.where(good & (ratio > 0.25), kept, search.length / 4)
 
     def proposed(search: Search) -> Search:
         """The search with its next trial, or at its end."""
-        plain = (search.bound == 0) | (method == "dogleg")
+        plain = search.damping == 0
         known = search.singular >= 0
-        make = dogleg if method == "dogleg" else marquardt
-        step = make(plan, search.system, search.bound)
+        step = marquardt(plan, search.system, search.damping)
         regular = step.regular.all(axis=0)
         culprit = plan.order[jnp.argmin(step.regular, axis=0)].astype(jnp.int32)
         singular = jnp.where(plain & ~regular & ~known, culprit, search.singular)
         chi2 = search.system.chi2
         least = jnp.maximum(tolerance * chi2, 32 * eps * (chi2 + 1))
-        small = step.decrement <= least
+        small = step.predicted <= least
         # What is regular at the end is determined there, whatever it was on the way.
         singular = jnp.where(plain & regular & small, -1, singular)
         known = singular >= 0
-        bound, stepped, judged = search.bound, ~no, search.judged
-        if method == "gauss_newton":
-            done = ~regular | small
-            ending = jnp.where(regular, Ending.CONVERGED, Ending.SINGULAR)
-        else:
-            stuck = (search.refused if method != "dogleg" else no) | (step.predicted <= 0)
-            done = small & (plain | (known & judged) | stuck)
-            ending = jnp.where(known, Ending.SINGULAR, Ending.CONVERGED)
-            # A gradient of exactly zero is no reason to stall.
-            stalled = ~plain | (stuck & (step.predicted != 0))
-            ending = jnp.where(~known & stalled, Ending.STALLED, ending)
-        if method == "dogleg":
-            stuck = ~small & (step.predicted <= least * 1e-3)
-            done, ending = done | stuck, jnp.where(stuck, Ending.STALLED, ending)
-        if method == "levenberg_marquardt":
-            # Without a step: an undamped factor that failed, or that has to confirm convergence.
-            stepped = regular & ~(small & ~plain)
-            bound = jnp.where(regular, bound, jnp.maximum(10 * bound, FIRST_DAMPING))
-            again = regular & small & ~plain & ~done
-            bound, judged = jnp.where(again, 0.0, bound), judged | (again & known)
-            stuck = ~done & (bound > 1e10)
-            done, ending = done | stuck, jnp.where(stuck, Ending.STALLED, ending)
+        stuck = search.refused | (step.predicted <= 0)
+        done = small & (plain | (known & search.judged) | stuck)
+        ending = jnp.where(known, Ending.SINGULAR, Ending.CONVERGED)
+        # A gradient of exactly zero is no reason to stall.
+        stalled = ~plain | (stuck & (step.predicted != 0))
+        ending = jnp.where(~known & stalled, Ending.STALLED, ending)
+        # Without a step: an undamped factor that failed, or that has to confirm convergence.
+        more = jnp.maximum(10 * search.damping, FIRST_DAMPING)
+        damping = jnp.where(regular, search.damping, more)
+        again = regular & small & ~plain & ~done
+        damping = jnp.where(again, 0.0, damping)
+        stuck = ~done & (damping > 1e10)
+        done, ending = done | stuck, jnp.where(stuck, Ending.STALLED, ending)
         ends = search.going & done
         return search._replace(
             trial=retract(search.variables, step.increments, plan),
             predicted=step.predicted,
-            length=step.length,
-            stepped=stepped,
-            bound=jnp.where(search.going, bound, search.bound),
+            stepped=regular & (~small | plain),
+            damping=jnp.where(search.going, damping, search.damping),
             going=search.going & ~done & (search.taken < iterations),
             ending=jnp.where(ends, ending, search.ending).astype(jnp.int32),
             singular=jnp.where(search.going, singular, search.singular),
-            judged=judged,
+            judged=search.judged | (again & known),
         )
 
     end, first_chi2, first_gradient = jax.lax.while_loop(
         lambda carry: carry[0].going.any(), iterate, (begin, zero, zero)
     )
-    ending = end.ending
-    if method == "gauss_newton":
-        rose = (ending == Ending.EXHAUSTED) & (end.system.chi2 > first_chi2)
-        ending = jnp.where(rose, Ending.DIVERGED, ending)
     return Solution(
         graph=graph._replace(poses=end.variables.poses, points=end.variables.points),
         chi2=end.system.chi2,
-        status=ending,
+        status=end.ending,
         iterations=jnp.maximum(end.taken, 0),
         singular=end.singular,
         chi2_start=first_chi2,

@@ -2,13 +2,12 @@
 
 import time
 from collections import deque
-from collections.abc import Callable
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxslam.consistency import Measure, Score, condense, mean_pose_nees, positive_interval, score
+from jaxslam.consistency import Score, condense, score
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.monte_carlo.blocks.limit import divergence_limit, first_run
@@ -20,40 +19,29 @@ BOUND = "bound"
 """Under this name a block keeps the sums of the conditional bound, and the divergence limit."""
 
 
-Glimpse = Callable[[str, int, Measure | None], PyTree]
-"""(filter, runs, their mean pose NEES)."""
-
-
 class BlockRunner:
     """Computes blocks; one may be begun before all programs are there, and waits for each."""
 
-    def __init__(
-        self, plan: CampaignPlan, promises: Promises, glimpse: Glimpse | None = None
-    ) -> None:
-        self.plan, self.promises, self.glimpse = plan, promises, glimpse
+    def __init__(self, plan: CampaignPlan, promises: Promises) -> None:
+        self.plan, self.promises = plan, promises
         self.first: dict[str, tuple[Truth, Estimate]] = {}
         """run 0 of each filter, once its block has run"""
         self._spent: dict[str, list[tuple[bool, float]]] = {name: [] for name in plan.filters}
         """whether nothing was being compiled, and wall seconds; of each block so far"""
 
-    def block(
-        self, first: int, runs: int, early: bool, tell: bool
-    ) -> dict[str, dict[str, np.ndarray]]:
+    def block(self, first: int, runs: int, early: bool) -> dict[str, dict[str, np.ndarray]]:
         """The condensed scores of runs first … first + runs - 1 by filter, all within a block.
 
-        early: begin while other programs are being compiled, and do not time that. tell: let
-        `glimpse` know of each filter as soon as it has run.
+        early: begin while other programs are being compiled, and do not time that.
         """
         try:
-            return self._block(first, runs, early, tell)
+            return self._block(first, runs, early)
         except BaseException as error:
             if first == 0:
                 self.promises.give_up(error)  # nobody else finds the limit
             raise
 
-    def _block(
-        self, first: int, runs: int, early: bool, tell: bool
-    ) -> dict[str, dict[str, np.ndarray]]:
+    def _block(self, first: int, runs: int, early: bool) -> dict[str, dict[str, np.ndarray]]:
         plan, promises = self.plan, self.promises
         if not early:
             promises.complete.result()
@@ -78,10 +66,6 @@ class BlockRunner:
                     jax.tree.map(lambda leaf: leaf[0], truth),
                     jax.tree.map(lambda leaf: first_run(leaf, 1), results.estimate),
                 )
-            if tell and self.glimpse is not None:
-                poses = truth.pose, *trace.estimate[:2]
-                nees, defined = mean_pose_nees(*(np.asarray(rows)[mine] for rows in poses))
-                self.glimpse(name, runs, positive_interval(nees[defined]))
             waiting.append((name, results, trace))
             # A filter is compiled before the statistics of the one before it.
             while waiting and (len(waiting) > 1 or promises.statistics[waiting[0][0]].done()):

@@ -35,7 +35,6 @@ def circle(steps: int = 2500) -> Scenario:
         "right_invariant": (2.51, 0.55, 1.01, 2 * 1.17),
         "ukf": (3.01, 0.67, 2.93, 2 * 2.63),
         "ukf_right": (2.51, 0.55, 1.01, 2 * 1.09),
-        "ukf_left": (3.30, 0.75, 10.38, 2 * 118.60),
     }
     published = {name: dict(zip(names, row, strict=True)) for name, row in figures.items()}
     fullest = int(((distance > 1) & (distance < 5)).sum(axis=1).max())

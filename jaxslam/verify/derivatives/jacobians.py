@@ -12,7 +12,6 @@ from jaxtyping import Float, PyTree
 
 from jaxslam.math.xla import quick_jit
 from jaxslam.verify.derivatives.differences import Batch, Quotient, complex_step, quotients
-from jaxslam.verify.derivatives.jumps import Jump, find_jumps
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.inputs.claims import as_claim, split_claim
 from jaxslam.verify.inputs.functions import Function, periods
@@ -56,8 +55,6 @@ class Evaluated(NamedTuple):
     """in float64; None if the function cannot be called"""
     by_argument: tuple[Jacobians, ...]
     checks: tuple[Check, ...]
-    jumps: tuple[Jump, ...] = ()
-    """of outputs that are not named as angles"""
 
 
 def evaluate_jacobians(function: Function, samples: Samples) -> Evaluated:
@@ -108,7 +105,6 @@ class _Evaluator:
             values,
             tuple(evaluations),
             tuple(self.checks),
-            self._jumps(),
         )
 
     @cached_property
@@ -221,12 +217,6 @@ class _Evaluator:
         """A claimed Jacobian split by argument; raises ValueError on a wrong shape."""
         names = [argument.name for argument in self.function.arguments]
         return split_claim(claim, len(self.function.outputs), names, self.sizes)
-
-    def _jumps(self) -> tuple[Jump, ...]:
-        """Jumps by a whole turn; none are sought in a function that is called state by state."""
-        if not self.traceable:
-            return ()
-        return find_jumps(self.values, self.samples, self.function.periods)
 
     def _quotient(self, which: int) -> tuple[Quotient, str]:
         """The Jacobian by differences or, where possible, by the complex step; and which it is."""

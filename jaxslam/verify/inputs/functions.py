@@ -14,7 +14,6 @@ from jaxslam.core.record import set_field
 from jaxslam.graphs import Factor
 from jaxslam.protocols import Motion, Sensor, unfit_signature
 from jaxslam.verify.inputs.claims import Claim
-from jaxslam.verify.inputs.lengths import LONGEST, MOST_UNKNOWN, Deduced, deduce_lengths
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
 POINT = ("x [m]", "y [m]")
@@ -39,8 +38,6 @@ class Argument:
     entries: tuple[str, ...]
     scale: float = 1.0
     """factor of its random values; noise is small"""
-    deduced: bool = False
-    """whether its length is known from shapes alone, so that its entries have no names"""
 
 
 @dataclass(frozen=True)
@@ -54,11 +51,6 @@ class Function:
     hand: Claim | None = None
     """arguments -> a tuple of a Jacobian or None for each argument, or one array: by the first
     argument, or by all of them side by side"""
-
-    @property
-    def periods(self) -> Float[np.ndarray, "m"]:
-        """The periods of the outputs, inf of those on a line."""
-        return periods(self.outputs)
 
 
 def at_state(function: Function, state: Sequence[ArrayLike]) -> str:
@@ -162,8 +154,8 @@ def plain_function(
 ) -> Function:
     """A function of vectors, whose arguments are known by the names of its parameters.
 
-    Lengths that are neither given nor follow from a parameter's name are those of the states, or
-    deduced by `deduce_lengths`. Raises ValueError where the length of an argument is undetermined.
+    Lengths that are neither given nor follow from a parameter's name are those of the states.
+    Raises ValueError where the length of an argument is not known.
     """
     name = name or str(getattr(call, "__name__", type(call).__name__))
     if arguments is not None and not isinstance(arguments, Mapping):
@@ -182,22 +174,17 @@ def plain_function(
             f"{name}: expected a function with a parameter to differentiate by, got none"
         )
     named = {p: _entries(name, p, given.get(p, GLOSSARY.get(p))) for p in parameters}
-    lengths = {p: None if entries is None else len(entries) for p, entries in named.items()}
     shapes = [np.shape(table) for table in (() if states is None else states)]
     if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
         pairs = zip(parameters, shapes, strict=True)
-        lengths |= {p: shape[1] for p, shape in pairs if lengths[p] is None}
-    if None in lengths.values():
-        deduced = deduce_lengths(call, jacobian, lengths, len(outputs) if outputs else None)
-        lengths |= deduced.lengths
-        if missing := [p for p, length in lengths.items() if length is None]:
-            raise ValueError(_undetermined(name, missing, jacobian is not None, deduced))
-    arguments_of = tuple(
-        Argument(p, _numbered(p, lengths[p] or 0), deduced=True)
-        if entries is None
-        else Argument(p, entries)
-        for p, entries in named.items()
-    )
+        named |= {p: _numbered(p, shape[1]) for p, shape in pairs if named[p] is None}
+    known = {p: entries for p, entries in named.items() if entries is not None}
+    if missing := [p for p in named if p not in known]:
+        raise ValueError(
+            f"{name}: the length of {', '.join(map(repr, missing))} is not known. Name the "
+            f"entries, each with its unit: {_example(name, missing)}"
+        )
+    arguments_of = tuple(Argument(p, entries) for p, entries in known.items())
     return Function(name, call, arguments_of, tuple(outputs or ()), jacobian)
 
 
@@ -229,37 +216,12 @@ def _numbered(parameter: str, count: int) -> tuple[str, ...]:
     return tuple(f"{parameter}[{k}]" for k in range(count))
 
 
-def _undetermined(name: str, missing: list[str], claimed: bool, deduced: Deduced) -> str:
-    """The message that the lengths of some arguments are needed, and how they are given."""
-    both = f"{name} and its Jacobian accept" if claimed else f"{name} accepts"
-    why = f"{both} more than one"
-    if deduced.error:
-        why = f"{name} fails with 1 to {LONGEST} entries ({deduced.error})"
-    elif len(missing) > MOST_UNKNOWN:
-        why = f"at most {MOST_UNKNOWN} are deduced"
-    which = ", ".join(map(repr, missing))
-    return (
-        f"{name}: the length of {which} is not known: {why}. Name the entries, each "
-        f"with its unit: {example_of(name, dict.fromkeys(missing, 2))}"
-    )
-
-
-def example_of(name: str, lengths: Mapping[str, int]) -> str:
-    """Where a user names the entries of a function's arguments, with as many names as entries.
-
-    Two are named as a speed and a turn rate, three as a pose.
-    """
-
-    def names(parameter: str, count: int) -> str:
-        told = {2: ("v [m/s]", "omega [rad/s]"), 3: POSE}.get(count)
-        told = told or tuple(f"{parameter}{k} [unit]" for k in range(count))
-        inside = ", ".join(f'"{one}"' for one in told)
-        return f'"{parameter}": ({inside}{"," * (count == 1)})'
-
-    line = "{" + ", ".join(names(*pair) for pair in lengths.items()) + "}"
+def _example(name: str, parameters: Sequence[str]) -> str:
+    """Where a user names the entries of a function's arguments, of two entries each."""
+    line = ", ".join(f'"{one}": ("v [m/s]", "omega [rad/s]")' for one in parameters)
     if name.isidentifier():
-        return f"{name}_arguments = {line} in the file, or arguments= in Python"
-    return f"arguments={line} in Python; in a file define a function, which has a name"
+        return f"{name}_arguments = {{{line}}} in the file, or arguments= in Python"
+    return f"arguments={{{line}}} in Python; in a file define a function, which has a name"
 
 
 def _has_signature(call: Callable[..., object]) -> bool:

@@ -1,7 +1,6 @@
 """The active set of a `SparseState`: its landmarks, activation and deactivation.
 
-A landmark leaves only without a link to the robot: `seif` cuts the link
-(`sparsification.sparsify`), `eseif` waits until there is none.
+A landmark leaves only without a link to the robot, which `sparsification.sparsify` cuts.
 """
 
 import jax

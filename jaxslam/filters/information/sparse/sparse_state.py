@@ -17,11 +17,9 @@ class ApproximationCounts(NamedTuple):
     """Counts of approximations and failures since the start."""
 
     cut: Int[Array, ""]
-    """landmarks whose link to the robot was removed, by `sparsification.sparsify` or a relocation
-    (`eseif`)"""
+    """landmarks whose link to the robot was removed (`sparsification.sparsify`)"""
     cut_nats: Float[Array, ""]
-    """Σ I(x; m0 | active) that sparsification dropped, and Σ ½ (log |Ω| - log |Ω̃|) of the active
-    block by relocations, in nats"""
+    """Σ I(x; m0 | active) that sparsification dropped, in nats"""
     dropped: Int[Array, ""]
     """links between landmarks dropped, their lists being full (`sparsification.drop_link`)"""
     dropped_links: Float[Array, ""]
@@ -30,8 +28,6 @@ class ApproximationCounts(NamedTuple):
     """number of them dropped overconfidently, so that Ω stays positive definite"""
     refused: Int[Array, ""]
     """scans refused because Ω of the active block was not positive definite"""
-    relocated: Int[Array, ""]
-    """how often the robot's pose was marginalized out, and estimated anew (`eseif`)"""
 
 
 class SparseState(NamedTuple):
@@ -86,7 +82,7 @@ def empty_map(
         links=jnp.zeros((capacity, links, 2, 2), dtype),
         next_recovered=none,
         scans=none,
-        counts=ApproximationCounts(none, zero, none, zero, none, none, none),
+        counts=ApproximationCounts(none, zero, none, zero, none, none),
     )
 
 

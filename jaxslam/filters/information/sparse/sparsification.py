@@ -5,11 +5,11 @@
 
        Ω̃ = Ω + G Σ⁻¹ Gᵀ - Ω F_x Ω_x⁻¹ F_xᵀ Ω,   G = Ω F_x - Ω F_m0 Ω_m0⁻¹ Ω_m0,x,   Σ = F_xᵀ G.
 
-   `seif` does it in every scan that needs room; `eseif` relocates instead (`relocation`), unless
-   wait=False. `ApproximationCounts.cut` and `.cut_nats` count what was dropped.
+   `seif` does it in every scan that needs room. `ApproximationCounts.cut` and `.cut_nats` count
+   what was dropped.
 2. Landmark to landmark, `drop_link`: a landmark's list has room for K links; a full list drops its
    weakest link Ω_ij (`link_lists`), and the two diagonal blocks change so that Ω̃ stays positive
-   definite. Both filters do it; `.dropped`, `.dropped_links` and `.anchored` count it.
+   definite. `.dropped`, `.dropped_links` and `.anchored` count it.
 """
 
 import jax.numpy as jnp
