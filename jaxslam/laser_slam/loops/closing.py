@@ -26,7 +26,7 @@ from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
 from jaxslam.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops
-from jaxslam.laser_slam.scans import Scans
+from jaxslam.laser_slam.scans import ROWS, Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.math.stats import chi2_quantile
 
@@ -69,9 +69,9 @@ def closed(
     total = covariances.along(at, covs)
     middle = index[:: settings.submap_every]
     usable = scans.usable[keyframe] & ~odometry.doubted[keyframe]
-    looks = descriptors(
-        *(np.asarray(part)[keyframe] for part in (scans.points.position, scans.points.valid))
-    )
+    ends_at, there = np.asarray(scans.points.position), np.asarray(scans.points.valid)
+    parts = np.split(keyframe, range(ROWS, len(keyframe), ROWS))
+    looks = np.concatenate([descriptors(ends_at[some], there[some]) for some in parts])
     graph = graph_of(at, keyframe, chain)
     solution: graphs.Solution | None = None
     tried: list[Candidates] = []
