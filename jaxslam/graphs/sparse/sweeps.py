@@ -126,7 +126,7 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
     counts = np.bincount(sums.target, minlength=size)
     begin = (np.cumsum(counts) - counts)[order]
     count = counts[order]
-    by_target = np.append(np.argsort(sums.target, kind="stable"), len(sums.target))  # then none
+    by_target = np.argsort(sums.target, kind="stable").astype(np.int32)
     levels = int(sums.level.max(initial=-1)) + 1
     first = np.searchsorted(sums.level[order], np.arange(levels + 1))
     # (first place, first product of a target, end of the round's targets) of each chunk
@@ -147,24 +147,20 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
     ending = order[np.minimum(end_place, size - 1)]
     width = padded_table_size(len(bases), 16 * room)
     finished = padded_table_size(len(end_base), 4 * room)
-    # By product, and of none: its factors, and whether the left one is transposed.
-    of = [np.append(at[factor], at[-1]) for factor, at in ((sums.left, left), (sums.right, right))]
-    of += [] if sums.flip is None else [np.append(sums.flip, False)]
-    kinds = [np.int32, np.int32, bool]
-    tables = [
-        np.full((width, TARGETS, TERMS), one[-1], kind)
-        for one, kind in zip(of, kinds, strict=False)
-    ]
+    tables = [np.full((width, TARGETS, TERMS), at[-1], np.int32) for at in (left, right)]
+    flips = None if sums.flip is None else np.zeros((width, TARGETS, TERMS), bool)
     for part in range(0, len(bases), PART):
         some = slice(part, min(part + PART, len(bases)))
         place = bases[some, None] + np.arange(TARGETS)
         there = np.minimum(place, size - 1)[..., None]
         term = shifts[some, None, None] + np.arange(TERMS)
         real = (place < stops[some, None])[..., None] & (term < count[there])
-        product = by_target[np.where(real, begin[there] + term, -1)]
-        for table, one in zip(tables, of, strict=True):
-            table[some] = one[product]
-    lefts, rights, *flips = map(index_table, tables)
+        product = by_target[np.where(real, begin[there] + term, 0)]
+        for table, factor, at in zip(tables, (sums.left, sums.right), (left, right), strict=True):
+            table[some] = at[np.where(real, factor[product], -1)]
+        if flips is not None and sums.flip is not None:
+            flips[some] = sums.flip[product]
+    lefts, rights = map(index_table, tables)
     return Sweep(
         index_table(np.array(levels)),
         level_table(rounds, room),
@@ -174,7 +170,7 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
         level_table(ends, room),
         index_table(np.array(end_base, int), finished),
         index_table(end[np.where(inside, ending, -1)], finished, int(end[-1])),
-        flips[0] if flips else None,
+        None if flips is None else index_table(flips),
     )
 
 
