@@ -24,7 +24,7 @@ TARGETS = 8
 TERMS = 2
 """K, products of a target that are computed together"""
 
-PART = 1 << 14
+PART = 1 << 12
 """Chunks whose tables are made at once: a large graph has some hundred thousand of them."""
 
 Ints = Int[np.ndarray, "_"]
