@@ -24,6 +24,7 @@ from jaxslam.laser_slam.loops.candidates import (
 from jaxslam.laser_slam.loops.descriptor import descriptors
 from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
+from jaxslam.laser_slam.memory import give_back
 from jaxslam.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops
 from jaxslam.laser_slam.scans import ROWS, Scans
@@ -110,6 +111,7 @@ def closed(
 
         tried.append(new)
         found.append(matched(scans, keyframe, path, new, settings, tell))
+        give_back()
         loops, kept = _agreeing(tried, found, at, total, settings)
         ends |= set(zip(loops.first[kept].tolist(), loops.second[kept].tolist(), strict=True))
         edges = table_of(loops.first[kept], loops.second[kept], loops.z[kept], loops.cov[kept])
@@ -117,6 +119,7 @@ def closed(
         kernel = KERNEL if kept.any() else None
         solution = graphs.optimize(graph, kernel=kernel, room=ROOM)
         graph = _host(solution.graph)
+        give_back()
     doubtful = table_of(index[:-1], index[1:], steps, odometry.cov[keyframe[1:]])
     return _final(graph, doubtful, loops, kept, keyframe, settings)._replace(left_out=left_out)
 

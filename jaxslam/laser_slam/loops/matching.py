@@ -66,15 +66,12 @@ def matched(
                 outcome[row] = LoopOutcome.AMBIGUOUS
         return len(rows)
 
-    # The first of each window compiles what the others share; here, since glibc keeps the memory of
-    # a compilation for the thread that made it.
     submaps = np.unique(candidates.first)
-    begin = np.unique(candidates.first[np.unique(candidates.wide, return_index=True)[1]])
-    for _ in range(sum(map(of_submap, begin))):
+    for _ in range(of_submap(submaps[0]) if count else 0):  # compiles what the others share
         progress()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
-            for done in pool.map(of_submap, np.setdiff1d(submaps, begin)):
+            for done in pool.map(of_submap, submaps[1:]):
                 for _ in range(done):
                     progress()
         except BaseException:
