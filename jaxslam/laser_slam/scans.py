@@ -89,7 +89,8 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     spacing = max(_spacing(angles[:, ::stride], there[:, ::stride]), 1e-3)
     span = np.int32(np.clip(round(SPAN / spacing), 2, MAX_NEIGHBOURS))
     every, kept = -(-len(range(0, beams, stride)) // settings.beams), settings.beams
-    parts, changed = [], []
+    changed = []
+    scans: Any = None
     for begin in range(0, count, ROWS):  # some at a time, since a log may be long
         last = max(begin - 1, 0)
         near = met_something(
@@ -103,11 +104,14 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
         lines = jax.tree.map(np.asarray, _surfaces(filled, span))
         # Beams that fill a scan up come last: they are cut off, or stay without a point.
         size = len(rows.range)
-        both = filled, lines
-        parts.append(jax.tree.map(lambda part, n=size: _thinned(part[:n], every, kept), both))
-    whole, line = jax.tree.map(lambda *each: np.concatenate(each), *parts)
-    usable = np.asarray(whole.valid).sum(axis=1) >= settings.fewest
-    return Scans(whole, line, usable, np.concatenate(changed))
+        found = jax.tree.map(lambda part, n=size: _thinned(part[:n], every, kept), (filled, lines))
+        if not begin:  # all at once: parts and their concatenation would take twice the memory
+            scans = jax.tree.map(lambda of: np.empty((count, *of.shape[1:]), of.dtype), found)
+        for whole, part in zip(jax.tree.leaves(scans), jax.tree.leaves(found), strict=True):
+            whole[begin : begin + size] = part
+    points, lines = scans
+    usable = points.valid.sum(axis=1) >= settings.fewest
+    return Scans(points, lines, usable, np.concatenate(changed))
 
 
 def _points(beams: Beams, mount: Float[np.ndarray, "3"], max_range: float) -> Points:

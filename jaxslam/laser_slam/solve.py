@@ -11,6 +11,7 @@ from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM
 from jaxslam.laser_slam.loops.closing import closed
 from jaxslam.laser_slam.mapping import frame_of, map_of
+from jaxslam.laser_slam.memory import give_back
 from jaxslam.laser_slam.odometry.pieces import laser_odometry
 from jaxslam.laser_slam.odometry.raw import Steps, steps_of
 from jaxslam.laser_slam.odometry.tracking import Odometry
@@ -51,6 +52,7 @@ def solve(
         nonlocal began
         now = time.perf_counter()
         seconds[stage], began = now - began, now
+        give_back()
 
     def telling(stage: str) -> Callable[[int, int], object] | None:
         return None if progress is None else lambda done, of: progress(stage, done, of)

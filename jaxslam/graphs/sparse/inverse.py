@@ -40,24 +40,10 @@ def inverse_tables(
 
     cholesky_places: of each block in `Factored.blocks`, and of none.
     """
-    size, rows, columns = len(pattern.order), pattern.rows, pattern.columns
-    target, left, right, flip = [], [], [], []
-    for column, blocks in pattern.below():
-        own = rows[blocks]  # (C, m)
-        # The rows of a column, its own included, by the rows below its diagonal.
-        every = np.concatenate([column[:, None], own], axis=1)
-        one, other = np.broadcast_arrays(every[:, :, None], own[:, None, :])
-        at = np.concatenate([pattern.first[column][:, None], blocks], axis=1)
-        target.append(np.broadcast_to(at[:, :, None], one.shape).ravel())
-        left.append(pattern.find(np.maximum(one, other).ravel(), np.minimum(one, other).ravel()))
-        flip.append((one < other).ravel())
-        right.append(np.broadcast_to(blocks[:, None, :], one.shape).ravel())
-    depth = pattern.heights[-1] - pattern.heights
-    # The diagonal block of a column comes after those below it, of which it is a sum.
-    level = 2 * depth[columns] + (rows == columns)
-    sums = Sums(level, *map(np.concatenate, (target, left, right, flip)))
+    size = len(pattern.order)
+    sums = _sums(pattern)
     _, place = places(sums, block_count(pattern, room))
-    end = np.append(columns, nothing(size))
+    end = np.append(pattern.columns, nothing(size))
     one, other = pattern.position[first], pattern.position[second]
     pairs = place[pattern.find(np.maximum(one, other), np.minimum(one, other))]
     return InverseTables(
@@ -66,6 +52,26 @@ def inverse_tables(
         index_table(pairs),
         index_table(one < other),
     )
+
+
+def _sums(pattern: Pattern) -> Sums:
+    """The products of the selected inversion, of which a large graph has millions."""
+    rows, columns = pattern.rows, pattern.columns
+    target, left, right, flip = [], [], [], []
+    for column, blocks in pattern.below():
+        own = rows[blocks]  # (C, m)
+        # The rows of a column, its own included, by the rows below its diagonal.
+        every = np.concatenate([column[:, None], own], axis=1)
+        one, other = np.broadcast_arrays(every[:, :, None], own[:, None, :])
+        at = np.concatenate([pattern.first[column][:, None], blocks], axis=1, dtype=np.int32)
+        target.append(np.broadcast_to(at[:, :, None], one.shape).ravel())
+        left.append(pattern.find(np.maximum(one, other).ravel(), np.minimum(one, other).ravel()))
+        flip.append((one < other).ravel())
+        right.append(np.broadcast_to(blocks[:, None, :], one.shape).ravel())
+    depth = pattern.heights[-1] - pattern.heights
+    # The diagonal block of a column comes after those below it, of which it is a sum.
+    level = 2 * depth[columns] + (rows == columns)
+    return Sums(level, *map(np.concatenate, (target, left, right, flip)))
 
 
 def selected_inverse(tables: InverseTables, factored: Factored) -> Float[Array, "places d d B"]:

@@ -24,6 +24,9 @@ TARGETS = 8
 TERMS = 2
 """K, products of a target that are computed together"""
 
+PART = 1 << 12
+"""Chunks whose tables are made at once: a large graph has some hundred thousand of them."""
+
 Ints = Int[np.ndarray, "_"]
 Product = Callable[[Array, Array], Array]
 
@@ -77,7 +80,7 @@ def padded_table_size(size: int, room: int = 0) -> int:
 
 def index_table(numbers: np.ndarray, size: int | None = None, fill: int = 0) -> Array:
     """A table of integers or flags, on the device; filled up to so many rows."""
-    kept = numbers if numbers.dtype == bool else numbers.astype(np.int32)
+    kept = numbers if numbers.dtype == bool else numbers.astype(np.int32, copy=False)
     if size is not None:
         more = [(0, size - len(kept))] + [(0, 0)] * (kept.ndim - 1)
         kept = np.pad(kept, more, constant_values=fill)
@@ -123,45 +126,51 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
     counts = np.bincount(sums.target, minlength=size)
     begin = (np.cumsum(counts) - counts)[order]
     count = counts[order]
-    by_target = np.append(np.argsort(sums.target, kind="stable"), 0)
+    by_target = np.argsort(sums.target, kind="stable").astype(np.int32)
     levels = int(sums.level.max(initial=-1)) + 1
     first = np.searchsorted(sums.level[order], np.arange(levels + 1))
     # (first place, first product of a target, end of the round's targets) of each chunk
-    chunks: list[tuple[int, int, int]] = []
+    chunks = [np.zeros((3, 0), int)]
     rounds, ends, end_base = [0], [0], list[int]()
     for low, high in zip(first[:-1].tolist(), first[1:].tolist(), strict=True):
+        rounds.append(rounds[-1])
         for shift in range(0, int(count[low]), TERMS):
             stop = low + int(np.count_nonzero(count[low:high] > shift))
-            chunks += [(first_place, shift, stop) for first_place in range(low, stop, TARGETS)]
-        rounds.append(len(chunks))
+            base = np.arange(low, stop, TARGETS)
+            chunks.append(np.stack([base, np.full_like(base, shift), np.full_like(base, stop)]))
+            rounds[-1] += len(base)
         end_base += range(low, high, TARGETS)
         ends.append(len(end_base))
-    bases, shifts, stops = np.array(chunks, int).reshape(-1, 3).T
-    place = bases[:, None] + np.arange(TARGETS)
-    there = np.minimum(place, size - 1)[..., None]
-    term = shifts[:, None, None] + np.arange(TERMS)
-    real = (place < stops[:, None])[..., None] & (term < count[there])
-    product = by_target[np.where(real, begin[there] + term, -1)]
+    bases, shifts, stops = np.concatenate(chunks, axis=1)
     end_place = np.array(end_base, int)[:, None] + np.arange(TARGETS)
     inside = end_place < np.repeat(first[1:], np.diff(ends))[:, None]
     ending = order[np.minimum(end_place, size - 1)]
     width = padded_table_size(len(bases), 16 * room)
     finished = padded_table_size(len(end_base), 4 * room)
-
-    def factors(numbers: Ints, place: Ints) -> Array:
-        numbers = np.append(numbers, 0)[product]
-        return index_table(place[np.where(real, numbers, -1)], width, int(place[-1]))
-
+    tables = [np.full((width, TARGETS, TERMS), at[-1], np.int32) for at in (left, right)]
+    flips = None if sums.flip is None else np.zeros((width, TARGETS, TERMS), bool)
+    for part in range(0, len(bases), PART):
+        some = slice(part, min(part + PART, len(bases)))
+        place = bases[some, None] + np.arange(TARGETS)
+        there = np.minimum(place, size - 1)[..., None]
+        term = shifts[some, None, None] + np.arange(TERMS)
+        real = (place < stops[some, None])[..., None] & (term < count[there])
+        product = by_target[np.where(real, begin[there] + term, 0)]
+        for table, factor, at in zip(tables, (sums.left, sums.right), (left, right), strict=True):
+            table[some] = at[np.where(real, factor[product], -1)]
+        if flips is not None and sums.flip is not None:
+            flips[some] = sums.flip[product]
+    lefts, rights = map(index_table, tables)
     return Sweep(
         index_table(np.array(levels)),
         level_table(rounds, room),
         index_table(bases, width),
-        factors(sums.left, left),
-        factors(sums.right, right),
+        lefts,
+        rights,
         level_table(ends, room),
         index_table(np.array(end_base, int), finished),
         index_table(end[np.where(inside, ending, -1)], finished, int(end[-1])),
-        None if sums.flip is None else index_table(np.append(sums.flip, False)[product], width),
+        None if flips is None else index_table(flips),
     )
 
 

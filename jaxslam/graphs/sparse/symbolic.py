@@ -49,7 +49,7 @@ class Pattern:
         size = len(self.order)
         keys = self.columns * size + self.rows
         wanted = columns * size + rows
-        found: Ints = np.searchsorted(keys, wanted)
+        found: Ints = np.searchsorted(keys, wanted).astype(np.int32)  # half the memory
         if len(wanted) and (found.max() >= len(keys) or (keys[found] != wanted).any()):
             raise ValueError("graphs: a block is not in the pattern of the plan")
         return found
@@ -61,7 +61,8 @@ class Pattern:
         out = []
         for m in np.unique(counts):
             columns = np.flatnonzero(counts == m)
-            out.append((columns, self.first[columns][:, None] + 1 + np.arange(m)))
+            blocks = self.first[columns][:, None] + 1 + np.arange(m)
+            out.append((columns, blocks.astype(np.int32)))
         return out
 
 

@@ -24,9 +24,10 @@ from jaxslam.laser_slam.loops.candidates import (
 from jaxslam.laser_slam.loops.descriptor import descriptors
 from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
+from jaxslam.laser_slam.memory import give_back
 from jaxslam.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops
-from jaxslam.laser_slam.scans import Scans
+from jaxslam.laser_slam.scans import ROWS, Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.math.stats import chi2_quantile
 
@@ -69,9 +70,9 @@ def closed(
     total = covariances.along(at, covs)
     middle = index[:: settings.submap_every]
     usable = scans.usable[keyframe] & ~odometry.doubted[keyframe]
-    looks = descriptors(
-        *(np.asarray(part)[keyframe] for part in (scans.points.position, scans.points.valid))
-    )
+    ends_at, there = np.asarray(scans.points.position), np.asarray(scans.points.valid)
+    parts = np.split(keyframe, range(ROWS, len(keyframe), ROWS))
+    looks = np.concatenate([descriptors(ends_at[some], there[some]) for some in parts])
     graph = graph_of(at, keyframe, chain)
     solution: graphs.Solution | None = None
     tried: list[Candidates] = []
@@ -110,6 +111,7 @@ def closed(
 
         tried.append(new)
         found.append(matched(scans, keyframe, path, new, settings, tell))
+        give_back()
         loops, kept = _agreeing(tried, found, at, total, settings)
         ends |= set(zip(loops.first[kept].tolist(), loops.second[kept].tolist(), strict=True))
         edges = table_of(loops.first[kept], loops.second[kept], loops.z[kept], loops.cov[kept])
@@ -117,6 +119,7 @@ def closed(
         kernel = KERNEL if kept.any() else None
         solution = graphs.optimize(graph, kernel=kernel, room=ROOM)
         graph = _host(solution.graph)
+        give_back()
     doubtful = table_of(index[:-1], index[1:], steps, odometry.cov[keyframe[1:]])
     return _final(graph, doubtful, loops, kept, keyframe, settings)._replace(left_out=left_out)
 

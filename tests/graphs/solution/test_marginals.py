@@ -1,5 +1,8 @@
 """Marginal covariances, against the dense inverse."""
 
+import tracemalloc
+
+import jax
 import numpy as np
 import pytest
 import small_graphs
@@ -8,6 +11,7 @@ from reference import graph as plain
 from small_graphs import POINTS, POSES
 
 from jaxslam import graphs
+from jaxslam.graphs.sparse.sweeps import Sums, places, sweep
 
 
 def as_it_is(graph):
@@ -69,3 +73,18 @@ def test_pairs_are_two_whole_numbers_each(pairs):
     """A table on its side would else be read as other pairs."""
     with pytest.raises(ValueError, match=r"expected pairs of whole numbers, \(Q, 2\), got"):
         graphs.marginals(as_it_is(ring()), pairs=pairs)
+
+
+def test_tables_of_sums_take_little_more_memory_than_they_hold_in_the_end():
+    # A plan with marginals of 15,000 poses has nine million products.
+    rng, targets, products = np.random.default_rng(0), 4_000, 1_000_000
+    numbers = rng.integers(0, targets, (3, products)).astype(np.int32)
+    sums = Sums(np.sort(rng.integers(0, 20, targets)), *numbers, rng.random(products) < 0.5)
+    _, place = places(sums, targets)
+    tracemalloc.start()
+    try:
+        tables = sweep(sums, place, place, place)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 3 * sum(part.nbytes for part in jax.tree.leaves(tables))
